@@ -1,0 +1,33 @@
+# `make demo` and `make test` set up a virtual environment on the first call and reuse it afterwards.
+# Options: PYTHON=python3.12 (which interpreter), VENV=.venv (where the environment lies).
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+SET_UP_INPUTS := pyproject.toml constraints.txt CMakeLists.txt \
+	$(shell find native -type f 2>/dev/null | LC_ALL=C sort)
+
+.PHONY: demo test lint types setup clean
+
+demo: $(STAMP)
+	$(BIN)/evsplat demo $(DEMO_OPTIONS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest $(TEST_OPTIONS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(STAMP)
+	$(BIN)/mypy src
+
+setup: $(STAMP)
+
+$(STAMP): $(SET_UP_INPUTS)
+	@PYTHON="$(PYTHON)" sh tools/make_venv.sh "$(VENV)"
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev]"
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,704 @@
+// Projection, compositing and their gradients for one SIMD level; compiled once per level.
+//
+// EVSPLAT_LEVEL is the namespace, EVSPLAT_LANES the floats per vector. No function of the C++ library
+// is used and everything but the table has internal linkage (see simd.h).
+
+#include "kernels.h"
+
+#if defined(__x86_64__) || defined(__i386__)
+#include <immintrin.h>
+#endif
+
+namespace evsplat {
+namespace EVSPLAT_LEVEL {
+namespace {
+
+#include "simd.h"
+
+constexpr float kEps2d = 0.3f;              // low-pass filter, px^2
+constexpr float kMinAlpha = 1.f / 255.f;
+constexpr float kMaxAlpha = 0.999f;
+constexpr float kMinTransmittance = 1e-4f;
+constexpr float kMaxExtent = 3.33f;         // standard deviations
+constexpr float kHalfLog2e = 0.72134752f;   // exp(-s/2) = exp2(-kHalfLog2e s)
+constexpr float kMaxPixel = 1e6f;           // farther than this from the image is not drawn
+constexpr uint32_t kChunk = 32;             // entries of a tile handled together
+
+// ------------------------------------------------------------------ projection
+
+// Everything that both directions of the projection of W Gaussians need.
+struct Projection {
+    F px, py, pz;                  // mean in the world
+    F x, y, z, rz, xn, yn;         // mean in the camera; 1/z, x/z, y/z
+    F j00, j02, j11, j12;          // Jacobian of the projection
+    I inside_x, inside_y;          // the Jacobian's angle is not clamped
+    F a[2][3], b[2][3], br[2][3];  // J Rv, J Rv linear, J Rv linear R
+    F lin[3][3], rot[3][3], s[3];
+    F qw, qx, qy, qz, inv_norm;    // unit quaternion
+    F m[2][3];                     // J Rv linear R S
+    F cov_xx, cov_xy, cov_yy, det;
+};
+
+struct Limits { float x_lo, x_hi, y_lo, y_hi; };
+
+// gsplat clamps the angle in the Jacobian to the field of view enlarged by 30 % of its half width.
+INLINE Limits limits(const View& view) {
+    const float mx = 0.15f * view.width / view.fx, my = 0.15f * view.height / view.fy;
+    return {-view.cx / view.fx - mx, (view.width - view.cx) / view.fx + mx,
+            -view.cy / view.fy - my, (view.height - view.cy) / view.fy + my};
+}
+
+INLINE void project_lanes(const View& view, const Gaussians& g, uint32_t i, uint32_t n, Projection& p) {
+    const float* r = view.r;
+    const float* mean = g.means + 3 * size_t(i);
+    p.px = gather<3>(mean, n), p.py = gather<3>(mean + 1, n), p.pz = gather<3>(mean + 2, n);
+    p.x = r[0] * p.px + r[1] * p.py + r[2] * p.pz + view.t[0];
+    p.y = r[3] * p.px + r[4] * p.py + r[5] * p.pz + view.t[1];
+    p.z = r[6] * p.px + r[7] * p.py + r[8] * p.pz + view.t[2];
+    p.rz = 1.f / p.z;
+    p.xn = p.x * p.rz, p.yn = p.y * p.rz;
+
+    const Limits lim = limits(view);
+    const F cx = min(max(p.xn, splat(lim.x_lo)), splat(lim.x_hi));
+    const F cy = min(max(p.yn, splat(lim.y_lo)), splat(lim.y_hi));
+    p.inside_x = cx == p.xn, p.inside_y = cy == p.yn;
+    p.j00 = view.fx * p.rz, p.j11 = view.fy * p.rz;
+    p.j02 = -p.j00 * cx, p.j12 = -p.j11 * cy;
+    for (int k = 0; k < 3; ++k) {
+        p.a[0][k] = p.j00 * r[k] + p.j02 * r[6 + k];
+        p.a[1][k] = p.j11 * r[3 + k] + p.j12 * r[6 + k];
+    }
+    if (g.linear) {
+        const float* linear = g.linear + 9 * size_t(i);
+        for (int k = 0; k < 9; ++k) p.lin[k / 3][k % 3] = gather<9>(linear + k, n);
+        for (int o = 0; o < 2; ++o)
+            for (int k = 0; k < 3; ++k)
+                p.b[o][k] = p.a[o][0] * p.lin[0][k] + p.a[o][1] * p.lin[1][k] + p.a[o][2] * p.lin[2][k];
+    } else {
+        for (int o = 0; o < 2; ++o)
+            for (int k = 0; k < 3; ++k) p.b[o][k] = p.a[o][k];
+    }
+
+    const float* quat = g.quats + 4 * size_t(i);
+    F qw = gather<4>(quat, n), qx = gather<4>(quat + 1, n), qy = gather<4>(quat + 2, n), qz = gather<4>(quat + 3, n);
+    p.inv_norm = 1.f / sqrt(qw * qw + qx * qx + qy * qy + qz * qz);
+    p.qw = qw *= p.inv_norm, p.qx = qx *= p.inv_norm, p.qy = qy *= p.inv_norm, p.qz = qz *= p.inv_norm;
+    p.rot[0][0] = 1.f - 2.f * (qy * qy + qz * qz);
+    p.rot[0][1] = 2.f * (qx * qy - qw * qz);
+    p.rot[0][2] = 2.f * (qx * qz + qw * qy);
+    p.rot[1][0] = 2.f * (qx * qy + qw * qz);
+    p.rot[1][1] = 1.f - 2.f * (qx * qx + qz * qz);
+    p.rot[1][2] = 2.f * (qy * qz - qw * qx);
+    p.rot[2][0] = 2.f * (qx * qz - qw * qy);
+    p.rot[2][1] = 2.f * (qy * qz + qw * qx);
+    p.rot[2][2] = 1.f - 2.f * (qx * qx + qy * qy);
+    const float* scale = g.scales + 3 * size_t(i);
+    for (int k = 0; k < 3; ++k) {
+        p.s[k] = gather<3>(scale + k, n);
+        for (int o = 0; o < 2; ++o) {
+            p.br[o][k] = p.b[o][0] * p.rot[0][k] + p.b[o][1] * p.rot[1][k] + p.b[o][2] * p.rot[2][k];
+            p.m[o][k] = p.br[o][k] * p.s[k];
+        }
+    }
+
+    const F(&m)[2][3] = p.m;
+    const F xx = m[0][0] * m[0][0] + m[0][1] * m[0][1] + m[0][2] * m[0][2];
+    const F yy = m[1][0] * m[1][0] + m[1][1] * m[1][1] + m[1][2] * m[1][2];
+    p.cov_xy = m[0][0] * m[1][0] + m[0][1] * m[1][1] + m[0][2] * m[1][2];
+    p.cov_xx = xx + kEps2d, p.cov_yy = yy + kEps2d;
+    // det(M M^T + eps I) from the minors of M: xx yy - xy^2 would cancel for long thin Gaussians.
+    const F n01 = m[0][0] * m[1][1] - m[0][1] * m[1][0];
+    const F n02 = m[0][0] * m[1][2] - m[0][2] * m[1][0];
+    const F n12 = m[0][1] * m[1][2] - m[0][2] * m[1][1];
+    p.det = n01 * n01 + n02 * n02 + n12 * n12 + kEps2d * (xx + yy) + kEps2d * kEps2d;
+}
+
+// Which patches of the tile at (x0, y0) hold a pixel where u^2 + v^2 <= limit; exact up to rounding.
+INLINE uint64_t patches_reached(const Projected& p, float kx, float ky, float x0, float y0, float limit) {
+    const float left = x0 + 0.5f - p.x, top = y0 + 0.5f - p.y;
+    uint64_t reached = 0;
+    for (int first = 0; first < kPatches; first += W) {
+        F xa, ya;
+        for (int l = 0; l < W; ++l) {
+            xa[l] = float((first + l) % kPatchesX * kPatchW);
+            ya[l] = float((first + l) / kPatchesX * kPatchH);
+        }
+        xa += left, ya += top;
+        const F xb = xa + float(kPatchW - 1), yb = ya + float(kPatchH - 1);
+        // The least value over a rectangle lies on the vertical or the horizontal line through the
+        // point of the rectangle that is nearest to the centre in that coordinate.
+        const F xc = min(max(F{}, xa), xb), yc = min(max(F{}, ya), yb);
+        const F xe = min(max(kx * yc, xa), xb), ye = min(max(ky * xc, ya), yb);
+        const F u1 = p.l11 * xc + p.l12 * ye, v1 = p.l22 * ye;
+        const F u2 = p.l11 * xe + p.l12 * yc, v2 = p.l22 * yc;
+        const F least = min(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2);
+        reached |= bits(least <= limit) << first;
+    }
+    return reached;
+}
+
+INLINE int clamp_tile(float pixel, int last) {
+    const float tile = pixel * (1.f / kTile);
+    return tile < 0.f ? 0 : tile > float(last) ? last : int(tile);
+}
+
+void project(const View& view, const Gaussians& g, uint32_t begin, uint32_t end, Projected* projected,
+             int32_t* radii, uint32_t* first_slot, SlotList& slots) {
+    for (uint32_t i = begin; i < end; i += W) {
+        const uint32_t n = end - i < uint32_t(W) ? end - i : uint32_t(W);
+        Projection p;
+        project_lanes(view, g, i, n, p);
+        F mx = view.fx * p.xn + view.cx, my = view.fy * p.yn + view.cy;
+        if (g.offset) {
+            mx += gather<2>(g.offset + 2 * size_t(i), n);
+            my += gather<2>(g.offset + 2 * size_t(i) + 1, n);
+        }
+        const F opacity = gather<1>(g.opacities + i, n);
+        const float s = __builtin_sqrtf(kHalfLog2e);
+        const F l22 = s / sqrt(p.cov_yy);
+        const F l11 = s * sqrt(p.cov_yy / p.det);
+        const F kx = p.cov_xy / p.cov_yy, ky = p.cov_xy / p.cov_xx;
+        const F l12 = -l11 * kx;
+        const F sx = sqrt(p.cov_xx), sy = sqrt(p.cov_yy);
+        // Comparisons are written so that NaN fails them and is not drawn.
+        const I ok = (p.z >= view.near_plane) & (p.det > 0.f) & (opacity >= kMinAlpha) & (p.det < 1e30f) &
+                     (mx > -kMaxPixel) & (mx < kMaxPixel) & (my > -kMaxPixel) & (my < kMaxPixel) &
+                     (sx < kMaxPixel) & (sy < kMaxPixel) & (l11 < 1e6f);
+
+        for (uint32_t l = 0; l < n; ++l) {
+            const uint32_t gaussian = i + l;
+            first_slot[gaussian] = uint32_t(slots.size);
+            radii[gaussian] = 0;
+            if (!ok[l]) continue;
+            const float log2_opacity = __builtin_log2f(opacity[l]);
+            const float limit = log2_opacity + 7.9943534f;  // log2(255)
+            const float extent = __builtin_sqrtf((limit > 0.f ? limit : 0.f) / kHalfLog2e);
+            const float drawn = extent < kMaxExtent ? extent : kMaxExtent;
+            const float rx = __builtin_ceilf(drawn * sx[l]), ry = __builtin_ceilf(drawn * sy[l]);
+            if (!(mx[l] + rx > 0.f && mx[l] - rx < float(view.width) && my[l] + ry > 0.f &&
+                  my[l] - ry < float(view.height)))
+                continue;
+            const Projected out = {mx[l], my[l], l11[l], l12[l], l22[l], log2_opacity, p.z[l], 0.f};
+            projected[gaussian] = out;
+            radii[gaussian] = int32_t(rx > ry ? rx : ry);
+
+            // Rounding must not cut a patch that the pixel test would keep; that test decides.
+            const float slack = limit * 1.001f + 1e-3f;
+            const float ex = extent * sx[l] * 1.001f + 0.51f, ey = extent * sy[l] * 1.001f + 0.51f;
+            const int tx0 = clamp_tile(mx[l] - ex, view.tiles_x - 1), tx1 = clamp_tile(mx[l] + ex, view.tiles_x - 1);
+            const int ty0 = clamp_tile(my[l] - ey, view.tiles_y - 1), ty1 = clamp_tile(my[l] + ey, view.tiles_y - 1);
+            for (int ty = ty0; ty <= ty1; ++ty) {
+                for (int tx = tx0; tx <= tx1; ++tx) {
+                    const uint64_t reached =
+                        patches_reached(out, kx[l], ky[l], float(tx * kTile), float(ty * kTile), slack);
+                    if (!reached) continue;
+                    if (slots.size == slots.capacity) slots.grow(slots);
+                    slots.data[slots.size++] = {uint32_t(ty * view.tiles_x + tx), gaussian, reached};
+                }
+            }
+        }
+    }
+}
+
+// ------------------------------------------------------------------ compositing
+
+struct Tile {
+    int x0, y0, columns, rows;  // pixels inside the image
+};
+
+INLINE Tile tile_of(const View& view, uint32_t index) {
+    Tile t;
+    t.x0 = int(index) % view.tiles_x * kTile, t.y0 = int(index) / view.tiles_x * kTile;
+    t.columns = view.width - t.x0 < kTile ? view.width - t.x0 : kTile;
+    t.rows = view.height - t.y0 < kTile ? view.height - t.y0 : kTile;
+    return t;
+}
+
+// Pixel centres of each patch, and whether they are in the image.
+struct Pixels {
+    F x[kPatches], y[kPatches];
+    I inside[kPatches];
+};
+
+INLINE void fill_pixels(const Tile& t, Pixels& pixels) {
+    F lane_x, lane_y;
+    for (int l = 0; l < W; ++l) lane_x[l] = float(l % kPatchW) + 0.5f, lane_y[l] = float(l / kPatchW) + 0.5f;
+    for (int p = 0; p < kPatches; ++p) {
+        const F x = lane_x + float(p % kPatchesX * kPatchW), y = lane_y + float(p / kPatchesX * kPatchH);
+        pixels.x[p] = x + float(t.x0), pixels.y[p] = y + float(t.y0);
+        pixels.inside[p] = (x < float(t.columns)) & (y < float(t.rows));
+    }
+}
+
+// Calls f(patch, lane, x, y) for each pixel of the tile inside the image.
+template <class Function>
+INLINE void for_pixels(const Tile& t, Function f) {
+    for (int p = 0; p < kPatches; ++p)
+        for (int l = 0; l < W; ++l) {
+            const int x = p % kPatchesX * kPatchW + l % kPatchW, y = p / kPatchesX * kPatchH + l / kPatchW;
+            if (x < t.columns && y < t.rows) f(p, l, t.x0 + x, t.y0 + y);
+        }
+}
+
+// Copies planar image rows to or from the patches' lanes.
+INLINE void store_plane(const Tile& t, const F* patches, int step, float* plane, int width) {
+    if (t.columns == kTile && t.rows == kTile) {
+        for (int p = 0; p < kPatches; ++p) {
+            float* out = plane + size_t(t.y0 + p / kPatchesX * kPatchH) * width + t.x0 + p % kPatchesX * kPatchW;
+            const float* lanes = (const float*)&patches[p * step];
+            for (int r = 0; r < kPatchH; ++r)
+                __builtin_memcpy(out + size_t(r) * width, lanes + r * kPatchW, kPatchW * sizeof(float));
+        }
+    } else {
+        for_pixels(t, [&](int p, int l, int x, int y) { plane[size_t(y) * width + x] = patches[p * step][l]; });
+    }
+}
+
+INLINE void load_plane(const Tile& t, F* patches, int step, const float* plane, ptrdiff_t sx, ptrdiff_t sy) {
+    if (t.columns == kTile && t.rows == kTile) {
+        for (int p = 0; p < kPatches; ++p) {
+            const float* in = plane + (t.y0 + p / kPatchesX * kPatchH) * sy + (t.x0 + p % kPatchesX * kPatchW) * sx;
+            float lanes[W];
+            if (sx == 1) {
+                for (int r = 0; r < kPatchH; ++r)
+                    __builtin_memcpy(lanes + r * kPatchW, in + r * sy, kPatchW * sizeof(float));
+            } else {
+                for (int l = 0; l < W; ++l) lanes[l] = in[l / kPatchW * sy + l % kPatchW * sx];
+            }
+            patches[p * step] = load(lanes);
+        }
+    } else {
+        for (int p = 0; p < kPatches; ++p) patches[p * step] = F{};
+        for_pixels(t, [&](int p, int l, int x, int y) { patches[p * step][l] = plane[x * sx + y * sy]; });
+    }
+}
+
+// A run of entries with what compositing reads, copied close together.
+struct Chunk {
+    Projected projected[kChunk];
+    const float* values[kChunk];
+    uint32_t count;
+};
+
+INLINE void fill_chunk(const ForwardJob& job, uint32_t begin, uint32_t end, Chunk& chunk) {
+    chunk.count = end - begin < kChunk ? end - begin : kChunk;
+    for (uint32_t j = 0; j < chunk.count; ++j) {
+        const uint32_t g = job.entries[begin + j].gaussian;
+        chunk.projected[j] = job.projected[g];
+        chunk.values[j] = job.values + size_t(g) * job.value_stride;
+        if (begin + j + kChunk < end) {
+            const uint32_t next = job.entries[begin + j + kChunk].gaussian;
+            __builtin_prefetch(&job.projected[next]);
+            __builtin_prefetch(job.values + size_t(next) * job.value_stride);
+        }
+    }
+}
+
+struct Alpha {
+    F u, v, raw, value;  // value: 0 below 1/255, at most 0.999
+};
+
+INLINE Alpha alpha_at(const Projected& g, F x, F y) {
+    Alpha a;
+    const F dx = x - g.x, dy = y - g.y;
+    a.u = g.l11 * dx + g.l12 * dy;
+    a.v = g.l22 * dy;
+    a.raw = exp2(g.log2_opacity - a.u * a.u - a.v * a.v);
+    a.value = select(a.raw >= kMinAlpha, min(a.raw, splat(kMaxAlpha)), F{});
+    return a;
+}
+
+// words[p] bit j: entry j of the chunk reaches patch p.
+INLINE void transpose_masks(const Entry* entries, uint32_t count, uint32_t* words) {
+#if EVSPLAT_LANES >= 8
+    U lane, word[kPatches / W] = {};
+    for (int l = 0; l < W; ++l) lane[l] = l;
+    for (uint32_t j = 0; j < count; ++j) {
+        const U mask = U{} + uint32_t(entries[j].patches);
+        for (int k = 0; k < kPatches / W; ++k) word[k] |= ((mask >> (lane + uint32_t(k * W))) & 1u) << j;
+    }
+    __builtin_memcpy(words, word, sizeof word);
+#else
+    for (int p = 0; p < kPatches; ++p) words[p] = 0;
+    for (uint32_t j = 0; j < count; ++j)
+        for (uint64_t mask = entries[j].patches; mask; mask &= mask - 1) words[__builtin_ctzll(mask)] |= 1u << j;
+#endif
+}
+
+// C > 0: that many channels, kept in registers; C = 0: up to kMaxChannels, kept in memory.
+template <int C>
+void forward_tile(const ForwardJob& job, uint32_t index) {
+    const View& view = job.view;
+    const int channels = C ? C : job.channels;
+    const Tile tile = tile_of(view, index);
+    Pixels pixels;
+    fill_pixels(tile, pixels);
+    F live[kPatches], final[kPatches];  // transmittance, 0 once stopped; what it was when it stopped
+    F colour[kPatches * (C ? C : kMaxChannels)];
+    for (int p = 0; p < kPatches; ++p) {
+        live[p] = select(pixels.inside[p], splat(1.f), F{});
+        final[p] = splat(1.f);
+    }
+    for (int k = 0; k < kPatches * channels; ++k) colour[k] = F{};
+
+    const uint32_t begin = job.tile_begin[index], end = job.tile_begin[index + 1];
+    uint32_t* patch_end = job.patch_end + size_t(index) * kPatches;
+    uint64_t open = 0;
+    for (int p = 0; p < kPatches; ++p) {
+        patch_end[p] = end - begin;
+        open |= uint64_t(bits(pixels.inside[p]) != 0) << p;
+    }
+    Chunk chunk;
+    for (uint32_t first = begin; first < end && open; first += kChunk) {
+        fill_chunk(job, first, end, chunk);
+        uint32_t words[kPatches];
+        transpose_masks(job.entries + first, chunk.count, words);
+        for (uint64_t left = open; left; left &= left - 1) {
+            const int p = __builtin_ctzll(left);
+            uint32_t word = words[p];
+            if (!word) continue;
+            const F x = pixels.x[p], y = pixels.y[p];
+            F t = live[p], t_final = final[p];
+            F* out = colour + p * channels;
+            F c[C ? C : 1];
+            for (int k = 0; k < C; ++k) c[k] = out[k];
+            for (; word; word &= word - 1) {
+                const int j = __builtin_ctz(word);
+                const F alpha = alpha_at(chunk.projected[j], x, y).value;
+                const F next = t - t * alpha;
+                const I go = next > kMinTransmittance;
+                const F weight = select(go, t * alpha, F{});
+                t_final = select(go, next, t_final);
+                t = select(go, next, F{});
+                const float* value = chunk.values[j];
+                if (C) {
+                    for (int k = 0; k < C; ++k) c[k] += weight * value[k];
+                } else {
+                    for (int k = 0; k < channels; ++k) out[k] += weight * value[k];
+                }
+            }
+            for (int k = 0; k < C; ++k) out[k] = c[k];
+            live[p] = t, final[p] = t_final;
+            if (!bits(t > 0.f)) {
+                open &= ~(uint64_t(1) << p);
+                patch_end[p] = first - begin + chunk.count;
+            }
+        }
+    }
+
+    if (job.background) {
+        F value[kPatches];
+        for (int k = 0; k < channels; ++k) {
+            load_plane(tile, value, 1, job.background + k * job.background_c, job.background_x, job.background_y);
+            for (int p = 0; p < kPatches; ++p) colour[p * channels + k] += final[p] * value[p];
+        }
+    }
+    const size_t plane = size_t(view.width) * view.height;
+    for (int k = 0; k < channels; ++k) store_plane(tile, colour + k, channels, job.image + k * plane, view.width);
+    for (int p = 0; p < kPatches; ++p) final[p] = 1.f - final[p];
+    store_plane(tile, final, 1, job.alpha, view.width);
+}
+
+// Front to back, with one running scalar per pixel: `rest` = gradient-weighted light from behind the
+// current Gaussian, so that dL/dalpha_i = T_i s_i - rest_i / (1 - alpha_i), s_i = value_i . dL/dpixel.
+template <int C>
+void backward_tile(const BackwardJob& back, uint32_t index) {
+    const ForwardJob& job = back.forward;
+    const View& view = job.view;
+    const int channels = C ? C : job.channels;
+    const int stride = slot_stride(channels);
+    const Tile tile = tile_of(view, index);
+    const size_t plane = size_t(view.width) * view.height;
+    Pixels pixels;
+    fill_pixels(tile, pixels);
+    F live[kPatches], rest[kPatches], value[kPatches];
+    F grad[kPatches * (C ? C : kMaxChannels)];
+
+    for (int p = 0; p < kPatches; ++p) {
+        live[p] = select(pixels.inside[p], splat(1.f), F{});
+        rest[p] = F{};
+    }
+    for (int k = 0; k < channels; ++k) {
+        if (back.image_grad) {
+            load_plane(tile, grad + k, channels, back.image_grad + k * back.image_grad_c, back.image_grad_x,
+                       back.image_grad_y);
+            load_plane(tile, value, 1, job.image + k * plane, 1, view.width);
+            for (int p = 0; p < kPatches; ++p) rest[p] += grad[p * channels + k] * value[p];
+        } else {
+            for (int p = 0; p < kPatches; ++p) grad[p * channels + k] = F{};
+        }
+    }
+    F transparency[kPatches];
+    load_plane(tile, transparency, 1, job.alpha, 1, view.width);
+    for (int p = 0; p < kPatches; ++p) transparency[p] = 1.f - transparency[p];
+    if (back.alpha_grad) {
+        load_plane(tile, value, 1, back.alpha_grad, back.alpha_grad_x, back.alpha_grad_y);
+        for (int p = 0; p < kPatches; ++p) rest[p] -= value[p] * transparency[p];
+    }
+    if (back.background_grad) {
+        if (back.background_is_image) {
+            for (int k = 0; k < channels; ++k)
+                for_pixels(tile, [&](int p, int l, int x, int y) {
+                    back.background_grad[(size_t(y) * view.width + x) * job.value_stride + k] +=
+                        grad[p * channels + k][l] * transparency[p][l];
+                });
+        } else {
+            for (int k = 0; k < channels; ++k) {
+                F total = F{};
+                for (int p = 0; p < kPatches; ++p) total += grad[p * channels + k] * transparency[p];
+                back.background_grad[size_t(index) * channels + k] = sum(total);
+            }
+        }
+    }
+
+    const uint32_t begin = job.tile_begin[index], end = job.tile_begin[index + 1];
+    const uint32_t* patch_end = job.patch_end + size_t(index) * kPatches;
+    Chunk chunk;
+    for (uint32_t first = begin; first < end; first += kChunk) {
+        uint64_t open = 0;
+        for (int p = 0; p < kPatches; ++p) open |= uint64_t(first - begin < patch_end[p]) << p;
+        fill_chunk(job, first, end, chunk);
+        for (uint32_t j = 0; j < chunk.count; ++j)
+            __builtin_prefetch(back.slots + size_t(job.entries[first + j].slot) * stride, 1);
+        for (uint32_t j = 0; j < chunk.count; ++j) {
+            const Entry& entry = job.entries[first + j];
+            const Projected g = chunk.projected[j];
+            const float* colour = chunk.values[j];
+            F h0 = F{}, hu = F{}, hv = F{}, huu = F{}, huv = F{}, hvv = F{};
+            F hc[C ? C : kMaxChannels];
+            for (int k = 0; k < channels; ++k) hc[k] = F{};
+            for (uint64_t left = entry.patches & open; left; left &= left - 1) {
+                const int p = __builtin_ctzll(left);
+                const Alpha a = alpha_at(g, pixels.x[p], pixels.y[p]);
+                const F t = live[p];
+                const F next = t - t * a.value;
+                const I go = next > kMinTransmittance;
+                const F weight = select(go, t * a.value, F{});
+                live[p] = select(go, next, F{});
+                const F* v = grad + p * channels;
+                F shade = F{};
+                for (int k = 0; k < channels; ++k) {
+                    shade += colour[k] * v[k];
+                    hc[k] += weight * v[k];
+                }
+                const F lit = weight * shade;
+                const F behind = rest[p] - lit;
+                rest[p] = behind;
+                const F passes = 1.f - a.value;
+                const F h = select(go & (a.raw <= kMaxAlpha), lit - behind * (a.value / passes), F{});
+                const F h_u = h * a.u, h_v = h * a.v;
+                h0 += h, hu += h_u, hv += h_v;
+                huu += h_u * a.u, huv += h_u * a.v, hvv += h_v * a.v;
+            }
+            float* slot = back.slots + size_t(entry.slot) * stride;
+            const F zero = F{};
+            F4 out = sum4(h0, hu, hv, huu);
+            __builtin_memcpy(slot, &out, sizeof out);
+            out = sum4(huv, hvv, hc[0], channels > 1 ? hc[1] : zero);
+            __builtin_memcpy(slot + 4, &out, sizeof out);
+            for (int k = 2; k < channels; k += 4) {
+                out = sum4(hc[k], k + 1 < channels ? hc[k + 1] : zero, k + 2 < channels ? hc[k + 2] : zero,
+                           k + 3 < channels ? hc[k + 3] : zero);
+                __builtin_memcpy(slot + kMoments + k, &out, sizeof out);
+            }
+        }
+    }
+}
+
+#define BY_CHANNELS(function, job, index)       \
+    switch (channels) {                         \
+        case 1: function<1>(job, index); break; \
+        case 2: function<2>(job, index); break; \
+        case 3: function<3>(job, index); break; \
+        case 4: function<4>(job, index); break; \
+        case 5: function<5>(job, index); break; \
+        case 6: function<6>(job, index); break; \
+        case 7: function<7>(job, index); break; \
+        case 8: function<8>(job, index); break; \
+        default: function<0>(job, index);       \
+    }
+
+void forward(const ForwardJob& job, uint32_t tile) {
+    const int channels = job.channels;
+    BY_CHANNELS(forward_tile, job, tile)
+}
+
+void backward(const BackwardJob& job, uint32_t tile) {
+    const int channels = job.forward.channels;
+    BY_CHANNELS(backward_tile, job, tile)
+}
+
+// ------------------------------------------------------------------ back through the projection
+
+INLINE void scatter_add(float* p, int stride, uint32_t n, F v) {
+    for (uint32_t l = 0; l < n; ++l) p[l * stride] += v[l];
+}
+
+void project_backward(const View& view, const Gaussians& g, uint32_t begin, uint32_t end,
+                      const Projected* projected, const uint32_t* first_slot, const float* slots,
+                      int channels, const GaussianGrads& grads) {
+    const int stride = slot_stride(channels);
+    const float* r = view.r;
+    F view_grad[12] = {};
+    const bool geometry = grads.means || grads.quats || grads.scales || grads.opacities || grads.linear ||
+                          grads.offset || grads.view;
+    for (uint32_t i = begin; i < end; i += W) {
+        const uint32_t n = end - i < uint32_t(W) ? end - i : uint32_t(W);
+        if (first_slot[i] == first_slot[i + n]) continue;
+        float moments[kMoments][W] = {};
+        float factors[3][W] = {};
+        for (uint32_t l = 0; l < n; ++l) {
+            const uint32_t from = first_slot[i + l], to = first_slot[i + l + 1];
+            if (from == to) continue;
+            const float* slot = slots + size_t(from) * stride;
+            F4 low = {}, high = {};
+            for (uint32_t s = 0; s < to - from; ++s) {
+                F4 a, b;
+                __builtin_memcpy(&a, slot + size_t(s) * stride, sizeof a);
+                __builtin_memcpy(&b, slot + size_t(s) * stride + 4, sizeof b);
+                low += a, high += b;
+            }
+            for (int k = 0; k < 4; ++k) moments[k][l] = low[k];
+            moments[4][l] = high[0], moments[5][l] = high[1];
+            if (grads.values) {
+                float* out = grads.values + size_t(i + l) * grads.value_stride;
+                out[0] += high[2];
+                if (channels > 1) out[1] += high[3];
+                for (int k = 2; k < channels; ++k) {
+                    float total = 0.f;
+                    for (uint32_t s = 0; s < to - from; ++s) total += slot[size_t(s) * stride + kMoments + k];
+                    out[k] += total;
+                }
+            }
+            const Projected& q = projected[i + l];
+            factors[0][l] = q.l11, factors[1][l] = q.l12, factors[2][l] = q.l22;
+        }
+        if (!geometry) continue;
+
+        // Lanes without slots have zero moments but may hold NaN (behind the camera): they are
+        // masked at the end.
+        Projection p;
+        project_lanes(view, g, i, n, p);
+        const float inv_s2 = 1.f / kHalfLog2e;
+        const F l11 = load(factors[0]), l12 = load(factors[1]), l22 = load(factors[2]);
+        const F h0 = load(moments[0]), hu = load(moments[1]), hv = load(moments[2]);
+        const F huu = load(moments[3]), huv = load(moments[4]), hvv = load(moments[5]);
+        I drawn;
+        for (int l = 0; l < W; ++l) drawn[l] = uint32_t(l) < n && first_slot[i + l] != first_slot[i + l + 1] ? -1 : 0;
+        const F zero = F{};
+
+        const F gx = l11 * hu * inv_s2, gy = (l12 * hu + l22 * hv) * inv_s2;
+        if (grads.opacities)
+            scatter_add(grads.opacities + i, 1, n, select(drawn, h0 / gather<1>(g.opacities + i, n), zero));
+        if (grads.offset) {
+            scatter_add(grads.offset + 2 * size_t(i), 2, n, select(drawn, gx, zero));
+            scatter_add(grads.offset + 2 * size_t(i) + 1, 2, n, select(drawn, gy, zero));
+        }
+
+        // dL/dSigma = L^T W L / 2 with W the second moments of (u, v); every product is taken as
+        // L times something bounded, so that thin Gaussians lose no digits.
+        const F scale = splat(inv_s2 * inv_s2);
+        F db_r[2][3], d_scale[3];
+        for (int k = 0; k < 3; ++k) {
+            const F ub = l11 * p.br[0][k] + l12 * p.br[1][k], vb = l22 * p.br[1][k];
+            const F um = ub * p.s[k], vm = vb * p.s[k];
+            const F yu = (huu * um + huv * vm) * scale, yv = (huv * um + hvv * vm) * scale;
+            d_scale[k] = ub * yu + vb * yv;
+            db_r[0][k] = l11 * yu * p.s[k];
+            db_r[1][k] = (l12 * yu + l22 * yv) * p.s[k];
+        }
+        if (grads.scales)
+            for (int k = 0; k < 3; ++k)
+                scatter_add(grads.scales + 3 * size_t(i) + k, 3, n, select(drawn, d_scale[k], zero));
+
+        if (grads.quats) {
+            F d[3][3];
+            for (int a = 0; a < 3; ++a)
+                for (int k = 0; k < 3; ++k) d[a][k] = p.b[0][a] * db_r[0][k] + p.b[1][a] * db_r[1][k];
+            const F w = p.qw, x = p.qx, y = p.qy, z = p.qz;
+            F q[4];
+            q[0] = 2.f * (x * (d[2][1] - d[1][2]) + y * (d[0][2] - d[2][0]) + z * (d[1][0] - d[0][1]));
+            q[1] = 2.f * (-2.f * x * (d[1][1] + d[2][2]) + y * (d[1][0] + d[0][1]) + z * (d[2][0] + d[0][2]) +
+                          w * (d[2][1] - d[1][2]));
+            q[2] = 2.f * (x * (d[1][0] + d[0][1]) - 2.f * y * (d[0][0] + d[2][2]) + z * (d[2][1] + d[1][2]) +
+                          w * (d[0][2] - d[2][0]));
+            q[3] = 2.f * (x * (d[2][0] + d[0][2]) + y * (d[2][1] + d[1][2]) - 2.f * z * (d[0][0] + d[1][1]) +
+                          w * (d[1][0] - d[0][1]));
+            const F along = q[0] * w + q[1] * x + q[2] * y + q[3] * z;
+            const F unit[4] = {w, x, y, z};
+            for (int k = 0; k < 4; ++k)
+                scatter_add(grads.quats + 4 * size_t(i) + k, 4, n,
+                            select(drawn, (q[k] - along * unit[k]) * p.inv_norm, zero));
+        }
+
+        F db[2][3], da[2][3];
+        for (int o = 0; o < 2; ++o)
+            for (int k = 0; k < 3; ++k)
+                db[o][k] = db_r[o][0] * p.rot[k][0] + db_r[o][1] * p.rot[k][1] + db_r[o][2] * p.rot[k][2];
+        if (g.linear) {
+            if (grads.linear)
+                for (int a = 0; a < 3; ++a)
+                    for (int k = 0; k < 3; ++k)
+                        scatter_add(grads.linear + 9 * size_t(i) + 3 * a + k, 9, n,
+                                    select(drawn, p.a[0][a] * db[0][k] + p.a[1][a] * db[1][k], zero));
+            for (int o = 0; o < 2; ++o)
+                for (int k = 0; k < 3; ++k)
+                    da[o][k] = db[o][0] * p.lin[k][0] + db[o][1] * p.lin[k][1] + db[o][2] * p.lin[k][2];
+        } else {
+            for (int o = 0; o < 2; ++o)
+                for (int k = 0; k < 3; ++k) da[o][k] = db[o][k];
+        }
+        if (!grads.means && !grads.view) continue;
+
+        const F dj00 = da[0][0] * r[0] + da[0][1] * r[1] + da[0][2] * r[2];
+        const F dj02 = da[0][0] * r[6] + da[0][1] * r[7] + da[0][2] * r[8];
+        const F dj11 = da[1][0] * r[3] + da[1][1] * r[4] + da[1][2] * r[5];
+        const F dj12 = da[1][0] * r[6] + da[1][1] * r[7] + da[1][2] * r[8];
+        // With j00 = fx/z and j02 = -fx clamp(x/z)/z.
+        const F dx_n = select(p.inside_x, -p.j00 * dj02, zero) + view.fx * gx;
+        const F dy_n = select(p.inside_y, -p.j11 * dj12, zero) + view.fy * gy;
+        const F dx = select(drawn, dx_n * p.rz, zero), dy = select(drawn, dy_n * p.rz, zero);
+        const F dz = select(drawn,
+                            -(dx_n * p.xn + dy_n * p.yn + p.j00 * dj00 + p.j02 * dj02 + p.j11 * dj11 +
+                              p.j12 * dj12) * p.rz,
+                            zero);
+        if (grads.means)
+            for (int k = 0; k < 3; ++k)
+                scatter_add(grads.means + 3 * size_t(i) + k, 3, n, r[k] * dx + r[3 + k] * dy + r[6 + k] * dz);
+        if (grads.view) {
+            const F world[3] = {p.px, p.py, p.pz};
+            for (int k = 0; k < 3; ++k) {
+                view_grad[k] += select(drawn, dx * world[k] + p.j00 * da[0][k], zero);
+                view_grad[3 + k] += select(drawn, dy * world[k] + p.j11 * da[1][k], zero);
+                view_grad[6 + k] += select(drawn, dz * world[k] + p.j02 * da[0][k] + p.j12 * da[1][k], zero);
+            }
+            view_grad[9] += dx, view_grad[10] += dy, view_grad[11] += dz;
+        }
+    }
+    if (grads.view)
+        for (int k = 0; k < 12; ++k) grads.view[size_t(begin / kBlock) * 12 + k] = sum(view_grad[k]);
+}
+
+double multiply_add(int64_t rounds, float* sink) {
+    F a[10];
+    for (int k = 0; k < 10; ++k) a[k] = splat(float(k));
+    F b = splat(0.999f), c = splat(1e-3f);
+    for (int64_t i = 0; i < rounds; ++i) {
+        for (int k = 0; k < 10; ++k) {
+            a[k] = a[k] * b + c;
+            asm volatile("" : "+m"(*(char*)sink));
+        }
+    }
+    F total = a[0];
+    for (int k = 1; k < 10; ++k) total += a[k];
+    *sink = sum(total);
+    return double(rounds) * 10 * W * 2;
+}
+
+}  // namespace
+
+const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,         project, forward,
+                         backward,     project_backward, multiply_add};
+
+}  // namespace EVSPLAT_LEVEL
+}  // namespace evsplat

@@ -1,0 +1,108 @@
+// The plain data that the driver and the kernels exchange, and the table of kernels of one SIMD level.
+#pragma once
+
+#include <stddef.h>
+#include <stdint.h>
+
+namespace evsplat {
+
+constexpr int kTile = 16;              // pixels along the side of a tile
+constexpr int kTilePixels = kTile * kTile;
+constexpr uint32_t kBlock = 512;       // Gaussians per unit of projection work; fixes the order of sums
+constexpr int kMoments = 6;            // gradient slot: sums of h, hu, hv, huu, huv, hvv, then channels
+constexpr int kMaxChannels = 32;       // drawn in one go; more are drawn in blocks
+
+constexpr int slot_stride(int channels) { return (kMoments + channels + 3) / 4 * 4; }
+
+// Camera and image of one render. `r`, `t`: world to camera, row-major.
+struct View {
+    float r[9], t[3];
+    float fx, fy, cx, cy;
+    float near_plane;
+    int width, height, tiles_x, tiles_y;
+};
+
+// The Gaussians of one time. `linear` and `offset` may be null.
+struct Gaussians {
+    const float *means, *quats, *scales, *opacities, *linear, *offset;
+    uint32_t count;
+};
+
+// What compositing needs of one projected Gaussian. With d = pixel - (x, y), u = l11 dx + l12 dy and
+// v = l22 dy, the opacity at the pixel is exp2(log2_opacity - u^2 - v^2): a Cholesky factor of the
+// inverse covariance keeps digits that the quadratic form loses for long thin Gaussians.
+struct alignas(32) Projected {
+    float x, y, l11, l12, l22, log2_opacity, depth, unused;
+};
+
+// One Gaussian in one tile, in the order of the Gaussians; `patches` has a bit per patch it reaches.
+struct Slot {
+    uint32_t tile, gaussian;
+    uint64_t patches;
+};
+
+struct SlotList {
+    Slot* data = nullptr;
+    size_t size = 0, capacity = 0;
+    void (*grow)(SlotList&) = nullptr;
+};
+
+// One Gaussian in one tile, in the order of compositing.
+struct Entry {
+    uint32_t gaussian, slot;
+    uint64_t patches;
+};
+
+struct ForwardJob {
+    View view;
+    int channels;
+    const Projected* projected;
+    const float* values;          // (N, value_stride), of which `channels` are drawn
+    size_t value_stride;
+    const Entry* entries;
+    const uint32_t* tile_begin;   // (tiles + 1)
+    const float* background;      // null, or value of channel k at pixel (x, y): k*bc + x*bx + y*by
+    ptrdiff_t background_c, background_x, background_y;
+    float *image, *alpha;         // planar (C, H, W) and (H, W)
+    uint32_t* patch_end;          // (tiles, patches): entries of the tile after which a patch is opaque
+};
+
+struct BackwardJob {
+    ForwardJob forward;
+    const float *image_grad, *alpha_grad;  // any strides; may be null
+    ptrdiff_t image_grad_c, image_grad_x, image_grad_y, alpha_grad_x, alpha_grad_y;
+    float* slots;                 // (slots, slot_stride(C))
+    float* background_grad;       // null, or (tiles, C) partial sums, or (H, W, value_stride) added to
+    bool background_is_image;
+};
+
+// Gradients that are added to; each may be null.
+struct GaussianGrads {
+    float *means, *quats, *scales, *opacities, *values, *linear, *offset;
+    size_t value_stride;
+    float* view;                  // (blocks, 12): rotation row-major, translation; written, not added
+};
+
+struct Kernels {
+    const char* name;
+    int lanes, patches;
+    // Projects [begin, end), appends its slots; first_slot[i] is relative to the list's start.
+    void (*project)(const View&, const Gaussians&, uint32_t begin, uint32_t end, Projected*,
+                    int32_t* radii, uint32_t* first_slot, SlotList&);
+    void (*forward)(const ForwardJob&, uint32_t tile);
+    void (*backward)(const BackwardJob&, uint32_t tile);
+    // Sums the slots of each Gaussian of [begin, end) and goes back through the projection.
+    void (*project_backward)(const View&, const Gaussians&, uint32_t begin, uint32_t end,
+                             const Projected*, const uint32_t* first_slot, const float* slots,
+                             int channels, const GaussianGrads&);
+    // Independent multiply-adds for `rounds`; returns the floating-point operations done.
+    double (*multiply_add)(int64_t rounds, float* sink);
+};
+
+namespace portable { extern const Kernels kernels; }
+#ifdef EVSPLAT_X86
+namespace avx2 { extern const Kernels kernels; }
+namespace avx512 { extern const Kernels kernels; }
+#endif
+
+}  // namespace evsplat

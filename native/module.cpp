@@ -1,0 +1,189 @@
+// Python bindings of the native kernels; evsplat/render/native.py is their only caller.
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/unique_ptr.h>
+#include <nanobind/stl/vector.h>
+
+#include <optional>
+#include <stdexcept>
+
+#include "rasterizer.h"
+
+namespace nb = nanobind;
+using namespace evsplat;
+
+namespace {
+
+using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Strided = nb::ndarray<const float, nb::device::cpu>;
+using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using OutInt = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
+using Camera = nb::ndarray<const float, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
+using Pose = nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
+
+// Shapes and steps of the arrays of one render; Python has checked the meaning, this guards memory.
+void require(bool ok, const char* what) {
+    if (!ok) throw std::invalid_argument(std::string("evsplat._native: bad shape of ") + what);
+}
+
+// (T or 1, count, inner...) with `inner` floats per Gaussian.
+template <class Array>
+size_t step_of(const Array& a, size_t times, size_t count, size_t inner, const char* what) {
+    require(a.ndim() >= 1 && (a.shape(0) == times || a.shape(0) == 1), what);
+    require(a.size() == a.shape(0) * count * inner, what);
+    return a.shape(0) == 1 ? 0 : count * inner;
+}
+
+class Render {
+  public:
+    Render(int width, int height, const Camera& k, const Pose& pose, float near_plane, In means, In quats, In scales,
+           In opacities, In values, std::optional<In> linear, std::optional<In> offset,
+           std::optional<In> background, int times, int threads)
+        : means_(means), quats_(quats), scales_(scales), opacities_(opacities), values_(values), linear_(linear),
+          offset_(offset), background_(background), threads_(threads) {
+        require(width > 0 && height > 0 && width <= 1 << 16 && height <= 1 << 16 && times > 0, "the image");
+        require(means.ndim() == 3 && values.ndim() == 3 && means.shape(1) < (size_t(1) << 31), "means");
+        const size_t n = means.shape(1), c = values.shape(2), t = times;
+        require(c > 0 && c < 65536, "channels");
+        View& v = scene_.view;
+        for (int i = 0; i < 3; ++i) {
+            for (int j = 0; j < 3; ++j) v.r[3 * i + j] = pose.data()[4 * i + j];
+            v.t[i] = pose.data()[4 * i + 3];
+        }
+        v.fx = k.data()[0], v.cx = k.data()[2], v.fy = k.data()[4], v.cy = k.data()[5];
+        v.near_plane = near_plane;
+        v.width = width, v.height = height;
+        v.tiles_x = (width + kTile - 1) / kTile, v.tiles_y = (height + kTile - 1) / kTile;
+        scene_.times = times, scene_.channels = int(c), scene_.count = uint32_t(n);
+        scene_.means = {means.data(), step_of(means, t, n, 3, "means")};
+        scene_.quats = {quats.data(), step_of(quats, t, n, 4, "quats")};
+        scene_.scales = {scales.data(), step_of(scales, t, n, 3, "scales")};
+        scene_.opacities = {opacities.data(), step_of(opacities, t, n, 1, "opacities")};
+        scene_.values = {values.data(), step_of(values, t, n, c, "channels")};
+        if (linear) scene_.linear = {linear->data(), step_of(*linear, t, n, 9, "linear")};
+        if (offset) scene_.offset = {offset->data(), step_of(*offset, t, n, 2, "centers2d_offset")};
+        scene_.background_is_image = background && background->ndim() == 3;
+        if (background) {
+            require(background->size() == c * (scene_.background_is_image ? size_t(width) * height : 1), "background");
+            scene_.background = {background->data(), 0};
+        }
+    }
+
+    void forward(Out image, Out alpha, OutInt radii) {
+        const size_t pixels = size_t(scene_.view.width) * scene_.view.height * scene_.times;
+        require(image.size() == pixels * scene_.channels, "image");
+        require(alpha.size() == pixels, "alpha");
+        require(radii.size() == size_t(scene_.count) * scene_.times, "radii");
+        nb::gil_scoped_release release;
+        record_ = render_forward(scene_, threads_, image.data(), alpha.data(), radii.data());
+    }
+
+    void backward(In image, In alpha, std::optional<Strided> image_grad, std::optional<Strided> alpha_grad,
+                  std::optional<Out> means, std::optional<Out> quats, std::optional<Out> scales,
+                  std::optional<Out> opacities, std::optional<Out> values, std::optional<Out> linear,
+                  std::optional<Out> offset, std::optional<Out> view, std::optional<Out> background) {
+        if (!record_) throw std::runtime_error("evsplat._native: backward before forward");
+        const size_t h = scene_.view.height, w = scene_.view.width, t = scene_.times, c = scene_.channels;
+        require(image.size() == t * c * h * w && alpha.size() == t * h * w, "image");
+        OutputGrads out;
+        if (image_grad) {
+            require(image_grad->ndim() == 4 && image_grad->shape(0) == t && image_grad->shape(1) == h &&
+                        image_grad->shape(2) == w && image_grad->shape(3) == c,
+                    "image gradient");
+            out.image_data = image_grad->data();
+            for (int i = 0; i < 4; ++i) out.image[i] = image_grad->stride(i);
+        }
+        if (alpha_grad) {
+            require(alpha_grad->ndim() == 3 && alpha_grad->shape(0) == t && alpha_grad->shape(1) == h &&
+                        alpha_grad->shape(2) == w,
+                    "alpha gradient");
+            out.alpha_data = alpha_grad->data();
+            for (int i = 0; i < 3; ++i) out.alpha[i] = alpha_grad->stride(i);
+        }
+        const size_t n = scene_.count;
+        InputGrads in;
+        const auto field = [&](std::optional<Out>& a, const Field& like, size_t inner, const char* what) {
+            if (!a) return GradField{};
+            require(step_of(*a, t, n, inner, what) == like.step, what);
+            return GradField{a->data(), like.step};
+        };
+        in.means = field(means, scene_.means, 3, "means gradient");
+        in.quats = field(quats, scene_.quats, 4, "quats gradient");
+        in.scales = field(scales, scene_.scales, 3, "scales gradient");
+        in.opacities = field(opacities, scene_.opacities, 1, "opacities gradient");
+        in.values = field(values, scene_.values, c, "channels gradient");
+        if (scene_.linear.data) in.linear = field(linear, scene_.linear, 9, "linear gradient");
+        if (scene_.offset.data) in.offset = field(offset, scene_.offset, 2, "centers2d_offset gradient");
+        if (view) {
+            require(view->size() == 12, "camera gradient");
+            in.view = view->data();
+        }
+        if (background && scene_.background.data) {
+            require(background->size() == c * (scene_.background_is_image ? h * w : 1), "background gradient");
+            in.background = background->data();
+        }
+        nb::gil_scoped_release release;
+        render_backward(scene_, *record_, threads_, image.data(), alpha.data(), out, in);
+    }
+
+    size_t bytes() const { return record_ ? record_->bytes() : 0; }
+
+    size_t intersections() const {
+        size_t total = 0;
+        if (record_)
+            for (const Drawn& d : record_->times) total += d.entries.size();
+        return total;
+    }
+
+    size_t patch_steps() const {
+        size_t total = 0;
+        if (record_)
+            for (const Drawn& d : record_->times)
+                for (size_t i = 0; i < d.entries.size(); ++i) total += __builtin_popcountll(d.entries[i].patches);
+        return total;
+    }
+
+  private:
+    // The arrays keep the memory that scene_ points into alive.
+    In means_, quats_, scales_, opacities_, values_;
+    std::optional<In> linear_, offset_, background_;
+    Scene scene_ = {};
+    int threads_;
+    std::unique_ptr<Record> record_;
+};
+
+double multiply_add(int64_t rounds) {
+    float sink = 0.f;
+    nb::gil_scoped_release release;
+    return select_kernels().multiply_add(rounds, &sink);
+}
+
+}  // namespace
+
+NB_MODULE(_native, m) {
+    m.doc() = "CPU kernels of evsplat.";
+    nb::set_leak_warnings(false);  // images alive when the interpreter ends are no leak
+    nb::class_<Render>(m, "Render", "One render of T times; keeps what its backward pass needs.")
+        .def(nb::init<int, int, const Camera&, const Pose&, float, In, In, In, In, In, std::optional<In>,
+                      std::optional<In>, std::optional<In>, int, int>(),
+             nb::arg("width"), nb::arg("height"), nb::arg("K"), nb::arg("world_to_camera"), nb::arg("near"),
+             nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"), nb::arg("channels"),
+             nb::arg("linear").none(), nb::arg("offset").none(), nb::arg("background").none(), nb::arg("times"),
+             nb::arg("threads"))
+        .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"))
+        .def("backward", &Render::backward, nb::arg("image"), nb::arg("alpha"), nb::arg("image_grad").none(),
+             nb::arg("alpha_grad").none(), nb::arg("means").none(), nb::arg("quats").none(), nb::arg("scales").none(),
+             nb::arg("opacities").none(), nb::arg("channels").none(), nb::arg("linear").none(),
+             nb::arg("offset").none(), nb::arg("view").none(), nb::arg("background").none())
+        .def_prop_ro("bytes", &Render::bytes, "Memory kept for the backward pass.")
+        .def_prop_ro("intersections", &Render::intersections, "Pairs of Gaussian and tile.")
+        .def_prop_ro("patch_steps", &Render::patch_steps, "Pairs of Gaussian and patch.");
+    m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
+    m.def("levels", &available_levels, "SIMD levels that run here, best first.");
+    m.def("level", [] { return std::string(select_kernels().name); }, "SIMD level in use.");
+    m.def("multiply_add", &multiply_add, nb::arg("rounds"),
+          "Run independent multiply-adds; returns the floating-point operations done.");
+}

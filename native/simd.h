@@ -1,0 +1,114 @@
+// Vectors of floats of one SIMD level, written with the compiler's vector types.
+//
+// Included by kernels.cpp only, inside the namespace of its level: nothing here may have external
+// linkage, or the linker could hand AVX-512 code to a machine without it.
+
+constexpr int W = EVSPLAT_LANES;                   // lanes = pixels of a patch
+constexpr int kPatchW = W == 4 ? 2 : 4;
+constexpr int kPatchH = W / kPatchW;
+constexpr int kPatchesX = kTile / kPatchW;
+constexpr int kPatches = kTilePixels / W;
+
+typedef float F __attribute__((vector_size(W * 4), may_alias));
+typedef int32_t I __attribute__((vector_size(W * 4), may_alias));
+typedef uint32_t U __attribute__((vector_size(W * 4), may_alias));
+typedef float F4 __attribute__((vector_size(16), may_alias));
+typedef int32_t I4 __attribute__((vector_size(16), may_alias));
+
+#define INLINE static inline __attribute__((always_inline))
+
+#if defined(__clang__)
+#define SHUFFLE4(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l)
+#else
+#define SHUFFLE4(a, b, i, j, k, l) __builtin_shuffle(a, b, I4{i, j, k, l})
+#endif
+
+INLINE F splat(float value) { return value - F{}; }
+INLINE F load(const float* p) { F v; __builtin_memcpy(&v, p, sizeof v); return v; }
+INLINE void store(float* p, F v) { __builtin_memcpy(p, &v, sizeof v); }
+INLINE F min(F a, F b) { return a < b ? a : b; }
+INLINE F max(F a, F b) { return a > b ? a : b; }
+INLINE F select(I mask, F a, F b) { return mask ? a : b; }
+
+INLINE F sqrt(F v) {
+    F r;
+    for (int l = 0; l < W; ++l) r[l] = __builtin_sqrtf(v[l]);
+    return r;
+}
+
+// Field `stride * row + 0` of `count` rows; missing rows repeat the last one.
+template <int stride>
+INLINE F gather(const float* p, uint32_t count) {
+    float rows[W];
+    if (count >= W) {
+        for (int l = 0; l < W; ++l) rows[l] = p[l * stride];
+    } else {
+        for (uint32_t l = 0; l < W; ++l) rows[l] = p[(l < count ? l : count - 1) * stride];
+    }
+    return load(rows);
+}
+
+// Bit l = lane l of the mask.
+INLINE uint64_t bits(I mask) {
+#if defined(__AVX512DQ__) && EVSPLAT_LANES == 16
+    return uint32_t(_mm512_movepi32_mask((__m512i)mask));
+#elif defined(__AVX__) && EVSPLAT_LANES == 8
+    return uint32_t(_mm256_movemask_ps((__m256)mask));
+#elif defined(__SSE2__) && EVSPLAT_LANES == 4
+    return uint32_t(_mm_movemask_ps((__m128)mask));
+#else
+    uint64_t r = 0;
+    for (int l = 0; l < W; ++l) r |= uint64_t(mask[l] & 1) << l;
+    return r;
+#endif
+}
+
+// 2^e for e <= 1, 1e-7 relative; below -60 it gives 2^-60. The magic number rounds to nearest, which
+// -ffast-math would break.
+INLINE F exp2(F e) {
+    e = max(e, splat(-60.f));
+    const F magic = splat(12582912.f);
+    const F shifted = e + magic;
+    const F f = e - (shifted - magic);
+    F p = splat(1.3276472e-3f);
+    p = p * f + 9.6755419e-3f;
+    p = p * f + 5.5507131e-2f;
+    p = p * f + 2.4022120e-1f;
+    p = p * f + 6.9314694e-1f;
+    p = p * f + 1.0000001f;
+    return (F)((I)p + ((I)shifted << 23));
+}
+
+// The sum of four of the lanes' quarters, so that four vectors reduce together.
+INLINE F4 quarter(F v) {
+#if EVSPLAT_LANES == 16
+    typedef float F8 __attribute__((vector_size(32)));
+    F8 half[2];
+    __builtin_memcpy(half, &v, sizeof v);
+    half[0] += half[1];
+    F4 part[2];
+    __builtin_memcpy(part, half, sizeof part);
+    return part[0] + part[1];
+#elif EVSPLAT_LANES == 8
+    F4 part[2];
+    __builtin_memcpy(part, &v, sizeof v);
+    return part[0] + part[1];
+#else
+    F4 r;
+    __builtin_memcpy(&r, &v, sizeof v);
+    return r;
+#endif
+}
+
+// Sums over the lanes of four vectors.
+INLINE F4 sum4(F a, F b, F c, F d) {
+    const F4 qa = quarter(a), qb = quarter(b), qc = quarter(c), qd = quarter(d);
+    const F4 ab = SHUFFLE4(qa, qb, 0, 4, 1, 5) + SHUFFLE4(qa, qb, 2, 6, 3, 7);
+    const F4 cd = SHUFFLE4(qc, qd, 0, 4, 1, 5) + SHUFFLE4(qc, qd, 2, 6, 3, 7);
+    return SHUFFLE4(ab, cd, 0, 1, 4, 5) + SHUFFLE4(ab, cd, 2, 3, 6, 7);
+}
+
+INLINE float sum(F v) {
+    const F4 q = quarter(v);
+    return (q[0] + q[1]) + (q[2] + q[3]);
+}

@@ -1,0 +1,99 @@
+#include "thread_pool.h"
+
+#include <atomic>
+#include <condition_variable>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+#if !defined(_WIN32)
+#include <unistd.h>
+#endif
+
+namespace evsplat {
+namespace {
+
+class Pool {
+  public:
+    void run(int threads, size_t count, const std::function<void(size_t)>& task) {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            while (int(workers_.size()) < threads - 1) {
+                const int id = int(workers_.size());
+                workers_.emplace_back([this, id] { work(id); });
+            }
+            task_ = &task, count_ = count, next_ = 0;
+            helpers_ = threads - 1, running_ = helpers_;
+            ++generation_;
+        }
+        wake_.notify_all();
+        take(task, count);
+        std::unique_lock<std::mutex> lock(mutex_);
+        done_.wait(lock, [this] { return running_ == 0; });
+    }
+
+    std::mutex& in_use() { return in_use_; }
+
+  private:
+    void take(const std::function<void(size_t)>& task, size_t count) {
+        for (size_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < count;) task(i);
+    }
+
+    void work(int id) {
+        uint64_t seen = 0;
+        for (;;) {
+            std::unique_lock<std::mutex> lock(mutex_);
+            wake_.wait(lock, [&] { return generation_ != seen; });
+            seen = generation_;
+            if (id >= helpers_) continue;
+            const auto& task = *task_;
+            const size_t count = count_;
+            lock.unlock();
+            take(task, count);
+            lock.lock();
+            if (--running_ == 0) done_.notify_one();
+        }
+    }
+
+    std::mutex in_use_, mutex_;
+    std::condition_variable wake_, done_;
+    std::vector<std::thread> workers_;
+    const std::function<void(size_t)>* task_ = nullptr;
+    size_t count_ = 0;
+    std::atomic<size_t> next_{0};
+    int helpers_ = 0, running_ = 0;
+    uint64_t generation_ = 0;
+};
+
+// Never destroyed: joining threads while the process or the interpreter goes down can hang. A forked
+// child has none of its parent's threads and starts its own pool.
+Pool& pool() {
+    static std::mutex guard;
+    static Pool* current = nullptr;
+#if defined(_WIN32)
+    const long process = 0;
+#else
+    const long process = long(getpid());
+#endif
+    static long owner = -1;
+    std::lock_guard<std::mutex> lock(guard);
+    if (owner != process) {
+        current = new Pool;
+        owner = process;
+    }
+    return *current;
+}
+
+}  // namespace
+
+void parallel_for(int threads, size_t count, const std::function<void(size_t)>& task) {
+    if (threads <= 1 || count <= 1) {
+        for (size_t i = 0; i < count; ++i) task(i);
+        return;
+    }
+    Pool& p = pool();
+    std::lock_guard<std::mutex> lock(p.in_use());
+    p.run(threads, count, task);
+}
+
+}  // namespace evsplat

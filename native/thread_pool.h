@@ -1,0 +1,12 @@
+// Threads that stay alive between calls and take work in small pieces.
+#pragma once
+
+#include <functional>
+
+namespace evsplat {
+
+// Calls task(i) for every i < count on up to `threads` threads, the caller among them. Which thread
+// takes which i is left open, so tasks must not depend on it. One call runs at a time.
+void parallel_for(int threads, size_t count, const std::function<void(size_t)>& task);
+
+}  // namespace evsplat

@@ -1,0 +1,61 @@
+"""A sharp, animatable 3D Gaussian person in a scene, from a blurry video and events.
+
+The verbs of the command line are functions here, imported on first use:
+
+    import evsplat as ev
+    run = ev.train("my_capture", max_minutes=10)
+    ev.evaluate(run)
+    ev.write_report(run)
+    ev.render_run(run, slow=8)
+
+The command ``evsplat render`` is `render_run`, because ``evsplat.render`` is the rasteriser package.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from evsplat.capture import load_capture
+    from evsplat.capture.inspect import inspect_capture as inspect
+    from evsplat.cli.demo import demo
+    from evsplat.evaluation import evaluate_run as evaluate
+    from evsplat.evaluation.report import write_report
+    from evsplat.export import render_run
+    from evsplat.training import train
+    from evsplat.training.run import load_run
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "__version__",
+    "demo",
+    "evaluate",
+    "inspect",
+    "load_capture",
+    "load_run",
+    "render_run",
+    "train",
+    "write_report",
+]
+
+_LAZY = {
+    "demo": "evsplat.cli.demo:demo",
+    "evaluate": "evsplat.evaluation:evaluate_run",
+    "inspect": "evsplat.capture.inspect:inspect_capture",
+    "load_capture": "evsplat.capture:load_capture",
+    "load_run": "evsplat.training.run:load_run",
+    "render_run": "evsplat.export:render_run",
+    "train": "evsplat.training:train",
+    "write_report": "evsplat.evaluation.report:write_report",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module 'evsplat' has no attribute {name!r}")
+    module, attribute = _LAZY[name].split(":")
+    return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,31 @@
+"""Body models behind one small interface, body tracks over time, skinning."""
+
+from evsplat.body.adapters import default_body, load_body, make_body
+from evsplat.body.body import Body, bounding_box, skin
+from evsplat.body.rotations import (
+    axis_angle_to_matrix,
+    matrix_to_quaternion,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from evsplat.body.silhouette import body_box, silhouette
+from evsplat.body.surface import SurfaceSamples
+from evsplat.body.track import BodyTrack, load_body_track
+
+__all__ = [
+    "Body",
+    "BodyTrack",
+    "SurfaceSamples",
+    "axis_angle_to_matrix",
+    "body_box",
+    "bounding_box",
+    "default_body",
+    "load_body",
+    "load_body_track",
+    "make_body",
+    "matrix_to_quaternion",
+    "quaternion_multiply",
+    "quaternion_to_matrix",
+    "silhouette",
+    "skin",
+]

@@ -1,0 +1,156 @@
+"""Bodies from a capture's body file: a rig of its own, the shipped body, or the SMPL family."""
+
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from evsplat.body.body import Body
+from evsplat.body.tree import topological_order
+from evsplat.errors import DataError
+
+if TYPE_CHECKING:
+    from evsplat.capture.body_file import BodyFile
+
+
+def load_body(
+    body_file: "BodyFile", *, body_models: Path | str | None = None
+) -> tuple[Body, list[int]]:
+    """The body that a capture names, and the order of the file's joints in it.
+
+    ``body_models`` is where the user's licensed SMPL files lie (default: the environment variable
+    EVSPLAT_BODY_MODELS). ``poses[:, order]`` are the file's poses in the body's joint order.
+    """
+    if body_file.model == "rig":
+        return _rig_body(body_file)
+    if body_file.model == "default":
+        body = default_body(body_file.betas, source=f"{body_file.path}: betas")
+    elif body_file.model in ("smpl", "smplh", "smplx"):
+        from evsplat.body.smpl import smpl_body
+
+        body = smpl_body(
+            body_file.model,
+            body_file.betas,
+            gender=body_file.gender or "neutral",
+            path=body_models,
+            source=f"{body_file.path}: betas",
+        )
+    else:
+        raise DataError(
+            f"{body_file.path}: model is '{body_file.model}', expected one of "
+            "rig, default, smpl, smplh, smplx."
+        )
+    return body, list(range(len(body.parents)))
+
+
+def make_body(
+    rest_vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    weights: Float[np.ndarray, "V J"],
+    parents: Int[np.ndarray, "J"],
+    rest_joints: Float[np.ndarray, "J 3"],
+    joint_names: tuple[str, ...],
+    *,
+    source: str = "body",
+) -> tuple[Body, list[int]]:
+    """A checked `Body` from arrays whose joints may come in any order, and the order it took.
+
+    Raises:
+        DataError: shapes that do not fit, no single root, cycles, face indices out of range, values
+            that are not finite, negative weights, or a vertex without any.
+    """
+    parents = np.asarray(parents).astype(np.int64)
+    shapes = {
+        "parents": (parents, (len(parents),)),
+        "rest_joints": (rest_joints, (len(parents), 3)),
+        "rest_vertices": (rest_vertices, (len(rest_vertices), 3)),
+        "faces": (faces, (len(faces), 3)),
+        "weights": (weights, (len(rest_vertices), len(parents))),
+        "joint_names": (np.asarray(joint_names), (len(parents),)),
+    }
+    for name, (array, expected) in shapes.items():
+        if np.shape(array) != expected:
+            raise DataError(f"{source}: {name} has shape {np.shape(array)}, expected {expected}.")
+    for name in ("rest_joints", "rest_vertices", "weights"):
+        if not np.isfinite(shapes[name][0]).all():
+            raise DataError(f"{source}: {name} holds values that are not finite; repair the rig.")
+    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(rest_vertices):
+        raise DataError(
+            f"{source}: faces must hold at least one triangle and vertex indices in "
+            f"0..{len(rest_vertices) - 1}."
+        )
+    totals = weights.sum(1, keepdims=True, dtype=np.float64)
+    if (weights < 0).any() or (totals < 1e-6).any():
+        raise DataError(
+            f"{source}: weights must not be negative and every vertex needs a joint; "
+            f"vertex {int(np.argmax((weights < 0).any(1) | (totals[:, 0] < 1e-6)))} is wrong."
+        )
+    order = topological_order(parents.tolist(), source)
+    slot = np.argsort(order)
+    moved_parents = np.where(parents[order] < 0, -1, slot[parents[order]])
+    body = Body(
+        rest_vertices=torch.from_numpy(np.asarray(rest_vertices, np.float32).copy()),
+        faces=torch.from_numpy(np.asarray(faces).astype(np.int64)),
+        weights=torch.from_numpy((weights / totals)[:, order].astype(np.float32)),
+        parents=torch.from_numpy(moved_parents),
+        rest_joints=torch.from_numpy(np.asarray(rest_joints, np.float32)[order]),
+        joint_names=tuple(str(joint_names[joint]) for joint in order),
+    )
+    return body, order
+
+
+def default_body(
+    betas: Float[np.ndarray, "B"] | None = None, *, source: str = "betas"
+) -> Body:
+    """The shipped parametric body (CC0) with up to 10 shape coefficients, each about -3..3."""
+    data = _default_arrays()
+    shape = fit_betas(betas, len(data["shapedirs"]), source)
+    vertices = data["v_template"] + np.einsum("b,bvd->vd", shape, data["shapedirs"])
+    joints = data["j_template"] + np.einsum("b,bjd->jd", shape, data["j_shapedirs"])
+    weights = np.zeros((len(vertices), len(joints)), np.float32)
+    np.put_along_axis(weights, data["weights_idx"].astype(np.int64), data["weights_val"], axis=1)
+    names = tuple(str(name) for name in data["joint_names"])
+    body, _ = make_body(
+        vertices, data["faces"], weights, data["parents"], joints, names, source="default body"
+    )
+    return body
+
+
+def fit_betas(
+    betas: Float[np.ndarray, "B"] | None, count: int, source: str
+) -> Float[np.ndarray, "C"]:
+    """Shape coefficients padded with zeros to what the model has; more than that is an error."""
+    given = np.zeros(0) if betas is None else np.asarray(betas, np.float64).ravel()
+    if len(given) > count:
+        raise DataError(
+            f"{source}: {len(given)} shape coefficients, but the body has {count}; "
+            "give one subject's coefficients for this body model."
+        )
+    if not np.isfinite(given).all():
+        raise DataError(f"{source}: shape coefficients must be finite.")
+    return np.pad(given, (0, count - len(given)))
+
+
+@cache
+def _default_arrays() -> dict[str, np.ndarray]:
+    resource = files("evsplat") / "data" / "default_body.npz"
+    with resource.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+        return {key: archive[key] for key in archive.files}
+
+
+def _rig_body(body_file: "BodyFile") -> tuple[Body, list[int]]:
+    rig = {
+        name: getattr(body_file, name)
+        for name in ("rest_vertices", "faces", "weights", "parents", "rest_joints", "joint_names")
+    }
+    missing = [name for name, value in rig.items() if value is None]
+    if missing:
+        raise DataError(
+            f"{body_file.path}: model is 'rig' but {', '.join(missing)} is missing; "
+            "a rig needs all of rest_vertices, faces, weights, parents, rest_joints, joint_names."
+        )
+    return make_body(**rig, source=str(body_file.path))

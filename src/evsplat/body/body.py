@@ -1,0 +1,153 @@
+"""A small linear body: rest shape, kinematic tree, forward kinematics and linear blend skinning."""
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from evsplat.body.canonical import leg_spread_rotations
+from evsplat.body.surface import SurfaceSamples, sample_mesh
+from evsplat.body.tree import Level, level_inverse, tree_levels
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A subject's shaped body; metres, axes of the world."""
+
+    rest_vertices: Float[Tensor, "V 3"]
+    faces: Int[Tensor, "F 3"]
+    weights: Float[Tensor, "V J"]
+    """Skinning weights; rows sum to one."""
+    parents: Int[Tensor, "J"]
+    """Index of the parent joint, smaller than the own index; -1 for the root, which is joint 0."""
+    rest_joints: Float[Tensor, "J 3"]
+    joint_names: tuple[str, ...]
+
+    def to(self, device: torch.device | str) -> "Body":
+        """The same body with its arrays on ``device``."""
+        tensors = (f.name for f in fields(self) if f.name != "joint_names")
+        return replace(self, **{name: getattr(self, name).to(device) for name in tensors})
+
+    def joint_transforms(
+        self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
+    ) -> Float[Tensor, "*T J 4 4"]:
+        """Posed joint frames [R_j | t_j] from rotations local to the parent (design.md section 3).
+
+        ``R_j = R_parent r_j``, ``t_j = t_parent + R_parent (rest_j - rest_parent)``; the root
+        stands at ``rest_0 + transl``.
+        """
+        return _rigid(*self._kinematics(rotations, transl))
+
+    def bone_transforms(
+        self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
+    ) -> Float[Tensor, "*T J 4 4"]:
+        """Transforms of each bone, rest pose to world: ``B_j = [R_j | t_j - R_j rest_j]``."""
+        turned, origins = self._kinematics(rotations, transl)
+        rest = self.rest_joints.to(turned.dtype)
+        return _rigid(turned, origins - (turned @ rest[:, :, None]).squeeze(-1))
+
+    def canonical_bone_transforms(self) -> Float[Tensor, "J 4 4"]:
+        """Transforms of each bone, rest pose to canonical pose (legs apart)."""
+        return self._canonical_bones
+
+    def canonical_vertices(self) -> Float[Tensor, "V 3"]:
+        """Vertices in the canonical pose."""
+        return self._canonical_vertices
+
+    def canonical_to_world(
+        self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
+    ) -> Float[Tensor, "*T J 4 4"]:
+        """Transforms of each bone, canonical pose to world (method.md 1.3)."""
+        bones = self.bone_transforms(rotations, transl)
+        return bones @ self._inverse_canonical_bones.to(bones.dtype)
+
+    def sample_surface(self, count: int, generator: torch.Generator | None = None) -> SurfaceSamples:
+        """Points spread evenly by area over the canonical mesh, with normals and weights."""
+        return sample_mesh(self._canonical_vertices, self.faces, self.weights, count, generator)
+
+    @cached_property
+    def _levels(self) -> tuple[Level, ...]:
+        device = self.rest_joints.device
+        return tuple(
+            Level(level.joints.to(device), level.parents.to(device), level.parent_slots.to(device))
+            for level in tree_levels(self.parents.tolist())
+        )
+
+    @cached_property
+    def _level_inverse(self) -> Int[Tensor, "J"]:
+        return level_inverse(self._levels)
+
+    @cached_property
+    def _bone_vectors(self) -> Float[Tensor, "J 3 1"]:
+        """Rest joint minus rest joint of its parent; the root's own place for the root."""
+        above = self.rest_joints[self.parents.clamp_min(0)]
+        bones = torch.where((self.parents >= 0)[:, None], self.rest_joints - above, self.rest_joints)
+        return bones[:, :, None]
+
+    @cached_property
+    def _canonical_bones(self) -> Float[Tensor, "J 4 4"]:
+        local = leg_spread_rotations(self.parents.tolist(), self.rest_joints, self.joint_names)
+        return self.bone_transforms(local, self.rest_joints.new_zeros(3))
+
+    @cached_property
+    def _inverse_canonical_bones(self) -> Float[Tensor, "J 4 4"]:
+        return torch.linalg.inv(self._canonical_bones.double()).to(self._canonical_bones.dtype)
+
+    @cached_property
+    def _canonical_vertices(self) -> Float[Tensor, "V 3"]:
+        return skin(self.rest_vertices, self.weights, self._canonical_bones[None])[0][0]
+
+    def _kinematics(
+        self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
+    ) -> tuple[Float[Tensor, "*T J 3 3"], Float[Tensor, "*T J 3"]]:
+        """World rotation and place of every joint, one batched product per level of the tree."""
+        bones = self._bone_vectors.to(rotations.dtype)
+        turned, origins = [], []
+        for depth, level in enumerate(self._levels):
+            local = rotations.index_select(-3, level.joints)
+            if depth == 0:
+                turned.append(local)
+                origins.append(transl[..., None, :] + bones[level.joints, :, 0])
+                continue
+            above = turned[-1].index_select(-3, level.parent_slots)
+            start = origins[-1].index_select(-2, level.parent_slots)
+            turned.append(above @ local)
+            origins.append(start + (above @ bones[level.joints]).squeeze(-1))
+        inverse = self._level_inverse
+        return (
+            torch.cat(turned, -3).index_select(-3, inverse),
+            torch.cat(origins, -2).index_select(-2, inverse),
+        )
+
+
+def skin(
+    points: Float[Tensor, "N 3"] | Float[Tensor, "T N 3"],
+    weights: Float[Tensor, "N J"] | Float[Tensor, "T N J"],
+    bones: Float[Tensor, "T J 4 4"],
+) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N 4 4"]]:
+    """Linear blend skinning: points moved by the weighted mean of the bone transforms.
+
+    Returns the moved points and the blended matrices, whose 3x3 part is not a rotation where
+    bones disagree (the shear is kept; method.md 1.6).
+    """
+    blended = (weights @ bones.flatten(-2)).unflatten(-1, (4, 4))
+    moved = (blended[..., :3, :3] * points[..., None, :]).sum(-1) + blended[..., :3, 3]
+    return moved, blended
+
+
+def bounding_box(body: Body, margin: float = 0.1) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Corners (low, high) of the canonical body, enlarged per side by ``margin`` of the extent."""
+    vertices = body.canonical_vertices()
+    low, high = vertices.amin(0), vertices.amax(0)
+    extent = high - low
+    return low - margin * extent, high + margin * extent
+
+
+def _rigid(
+    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    top = torch.cat((rotation, translation[..., None]), -1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat((top, bottom), -2)

@@ -1,0 +1,146 @@
+"""The body's pose at any time: smooth rotation and translation splines through the key poses."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+from torch import Tensor
+
+from evsplat.body.adapters import load_body
+from evsplat.body.body import Body, skin
+from evsplat.body.rotations import axis_angle_to_matrix
+from evsplat.errors import DataError
+
+if TYPE_CHECKING:
+    from evsplat.capture.capture import Capture
+
+
+class BodyTrack:
+    """Pose of a body over time, twice continuously differentiable between first and last key.
+
+    Rotations: per joint, ``R(t) = R_i exp(p_i(t - t_i))`` with a cubic polynomial p_i of axis-angle
+    vectors (scipy's RotationSpline). Translation: a cubic spline. With two keys both are linear
+    (slerp), with one constant. Outside the keys the nearest key pose is held.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        times_us: Int[np.ndarray, "P"],
+        poses: Float[np.ndarray, "P J 3"],
+        transl: Float[np.ndarray, "P 3"],
+        *,
+        source: str = "body track",
+    ) -> None:
+        times = np.asarray(times_us, dtype=np.int64)
+        poses = np.asarray(poses, dtype=np.float64)
+        transl = np.asarray(transl, dtype=np.float64)
+        _check(body, times, poses, transl, source)
+        self.body = body
+        self.times_us = times
+        device = body.rest_joints.device
+        seconds = (times - times[0]) * 1e-6
+        keys, rates = _rotation_polynomials(seconds, poses)
+        shifts = _translation_polynomials(seconds, transl)
+        # float64 throughout: a few hundred numbers per call, and exact at the keys.
+        self._seconds = torch.from_numpy(seconds).to(device)
+        self._keys = torch.from_numpy(keys).to(device)
+        polynomials = np.concatenate((rates, shifts[:, None]), axis=1)
+        self._polynomials = torch.from_numpy(polynomials).to(device)
+
+    def at(
+        self, times_us: Int[Tensor, "T"] | Sequence[int]
+    ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
+        """Rotations local to the parent (root: in the world) and root translation, float32."""
+        device = self._seconds.device
+        times = torch.as_tensor(times_us, dtype=torch.int64, device=device)
+        seconds = (times - int(self.times_us[0])).double() * 1e-6
+        seconds = seconds.clamp(self._seconds[0], self._seconds[-1])
+        index = torch.searchsorted(self._seconds, seconds, right=True) - 1
+        index = index.clamp(0, len(self._polynomials) - 1)
+        step = (seconds - self._seconds[index])[:, None, None]
+        c3, c2, c1, c0 = self._polynomials[index].unbind(2)
+        value = ((c3 * step + c2) * step + c1) * step + c0
+        rotations = self._keys[index] @ axis_angle_to_matrix(value[:, :-1])
+        return rotations.float(), value[:, -1].float()
+
+    def bones(self, times_us: Int[Tensor, "T"] | Sequence[int]) -> Float[Tensor, "T J 4 4"]:
+        """Bone transforms, canonical pose to world, at the given times."""
+        return self.body.canonical_to_world(*self.at(times_us))
+
+    def vertices(self, time_us: int) -> Float[Tensor, "V 3"]:
+        """The posed body's vertices in the world at one time."""
+        body = self.body
+        return skin(body.canonical_vertices(), body.weights, self.bones([time_us]))[0][0]
+
+
+def load_body_track(capture: "Capture", *, dense: bool = False) -> BodyTrack:
+    """The capture's body with its key poses; ``dense`` takes the true poses of body_dense.npz.
+
+    The dense poses are for evaluation and ablation, never for training.
+    """
+    body, order = load_body(capture.body_file)
+    file = capture.body_file
+    if dense:
+        if capture.dense_body_file is None:
+            raise DataError(f"{capture.path}: body_dense.npz not found, but dense poses were asked for.")
+        file = capture.dense_body_file
+    poses = np.asarray(file.poses)
+    if poses.ndim != 3 or poses.shape[1] != len(order):
+        raise DataError(
+            f"{file.path}: poses has shape {poses.shape}, expected (P, {len(order)}, 3) "
+            f"for the joints of the body."
+        )
+    return BodyTrack(body, file.times_us, poses[:, order], file.transl, source=str(file.path))
+
+
+def _rotation_polynomials(
+    seconds: Float[np.ndarray, "P"], poses: Float[np.ndarray, "P J 3"]
+) -> tuple[Float[np.ndarray, "I J 3 3"], Float[np.ndarray, "I J 4 3"]]:
+    """Rotation at the start of each interval and cubic coefficients (highest first) from there."""
+    count, joints = poses.shape[:2]
+    if count == 1:
+        matrices = Rotation.from_rotvec(poses[0]).as_matrix()
+        return matrices[None], np.zeros((1, joints, 4, 3))
+    keys = np.empty((count - 1, joints, 3, 3))
+    polynomials = np.empty((count - 1, joints, 4, 3))
+    for joint in range(joints):
+        rotations = Rotation.from_rotvec(poses[:, joint])
+        keys[:, joint] = rotations[:-1].as_matrix()
+        coefficients = RotationSpline(seconds, rotations).interpolator.c
+        polynomials[:, joint] = coefficients.transpose(1, 0, 2)
+    return keys, polynomials
+
+
+def _translation_polynomials(
+    seconds: Float[np.ndarray, "P"], transl: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "I 4 3"]:
+    """Cubic coefficients (highest first) of each interval."""
+    if len(seconds) == 1:
+        return np.concatenate((np.zeros((3, 3)), transl))[None]
+    return CubicSpline(seconds, transl).c.transpose(1, 0, 2).copy()
+
+
+def _check(
+    body: Body, times: np.ndarray, poses: np.ndarray, transl: np.ndarray, source: str
+) -> None:
+    joints = len(body.parents)
+    expected = {"poses": (len(times), joints, 3), "transl": (len(times), 3)}
+    if times.ndim != 1 or len(times) == 0:
+        raise DataError(f"{source}: times_us has shape {times.shape}, expected (P,) with P >= 1.")
+    for name, value in (("poses", poses), ("transl", transl)):
+        if value.shape != expected[name]:
+            raise DataError(f"{source}: {name} has shape {value.shape}, expected {expected[name]}.")
+        if not np.isfinite(value).all():
+            key = int(np.argwhere(~np.isfinite(value))[0, 0])
+            raise DataError(f"{source}: {name}[{key}] is not finite; remove or repair that key pose.")
+    if (np.diff(times) <= 0).any():
+        key = int(np.argmax(np.diff(times) <= 0)) + 1
+        raise DataError(
+            f"{source}: times_us[{key}] = {times[key]} does not follow {times[key - 1]}; "
+            "times must increase strictly. Sort the key poses and drop repeated ones."
+        )

@@ -1,0 +1,19 @@
+"""What was recorded: the capture on disk, its cameras and frames, and the validator."""
+
+from evsplat.capture.body_file import BodyFile
+from evsplat.capture.camera import Camera
+from evsplat.capture.capture import Capture, load_capture
+from evsplat.capture.finding import Finding
+from evsplat.capture.metadata import Frame, NovelView
+from evsplat.capture.validate import validate_capture
+
+__all__ = [
+    "BodyFile",
+    "Camera",
+    "Capture",
+    "Finding",
+    "Frame",
+    "NovelView",
+    "load_capture",
+    "validate_capture",
+]

@@ -1,0 +1,73 @@
+"""The body and its key poses as they stand in ``body.npz``."""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, Int64
+
+from evsplat.errors import DataError
+
+
+@dataclass(frozen=True, eq=False)
+class BodyFile:
+    """Raw arrays of ``body.npz``; what a body model does not have is None.
+
+    P key poses, J joints, V vertices, F triangles.
+    """
+
+    path: Path
+    model: str
+    """"rig", "default", "smpl", "smplh" or "smplx"."""
+    times_us: Int64[np.ndarray, "P"]
+    poses: Float[np.ndarray, "P J 3"]
+    """Axis-angle, local to the parent; the root's is the orientation in the world."""
+    transl: Float[np.ndarray, "P 3"]
+    """Posed root joint minus rest root joint, metres."""
+    joint_names: tuple[str, ...] | None = None
+    parents: Int[np.ndarray, "J"] | None = None
+    rest_joints: Float[np.ndarray, "J 3"] | None = None
+    rest_vertices: Float[np.ndarray, "V 3"] | None = None
+    faces: Int[np.ndarray, "F 3"] | None = None
+    weights: Float[np.ndarray, "V J"] | None = None
+    betas: Float[np.ndarray, "B"] | None = None
+    gender: str | None = None
+
+
+RIG_ARRAYS = ("joint_names", "parents", "rest_joints", "rest_vertices", "faces", "weights")
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an npz; pickled objects are refused, because unpickling can run code."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except FileNotFoundError:
+        raise DataError(f"{path}: file not found.") from None
+    except ValueError as error:
+        if "pickle" not in str(error).lower():
+            raise DataError(f"{path}: not a readable npz ({error}); write it anew.") from error
+        raise DataError(
+            f"{path}: holds pickled Python objects, expected plain arrays only; save it with plain "
+            "numeric and string arrays (np.savez never pickles those)."
+        ) from None
+    except (OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        raise DataError(f"{path}: not a readable npz ({error}); write it anew.") from error
+
+
+def body_from_arrays(path: Path, arrays: dict[str, np.ndarray], model: str) -> BodyFile:
+    """A `BodyFile` of well-formed arrays; ``model`` where they name none."""
+    names = arrays.get("joint_names")
+    gender = arrays.get("gender")
+    return BodyFile(
+        path=path,
+        model=str(arrays["model"]) if "model" in arrays else model,
+        times_us=arrays["times_us"].astype(np.int64),
+        poses=arrays["poses"],
+        transl=arrays["transl"],
+        joint_names=None if names is None else tuple(str(name) for name in names),
+        gender=None if gender is None else str(gender),
+        betas=None if "betas" not in arrays else np.ravel(arrays["betas"]),
+        **{key: arrays.get(key) for key in RIG_ARRAYS if key != "joint_names"},
+    )

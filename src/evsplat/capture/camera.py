@@ -1,0 +1,38 @@
+"""Pinhole cameras: the OpenCV convention, pixel centres at +0.5."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion: x right, y down, z forward."""
+
+    width: int
+    height: int
+    K: Float[Tensor, "3 3"]
+    """Intrinsics in pixels, float32; the centre of the first pixel is (0.5, 0.5)."""
+    world_to_camera: Float[Tensor, "4 4"]
+    """Rigid transform of world points (metres) to the camera, float32."""
+
+    def center(self) -> Float[Tensor, "3"]:
+        """Optical centre in the world."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+    def to(self, device: torch.device | str) -> "Camera":
+        """The same camera with its matrices on ``device``."""
+        return replace(self, K=self.K.to(device), world_to_camera=self.world_to_camera.to(device))
+
+    def project(
+        self, points: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+        """Pixels (x, y) and depth z of world points; pixels mean nothing where z <= 0."""
+        world_to_camera = self.world_to_camera.to(points)
+        in_camera = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+        depth = in_camera[..., 2]
+        homogeneous = in_camera @ self.K.to(points).T
+        return homogeneous[..., :2] / depth[..., None], depth

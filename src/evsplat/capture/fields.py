@@ -1,0 +1,105 @@
+"""Typed access to JSON objects, with findings that say where a value is wrong."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evsplat.capture.finding import Findings, nearest
+
+MISSING = object()
+
+
+class Fields:
+    """One JSON object; what is missing or ill-typed in it becomes a finding."""
+
+    def __init__(
+        self, file: Path, where: str, value: Any, known: tuple[str, ...], findings: Findings
+    ) -> None:
+        self.file, self.where, self.findings = file, where, findings
+        self.value = value if isinstance(value, dict) else {}
+        self.is_object = self.valid = isinstance(value, dict)
+        if not self.is_object:
+            self.fail("", brief(value), "a JSON object", "Write it as { ... }.")
+        for key in self.value:
+            if key not in known:
+                findings.warning(
+                    file, self.field(key), "an unknown key", "a known key", nearest(key, known)
+                )
+
+    def field(self, key: str) -> str:
+        """Dotted name of a key of this object."""
+        return f"{self.where}.{key}".strip(".")
+
+    def fail(self, key: str, found: str, expected: str, remedy: str) -> None:
+        """Note an error of this object, which makes it invalid."""
+        self.valid = False
+        self.findings.error(self.file, self.field(key), found, expected, remedy)
+
+    def has(self, key: str) -> bool:
+        """Whether the key has a value; a finding where it has none."""
+        there = self.value.get(key) is not None
+        if not there and self.is_object:
+            found = "null" if key in self.value else "nothing"
+            self.fail(key, found, "a value", f"Add the key {key!r}.")
+        return there
+
+    def get(self, key: str, default: Any = MISSING) -> Any:
+        """The raw value; None (and a finding, unless there is a default) where it is missing."""
+        if default is not MISSING:
+            return self.value.get(key, default)
+        return self.value[key] if self.has(key) else None
+
+    def text(self, key: str, default: Any = MISSING) -> str:
+        """A non-empty text, "" after a finding."""
+        value = self.get(key, default)
+        if value is not None and (not isinstance(value, str) or not value):
+            self.fail(key, brief(value), "a text", "Write it in quotation marks.")
+        return value if isinstance(value, str) else ""
+
+    def path(self, key: str, root: Path, *, required: bool = True) -> Path | None:
+        """A path below ``root``."""
+        text = self.text(key) if required else self.text(key, None)
+        return root / text if text else None
+
+    def integer(self, key: str, default: Any = MISSING, *, minimum: int | None = None) -> int:
+        """A whole number, 0 after a finding."""
+        value = self.get(key, default)
+        if value is None:
+            return 0
+        whole = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not whole or value != value or math.isinf(value) or int(value) != value:
+            self.fail(key, brief(value), "a whole number", "Correct it.")
+            return 0
+        if minimum is not None and value < minimum:
+            self.fail(key, brief(value), f"a number of at least {minimum}", "Correct it.")
+        return int(value)
+
+    def numbers(self, key: str, shape: tuple[int, ...], default: Any = MISSING) -> Any:
+        """Finite numbers of that shape as float64, None after a finding."""
+        value = self.get(key, default)
+        if value is None:
+            return None
+        expected = f"{'x'.join(map(str, shape))} finite numbers"
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            array = np.empty(0)
+        if array.shape != shape or not np.isfinite(array).all():
+            self.fail(key, brief(value), expected, "Correct it.")
+            return None
+        return array
+
+    def entries(self, key: str, default: Any = MISSING) -> list[Any]:
+        """A list, empty after a finding."""
+        value = self.get(key, default)
+        if value is not None and not isinstance(value, list):
+            self.fail(key, brief(value), "a list", "Write it as [ ... ].")
+        return value if isinstance(value, list) else []
+
+
+def brief(value: Any, limit: int = 80) -> str:
+    """``repr`` cut to a length that fits a message."""
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 1] + "…"

@@ -1,0 +1,49 @@
+"""What the validator found wrong: always the file, the field, what is there and what to do."""
+
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault of a capture."""
+
+    severity: Literal["error", "warning"]
+    """An error makes the capture unusable, a warning does not."""
+    file: Path
+    field: str
+    """Where in the file, e.g. ``frames[3].exposure_us``; empty for the file as a whole."""
+    found: str
+    expected: str
+    remedy: str
+
+    def __str__(self) -> str:
+        where = f"{self.file}: {self.field}" if self.field else f"{self.file}"
+        return f"{where}: found {self.found}, expected {self.expected}. {self.remedy}"
+
+
+@dataclass
+class Findings:
+    """Collects findings in the order in which they are met."""
+
+    items: list[Finding] = field(default_factory=list)
+
+    def error(self, file: Path, field: str, found: str, expected: str, remedy: str) -> None:
+        """Note an error."""
+        self.items.append(Finding("error", file, field, found, expected, remedy))
+
+    def warning(self, file: Path, field: str, found: str, expected: str, remedy: str) -> None:
+        """Note a warning."""
+        self.items.append(Finding("warning", file, field, found, expected, remedy))
+
+    def error_count(self) -> int:
+        """How many errors were noted so far."""
+        return sum(item.severity == "error" for item in self.items)
+
+
+def nearest(key: str, known: tuple[str, ...]) -> str:
+    """A hint with the known key that looks most like ``key``."""
+    matches = get_close_matches(key, known, n=1, cutoff=0.0)
+    return f"Did you mean {matches[0]!r}? Otherwise remove it." if matches else "Remove it."

@@ -1,0 +1,116 @@
+"""Decoding pictures (8 or 16 bit, grey or RGB) and a cache of them bounded in bytes."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from evsplat.errors import DataError
+
+
+def read_image(path: Path) -> np.ndarray:
+    """The stored pixels: (H, W) or (H, W, 3), uint8 or uint16; transparency is dropped."""
+    try:
+        with Image.open(path) as image:
+            if image.mode in ("RGB", "RGBA") and _has_16_bits(image):
+                return _read_16_bit_colour(path)
+            if image.mode in ("L", "RGB", "I;16"):
+                return np.array(image)
+            if image.mode == "I;16B":
+                return np.array(image).astype(np.uint16)
+            return np.array(image.convert("L" if image.mode in ("1", "LA") else "RGB"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: file not found.") from None
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        raise DataError(
+            f"{path}: cannot be decoded as a picture ({error}); save it again as PNG."
+        ) from error
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header, without decoding the pixels."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except FileNotFoundError:
+        raise DataError(f"{path}: file not found.") from None
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        raise DataError(
+            f"{path}: not a readable picture ({error}); save it again as PNG."
+        ) from error
+
+
+def to_unit_range(pixels: np.ndarray) -> Float[Tensor, "..."]:
+    """Float32 in [0, 1] of stored pixels; float pixels are taken to be in that range already."""
+    if pixels.dtype == np.float32:
+        return torch.from_numpy(pixels.copy())
+    scale = float(np.iinfo(pixels.dtype).max)
+    return torch.from_numpy(pixels.astype(np.float32) / np.float32(scale))
+
+
+def to_rgb(image: Float[Tensor, "..."]) -> Float[Tensor, "H W 3"]:
+    """Grey is replicated; RGB stays."""
+    return image[..., None].repeat(1, 1, 3) if image.ndim == 2 else image
+
+
+def to_grey(image: Float[Tensor, "..."]) -> Float[Tensor, "H W"]:
+    """The mean of the channels; grey stays."""
+    return image if image.ndim == 2 else image.mean(-1)
+
+
+class ImageCache:
+    """Least recently used pixel arrays, at most ``limit_bytes`` of them; safe between threads."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        self.limit_bytes = limit_bytes
+        self.bytes = 0
+        self._arrays: OrderedDict[Any, np.ndarray] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"limit_bytes": self.limit_bytes}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["limit_bytes"])  # type: ignore[misc]
+
+    def get(self, key: Any, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The array of ``key``, made and kept when absent; not to be written to."""
+        with self._lock:
+            if key in self._arrays:
+                self._arrays.move_to_end(key)
+                return self._arrays[key]
+        array = make()
+        with self._lock:
+            if key not in self._arrays and array.nbytes <= self.limit_bytes:
+                self._arrays[key] = array
+                self.bytes += array.nbytes
+                while self.bytes > self.limit_bytes:
+                    self.bytes -= self._arrays.popitem(last=False)[1].nbytes
+        return array
+
+
+def _has_16_bits(image: Image.Image) -> bool:
+    """Whether the file holds 16 bits per channel, which Pillow would cut to 8."""
+    return any(
+        "16" in str(tile[3][0] if isinstance(tile[3], tuple) else tile[3])
+        for tile in getattr(image, "tile", [])
+    )
+
+
+def _read_16_bit_colour(path: Path) -> np.ndarray:
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            return next(container.decode(video=0)).to_ndarray(format="rgb48le")
+    except (av.error.FFmpegError, StopIteration) as error:
+        raise DataError(
+            f"{path}: cannot be decoded as a 16-bit picture ({error}); save it again as PNG."
+        ) from error

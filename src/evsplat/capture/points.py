@@ -1,0 +1,81 @@
+"""Reading the optional initial scene points (PLY, ASCII or binary)."""
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from jaxtyping import Float32
+
+from evsplat.errors import DataError
+
+_TYPES = {
+    **{name: "i1" for name in ("char", "int8")},
+    **{name: "u1" for name in ("uchar", "uint8")},
+    **{name: "i2" for name in ("short", "int16")},
+    **{name: "u2" for name in ("ushort", "uint16")},
+    **{name: "i4" for name in ("int", "int32")},
+    **{name: "u4" for name in ("uint", "uint32")},
+    **{name: "f4" for name in ("float", "float32")},
+    **{name: "f8" for name in ("double", "float64")},
+}
+_BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+
+
+def read_points(
+    path: Path,
+) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 3"]]:
+    """Positions (metres, world) and colours in [0, 1] of the vertices; grey 0.5 without colour."""
+    try:
+        with path.open("rb") as file:
+            layout, count, fields = _read_header(file)
+            dtype = np.dtype([(name, _BYTE_ORDER[layout] + kind) for name, kind in fields])
+            if layout == "ascii":
+                table = np.atleast_2d(np.loadtxt(file, max_rows=count, dtype=np.float64))
+                columns = {name: table[:, i] for i, (name, _) in enumerate(fields)}
+                length = len(table)
+            else:
+                rows = np.frombuffer(file.read(count * dtype.itemsize), dtype=dtype)
+                columns = {name: rows[name] for name, _ in fields}
+                length = len(rows)
+    except (OSError, ValueError, IndexError) as error:
+        raise DataError(f"{path}: not a readable PLY ({error}); write it anew.") from error
+    if length != count:
+        raise DataError(f"{path}: holds {length} vertices, expected {count}; write it anew.")
+    missing = [axis for axis in "xyz" if axis not in columns]
+    if missing:
+        raise DataError(f"{path}: vertices have no {missing}, expected x, y and z; write it anew.")
+    points = np.stack([columns[axis] for axis in "xyz"], axis=-1).astype(np.float32)
+    kinds = dict(fields)
+    if not all(name in columns for name in ("red", "green", "blue")):
+        return points, np.full_like(points, 0.5)
+    colours = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
+    scale = 255.0 if kinds["red"] == "u1" else 1.0
+    return points, (colours / scale).astype(np.float32)
+
+
+def _read_header(file: BinaryIO) -> tuple[str, int, list[tuple[str, str]]]:
+    """Layout, vertex count and (name, numpy type) of the vertex properties."""
+    lines = []
+    for raw in file:
+        lines.append(raw.decode("ascii").split())
+        if lines[-1] == ["end_header"]:
+            break
+        if len(lines) > 200:
+            raise ValueError("no end of the header")
+    if not lines or lines[0] != ["ply"]:
+        raise ValueError("the first line is not 'ply'")
+    layout, count, element = "", 0, ""
+    fields: list[tuple[str, str]] = []
+    for words in lines:
+        if words[:1] == ["format"]:
+            layout = words[1]
+        elif words[:1] == ["element"]:
+            if not fields and words[1] != "vertex":
+                raise ValueError("the first element is not 'vertex'")
+            element = words[1]
+            count = int(words[2]) if element == "vertex" else count
+        elif words[:1] == ["property"] and element == "vertex":
+            fields.append((words[2], _TYPES[words[1]]))
+    if layout not in _BYTE_ORDER:
+        raise ValueError(f"unknown layout {layout!r}")
+    return layout, count, fields

@@ -1,0 +1,26 @@
+"""``evsplat evaluate``: measure a run against the capture's ground truth."""
+
+from pathlib import Path
+from typing import Annotated
+
+from evsplat.cli.options import RunFolder, option
+from evsplat.cli.summary import print_summary
+
+
+def evaluate(
+    run: RunFolder,
+    /,
+    *,
+    lpips_weights: Annotated[Path | None, option("FILE", default="torch hub cache")] = None,
+) -> None:
+    """Measure a run on its test frames: metrics.json, tables, pictures, report.html.
+
+    Args:
+        run: Run folder written by 'evsplat train'.
+        lpips_weights: Backbone weights for LPIPS; without any it stays empty, with the reason.
+    """
+    from evsplat.evaluation import evaluate_run
+    from evsplat.evaluation.report import write_report
+
+    metrics = evaluate_run(run, lpips_weights=lpips_weights)
+    print_summary(metrics, run=run, report=write_report(run))

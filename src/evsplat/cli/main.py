@@ -1,0 +1,54 @@
+"""Reading the command line, and turning what goes wrong into a message and an exit code."""
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import tyro
+
+import evsplat
+from evsplat.cli.demo import demo
+from evsplat.cli.doctor import doctor
+from evsplat.cli.evaluate import evaluate
+from evsplat.cli.inspect import inspect
+from evsplat.cli.render import render
+from evsplat.cli.report import report
+from evsplat.cli.train import train
+from evsplat.errors import EvsplatError
+
+_VERBS: dict[str, Callable[..., Any]] = {
+    verb.__name__: verb for verb in (demo, doctor, inspect, train, evaluate, report, render)
+}
+_DESCRIPTION = (
+    "A sharp, animatable 3D Gaussian person in a scene, from a blurry video and events.\n\n"
+    "Start with 'evsplat demo'; 'evsplat VERB --help' tells more."
+)
+_CODE_BAD_INPUT = 2
+_CODE_INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    0: done; 2: the input, the machine or an option is at fault (one message on stderr);
+    130: stopped by Ctrl-C.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments == ["--version"]:
+        print(f"evsplat {evsplat.__version__}")
+        return 0
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            _VERBS,
+            prog="evsplat",
+            description=_DESCRIPTION,
+            args=arguments or ["--help"],
+            config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
+        )
+    except EvsplatError as error:
+        print(f"evsplat: {error}", file=sys.stderr)
+        return _CODE_BAD_INPUT
+    except KeyboardInterrupt as stop:
+        print(f"\nevsplat: stopped. {stop}".rstrip(), file=sys.stderr)
+        return _CODE_INTERRUPTED
+    return 0

@@ -1,0 +1,33 @@
+"""The table that is printed when a run has been evaluated."""
+
+from pathlib import Path
+from typing import Any
+
+_REGIONS = ("full", "person_crop", "person_mask")
+
+
+def print_summary(metrics: dict[str, Any], *, run: Path, report: Path) -> None:
+    """Print the run's figures above the trivial rows, and where the report is."""
+    print(summary_table(metrics))
+    print(f"run:    {run}\nreport: {report}")
+
+
+def summary_table(metrics: dict[str, Any]) -> str:
+    """Format PSNR (dB) / SSIM of protocol 'standard' per region: the run and the trivial rows."""
+    rows = {metrics["method"]: metrics["protocols"]["standard"], **metrics["trivial"]}
+    width = max(map(len, rows))
+    head = "".join(f"{region.replace('_', ' '):>18}" for region in _REGIONS)
+    lines = [f"PSNR dB / SSIM on the test frames, protocol 'standard'\n{'':{width}}{head}"]
+    for name, regions in rows.items():
+        cells = "".join(f"{_cell(regions[region]):>18}" for region in _REGIONS)
+        lines.append(f"{name:{width}}{cells}")
+    return "\n".join(lines)
+
+
+def _cell(values: dict[str, float | None] | None) -> str:
+    """Format one region; a figure that could not be measured is a dash."""
+    values = values or {}
+    psnr, ssim = values.get("psnr"), values.get("ssim")
+    return (
+        f"{'-' if psnr is None else f'{psnr:.2f}'} / {'-' if ssim is None else f'{ssim:.3f}'}"
+    )

@@ -1,0 +1,301 @@
+"""A person and a scene in one Gaussian set, posed at any time: the paper's model (eq. 1-7)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from evsplat.body import BodyTrack, bounding_box, skin
+from evsplat.body.rotations import axis_angle_to_matrix, quaternion_multiply
+from evsplat.deform.colour import HumanColour, SceneColour, view_jitter
+from evsplat.deform.encodings import make_encoding
+from evsplat.deform.non_rigid import NonRigidNetwork
+from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
+from evsplat.deform.skinning_network import SkinningNetwork
+from evsplat.gaussians import GaussianSet, PosedGaussians, PosedHuman, StaticScene
+
+Semantics = Literal["fixed", "ste", "rendered"]
+
+
+@dataclass(frozen=True)
+class DeformConfig:
+    """Networks that move and colour Gaussians (3DGS-Avatar; reference 1.4-1.8)."""
+
+    encoding: Literal["oneblob", "hashgrid"] = "oneblob"
+    """Position encoding of the non-rigid network. The released 3DGS-Avatar asks for a hash grid and
+    gets one-blob (reference 1.5); the smooth one generalises better to held-out poses."""
+    width: int = 128
+    """Hidden width of the non-rigid and the skinning network."""
+    non_rigid_depth: int = 3
+    """Hidden layers of the non-rigid network."""
+    non_rigid_last_std: float | None = 1e-3
+    """Start of its last layer; null starts it at random as 3DGS-Avatar does, which makes every
+    point jump when the network is switched on."""
+    skinning_depth: int = 4
+    """Hidden layers of the skinning network."""
+    colour_width: int = 64
+    """Hidden width of the colour networks (A10)."""
+    latent_dim: int = 16
+    """Size of the per-frame latent of the person's colour."""
+    non_rigid_start: float = 3_000
+    """Nominal iteration at which the non-rigid network is switched on (A9)."""
+    pose_noise: float = 0.1
+    """Standard deviation of the noise on the rotation matrices fed to the pose encoder."""
+    pose_noise_probability: float = 0.5
+    """How often that noise is added in training."""
+    view_noise: bool = True
+    """Turn all canonical view directions of a training step at random, 45 degrees per axis."""
+    scene_view_dependent: bool = True
+    """Whether the scene's colour sees the view direction (paper eq. 7, A10)."""
+    scene_direction_dropout: float = 0.5
+    """How often a training step hides that direction; a static camera cannot teach it (A10)."""
+    pose_correction_start: float | None = None
+    """Nominal iteration from which per-frame pose residuals are learned; null = never.
+    3DGS-Avatar starts at 5000 (A9). Exact poses get worse by it, noisy ones better."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Random perturbations of one training step, drawn outside so that a resume repeats them."""
+
+    rotations: Float[Tensor, "T J 3 3"] | None
+    """Added to what the pose encoder sees."""
+    view_turn: Float[Tensor, "3 3"]
+    """Rotation applied to canonical view directions."""
+    hide_scene_direction: bool
+
+
+class HumanSceneModel(nn.Module):
+    """Gaussians, networks and the body track; `at` poses them at given times.
+
+    ``frame_times_us`` are the mid-exposures of the training frames, the anchors of the per-frame
+    latents and pose residuals; both are interpolated in time, so held-out frames get their
+    neighbours' values (A22).
+    """
+
+    def __init__(
+        self,
+        config: DeformConfig,
+        semantics: Semantics,
+        track: BodyTrack,
+        frame_times_us: Sequence[int],
+        gaussians: GaussianSet,
+    ) -> None:
+        """Build the networks for the track's body; ``gaussians`` is the start."""
+        super().__init__()
+        body = track.body
+        joints = len(body.parents)
+        self.config, self.semantics, self.track = config, semantics, track
+        self.gaussians = gaussians
+        parents = body.parents.tolist()
+        joints_seen = normalise_joints(body.rest_joints, body.rest_vertices)
+        self.pose_encoder = PoseEncoder(parents, joints_seen)
+        self.non_rigid = NonRigidNetwork(
+            make_encoding(config.encoding),
+            self.pose_encoder.dim,
+            width=config.width,
+            depth=config.non_rigid_depth,
+            last_layer_std=config.non_rigid_last_std,
+        )
+        self.skinning = SkinningNetwork(parents, width=config.width, depth=config.skinning_depth)
+        self.human_colour = HumanColour(latent_dim=config.latent_dim, width=config.colour_width)
+        self.scene_colour = SceneColour(
+            view_dependent=config.scene_view_dependent, width=config.colour_width
+        )
+        frames = len(frame_times_us)
+        # Zero, not random: what a frame has not learned must not show between frames.
+        self.latents = nn.Parameter(torch.zeros(frames, config.latent_dim))
+        self.rotation_residuals = nn.Parameter(torch.zeros(frames, joints, 3))
+        self.translation_residuals = nn.Parameter(torch.zeros(frames, 3))
+        low, high = bounding_box(body)
+        self.box_low: Tensor
+        self.box_high: Tensor
+        self.nominal: Tensor
+        self.register_buffer("box_low", low.float())
+        self.register_buffer("box_high", high.float())
+        self.register_buffer("frame_times", torch.tensor(frame_times_us, dtype=torch.float64))
+        self.register_buffer("nominal", torch.zeros((), dtype=torch.float64))
+
+    @property
+    def non_rigid_active(self) -> bool:
+        """Whether training has reached the start of the non-rigid network."""
+        return float(self.nominal) >= self.config.non_rigid_start
+
+    @property
+    def pose_correction_active(self) -> bool:
+        """Whether training has reached the start of pose correction."""
+        start = self.config.pose_correction_start
+        return start is not None and float(self.nominal) >= start
+
+    def normalise(self, positions: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+        """Canonical metres to [-1, 1] over the enlarged bounding box of the body."""
+        return 2 * (positions - self.box_low) / (self.box_high - self.box_low) - 1
+
+    def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4)."""
+        rotations, translation = self.track.at(torch.as_tensor(times_us))
+        if self.pose_correction_active:
+            weights = self._time_weights(times_us)
+            residual = torch.einsum("tf,fjc->tjc", weights, self.rotation_residuals)
+            rotations = rotations @ axis_angle_to_matrix(residual)
+            translation = translation + weights @ self.translation_residuals
+        return rotations, self.track.body.canonical_to_world(rotations, translation)
+
+    def at(
+        self,
+        times_us: Sequence[int],
+        camera_center: Float[Tensor, "3"],
+        *,
+        noise: Noise | None = None,
+        hard_semantics: bool = False,
+    ) -> PosedGaussians:
+        """All Gaussians in world space at ``times_us``, coloured for a camera at that centre.
+
+        ``hard_semantics`` puts the hard label into the semantic channel (evaluation); otherwise it
+        is the soft attribute m.
+        """
+        gaussians = self.gaussians
+        rotations, bones = self.pose(times_us)
+        moving = self._moving_rows()
+        canonical = gaussians.means[moving]
+        non_rigid = self._non_rigid(canonical, rotations, noise)
+        deformed, log_scales, quaternions, feature = non_rigid
+        weights = self.skinning(self.normalise(deformed))
+        world, transforms = skin(deformed, weights, bones)
+
+        people = slice(0, gaussians.human_count)
+        human_means, scene_means = world[:, people], gaussians.means[gaussians.scene]
+        if self.semantics == "ste":
+            human_means, scene_means = self._straight_through(world, canonical, moving)
+        rgb = self._human_rgb(
+            human_means, transforms[:, people], feature[:, people], camera_center, times_us, noise
+        )
+        hidden = noise is not None and noise.hide_scene_direction
+        directions = nn.functional.normalize(scene_means.detach() - camera_center, dim=-1)
+        soft = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
+        opacities = gaussians.opacities()
+        times = len(times_us)
+        return PosedGaussians(
+            human=PosedHuman(
+                human_means,
+                quaternions[:, people].expand(times, -1, -1),
+                log_scales[:, people].exp().expand(times, -1, -1),
+                rgb,
+                transforms[:, people],
+            ),
+            scene=StaticScene(
+                scene_means,
+                gaussians.quaternions[gaussians.scene],
+                gaussians.scales_log[gaussians.scene].exp(),
+                self.scene_colour(
+                    gaussians.features[gaussians.scene], directions * (0.0 if hidden else 1.0)
+                ),
+            ),
+            human_opacities=opacities[gaussians.human],
+            scene_opacities=opacities[gaussians.scene],
+            human_semantics=soft[gaussians.human],
+            scene_semantics=soft[gaussians.scene],
+        )
+
+    def draw_noise(self, times: int, generator: torch.Generator) -> Noise:
+        """The random perturbations of one training step."""
+        config, joints = self.config, len(self.track.body.parents)
+        rotations = None
+        if float(torch.rand((), generator=generator)) < config.pose_noise_probability:
+            rotations = config.pose_noise * torch.randn(1, joints, 3, 3, generator=generator)
+            rotations = rotations.expand(times, -1, -1, -1)
+        turn = view_jitter(generator, symmetric=True) if config.view_noise else torch.eye(3)
+        hide = float(torch.rand((), generator=generator)) < config.scene_direction_dropout
+        return Noise(rotations, turn, hide)
+
+    def _moving_rows(self) -> Tensor | slice:
+        """Rows that the networks see: the person's, and with ``ste`` scene rows inside the box."""
+        if self.semantics != "ste":
+            return self.gaussians.human
+        inside = self._scene_inside_box()
+        people = torch.arange(self.gaussians.human_count)
+        return torch.cat([people, torch.nonzero(inside)[:, 0] + self.gaussians.human_count])
+
+    def _scene_inside_box(self) -> Bool[Tensor, " S"]:
+        """Scene rows whose centre, read as canonical, lies in the body's box (literal eq. 6)."""
+        scene = self.gaussians.means[self.gaussians.scene].detach()
+        return ((scene > self.box_low) & (scene < self.box_high)).all(-1)
+
+    def _straight_through(
+        self, world: Tensor, canonical: Tensor, moving: Tensor | slice
+    ) -> tuple[Tensor, Tensor]:
+        """Both placements of each row, chosen by the hard label, with the gradient of m (A2 ii).
+
+        Forward: ``h * deformed + (1 - h) * canonical`` with the hard label h; backward: dm/dl. Rows
+        outside the canonical box have no deformed placement and so no gradient.
+        """
+        count = self.gaussians.human_count
+        soft = self.gaussians.semantics()[moving]
+        slope = (soft - soft.detach())[None, :, None]
+        step = slope * (world.detach() - canonical.detach())
+        human = world[:, :count] + step[:, :count]
+        scene = self.gaussians.means[self.gaussians.scene]
+        if step.shape[1] > count:
+            inside = torch.nonzero(self._scene_inside_box())[:, 0]
+            # The scene is drawn once for all times; its label sees the mean placement.
+            scene = scene.index_add(0, inside, step[:, count:].mean(0))
+        return human, scene
+
+    def _non_rigid(
+        self, canonical: Tensor, rotations: Tensor, noise: Noise | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Deformed centres, log-scales, quaternions and colour feature (eq. 1), time leading.
+
+        Before the network is switched on all but the feature have a leading axis of 1.
+        """
+        rows = self._moving_rows()
+        log_scales = self.gaussians.scales_log[rows][None]
+        quaternions = self.gaussians.quaternions[rows][None]
+        if not self.non_rigid_active:
+            feature = canonical.new_zeros(len(rotations), len(canonical), self.non_rigid.feature_dim)
+            return canonical[None], log_scales, quaternions, feature
+        seen = rotations if noise is None or noise.rotations is None else rotations + noise.rotations
+        delta = self.non_rigid(self.normalise(canonical), self.pose_encoder(seen))
+        return (
+            canonical + delta.offset,
+            log_scales + delta.log_scale,
+            quaternion_multiply(delta.rotation, nn.functional.normalize(quaternions, dim=-1)),
+            delta.feature,
+        )
+
+    def _human_rgb(
+        self,
+        world: Tensor,
+        transforms: Tensor,
+        feature: Tensor,
+        camera_center: Tensor,
+        times_us: Sequence[int],
+        noise: Noise | None,
+    ) -> Float[Tensor, "T H 3"]:
+        """Colours of the person, from the view direction turned back into canonical space."""
+        # Detached as in 3DGS-Avatar: colour must not be bought by moving the body.
+        view = (world - camera_center).detach()[..., None, :]
+        canonical_view = (view @ transforms[..., :3, :3].detach())[..., 0, :]
+        if noise is not None:
+            canonical_view = canonical_view @ noise.view_turn.T
+        canonical_view = nn.functional.normalize(canonical_view, dim=-1)
+        latent = self._time_weights(times_us) @ self.latents
+        features = self.gaussians.features[self.gaussians.human]
+        return self.human_colour(features, canonical_view, feature, latent)
+
+    def _time_weights(self, times_us: Sequence[int]) -> Float[Tensor, "T F"]:
+        """Linear interpolation between the training frames around each time; held at the ends."""
+        anchors = self.get_buffer("frame_times")
+        times = torch.as_tensor(list(times_us), dtype=torch.float64).clamp(anchors[0], anchors[-1])
+        after = torch.searchsorted(anchors, times).clamp(1, max(len(anchors) - 1, 1))
+        if len(anchors) == 1:
+            return torch.ones(len(times), 1)
+        before = after - 1
+        share = (times - anchors[before]) / (anchors[after] - anchors[before])
+        weights = torch.zeros(len(times), len(anchors), dtype=torch.float64)
+        weights.scatter_(1, before[:, None], (1 - share)[:, None])
+        weights.scatter_(1, after[:, None], share[:, None])
+        return weights.float()

@@ -1,0 +1,104 @@
+"""Skinning weights from canonical position: an MLP and a hierarchical softmax over the skeleton."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from evsplat.body.tree import joint_depths
+from evsplat.deform.mlp import PointMLP
+
+
+class HierarchicalSoftmax(nn.Module):
+    """Weights over the joints of any tree by passing mass from the root down (method.md 1.6).
+
+    The root starts with mass one. A joint with one child passes it ``sigmoid(l_child)`` of its mass
+    and keeps the rest. The root, and any joint with several children, passes on ``sigmoid(gate)``
+    of its mass, divided by ``softmax(l_children)``. The root's gate is its own logit; the other
+    gates follow the J logits in the order of their joints. For SMPL this is the 25-logit rule of
+    3DGS-Avatar. All joints are computed at once: along a path logarithms of shares add up, so that
+    the logarithm of the weights is a fixed matrix times the logarithms of all shares.
+    """
+
+    gate_paths: Tensor
+    logit_paths: Tensor
+    child_paths: Tensor
+    siblings: Tensor
+    sibling_mask: Tensor
+    sibling_places: Tensor
+
+    def __init__(self, parents: Sequence[int]) -> None:
+        super().__init__()
+        joints = len(parents)
+        joint_depths(parents)  # refuses what is not a tree
+        children = [[c for c, parent in enumerate(parents) if parent == j] for j in range(joints)]
+        root = list(parents).index(-1)
+        gates = {root: root} if children[root] else {}
+        for joint in range(joints):
+            if joint != root and len(children[joint]) > 1:
+                gates[joint] = joints + len(gates) - 1
+        self.logits = joints + sum(joint != root for joint in gates)
+        families = [children[joint] for joint in gates]
+        most = max((len(family) for family in families), default=0)
+        places = {
+            child: slot * most + order
+            for slot, family in enumerate(families)
+            for order, child in enumerate(family)
+        }
+        # log sigmoid(-l) = log sigmoid(l) - l: "keeps the rest" needs no second sigmoid.
+        sigmoid = torch.zeros(self.logits, joints)
+        logit = torch.zeros(self.logits, joints)
+        child = torch.zeros(len(places), joints)
+        column = {joint: index for index, joint in enumerate(places)}
+        for joint in range(joints):
+            keep = gates.get(joint, children[joint][0] if children[joint] else None)
+            if keep is not None:
+                sigmoid[keep, joint] += 1
+                logit[keep, joint] -= 1
+            member = joint
+            while (above := parents[member]) >= 0:
+                sigmoid[gates.get(above, member), joint] += 1
+                if above in gates:
+                    child[column[member], joint] += 1
+                member = above
+        padded = [family + [family[0]] * (most - len(family)) for family in families]
+        mask = [[order >= len(family) for order in range(most)] for family in families]
+        buffers = {
+            "gate_paths": sigmoid,
+            "logit_paths": logit,
+            "child_paths": child,
+            "siblings": torch.tensor(padded, dtype=torch.int64).flatten(),
+            "sibling_mask": torch.tensor(mask, dtype=torch.bool).reshape(len(families), most),
+            "sibling_places": torch.tensor(list(places.values()), dtype=torch.int64),
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def forward(self, logits: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch J"]:
+        """Weights that sum to one."""
+        log_weights = nn.functional.logsigmoid(logits) @ self.gate_paths.to(logits)
+        log_weights = log_weights + logits @ self.logit_paths.to(logits)
+        if len(self.siblings):
+            families = logits.index_select(-1, self.siblings).unflatten(-1, self.sibling_mask.shape)
+            shares = families.masked_fill(self.sibling_mask, -torch.inf).log_softmax(-1).flatten(-2)
+            shares = shares.index_select(-1, self.sibling_places)
+            log_weights = log_weights + shares @ self.child_paths.to(logits)
+        return log_weights.exp()
+
+
+class SkinningNetwork(nn.Module):
+    """Normalised canonical position to skinning weights (method.md 1.6).
+
+    Defaults: 4 hidden layers of 128, no position encoding, no temperature.
+    """
+
+    def __init__(self, parents: Sequence[int], width: int = 128, depth: int = 4) -> None:
+        super().__init__()
+        self.softmax = HierarchicalSoftmax([int(parent) for parent in parents])
+        self.mlp = PointMLP(3, 0, 0, width, depth, self.softmax.logits)
+
+    def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch J"]:
+        """Weights at positions in [-1, 1]; each sums to one."""
+        logits = self.mlp(positions.reshape(-1, 3))[0]
+        return self.softmax(logits).unflatten(0, positions.shape[:-1])

@@ -1,0 +1,21 @@
+"""The exceptions that a user may meet; each message is one sentence that says what to do."""
+
+
+class EvsplatError(Exception):
+    """Anything that is the input's or the machine's fault; the command line prints it and exits 2."""
+
+
+class DataError(EvsplatError):
+    """A capture, event file or run folder is not what it should be."""
+
+
+class ConfigError(EvsplatError):
+    """A configuration value or option is unknown or out of range."""
+
+
+class WeightsError(EvsplatError):
+    """Weights of a pretrained network are missing or do not fit."""
+
+
+class BackendError(EvsplatError):
+    """A backend or device that was asked for cannot run here."""

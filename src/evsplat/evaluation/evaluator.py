@@ -1,0 +1,307 @@
+"""One evaluator for all methods: figures, pictures and tables of a reconstruction's test frames."""
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from evsplat.capture import Capture, Frame, NovelView
+from evsplat.errors import DataError
+from evsplat.evaluation.event_maps import evaluate_event_maps
+from evsplat.evaluation.lpips import MissingWeights, load_lpips
+from evsplat.evaluation.people import People
+from evsplat.evaluation.perceptual import PerceptualMetric
+from evsplat.evaluation.pictures import error_map, file_stem, save_png, to_bytes
+from evsplat.evaluation.protocols import (
+    METRICS,
+    PROTOCOLS,
+    STANDARD,
+    Absent,
+    Measured,
+    Networks,
+    Protocol,
+    Truth,
+)
+from evsplat.evaluation.st_lpips import load_st_lpips
+from evsplat.evaluation.tables import write_tables
+from evsplat.evaluation.tally import Tally, all_absent, without_reasons
+from evsplat.files import write_json
+from evsplat.methods.reconstruction import Reconstruction
+from evsplat.methods.trivial import MedianBackground, NearestFrame
+
+logger = logging.getLogger(__name__)
+
+TRIVIAL_ROWS = ("median_background", "nearest_frame")
+BLURRY_INPUT = "blurry_input"
+"""The picture that the camera took at the test time: no method, for no method sees it."""
+
+Picture = Callable[[Frame], Float[Tensor, "H W 3"]]
+
+
+def evaluate(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    *,
+    out_dir: Path | str,
+    protocols: Sequence[Protocol] = PROTOCOLS,
+    lpips_weights: Path | str | None = None,
+    device: torch.device | str = "cpu",
+) -> dict[str, Any]:
+    """Measure ``reconstruction`` on the test frames and novel views of ``capture``.
+
+    Returns what metrics.json holds, less the facts of a run; pictures go to ``out_dir/pictures``.
+    Every figure is a mean over test frames of per-frame values. What cannot be measured is None,
+    with the reason under "reasons" (a path of keys). Pictures are handled one by one, so that
+    memory does not grow with the length of the recording.
+    """
+    out_dir = Path(out_dir)
+    networks, weights = _load_networks(lpips_weights, device)
+    protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
+    people = People(capture)
+    test = _TestFrames(capture, reconstruction, protocols, networks, people, out_dir)
+    for frame in tqdm(capture.test_frames, desc="test frames", unit="frame", leave=False):
+        test.measure(frame)
+    result = {
+        "capture": capture.name,
+        "method": reconstruction.name,
+        "frames": {"train": len(capture.train_frames), "test": len(capture.test_frames)},
+        **test.results(),
+    }
+    reasons: dict[str, str] = result["reasons"]
+    result["novel_views"] = _novel_views(
+        capture, reconstruction, networks, people, out_dir, reasons
+    )
+    events = evaluate_event_maps(capture, reconstruction, out_dir=out_dir)
+    result["events"] = None if isinstance(events, Absent) else events
+    if isinstance(events, Absent):
+        reasons["events"] = events.reason
+    result["weights"] = weights
+    result["protocol_notes"] = {protocol.name: protocol.summary for protocol in protocols}
+    return result
+
+
+def evaluate_run(run_dir: Path | str, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
+    """Measure a trained run and write metrics.json, metrics.md, metrics.tex and pictures/."""
+    from evsplat.training.run import load_run
+
+    run = load_run(Path(run_dir))
+    measured = evaluate(
+        run.capture,
+        run.reconstruction,
+        out_dir=run.path,
+        lpips_weights=lpips_weights,
+        device=run.device,
+    )
+    metrics = {
+        "capture": measured.pop("capture"),
+        "method": measured.pop("method"),
+        "iteration": run.iteration,
+        "train_seconds": run.train_seconds,
+        "device": str(run.device),
+        "gaussians": run.gaussians,
+        **measured,
+    }
+    write_json(Path(run.path) / "metrics.json", metrics)
+    write_tables(Path(run.path), metrics)
+    return metrics
+
+
+class _TestFrames:
+    """All rows and protocols over the test frames."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        reconstruction: Reconstruction,
+        protocols: Sequence[Protocol],
+        networks: Networks,
+        people: People,
+        out_dir: Path,
+    ) -> None:
+        self._capture = capture
+        self._protocols = protocols
+        self._networks = networks
+        self._people = people
+        self._out_dir = out_dir
+        self._method: Picture = partial(_render, capture, reconstruction)
+        self._others: dict[str, Picture | Absent] = {
+            "median_background": _trivial(MedianBackground, capture),
+            "nearest_frame": _trivial(NearestFrame, capture),
+            BLURRY_INPUT: capture.image,
+        }
+        rows = ("method", *self._others)
+        self._tallies = {(row, p.name): Tally() for row in rows for p in protocols}
+        self._against_blurry = Tally()
+        self._per_frame: list[dict[str, Any]] = []
+
+    def measure(self, frame: Frame) -> None:
+        """Measure one test frame and write its pictures."""
+        ours = self._method(frame)
+        mask, person = self._people.in_mask(frame)
+        truth = None if frame.sharp is None else self._capture.sharp(frame)
+        blurry = Truth(STANDARD, self._capture.image(frame), mask, person, self._networks)
+        against_blurry = blurry.measure(ours)
+        self._against_blurry.add(against_blurry)
+
+        # Standard comes first in self._protocols; the report shows it for every frame and row.
+        pictures = {"method": ours, **self._other_pictures(frame)}
+        measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
+        for protocol in self._protocols:
+            judge = None if truth is None else Truth(protocol, truth, mask, person, self._networks)
+            for row, picture in pictures.items():
+                measured[row][protocol.name] = _compare(judge, picture)
+                self._tallies[row, protocol.name].add(measured[row][protocol.name])
+        self._per_frame.append(
+            {
+                "frame": frame.name,
+                "time_us": frame.mid_us,
+                "protocols": {
+                    name: without_reasons(values) for name, values in measured["method"].items()
+                },
+                "others": {
+                    row: without_reasons(measured[row][STANDARD.name]) for row in self._others
+                },
+                "blurry_ground_truth": without_reasons(against_blurry),
+                "pictures": self._save(frame, ours, truth),
+            }
+        )
+
+    def results(self) -> dict[str, Any]:
+        """Means of everything; "trivial" and "blurry_input" are of the protocol standard."""
+        reasons: dict[str, str] = {}
+
+        def means(tally: Tally, path: str) -> dict[str, Any]:
+            values, why = tally.means()
+            reasons.update({f"{path}.{key}": reason for key, reason in why.items()})
+            return values
+
+        def row(name: str, protocol: Protocol, path: str) -> dict[str, Any]:
+            return means(self._tallies[name, protocol.name], path)
+
+        compat = [protocol for protocol in self._protocols if protocol is not STANDARD]
+        return {
+            "protocols": {p.name: row("method", p, f"protocols.{p.name}") for p in self._protocols},
+            "trivial": {name: row(name, STANDARD, f"trivial.{name}") for name in TRIVIAL_ROWS},
+            BLURRY_INPUT: row(BLURRY_INPUT, STANDARD, BLURRY_INPUT),
+            "compat_rows": {
+                p.name: {
+                    name: row(name, p, f"compat_rows.{p.name}.{name}") for name in self._others
+                }
+                for p in compat
+            },
+            "blurry_ground_truth": means(self._against_blurry, "blurry_ground_truth"),
+            "per_frame": self._per_frame,
+            "reasons": reasons,
+        }
+
+    def _other_pictures(self, frame: Frame) -> dict[str, Tensor | Absent]:
+        return {
+            row: picture if isinstance(picture, Absent) else picture(frame)
+            for row, picture in self._others.items()
+        }
+
+    def _save(self, frame: Frame, ours: Tensor, truth: Tensor | None) -> dict[str, str]:
+        stem = file_stem("test", frame.name)
+        pictures = {"render": to_bytes(ours)}
+        if truth is not None:
+            pictures["error"] = error_map(ours, truth)
+        for kind, picture in pictures.items():
+            save_png(self._out_dir / "pictures" / f"{stem}_{kind}.png", picture)
+        return {kind: f"pictures/{stem}_{kind}.png" for kind in pictures}
+
+
+def _compare(judge: Truth | None, picture: Tensor | Absent) -> Measured:
+    if judge is None:
+        return all_absent("the frame has no sharp ground truth")
+    return all_absent(picture.reason) if isinstance(picture, Absent) else judge.measure(picture)
+
+
+def _novel_views(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    networks: Networks,
+    people: People,
+    out_dir: Path,
+    reasons: dict[str, str],
+) -> dict[str, Any]:
+    """Standard figures of cameras that took no part in the training; empty where there are none."""
+    result: dict[str, Any] = {}
+    for name in dict.fromkeys(view.camera for view in capture.novel_views):
+        tally = Tally(("full", "person_crop"))
+        views = [view for view in capture.novel_views if view.camera == name]
+        per_view = []
+        for view in tqdm(views, desc=f"novel view {name}", unit="picture", leave=False):
+            person = people.in_view(capture.cameras[name], view.time_us)
+            truth = Truth(STANDARD, capture.novel_image(view), None, person, networks)
+            ours = _render_view(capture, reconstruction, view)
+            measured = truth.measure(ours)
+            tally.add(measured)
+            path = f"pictures/{file_stem('novel', name, view.frame)}_render.png"
+            save_png(out_dir / path, to_bytes(ours))
+            per_view.append(
+                {
+                    "frame": view.frame,
+                    "time_us": view.time_us,
+                    "psnr": without_reasons(measured)["full"]["psnr"],
+                    "psnr_person_crop": without_reasons(measured)["person_crop"]["psnr"],
+                    "pictures": {"render": path},
+                }
+            )
+        means, why = tally.means()
+        reasons.update({f"novel_views.{name}.{key}": reason for key, reason in why.items()})
+        result[name] = {**means, "per_view": per_view}
+    if not result:
+        reasons["novel_views"] = "the capture has no novel views"
+    return result
+
+
+@torch.no_grad()
+def _render(capture: Capture, source: Reconstruction, frame: Frame) -> Float[Tensor, "H W 3"]:
+    return source.render(capture.camera(frame), [frame.mid_us]).rgb[0].cpu()
+
+
+@torch.no_grad()
+def _render_view(
+    capture: Capture, source: Reconstruction, view: NovelView
+) -> Float[Tensor, "H W 3"]:
+    return source.render(capture.cameras[view.camera], [view.time_us]).rgb[0].cpu()
+
+
+def _trivial(
+    kind: type[MedianBackground] | type[NearestFrame], capture: Capture
+) -> Picture | Absent:
+    try:
+        return partial(_render, capture, kind(capture))
+    except DataError as error:
+        return Absent(str(error))
+
+
+def _load_networks(
+    lpips_weights: Path | str | None, device: torch.device | str
+) -> tuple[dict[str, PerceptualMetric | Absent], dict[str, dict[str, str | None]]]:
+    """The network distances, and of each the SHA-256 of its weights or the reason for none."""
+    loaders: dict[str, Callable[[], PerceptualMetric]] = {
+        "lpips_alex": lambda: load_lpips("alex", lpips_weights, device=device),
+        "lpips_vgg": lambda: load_lpips("vgg", lpips_weights, device=device),
+        "st_lpips": lambda: load_st_lpips(device=device),
+    }
+    assert tuple(loaders) == METRICS[2:]
+    networks: dict[str, PerceptualMetric | Absent] = {}
+    weights: dict[str, dict[str, str | None]] = {}
+    for name, load in loaders.items():
+        try:
+            network = load()
+        except MissingWeights as error:
+            logger.info("%s", error)
+            networks[name] = Absent(f"no weights: see weights.{name}.reason")
+            weights[name] = {"sha256": None, "reason": str(error)}
+        else:
+            networks[name] = network
+            weights[name] = {"sha256": network.sha256, "reason": None}
+    return networks, weights

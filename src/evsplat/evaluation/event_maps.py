@@ -1,0 +1,137 @@
+"""The recorded event map between two frames beside the one that the reconstruction explains."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.capture import Capture, Frame
+from evsplat.evaluation.pictures import file_stem, save_png, signed_map
+from evsplat.evaluation.protocols import Absent
+from evsplat.events import count_map
+from evsplat.imaging.events import log_brightness_change
+from evsplat.methods.reconstruction import Reconstruction
+
+_TRAIN_PAIRS_SHOWN = 3
+
+
+@dataclass(frozen=True, eq=False)
+class EventPair:
+    """Two event maps of one window, in events per pixel."""
+
+    before: Frame
+    after: Frame
+    given: Float[Tensor, "H W"]
+    """Signed count of the recorded events between the two mid-exposures."""
+    rendered: Float[Tensor, "H W"]
+    """Rendered change of log brightness over the contrast threshold."""
+
+    @property
+    def split(self) -> str:
+        """ "test" where one of the two frames was held out."""
+        return "test" if "test" in (self.before.split, self.after.split) else "train"
+
+    @property
+    def similarity(self) -> float | None:
+        """Cosine of the two maps as vectors; None where one is all zero."""
+        norms = self.given.norm() * self.rendered.norm()
+        return float((self.given * self.rendered).sum() / norms) if norms > 0 else None
+
+
+def evaluate_event_maps(
+    capture: Capture, reconstruction: Reconstruction, *, out_dir: Path
+) -> dict[str, Any] | Absent:
+    """Similarity and pictures of frame pairs: one per test frame and a few training pairs.
+
+    The events between two frames are input of the training, also around test frames; the rendered
+    maps show whether the reconstruction explains them.
+    """
+    absent = _cannot(capture)
+    if absent is not None:
+        return absent
+    pairs: list[dict[str, Any]] = []
+    for pair in _pairs(capture, reconstruction):
+        stem = file_stem("events", pair.before.name, pair.after.name)
+        # The brightest percent would make the rest invisible; both maps get the same scale.
+        busy = pair.given[pair.given != 0].abs()
+        scale = max(1.0, float(busy.quantile(0.95))) if len(busy) else 1.0
+        paths = {}
+        for kind, values in (("given", pair.given), ("rendered", pair.rendered)):
+            save_png(out_dir / "pictures" / f"{stem}_{kind}.png", signed_map(values, scale))
+            paths[kind] = f"pictures/{stem}_{kind}.png"
+        pairs.append(
+            {
+                "frames": [pair.before.name, pair.after.name],
+                "split": pair.split,
+                "similarity": pair.similarity,
+                "full_scale": scale,
+                "pictures": paths,
+            }
+        )
+    return {
+        "threshold_known": capture.contrast_threshold is not None,
+        "mean_similarity": {split: _mean_similarity(pairs, split) for split in ("test", "train")},
+        "pairs": pairs,
+    }
+
+
+def _cannot(capture: Capture) -> Absent | None:
+    if capture.events is None:
+        return Absent("the capture has no events")
+    for camera in {frame.camera for frame in capture.frames}:
+        size = (capture.cameras[camera].width, capture.cameras[camera].height)
+        if size != (capture.events.width, capture.events.height):
+            return Absent(f"camera {camera!r} and the event sensor differ in resolution")
+    return None
+
+
+def _pairs(capture: Capture, reconstruction: Reconstruction) -> Iterator[EventPair]:
+    for before, after in chosen_pairs(capture):
+        assert capture.events is not None
+        stream = capture.events.between(before.mid_us, after.mid_us)
+        given = count_map(stream, capture.events.height, capture.events.width)
+        with torch.no_grad():
+            first, second = (
+                reconstruction.render(capture.camera(frame), [frame.mid_us]).rgb[0].cpu()
+                for frame in (before, after)
+            )
+        change = log_brightness_change(first.clamp(0, 1), second.clamp(0, 1)).float()
+        yield EventPair(before, after, given, change / _threshold(capture, given, change))
+
+
+def chosen_pairs(capture: Capture) -> list[tuple[Frame, Frame]]:
+    """Consecutive frames of one camera: each test frame with the one before, some training pairs.
+
+    A first frame that is a test frame is paired with the one after.
+    """
+    test: list[tuple[Frame, Frame]] = []
+    train: list[tuple[Frame, Frame]] = []
+    for camera in dict.fromkeys(frame.camera for frame in capture.frames):
+        frames = sorted(
+            (frame for frame in capture.frames if frame.camera == camera),
+            key=lambda frame: frame.mid_us,
+        )
+        for index, (before, after) in enumerate(zip(frames, frames[1:], strict=False)):
+            first = index == 0 and before.split == "test"
+            if after.split == "test" or first:
+                test.append((before, after))
+            elif before.split == "train":
+                train.append((before, after))
+    step = max(1, len(train) // _TRAIN_PAIRS_SHOWN)
+    return test + train[step // 2 :: step][:_TRAIN_PAIRS_SHOWN]
+
+
+def _threshold(capture: Capture, given: Tensor, change: Tensor) -> float:
+    """Contrast threshold; where it is unknown, the one that makes both maps equally strong."""
+    if capture.contrast_threshold is not None:
+        return sum(capture.contrast_threshold) / 2
+    return float(change.norm() / given.norm().clamp_min(1e-12)) or 1.0
+
+
+def _mean_similarity(pairs: list[dict[str, Any]], split: str) -> float | None:
+    values = [p["similarity"] for p in pairs if p["split"] == split and p["similarity"] is not None]
+    return sum(values) / len(values) if values else None

@@ -1,0 +1,171 @@
+"""LPIPS 0.1 on AlexNet and VGG16: the linear heads ship with us, the networks' weights do not."""
+
+import hashlib
+import os
+import re
+import zipfile
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evsplat.errors import WeightsError
+from evsplat.evaluation.perceptual import Conv, Layer, MaxPool, Network, PerceptualMetric, Relu
+
+LpipsName = Literal["alex", "vgg"]
+
+WEIGHTS_VARIABLE = "EVSPLAT_LPIPS_WEIGHTS"
+"""Environment variable with a weight file, or a folder with files named as in the hub's cache."""
+
+
+class MissingWeights(WeightsError):
+    """Nobody has put the weights where they are looked for; the message says where to get them."""
+
+
+def _alexnet() -> Network:
+    pool = MaxPool(3, 2)
+    return Network(
+        "LPIPS AlexNet",
+        (
+            (Conv("features.0", (64, 3, 11, 11), stride=4, padding=2), Relu()),
+            (pool, Conv("features.3", (192, 64, 5, 5), padding=2), Relu()),
+            (pool, Conv("features.6", (384, 192, 3, 3)), Relu()),
+            (Conv("features.8", (256, 384, 3, 3)), Relu()),
+            (Conv("features.10", (256, 256, 3, 3)), Relu()),
+        ),
+        min_side=31,
+    )
+
+
+def _vgg16() -> Network:
+    stages: list[tuple[Layer, ...]] = []
+    index, channels = 0, 3
+    for width, convolutions in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        layers: list[Layer] = [MaxPool(2, 2)] if stages else []
+        for _ in range(convolutions):
+            layers += [Conv(f"features.{index}", (width, channels, 3, 3)), Relu()]
+            index, channels = index + 2, width
+        stages.append(tuple(layers))
+        index += 1  # the pooling layer has a place in torchvision's numbering
+    return Network("LPIPS VGG16", tuple(stages), min_side=16)
+
+
+NETWORKS: dict[LpipsName, Network] = {"alex": _alexnet(), "vgg": _vgg16()}
+HUB_FILES: dict[LpipsName, str] = {
+    "alex": "alexnet-owt-7be5be79.pth",
+    "vgg": "vgg16-397923af.pth",
+}
+
+
+def lpips_heads(name: LpipsName) -> list[Tensor]:
+    """The five linear heads, version 0.1, each (C,) and not negative."""
+    file = resources.files("evsplat") / "data" / "lpips_heads.npz"
+    with file.open("rb") as stream, np.load(stream) as arrays:
+        return [torch.from_numpy(arrays[f"{name}_{stage}"]) for stage in range(5)]
+
+
+def load_lpips(
+    name: LpipsName, weights: Path | str | None = None, *, device: torch.device | str = "cpu"
+) -> PerceptualMetric:
+    """LPIPS with weights from ``weights``, the environment variable or torch's hub cache.
+
+    The three places are tried in this order; nothing is ever downloaded. A file or folder that was
+    named but holds no network at all is a WeightsError; `MissingWeights` says that all is well but
+    this network is in none of the places. torchvision's state dicts are read, with or without the
+    classifier.
+    """
+    variable = os.environ.get(WEIGHTS_VARIABLE)
+    named = [Path(place).expanduser() for place in (weights, variable) if place]
+    for place in named:
+        found = _look_in(place, name)
+        if found is not None:
+            return _metric(name, *found, device=device)
+    cached = Path(torch.hub.get_dir()) / "checkpoints" / HUB_FILES[name]
+    if cached.is_file():
+        return _metric(name, cached, _read(cached), device=device)
+    raise MissingWeights(
+        f"{NETWORKS[name].name}: no weights. Fetch https://download.pytorch.org/models/"
+        f"{HUB_FILES[name]} and put it in {_home_as_tilde(cached.parent)}, or give its place with "
+        f"--lpips-weights or {WEIGHTS_VARIABLE}."
+    )
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """A state dict read without running anything that the file may contain."""
+    try:
+        state = torch.load(
+            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
+        )
+    except Exception as error:  # torch raises many kinds for files that are not its own
+        raise WeightsError(f"{path}: not a readable PyTorch weight file ({error}).") from error
+    if not isinstance(state, dict):
+        raise WeightsError(f"{path}: holds a {type(state).__name__}, expected a state dict.")
+    return state
+
+
+def _look_in(place: Path, name: LpipsName) -> tuple[Path, dict[str, Tensor]] | None:
+    """The weights of ``name`` in a file or folder that the user named; None if it has others."""
+    if place.is_dir():
+        files = {net: place / file for net, file in HUB_FILES.items() if (place / file).is_file()}
+        if not files:
+            expected = " or ".join(HUB_FILES.values())
+            raise WeightsError(f"{place}: no LPIPS weights in this folder; expected {expected}.")
+        return (files[name], _read(files[name])) if name in files else None
+    if not place.is_file():
+        raise WeightsError(f"{place}: no such LPIPS weight file or folder.")
+    state = _read(place)
+    fitting = [net for net, network in NETWORKS.items() if not _misfits(network, state)]
+    if not fitting:
+        first = {net: _misfits(network, state)[0] for net, network in NETWORKS.items()}
+        raise WeightsError(
+            f"{place}: neither torchvision's AlexNet ({first['alex']}) nor its VGG16 "
+            f"({first['vgg']})."
+        )
+    return (place, state) if name in fitting else None
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    """State dict of ``path`` without the classifier; a hub file must have its own checksum."""
+    checksum = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
+    if checksum and not sha256_of(path).startswith(checksum[1]):
+        raise WeightsError(
+            f"{path}: the SHA-256 does not begin with {checksum[1]}; the file is damaged, fetch it "
+            "again."
+        )
+    return {k: v for k, v in read_state(path).items() if not k.startswith("classifier.")}
+
+
+def _misfits(network: Network, state: dict[str, Tensor]) -> list[str]:
+    expected = network.parameter_shapes
+    return [
+        f"{key}: expected {expected.get(key, 'nothing')}, found "
+        f"{tuple(state[key].shape) if key in state else 'nothing'}"
+        for key in sorted(expected.keys() | state.keys())
+        if key not in state or tuple(state[key].shape) != expected.get(key)
+    ]
+
+
+def _metric(
+    name: LpipsName, path: Path, state: dict[str, Tensor], *, device: torch.device | str
+) -> PerceptualMetric:
+    misfits = _misfits(NETWORKS[name], state)
+    if misfits:
+        raise WeightsError(f"{path}: not torchvision's {NETWORKS[name].name[6:]}: {misfits[0]}.")
+    parameters = {key: value.float() for key, value in state.items()}
+    return PerceptualMetric(
+        NETWORKS[name], parameters, lpips_heads(name), sha256=sha256_of(path), device=device
+    )
+
+
+def _home_as_tilde(path: Path) -> str:
+    home = Path.home()
+    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)

@@ -1,0 +1,120 @@
+"""Peak signal-to-noise ratio and structural similarity of two images, every choice explicit."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F
+
+
+def psnr(
+    image: Float[Tensor, "H W C"],
+    reference: Float[Tensor, "H W C"],
+    *,
+    data_range: float = 1.0,
+    mask: Bool[Tensor, "H W"] | None = None,
+) -> Float[Tensor, ""]:
+    """-10 log10(MSE / data_range²) over all pixels and channels, in dB; infinite for equal images.
+
+    With ``mask`` only its true pixels count; a mask without any is a ValueError.
+    """
+    _check_same_shape(image, reference)
+    error = (image - reference).square()
+    if mask is not None:
+        if not bool(mask.any()):
+            raise ValueError("the mask selects no pixel")
+        error = error[mask]
+    return -10.0 * torch.log10(error.mean() / data_range**2)
+
+
+def psnr_channel_mean(
+    image: Float[Tensor, "H W C"],
+    reference: Float[Tensor, "H W C"],
+    *,
+    data_range: float = 1.0,
+) -> Float[Tensor, ""]:
+    """Mean of the PSNRs of the single channels, in dB; never below `psnr` (Jensen)."""
+    _check_same_shape(image, reference)
+    error = (image - reference).square().mean(dim=(0, 1))
+    return (-10.0 * torch.log10(error / data_range**2)).mean()
+
+
+@dataclass(frozen=True)
+class Ssim:
+    """One definition of structural similarity (Wang et al. 2004); the value depends on all of it."""
+
+    window: Literal["gaussian", "uniform"] = "gaussian"
+    size: int = 11
+    """Side of the square window in pixels, odd."""
+    sigma: float = 1.5
+    """Standard deviation of the Gaussian window in pixels; not read by the uniform one."""
+    padding: Literal["valid", "zero"] = "valid"
+    """valid: only windows inside the image count. zero: windows reach over the border into zeros."""
+    data_range: float = 1.0
+    """Largest minus smallest possible value; the stabilising constants scale with its square."""
+    sample_covariance: bool = False
+    """Divide (co)variances by N - 1 instead of N, N the number of pixels of the window."""
+
+
+GAUSSIAN_SSIM = Ssim()
+"""Gaussian 11/1.5, range 1: scikit-image's gaussian_weights, sigma=1.5, no sample covariance."""
+
+SCIKIT_DEFAULT_SSIM = Ssim("uniform", 7, data_range=2.0, sample_covariance=True)
+"""What scikit-image up to 0.19 computes for float images where no data range is given."""
+
+ZERO_PADDED_SSIM = Ssim(padding="zero")
+"""Gaussian 11/1.5, range 1, with zero padding: the SSIM of most 3DGS code."""
+
+
+def ssim_map(
+    image: Float[Tensor, "H W C"], reference: Float[Tensor, "H W C"], settings: Ssim
+) -> Float[Tensor, "C h w"]:
+    """Structural similarity at every window position; float64 input keeps its precision."""
+    _check_same_shape(image, reference)
+    size = settings.size
+    if size % 2 == 0:
+        raise ValueError(f"the window's side must be odd, not {size}")
+    if settings.padding == "valid" and min(image.shape[:2]) < size:
+        raise ValueError(f"the {size}-pixel window is larger than the image")
+
+    if settings.window == "gaussian":
+        position = torch.arange(size, dtype=image.dtype, device=image.device) - size // 2
+        kernel = torch.exp(-0.5 * (position / settings.sigma) ** 2)
+        kernel = kernel / kernel.sum()
+    else:
+        kernel = torch.full((size,), 1.0 / size, dtype=image.dtype, device=image.device)
+    pad = size // 2 if settings.padding == "zero" else 0
+
+    def smooth(planes: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+        rows = F.conv2d(planes[:, None], kernel.view(1, 1, -1, 1), padding=(pad, 0))
+        return F.conv2d(rows, kernel.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
+
+    x, y = image.movedim(-1, 0), reference.movedim(-1, 0)
+    mean_x, mean_y = smooth(x), smooth(y)
+    unbias = size**2 / (size**2 - 1) if settings.sample_covariance else 1.0
+    variance_x = unbias * (smooth(x * x) - mean_x**2)
+    variance_y = unbias * (smooth(y * y) - mean_y**2)
+    covariance = unbias * (smooth(x * y) - mean_x * mean_y)
+    c1, c2 = (0.01 * settings.data_range) ** 2, (0.03 * settings.data_range) ** 2
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
+    return luminance * structure
+
+
+def ssim(
+    image: Float[Tensor, "H W C"],
+    reference: Float[Tensor, "H W C"],
+    settings: Ssim = GAUSSIAN_SSIM,
+) -> Float[Tensor, ""]:
+    """Mean structural similarity over channels and window positions.
+
+    A ValueError where no window fits into the image.
+    """
+    return ssim_map(image, reference, settings).mean()
+
+
+def _check_same_shape(image: Tensor, reference: Tensor) -> None:
+    if image.shape != reference.shape:
+        raise ValueError(f"images differ in shape: {tuple(image.shape)}, {tuple(reference.shape)}")

@@ -1,0 +1,254 @@
+"""Named sets of choices: the same picture gets other figures under each, so each has a name."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from evsplat.evaluation.metrics import (
+    GAUSSIAN_SSIM,
+    SCIKIT_DEFAULT_SSIM,
+    ZERO_PADDED_SSIM,
+    Ssim,
+    psnr,
+    psnr_channel_mean,
+    ssim,
+)
+from evsplat.evaluation.perceptual import Features, PerceptualMetric
+from evsplat.evaluation.regions import CROP_MARGIN, Box
+
+REGIONS = ("full", "person_crop", "person_mask")
+METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "st_lpips")
+
+PSNR_CEILING_DB = 100.0
+"""Equal pictures have an infinite PSNR, which no mean survives and JSON cannot hold."""
+
+
+@dataclass(frozen=True)
+class Absent:
+    """A figure that was not measured, and why."""
+
+    reason: str
+
+
+Value = float | Absent
+Measured = dict[str, dict[str, Value]]
+"""Region -> metric -> value, every region and metric present."""
+Networks = Mapping[str, PerceptualMetric | Absent]
+"""Of ``lpips_alex``, ``lpips_vgg`` and ``st_lpips``."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How a rendered picture is compared with the true one."""
+
+    name: str
+    summary: str
+    """One line for the foot of a table."""
+    eight_bit: bool
+    """Clamp to [0, 1] and round to 8 bits first, as a saved picture is."""
+    psnr: Literal["all_values", "channel_mean"]
+    """One mean squared error of all values, or the mean of one PSNR per channel."""
+    ssim: Ssim
+    perceptual: tuple[str, ...]
+    """The network distances that belong to the protocol."""
+    perceptual_range: tuple[float, float]
+    """What [0, 1] is mapped to before the networks see it."""
+    perceptual_clip: bool
+    """Whether the rendered picture is clipped at 1 (but not at 0) before the networks see it."""
+    crop: Literal["enlarged", "tight"]
+    """Person crop: box enlarged by 10 % per side, or the box without its last row and column."""
+    mask: Literal["pixels", "blackened"]
+    """Person mask: PSNR of its pixels only, or all figures with both pictures black outside."""
+
+
+STANDARD = Protocol(
+    name="standard",
+    summary="clamped and rounded to 8 bit; PSNR over all pixels and channels; SSIM Gaussian "
+    "11/1.5, data range 1; LPIPS on [-1, 1]; crop: person's box + 10 % per side",
+    eight_bit=True,
+    psnr="all_values",
+    ssim=GAUSSIAN_SSIM,
+    perceptual=("lpips_alex", "lpips_vgg", "st_lpips"),
+    perceptual_range=(-1.0, 1.0),
+    perceptual_clip=False,
+    crop="enlarged",
+    mask="pixels",
+)
+
+AVATAR_COMPAT = Protocol(
+    name="avatar-compat",
+    summary="as 3DGS-Avatar evaluates: not clamped, not rounded; SSIM uniform 7x7, data range 2 "
+    "(generous); LPIPS VGG on [-1, 1]",
+    eight_bit=False,
+    psnr="all_values",
+    ssim=SCIKIT_DEFAULT_SSIM,
+    perceptual=("lpips_vgg",),
+    perceptual_range=(-1.0, 1.0),
+    perceptual_clip=False,
+    crop="enlarged",
+    mask="pixels",
+)
+"""3DGS-Avatar's evaluator for ZJU: scikit-image 0.19.3 is given no data range and takes 2.
+
+It has no crops; the person's regions are ours, so that the rows can be compared.
+"""
+
+HUGS_COMPAT = Protocol(
+    name="hugs-compat",
+    summary="as HUGS evaluates: not rounded; PSNR is the mean of three per-channel PSNRs; SSIM "
+    "Gaussian 11/1.5 with zero padding; LPIPS AlexNet on [0, 1]; crop: tight box; mask: both "
+    "pictures black outside",
+    eight_bit=False,
+    psnr="channel_mean",
+    ssim=ZERO_PADDED_SSIM,
+    perceptual=("lpips_alex",),
+    perceptual_range=(0.0, 1.0),
+    perceptual_clip=True,
+    crop="tight",
+    mask="blackened",
+)
+"""HUGS's validation: the box is [min, max) of the mask's rows and columns, the last ones left out;
+masking both pictures is what it does for the data set called zju."""
+
+PROTOCOLS = (STANDARD, AVATAR_COMPAT, HUGS_COMPAT)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """One true picture and where the person is in it, under one protocol.
+
+    The features of the true picture are computed once for all pictures compared with it.
+    """
+
+    protocol: Protocol
+    image: Float[Tensor, "H W 3"]
+    mask: Bool[Tensor, "H W"] | None
+    """The person's pixels, where the capture has masks."""
+    person: Box | Absent
+    """Tight box around the person."""
+    networks: Networks
+
+    def measure(self, image: Float[Tensor, "H W 3"]) -> Measured:
+        """Every metric of every region; ``image`` is sRGB in [0, 1]."""
+        image = self._prepared(image)
+        result: Measured = {}
+        for region in REGIONS:
+            view = self._views[region]
+            result[region] = (
+                dict.fromkeys(METRICS, view)
+                if isinstance(view, Absent)
+                else view.measure(view.cut(image))
+            )
+        return result
+
+    def _prepared(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        # float64: variances as differences of squares lose digits in float32.
+        image = image.detach().cpu().double()
+        return eight_bit(image) if self.protocol.eight_bit else image
+
+    @cached_property
+    def _views(self) -> dict[str, "_View | Absent"]:
+        truth = self._prepared(self.image)
+        full = _View(self.protocol, truth, self.networks)
+        return {"full": full, "person_crop": self._crop(truth), "person_mask": self._masked(truth)}
+
+    def _crop(self, truth: Float[Tensor, "H W 3"]) -> "_View | Absent":
+        if isinstance(self.person, Absent):
+            return self.person
+        if self.protocol.crop == "enlarged":
+            box = self.person.enlarged(CROP_MARGIN, *truth.shape[:2])
+        else:
+            box = self.person.without_last()
+        if box.bottom <= box.top or box.right <= box.left:
+            return Absent("the person's box is empty")
+        return _View(self.protocol, box.crop(truth), self.networks, box=box)
+
+    def _masked(self, truth: Float[Tensor, "H W 3"]) -> "_View | Absent":
+        if self.mask is None:
+            return Absent("the capture has no person mask for this picture")
+        if not bool(self.mask.any()):
+            return Absent("the person mask is empty")
+        if self.protocol.mask == "pixels":
+            return _View(self.protocol, truth, self.networks, pixels=self.mask)
+        black = truth * self.mask[..., None]
+        return _View(self.protocol, black, self.networks, blacken=self.mask)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One region of the true picture, ready to be compared."""
+
+    protocol: Protocol
+    truth: Float[Tensor, "h w 3"]
+    networks: Networks
+    box: Box | None = None
+    pixels: Bool[Tensor, "h w"] | None = None
+    """Where only single pixels count: PSNR alone is defined."""
+    blacken: Bool[Tensor, "h w"] | None = None
+
+    def cut(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
+        if self.blacken is not None:
+            return image * self.blacken[..., None]
+        return image if self.box is None else self.box.crop(image)
+
+    def measure(self, image: Float[Tensor, "h w 3"]) -> dict[str, Value]:
+        values: dict[str, Value] = {"psnr": self._psnr(image)}
+        if self.pixels is not None:
+            reason = Absent("only PSNR is defined for single pixels; see person_crop")
+            return values | dict.fromkeys(METRICS[1:], reason)
+        try:
+            values["ssim"] = float(ssim(image, self.truth, self.protocol.ssim))
+        except ValueError as error:
+            values["ssim"] = Absent(str(error))
+        seen = image.clamp(max=1.0) if self.protocol.perceptual_clip else image
+        for name in METRICS[2:]:
+            values[name] = self._distance(name, seen)
+        return values
+
+    def _psnr(self, image: Float[Tensor, "h w 3"]) -> float:
+        if self.pixels is not None:
+            value = psnr(image, self.truth, mask=self.pixels)
+        elif self.protocol.psnr == "all_values":
+            value = psnr(image, self.truth)
+        else:
+            value = psnr_channel_mean(image, self.truth)
+        return min(float(value), PSNR_CEILING_DB)
+
+    def _distance(self, name: str, image: Float[Tensor, "h w 3"]) -> Value:
+        if name not in self.protocol.perceptual:
+            return Absent(f"not part of protocol {self.protocol.name}")
+        network = self.networks[name]
+        if isinstance(network, Absent):
+            return network
+        truth = self._truth_features[name]
+        if isinstance(truth, Absent):
+            return truth
+        with torch.no_grad():
+            return float(network.compare(network.features(self._ranged(image)), truth))
+
+    @cached_property
+    def _truth_features(self) -> dict[str, Features | Absent]:
+        features: dict[str, Features | Absent] = {}
+        for name in self.protocol.perceptual:
+            network = self.networks[name]
+            if isinstance(network, PerceptualMetric):
+                try:
+                    with torch.no_grad():
+                        features[name] = network.features(self._ranged(self.truth))
+                except ValueError as error:
+                    features[name] = Absent(str(error))
+        return features
+
+    def _ranged(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        low, high = self.protocol.perceptual_range
+        return low + (high - low) * image
+
+
+def eight_bit(image: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """The values that an 8-bit file of ``image`` holds, in [0, 1]."""
+    return (image.clamp(0, 1) * 255).round() / 255

@@ -1,0 +1,63 @@
+"""The parts of a picture that are measured by themselves: the person's box, the person's pixels."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from evsplat.body import BodyTrack, skin
+from evsplat.body import body_box as projected_box
+from evsplat.capture.camera import Camera
+
+CROP_MARGIN = 0.1
+
+
+@dataclass(frozen=True)
+class Box:
+    """Pixels ``[top, bottom) x [left, right)``."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    def crop(self, image: Float[Tensor, "H W *C"]) -> Float[Tensor, "h w *C"]:
+        """The part of ``image`` inside the box."""
+        return image[self.top : self.bottom, self.left : self.right]
+
+    def enlarged(self, margin: float, height: int, width: int) -> "Box":
+        """Wider by ``margin`` of its extent on each side, whole pixels, clipped to the picture."""
+        rows = int(margin * (self.bottom - self.top))
+        columns = int(margin * (self.right - self.left))
+        return Box(
+            max(self.top - rows, 0),
+            min(self.bottom + rows, height),
+            max(self.left - columns, 0),
+            min(self.right + columns, width),
+        )
+
+    def without_last(self) -> "Box":
+        """Without its last row and column."""
+        return Box(self.top, self.bottom - 1, self.left, self.right - 1)
+
+
+def mask_box(mask: Bool[Tensor, "H W"]) -> Box | None:
+    """Smallest box around the true pixels; None where there are none."""
+    if not bool(mask.any()):
+        return None
+    rows = torch.nonzero(mask.any(dim=1)).flatten()
+    columns = torch.nonzero(mask.any(dim=0)).flatten()
+    return Box(int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1)
+
+
+def body_box(track: BodyTrack, camera: Camera, time_us: int) -> Box | None:
+    """Smallest box around the posed body as ``camera`` sees it at ``time_us``; None if out of view."""
+    rotations, translation = track.at([time_us])
+    bones = track.body.bone_transforms(rotations, translation)
+    vertices, _ = skin(track.body.rest_vertices, track.body.weights, bones)
+    corners = projected_box(vertices[0], camera, margin=0.0)
+    if corners is None:
+        return None
+    left, top, right, bottom = corners
+    return Box(top, bottom, left, right)

@@ -1,0 +1,129 @@
+"""Line charts as inline SVG; colours come from the page's style sheet."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+_WIDTH, _HEIGHT = 560, 300
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 12, 34
+_MOST_POINTS = 240
+SERIES_COLOURS = 8
+"""How many line colours the style sheet has."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """One line."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+
+
+def line_chart(series: Sequence[Series], *, x_title: str, y_title: str, log: bool = False) -> str:
+    """An SVG element with axes and lines, and a legend where there are several.
+
+    Long series are averaged over bins. On a logarithmic axis values that are not positive leave a
+    gap.
+    """
+    prepared = [(line.name, *_prepared(line, log)) for line in series]
+    prepared = [(name, x, y) for name, x, y in prepared if len(x)]
+    if not prepared:
+        return ""
+    x_all = np.concatenate([x for _, x, _ in prepared])
+    y_all = np.concatenate([y for _, _, y in prepared])
+    x_low, x_high = _widened(float(x_all.min()), float(x_all.max()))
+    y_low, y_high = _widened(float(y_all.min()), float(y_all.max()))
+    margin = 0.05 * (y_high - y_low)
+    y_low, y_high = y_low - margin, y_high + margin
+
+    def place_x(value: float) -> float:
+        return _LEFT + (value - x_low) / (x_high - x_low) * (_WIDTH - _LEFT - _RIGHT)
+
+    def place_y(value: float) -> float:
+        return _HEIGHT - _BOTTOM - (value - y_low) / (y_high - y_low) * (_HEIGHT - _TOP - _BOTTOM)
+
+    parts = []
+    y_ticks = _log_ticks(y_low, y_high) if log else _ticks(y_low, y_high)
+    for value, label in y_ticks:
+        y = place_y(value)
+        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text class="tick" x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+    for value, label in _ticks(x_low, x_high):
+        x = place_x(value)
+        parts.append(f'<text class="tick" x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 18}" text-anchor="middle">{label}</text>')
+    base = _HEIGHT - _BOTTOM
+    parts.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{base}" y2="{base}"/>')
+    for number, (name, x, y) in enumerate(prepared):
+        points = " ".join(f"{place_x(a):.1f},{place_y(b):.1f}" for a, b in zip(x, y, strict=True))
+        parts.append(
+            f'<polyline class="line c{number % SERIES_COLOURS}" points="{points}">'
+            f"<title>{escape(name)}</title></polyline>"
+        )
+    parts.append(
+        f'<text class="tick" x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 2}" text-anchor="end">'
+        f"{escape(x_title)}</text>"
+    )
+    legend = "".join(
+        f'<span class="key"><i class="c{number % SERIES_COLOURS}"></i>{escape(name)}</span>'
+        for number, (name, _, _) in enumerate(prepared)
+    )
+    scale = ", logarithmic" if log else ""
+    return (
+        f'<figure class="chart"><figcaption>{escape(y_title)}{scale}</figcaption>'
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(y_title)}">'
+        f"{''.join(parts)}</svg>"
+        f'<div class="legend">{legend if len(prepared) > 1 else ""}</div></figure>'
+    )
+
+
+def _prepared(line: Series, log: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Finite points, binned; on a logarithmic axis the ordinate is the decimal logarithm."""
+    x, y = np.asarray(line.x, dtype=np.float64), np.asarray(line.y, dtype=np.float64)
+    keep = np.isfinite(x) & np.isfinite(y) & ((y > 0) if log else True)
+    x, y = x[keep], y[keep]
+    if len(x) > _MOST_POINTS:
+        groups = np.array_split(np.arange(len(x)), _MOST_POINTS)
+        x = np.array([x[group].mean() for group in groups])
+        y = np.array([y[group].mean() for group in groups])
+    return x, np.log10(y) if log else y
+
+
+def _widened(low: float, high: float) -> tuple[float, float]:
+    """An interval that is not empty."""
+    if high > low:
+        return low, high
+    half = max(abs(low) * 0.05, 0.5)
+    return low - half, high + half
+
+
+def _ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """About five round values inside [low, high] with labels."""
+    rough = (high - low) / 5
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough)
+    first = math.ceil(low / step)
+    last = math.floor(high / step)
+    return [(index * step, _label(index * step)) for index in range(first, last + 1)]
+
+
+def _log_ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """Powers of ten inside the range of decimal logarithms, with 2 and 5 where they are few."""
+    factors = (1,) if high - low > 2.5 else (1, 2, 5)
+    step = max(1, math.ceil((high - low) / 6))
+    exponents = range(math.floor(low), math.ceil(high) + 1, step)
+    values = [(e + math.log10(factor), factor * 10.0**e) for e in exponents for factor in factors]
+    ticks = [(place, _label(value)) for place, value in values if low <= place <= high]
+    # A range within a factor of two may hold none: fall back on linear places.
+    return ticks or [(place, _label(10**place)) for place, _ in _ticks(low, high)]
+
+
+def _label(value: float) -> str:
+    if value and abs(value) < 1e-3:
+        return f"{value:.0e}".replace("e-0", "e-")
+    if abs(value) >= 1e4:
+        return f"{value / 1000:g}k"
+    return f"{value:.4g}"

@@ -1,0 +1,87 @@
+"""The looping clip: the blurry video beside the sharp reconstruction, in slow motion."""
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from evsplat.capture import Capture
+from evsplat.evaluation.pictures import to_bytes
+from evsplat.methods.reconstruction import Reconstruction
+from evsplat.methods.trivial import nearest_in_time
+
+_PLAYED_HZ = 25
+_SLOWER = 5.0
+_LONGEST_SECONDS = 10.0
+_TIMES_AT_ONCE = 8
+_WIDE = 640
+"""Small pictures are enlarged by whole factors up to this width, so that pixels stay pixels."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """An encoded clip and what a caption needs."""
+
+    mp4: bytes
+    slower: float
+    """Times slower than life."""
+    first_us: int
+    last_us: int
+    pictures: int
+
+
+def make_clip(capture: Capture, reconstruction: Reconstruction) -> Clip | None:
+    """Both halves over the recording, or over its middle where it is long; None for one frame.
+
+    The left half shows the recorded frame nearest in time. Instants between frames are drawn for
+    cameras that stand still; a moving camera's pose is known at its frames only, so its clip has
+    one picture per frame.
+    """
+    from evsplat.export.video import write_video
+
+    camera_name = capture.frames[0].camera
+    frames = sorted((f for f in capture.frames if f.camera == camera_name), key=lambda f: f.mid_us)
+    moves = any(frame.world_to_camera is not None for frame in frames)
+    first, last = frames[0].mid_us, frames[-1].mid_us
+    if last <= first:
+        return None
+    shown_us = min(last - first, int(_LONGEST_SECONDS / _SLOWER * 1e6 * 1.5))
+    middle = (first + last) // 2
+    first, last = middle - shown_us // 2, middle + shown_us // 2
+    if moves:
+        frames = [frame for frame in frames if first <= frame.mid_us <= last]
+        times = [frame.mid_us for frame in frames]
+    else:
+        count = round(min(shown_us / 1e6 * _SLOWER, _LONGEST_SECONDS) * _PLAYED_HZ)
+        times = [round(float(t)) for t in np.linspace(first, last, max(2, count))]
+    played_hz = min(_PLAYED_HZ, max(2.0, len(times) / (shown_us / 1e6 * _SLOWER)))
+
+    def pictures() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        at_once = 1 if moves else _TIMES_AT_ONCE
+        for start in range(0, len(times), at_once):
+            batch = times[start : start + at_once]
+            nearest = [nearest_in_time(frames, time) for time in batch]
+            with torch.no_grad():
+                rgb = reconstruction.render(capture.camera(nearest[0]), batch).rgb
+            for frame, image in zip(nearest, rgb, strict=True):
+                yield _beside(to_bytes(capture.image(frame)), to_bytes(image))
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.mp4"
+        written = write_video(path, pictures(), fps=played_hz, crf=21)
+        mp4 = path.read_bytes()
+    return Clip(mp4, written / played_hz / (shown_us / 1e6), first, last, written)
+
+
+def _beside(
+    left: UInt8[np.ndarray, "H W 3"], right: UInt8[np.ndarray, "H W 3"]
+) -> UInt8[np.ndarray, "H2 W2 3"]:
+    """Two pictures with a thin white line between them, enlarged by a whole factor."""
+    factor = max(1, _WIDE // left.shape[1])
+    halves = [picture.repeat(factor, axis=0).repeat(factor, axis=1) for picture in (left, right)]
+    line = np.full((halves[0].shape[0], 4, 3), 255, dtype=np.uint8)
+    return np.concatenate([halves[0], line, halves[1]], axis=1)

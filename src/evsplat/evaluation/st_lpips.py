@@ -1,0 +1,65 @@
+"""ST-LPIPS on AlexNet (Ghildyal and Liu 2022), weights from the wheel of stlpips-pytorch.
+
+A learned distance that forgives shifts of a pixel or two. It is not LPIPS and never takes its name.
+Only the weight file of the installed package is read; its code is not imported.
+"""
+
+import importlib.util
+from pathlib import Path
+
+import torch
+
+from evsplat.errors import WeightsError
+from evsplat.evaluation.lpips import MissingWeights, read_state, sha256_of
+from evsplat.evaluation.perceptual import Blur, Conv, MaxPool, Network, PerceptualMetric, Relu
+
+PACKAGE = "stlpips_pytorch"
+
+_POOL = MaxPool(3, 1)
+NETWORK = Network(
+    "ST-LPIPS AlexNet",
+    (
+        (
+            Conv("net.slice1.0", (64, 3, 11, 11), padding=2),
+            Blur("net.slice1.1", 64),
+            Relu(),
+        ),
+        (
+            _POOL,
+            Blur("net.slice2.4", 64),
+            Conv("net.slice2.5", (192, 64, 5, 5), padding=2),
+            Relu(),
+        ),
+        (_POOL, Blur("net.slice3.8", 192), Conv("net.slice3.9", (384, 192, 3, 3)), Relu()),
+        (Conv("net.slice4.11", (256, 384, 3, 3)), Relu()),
+        (Conv("net.slice5.13", (256, 256, 3, 3)), Relu()),
+    ),
+    min_side=21,
+)
+
+
+def load_st_lpips(*, device: torch.device | str = "cpu") -> PerceptualMetric:
+    """ST-LPIPS with the installed package's weights; `MissingWeights` where it is not installed."""
+    spec = importlib.util.find_spec(PACKAGE)
+    if spec is None or not spec.submodule_search_locations:
+        raise MissingWeights(
+            "ST-LPIPS AlexNet: no weights. Install the package that carries them with: pip install "
+            "'evsplat[perceptual]'."
+        )
+    folder = Path(spec.submodule_search_locations[0])
+    path = folder / "weights" / "vST0.0" / "alex_shift_tolerant.pth"
+    if not path.is_file():
+        raise WeightsError(f"{path}: file not found; expected stlpips-pytorch 0.0.2.")
+    state = read_state(path)
+    heads = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(NETWORK.channels)}
+    for key, shape in {**NETWORK.parameter_shapes, **heads}.items():
+        found = tuple(state[key].shape) if key in state else "nothing"
+        if found != shape:
+            raise WeightsError(f"{path}: {key}: expected {shape}, found {found}.")
+    return PerceptualMetric(
+        NETWORK,
+        {key: state[key] for key in NETWORK.parameter_shapes},
+        [state[key].flatten() for key in heads],
+        sha256=sha256_of(path),
+        device=device,
+    )

@@ -1,0 +1,198 @@
+"""The figures as Markdown and LaTeX tables, one per protocol, trivial rows included."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evsplat.files import write_text
+
+ROW_TITLES = {
+    "median_background": "median background (trivial)",
+    "nearest_frame": "nearest training frame (trivial)",
+    "blurry_input": "blurry input itself (no method sees it)",
+}
+REGION_TITLES = {"full": "full", "person_crop": "person crop", "person_mask": "person mask"}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One figure of one region."""
+
+    region: str
+    metric: str
+
+    @property
+    def higher_is_better(self) -> bool:
+        """PSNR and SSIM grow with likeness, distances shrink."""
+        return self.metric in ("psnr", "ssim")
+
+    @property
+    def decimals(self) -> int:
+        """Digits after the point."""
+        return 2 if self.metric == "psnr" else 4
+
+
+METRIC_TITLES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips_alex": "LPIPS-Alex",
+    "lpips_vgg": "LPIPS-VGG",
+    "st_lpips": "ST-LPIPS",
+}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of one protocol; columns without any figure are left out."""
+
+    protocol: str
+    note: str
+    columns: tuple[Column, ...]
+    rows: dict[str, dict[str, dict[str, float | None]]]
+    """Row key (the method's name, trivial rows, blurry_input) -> region -> metric -> value."""
+    method: str
+
+    def value(self, row: str, column: Column) -> float | None:
+        """One cell."""
+        return self.rows[row][column.region][column.metric]
+
+    def text(self, row: str, column: Column) -> str:
+        """One cell, formatted; a dash where nothing was measured."""
+        value = self.value(row, column)
+        return "–" if value is None else f"{value:.{column.decimals}f}"
+
+    def is_best(self, row: str, column: Column) -> bool:
+        """Whether the row wins the column as it is printed; the blurry input does not compete."""
+        if row == "blurry_input" or self.value(row, column) is None:
+            return False
+        shown = [
+            round(value, column.decimals)
+            for name in self.rows
+            if name != "blurry_input" and (value := self.value(name, column)) is not None
+        ]
+        best = max(shown) if column.higher_is_better else min(shown)
+        return float(self.text(row, column)) == best
+
+    def title(self, row: str) -> str:
+        """What a reader sees instead of the row's key."""
+        return ROW_TITLES.get(row, row)
+
+
+def tables_of(metrics: dict[str, Any]) -> Iterator[Table]:
+    """One table per protocol, `standard` first."""
+    for protocol, ours in metrics["protocols"].items():
+        if protocol == "standard":
+            others = {**metrics["trivial"], "blurry_input": metrics["blurry_input"]}
+        else:
+            others = metrics["compat_rows"][protocol]
+        rows = {metrics["method"]: ours, **others}
+        columns = tuple(
+            Column(region, metric)
+            for region in REGION_TITLES
+            for metric in METRIC_TITLES
+            if any(row[region][metric] is not None for row in rows.values())
+        )
+        note = metrics["protocol_notes"][protocol]
+        yield Table(protocol, note, columns, rows, metrics["method"])
+
+
+def missing_networks(metrics: dict[str, Any]) -> list[str]:
+    """One sentence per network distance without weights."""
+    return [entry["reason"] for entry in metrics["weights"].values() if entry["sha256"] is None]
+
+
+def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
+    """Write metrics.md and metrics.tex."""
+    write_text(folder / "metrics.md", markdown(metrics))
+    write_text(folder / "metrics.tex", latex(metrics))
+
+
+def markdown(metrics: dict[str, Any]) -> str:
+    """All tables as Markdown; the best of each column in bold."""
+    lines = [f"# {metrics['method']} on {metrics['capture']}", ""]
+    lines += [f"Means over {metrics['frames']['test']} test frames against the sharp truth.", ""]
+    for table in tables_of(metrics):
+        lines += [f"## Protocol `{table.protocol}`", "", f"{table.note}.", ""]
+        head = [_heading(column) for column in table.columns]
+        lines.append("| " + " | ".join(["", *head]) + " |")
+        lines.append("|" + "|".join(["---", *["---:"] * len(head)]) + "|")
+        for row in table.rows:
+            cells = [
+                f"**{table.text(row, c)}**" if table.is_best(row, c) else table.text(row, c)
+                for c in table.columns
+            ]
+            lines.append("| " + " | ".join([table.title(row), *cells]) + " |")
+        lines.append("")
+    lines += _novel_markdown(metrics)
+    lines += [f"- {reason}" for reason in missing_networks(metrics)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _novel_markdown(metrics: dict[str, Any]) -> list[str]:
+    if not metrics["novel_views"]:
+        return []
+    lines = ["## Novel views, protocol `standard`", ""]
+    lines += ["| camera | full PSNR | full SSIM | person crop PSNR | person crop SSIM |"]
+    lines += ["|---|---:|---:|---:|---:|"]
+    for camera, regions in metrics["novel_views"].items():
+        cells = [
+            "–" if (value := regions[region][metric]) is None else f"{value:.{digits}f}"
+            for region in ("full", "person_crop")
+            for metric, digits in (("psnr", 2), ("ssim", 4))
+        ]
+        lines.append("| " + " | ".join([camera, *cells]) + " |")
+    return [*lines, ""]
+
+
+def latex(metrics: dict[str, Any]) -> str:
+    """All tables as LaTeX (booktabs)."""
+    lines: list[str] = []
+    for table in tables_of(metrics):
+        spans = {
+            region: sum(column.region == region for column in table.columns)
+            for region in REGION_TITLES
+        }
+        groups = [
+            rf"\multicolumn{{{span}}}{{c}}{{{REGION_TITLES[region]}}}"
+            for region, span in spans.items()
+            if span
+        ]
+        names = [
+            METRIC_TITLES[c.metric] + (r"$\uparrow$" if c.higher_is_better else r"$\downarrow$")
+            for c in table.columns
+        ]
+        lines += [
+            f"% protocol {table.protocol}: {table.note}",
+            rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}",
+            r"\toprule",
+            " & ".join([f"protocol {table.protocol}", *groups]) + r" \\",
+            " & ".join(["", *names]) + r" \\",
+            r"\midrule",
+        ]
+        for row in table.rows:
+            cells = [
+                rf"\textbf{{{table.text(row, c)}}}" if table.is_best(row, c) else table.text(row, c)
+                for c in table.columns
+            ]
+            cells = [cell.replace("–", "--") for cell in cells]
+            lines.append(" & ".join([_latex_text(table.title(row)), *cells]) + r" \\")
+        lines += [r"\bottomrule", r"\end{tabular}", ""]
+    return "\n".join(lines)
+
+
+def _heading(column: Column) -> str:
+    arrow = "↑" if column.higher_is_better else "↓"
+    return f"{REGION_TITLES[column.region]} {METRIC_TITLES[column.metric]} {arrow}"
+
+
+_LATEX_SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    **{character: "\\" + character for character in "&%$#_{}"},
+}
+
+
+def _latex_text(text: str) -> str:
+    return "".join(_LATEX_SPECIAL.get(character, character) for character in text)

@@ -1,0 +1,201 @@
+"""Event recordings on disk, sliced by time without loading the rest (layout of DSEC's HDF5 files).
+
+`events/{t,x,y,p}` are sorted by t; `ms_to_idx[m]` is the index of the first event with
+t >= 1000 m; `t_offset` is added to every t. Times that leave this module are on the camera's clock:
+``t + t_offset + clock_offset_us``.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from jaxtyping import Float, Int64
+
+from evsplat.errors import DataError
+from evsplat.events.stream import EventStream
+from evsplat.files import atomic_path
+
+CHUNK_EVENTS = 65_536
+# HDF5 keeps decoded chunks per dataset; 4 MiB hold eight chunks of int64 times.
+_CHUNK_CACHE_BYTES = 4 << 20
+
+
+class EventStore:
+    """One event file; opened at the first read and again after a fork or unpickling.
+
+    ``pixel_lookup`` (H, W, 2), int32, maps a sensor pixel to the (x, y) of the undistorted image,
+    -1 where it falls outside; those events are dropped from slices (but counted by ``len``).
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        width: int,
+        height: int,
+        clock_offset_us: int = 0,
+        pixel_lookup: np.ndarray | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.width = width
+        self.height = height
+        self.clock_offset_us = clock_offset_us
+        self._pixel_lookup = pixel_lookup
+        self._file: h5py.File | None = None
+        self._owner_pid = -1
+        self._shift_us = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_file": None, "_owner_pid": -1}
+
+    def __len__(self) -> int:
+        """Count of recorded events."""
+        return int(self._open()["events/t"].shape[0])
+
+    @property
+    def time_range_us(self) -> tuple[int, int]:
+        """First event and one past the last, so that ``between(*time_range_us)`` is everything.
+
+        (0, 0) for an empty recording.
+        """
+        t = self._open()["events/t"]
+        if len(t) == 0:
+            return 0, 0
+        return int(t[0]) + self._shift_us, int(t[-1]) + self._shift_us + 1
+
+    def between(self, start_us: int, end_us: int) -> EventStream:
+        """Events with ``start_us <= t < end_us``, read from disk.
+
+        Only the milliseconds that the window touches are read. Raises `DataError` where what was
+        read is out of order or outside of the sensor, so that a bad file is never used silently.
+        """
+        file = self._open()
+        start, end = start_us - self._shift_us, end_us - self._shift_us
+        first = self._index_at_ms(start // 1000)
+        last = max(first, self._index_at_ms(-(-end // 1000)))
+        t = self._read(file, "events/t", first, last).astype(np.int64)
+        if len(t) and (np.diff(t) < 0).any():
+            index = first + int(np.argmax(np.diff(t) < 0)) + 1
+            raise DataError(
+                f"{self.path}: events/t[{index}] is earlier than the event before it, expected "
+                "ascending times; sort the events by t and rebuild ms_to_idx."
+            )
+        low, high = np.searchsorted(t, [start, end], side="left")
+        high = max(low, high)
+        x = self._read(file, "events/x", first + low, first + high).astype(np.uint16)
+        y = self._read(file, "events/y", first + low, first + high).astype(np.uint16)
+        p = self._read(file, "events/p", first + low, first + high)
+        self._check_pixels(x, y, first + low)
+        stream = EventStream(
+            t[low:high] + self._shift_us, x, y, np.where(p > 0, np.int8(1), np.int8(-1))
+        )
+        return stream if self._pixel_lookup is None else self._undistort(stream)
+
+    def rate(self, bins: int) -> tuple[Int64[np.ndarray, "bins+1"], Float[np.ndarray, "bins"]]:
+        """Edges in camera microseconds and events per second between them, over the recording.
+
+        Edges lie on whole milliseconds of the file's clock, so that only the index is read;
+        recordings shorter than ``bins`` milliseconds get fewer bins.
+        """
+        start, end = (time - self._shift_us for time in self.time_range_us)
+        first_ms, last_ms = start // 1000, max(start // 1000 + 1, -(-end // 1000))
+        edges_ms = np.unique(np.linspace(first_ms, last_ms, bins + 1).round().astype(np.int64))
+        indices = np.array([self._index_at_ms(int(ms)) for ms in edges_ms])
+        per_second = np.diff(indices) / (np.diff(edges_ms) / 1000.0)
+        return edges_ms * 1000 + self._shift_us, per_second
+
+    def close(self) -> None:
+        """Close the file; the next read opens it again."""
+        if self._file is not None and self._owner_pid == os.getpid():
+            self._file.close()
+        self._file = None
+
+    def _open(self) -> h5py.File:
+        if self._file is None or self._owner_pid != os.getpid():
+            try:
+                self._file = h5py.File(self.path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
+                self._owner_pid = os.getpid()
+                self._shift_us = self.clock_offset_us + int(self._file["t_offset"][()])
+            except FileNotFoundError:
+                raise DataError(f"{self.path}: file not found.") from None
+            except (OSError, KeyError) as error:
+                self._file = None
+                raise DataError(
+                    f"{self.path}: not a readable event file ({error}); copy it again or write it "
+                    "anew."
+                ) from error
+        return self._file
+
+    def _index_at_ms(self, millisecond: int) -> int:
+        """Index of the first event at or after a millisecond of the file's clock."""
+        index: h5py.Dataset = self._open()["ms_to_idx"]
+        if millisecond < 0:
+            return 0
+        return int(index[millisecond]) if millisecond < len(index) else len(self)
+
+    def _read(self, file: h5py.File, key: str, first: int, last: int) -> np.ndarray:
+        try:
+            return file[key][first:last]
+        except OSError as error:
+            raise DataError(
+                f"{self.path}: {key}[{first}:{last}] cannot be read ({error}); copy the file again."
+            ) from error
+
+    def _check_pixels(self, x: np.ndarray, y: np.ndarray, first: int) -> None:
+        outside = (x >= self.width) | (y >= self.height)
+        if outside.any():
+            at = int(np.argmax(outside))
+            raise DataError(
+                f"{self.path}: event {first + at} is at x={x[at]}, y={y[at]}, expected x < "
+                f"{self.width} and y < {self.height}; correct events.width and events.height in "
+                "capture.json or remove the event."
+            )
+
+    def _undistort(self, stream: EventStream) -> EventStream:
+        assert self._pixel_lookup is not None
+        x, y = self._pixel_lookup[stream.y, stream.x].T
+        keep = x >= 0
+        return EventStream(
+            stream.t[keep],
+            x[keep].astype(np.uint16),
+            y[keep].astype(np.uint16),
+            stream.p[keep],
+        )
+
+
+def milliseconds_to_index(t: Int64[np.ndarray, "N"]) -> np.ndarray:
+    """``ms_to_idx`` of sorted, non-negative times: entry m is the first index with t >= 1000 m."""
+    last_ms = int(t[-1]) // 1000 if len(t) else 0
+    edges = np.arange(last_ms + 2, dtype=np.int64) * 1000
+    return np.searchsorted(t, edges, side="left").astype(np.uint64)
+
+
+def write_events(path: Path | str, stream: EventStream, *, compression_level: int = 4) -> None:
+    """Write events as `EventStore` reads them, whole or not at all.
+
+    Times go to ``t_offset`` and ``t`` so that the first stored millisecond is not negative.
+    """
+    if len(stream) and (np.diff(stream.t) < 0).any():
+        raise DataError(f"{path}: events must be sorted by t before they are written.")
+    offset = min(0, int(stream.t[0])) if len(stream) else 0
+    t = stream.t.astype(np.int64) - offset
+    columns = {
+        "t": t,
+        "x": stream.x.astype(np.uint16),
+        "y": stream.y.astype(np.uint16),
+        "p": (stream.p > 0).astype(np.uint8),
+    }
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        for name, values in columns.items():
+            file.create_dataset(
+                f"events/{name}",
+                data=values,
+                chunks=(min(CHUNK_EVENTS, max(1, len(values))),),
+                compression="gzip",
+                compression_opts=compression_level,
+                # bytes of equal weight together: neighbouring times share their high bytes
+                shuffle=True,
+            )
+        file["ms_to_idx"] = milliseconds_to_index(t)
+        file["t_offset"] = np.int64(offset)

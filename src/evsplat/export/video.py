@@ -1,0 +1,103 @@
+"""Writing a stream of pictures as an H.264 video or as a folder of PNG files, whole or not at all."""
+
+import shutil
+import tempfile
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from evsplat.errors import BackendError, ConfigError, DataError
+from evsplat.files import atomic_path
+
+_BT709 = 1
+_LIMITED_RANGE = 1
+
+
+def write_video(
+    path: Path | str, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], *, fps: float, crf: int = 16
+) -> int:
+    """Encode sRGB pictures as an mp4 (H.264, yuv420p, BT.709) and return how many there were.
+
+    Odd sizes are made even by repeating the last row or column, as yuv420p asks for. ``fps`` is
+    the playing speed in pictures per second; ``crf`` is x264's quality, lower is better (16 is
+    hard to tell from the original).
+    """
+    import av
+
+    if not 0 < fps <= 1000:
+        raise ConfigError(f"--fps {fps:g}: expected a frame rate above 0 and at most 1000 Hz.")
+    if "libx264" not in av.codecs_available:
+        raise BackendError(
+            "The installed PyAV has no H.264 encoder (libx264): install the wheel with "
+            "'pip install --force-reinstall --only-binary av av', or write PNG files "
+            "by giving --out a folder."
+        )
+    count = 0
+    with (
+        atomic_path(path) as temporary,
+        av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container,
+    ):
+        stream = None
+        for picture in pictures:
+            picture = _even(picture)
+            if stream is None:
+                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p"
+                stream.options = {"crf": str(crf), "preset": "medium"}
+                context = stream.codec_context
+                context.colorspace = context.color_primaries = context.color_trc = _BT709
+                context.color_range = _LIMITED_RANGE
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
+                format="yuv420p", dst_colorspace="ITU709", dst_color_range=_LIMITED_RANGE
+            )
+            container.mux(stream.encode(frame))
+            count += 1
+        if stream is None:
+            raise DataError(f"{path}: there is no picture to write.")
+        container.mux(stream.encode())
+    return count
+
+
+def write_pictures(
+    folder: Path | str,
+    pictures: Iterable[tuple[str, UInt8[np.ndarray, "H W 3"]]],
+    *,
+    replace: bool = False,
+) -> int:
+    """Write named pictures as ``folder/<name>.png`` and return how many there were.
+
+    The folder appears only when all are written. One that already holds files is refused, unless
+    ``replace`` says that it is ours to replace.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise DataError(f"{folder}: is a file; give a folder for PNG pictures or a name in .mp4.")
+    if not replace and folder.is_dir() and any(folder.iterdir()):
+        raise DataError(f"{folder}: the folder is not empty; give a new one to --out.")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
+    try:
+        count = 0
+        for name, picture in pictures:
+            Image.fromarray(picture).save(temporary / f"{name}.png")
+            count += 1
+        if not count:
+            raise DataError(f"{folder}: there is no picture to write.")
+        temporary.chmod(0o755)
+        if folder.exists():
+            shutil.rmtree(folder)
+        temporary.rename(folder)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    return count
+
+
+def _even(picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H2 W2 3"]:
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

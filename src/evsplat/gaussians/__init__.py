@@ -1,0 +1,24 @@
+"""The Gaussian set: parameters, semantic attribute, start, densification."""
+
+from evsplat.gaussians.densify import DensifyConfig, Edit, ScreenStatistics, densify
+from evsplat.gaussians.flip import BodyFrames, flip_labels
+from evsplat.gaussians.gaussian_set import ATTRIBUTES, FEATURE_DIM, GaussianSet
+from evsplat.gaussians.posed import Parts, PosedGaussians, PosedHuman, StaticScene
+from evsplat.gaussians.row_adam import RowAdam
+
+__all__ = [
+    "ATTRIBUTES",
+    "FEATURE_DIM",
+    "BodyFrames",
+    "DensifyConfig",
+    "Edit",
+    "GaussianSet",
+    "Parts",
+    "PosedGaussians",
+    "PosedHuman",
+    "RowAdam",
+    "ScreenStatistics",
+    "StaticScene",
+    "densify",
+    "flip_labels",
+]

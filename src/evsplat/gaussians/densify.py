@@ -1,0 +1,192 @@
+"""Densification: where Gaussians are cloned, split and pruned, each class by its own limits."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from evsplat.gaussians.gaussian_set import ATTRIBUTES, GaussianSet, person_first
+from evsplat.gaussians.initialise import logit
+from evsplat.body.rotations import quaternion_to_matrix
+from evsplat.gaussians.row_adam import RowAdam
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """Limits of one class, in nominal iterations (of 15,000) and metres; reference 1.11, A20."""
+
+    start: float = 1_000
+    """First nominal iteration."""
+    end: float = 10_000
+    """Last nominal iteration."""
+    every: float = 100
+    """Nominal iterations between edits."""
+    gradient: float = 2e-4
+    """A Gaussian is cloned or split above this mean screen-space gradient (NDC units, as 3DGS)."""
+    split_above_m: float = 0.035
+    """Larger Gaussians are split in two, smaller ones cloned, metres."""
+    prune_opacity: float = 0.05
+    """Fainter Gaussians are removed."""
+    prune_after: float = 3_000
+    """Nominal iteration from which the two size limits below hold."""
+    prune_screen_px: float | None = 20
+    """Largest 3-sigma radius on the screen, pixels; null = no limit (scene)."""
+    prune_scale_m: float | None = 0.35
+    """Largest standard deviation, metres; null = no limit (scene)."""
+    opacity_reset: tuple[float, ...] = ()
+    """Nominal iterations at which opacities are lowered to 0.01. 3DGS-Avatar resets at 3000, 6000
+    and 9000; a static camera recovers badly from it, so none by default (A20)."""
+    max_count: int = 60_000
+    """No clone or split beyond this number of Gaussians."""
+
+
+@dataclass
+class ScreenStatistics:
+    """What densification needs to know about the renders since the last edit, one row each."""
+
+    gradient_sum: Float[Tensor, " N"]
+    """Sum of the norms of the gradients of the 2-D centres, NDC units."""
+    seen: Float[Tensor, " N"]
+    """In how many renders the Gaussian was drawn."""
+    radius_px: Float[Tensor, " N"]
+    """Largest 3-sigma radius."""
+
+    @classmethod
+    def zeros(cls, count: int, device: torch.device) -> "ScreenStatistics":
+        """Nothing seen yet."""
+        return cls(*(torch.zeros(count, device=device) for _ in range(3)))
+
+    def add(
+        self,
+        centers_gradient: Float[Tensor, "T N 2"],
+        radii: Int[Tensor, "T N"],
+        width: int,
+        height: int,
+    ) -> None:
+        """Count T renders; gradients are of the loss with respect to centres in pixels."""
+        # The T renders share one mean loss; 3DGS's threshold is for the loss of a single view.
+        scale = centers_gradient.new_tensor([width / 2, height / 2]) * len(centers_gradient)
+        visible = radii > 0
+        norms = (centers_gradient * scale).norm(dim=-1) * visible
+        self.gradient_sum += norms.sum(0)
+        self.seen += visible.sum(0)
+        torch.maximum(self.radius_px, radii.amax(0).float(), out=self.radius_px)
+
+    def mean_gradient(self) -> Float[Tensor, " N"]:
+        """Mean gradient per render in which the Gaussian was drawn."""
+        return self.gradient_sum / self.seen.clamp_min(1)
+
+
+@dataclass(frozen=True)
+class Edit:
+    """What one densification did, for the log."""
+
+    cloned: int = 0
+    split: int = 0
+    pruned: int = 0
+    flipped: int = 0
+    details: dict[str, int] = field(default_factory=dict)
+
+
+def densify(
+    gaussians: GaussianSet,
+    optimiser: RowAdam,
+    statistics: ScreenStatistics,
+    limits: dict[str, DensifyConfig],
+    nominal: float,
+    generator: torch.Generator,
+) -> Edit:
+    """Clone, split and prune every class that is in its window; labels are inherited exactly.
+
+    Optimiser moments follow kept rows and start at zero for new ones.
+    """
+    keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    clone, split = torch.zeros_like(keep), torch.zeros_like(keep)
+    for rows, limit in ((gaussians.human, limits["human"]), (gaussians.scene, limits["scene"])):
+        if limit.start <= nominal < limit.end:
+            keep[rows], clone[rows], split[rows] = _decide(
+                gaussians, statistics, rows, limit, nominal
+            )
+    if bool(keep.all()) and not bool((clone | split).any()):
+        return Edit()
+
+    every = torch.arange(len(gaussians), device=keep.device)
+    survivors = every[keep & ~split]
+    children = every[split].repeat_interleave(2)
+    source = torch.cat([survivors, every[clone], children])
+    fresh = torch.ones(len(source), dtype=torch.bool, device=keep.device)
+    fresh[: len(survivors)] = False
+
+    values = {name: getattr(gaussians, name).detach()[source] for name in ATTRIBUTES}
+    first_child = len(source) - len(children)
+    offsets = _offsets_inside(gaussians, children, generator)
+    values["means"][first_child:] += offsets
+    values["scales_log"][first_child:] -= torch.log(torch.tensor(1.6))
+    rebuild(gaussians, optimiser, values, source, fresh, gaussians.human_mask()[source])
+    return Edit(int(clone.sum()), int(split.sum()), int((~keep & ~split).sum()))
+
+
+def rebuild(
+    gaussians: GaussianSet,
+    optimiser: RowAdam,
+    values: dict[str, Tensor],
+    source: Int[Tensor, " M"],
+    fresh: Bool[Tensor, " M"],
+    is_human: Bool[Tensor, " M"],
+) -> None:
+    """Give the set new rows: the one place where rows and optimiser moments move together.
+
+    ``values`` holds the new rows, ``source`` the old row each comes from, ``fresh`` whether its
+    moments restart, ``is_human`` its class.
+    """
+    order, human_count = person_first(
+        is_human, torch.arange(len(source), device=source.device)
+    )
+    gaussians.set_rows({name: value[order] for name, value in values.items()}, human_count)
+    parameters = {name: getattr(gaussians, name) for name in ATTRIBUTES}
+    optimiser.move_rows(parameters, source[order], fresh[order])
+
+
+def reset_opacities(gaussians: GaussianSet, optimiser: RowAdam, rows: slice) -> None:
+    """Lower the opacities of ``rows`` to at most 0.01 and forget their moments."""
+    with torch.no_grad():
+        gaussians.opacity_logits[rows].clamp_max_(logit(0.01))
+    optimiser.forget("opacity_logits", rows)
+
+
+def _decide(
+    gaussians: GaussianSet,
+    statistics: ScreenStatistics,
+    rows: slice,
+    limit: DensifyConfig,
+    nominal: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Which rows of one class are kept, cloned and split."""
+    largest = gaussians.scales_log.detach()[rows].amax(-1).exp()
+    keep = gaussians.opacities().detach()[rows] >= limit.prune_opacity
+    if nominal >= limit.prune_after:
+        if limit.prune_screen_px is not None:
+            keep &= statistics.radius_px[rows] <= limit.prune_screen_px
+        if limit.prune_scale_m is not None:
+            keep &= largest <= limit.prune_scale_m
+    gradient = statistics.mean_gradient()[rows]
+    grow = keep & (gradient > limit.gradient)
+    room = limit.max_count - int(keep.sum())
+    if int(grow.sum()) > room:
+        # Within the cap, the Gaussians with the largest gradients go first.
+        ranked = torch.where(grow, gradient, gradient.new_tensor(-1.0)).argsort(descending=True)
+        grow = torch.zeros_like(grow)
+        grow[ranked[: max(room, 0)]] = True
+    large = largest > limit.split_above_m
+    return keep, grow & ~large, grow & large
+
+
+def _offsets_inside(
+    gaussians: GaussianSet, rows: Int[Tensor, " M"], generator: torch.Generator
+) -> Float[Tensor, "M 3"]:
+    """One random offset per row, drawn from the row's own Gaussian, metres."""
+    scales = gaussians.scales_log.detach()[rows].exp()
+    noise = torch.randn(len(rows), 3, generator=generator).to(scales.device) * scales
+    rotation = quaternion_to_matrix(gaussians.quaternions.detach()[rows])
+    return (rotation @ noise[..., None])[..., 0]

@@ -1,0 +1,94 @@
+"""The one set of Gaussians: person and scene together, told apart by a semantic attribute."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+ATTRIBUTES = (
+    "means",
+    "scales_log",
+    "quaternions",
+    "opacity_logits",
+    "features",
+    "semantic_logits",
+)
+FEATURE_DIM = 32
+
+
+class GaussianSet(nn.Module):
+    """Parameters of ``N`` Gaussians; rows ``[0, human_count)`` are the person's.
+
+    The person's Gaussians live in canonical metres, those of the scene in world metres (A6). The
+    hard label is the row's place, not a tensor: it changes at densification steps only, when
+    ``rebuild`` moves rows, so a row can never be in one class and be treated as the other.
+    """
+
+    means: nn.Parameter
+    """(N, 3) centre, metres."""
+    scales_log: nn.Parameter
+    """(N, 3) natural logarithm of the standard deviations, metres."""
+    quaternions: nn.Parameter
+    """(N, 4) rotation (w, x, y, z), normalised where it is used."""
+    opacity_logits: nn.Parameter
+    """(N,) opacity before the sigmoid."""
+    features: nn.Parameter
+    """(N, 32) input of the colour networks."""
+    semantic_logits: nn.Parameter
+    """(N,) l in ``m = sigmoid(l)``, the probability of "person" (paper eq. 4-5, A1)."""
+
+    def __init__(self, human: Mapping[str, Tensor], scene: Mapping[str, Tensor]) -> None:
+        """Join the two starts; every mapping holds all of `ATTRIBUTES`."""
+        super().__init__()
+        self.human_count = len(human["means"])
+        for name in ATTRIBUTES:
+            values = torch.cat([human[name], scene[name]]).float()
+            setattr(self, name, nn.Parameter(values))
+
+    def __len__(self) -> int:
+        """Number of Gaussians of both classes."""
+        return len(self.means)
+
+    @property
+    def scene_count(self) -> int:
+        """Number of Gaussians of the scene."""
+        return len(self) - self.human_count
+
+    @property
+    def human(self) -> slice:
+        """Rows of the person."""
+        return slice(0, self.human_count)
+
+    @property
+    def scene(self) -> slice:
+        """Rows of the scene."""
+        return slice(self.human_count, len(self))
+
+    def opacities(self) -> Float[Tensor, " N"]:
+        """Opacity in (0, 1)."""
+        return torch.sigmoid(self.opacity_logits)
+
+    def semantics(self) -> Float[Tensor, " N"]:
+        """Soft probability of "person", m in (0, 1) (paper eq. 5)."""
+        return torch.sigmoid(self.semantic_logits)
+
+    def human_mask(self) -> Bool[Tensor, " N"]:
+        """Hard label h per row."""
+        mask = torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
+        mask[self.human] = True
+        return mask
+
+    def set_rows(self, values: Mapping[str, Tensor], human_count: int) -> None:
+        """Replace all rows, person first; the parameters become new objects."""
+        for name in ATTRIBUTES:
+            setattr(self, name, nn.Parameter(values[name].detach().contiguous()))
+        self.human_count = human_count
+
+
+def person_first(
+    is_human: Bool[Tensor, " N"], source: Int[Tensor, " N"]
+) -> tuple[Int[Tensor, " N"], int]:
+    """Order that brings the person's rows to the front (stable), and their number."""
+    order = torch.argsort((~is_human).to(torch.int8), stable=True)
+    return source[order], int(is_human.sum())

@@ -1,0 +1,131 @@
+"""Where Gaussians start: on the body's surface, in a random cube, or on the median backdrop."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from evsplat.capture import Camera
+from evsplat.gaussians.gaussian_set import FEATURE_DIM
+
+COLOUR_LOGITS = slice(0, 3)
+"""Feature entries that carry the start colour of a scene Gaussian, as logits of sRGB."""
+
+
+def logit(probability: float) -> float:
+    """Inverse of the sigmoid."""
+    return math.log(probability / (1 - probability))
+
+
+def nearest_spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+    """Root mean squared distance to the three nearest neighbours, metres, at least 0.3 mm."""
+    positions = points.detach().cpu().double().numpy()
+    if len(positions) < 4:
+        return torch.full((len(positions),), 0.05)
+    distances, _ = cKDTree(positions).query(positions, k=4)
+    spacing = np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
+    return torch.from_numpy(spacing).float().clamp_min(3e-4)
+
+
+def gaussians_at(
+    points: Float[Tensor, "N 3"],
+    scales: Float[Tensor, "N 3"],
+    *,
+    opacity: float,
+    semantic_logit: float,
+    quaternions: Float[Tensor, "N 4"] | None = None,
+    rgb_srgb: Float[Tensor, "N 3"] | None = None,
+) -> dict[str, Tensor]:
+    """Start values of all attributes; features are zero except for a given colour."""
+    count = len(points)
+    features = torch.zeros(count, FEATURE_DIM)
+    if rgb_srgb is not None:
+        features[:, COLOUR_LOGITS] = torch.logit(rgb_srgb.float().clamp(0.01, 0.99))
+    if quaternions is None:
+        quaternions = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    return {
+        "means": points.float(),
+        "scales_log": scales.float().log(),
+        "quaternions": quaternions.float(),
+        "opacity_logits": torch.full((count,), logit(opacity)),
+        "features": features,
+        "semantic_logits": torch.full((count,), semantic_logit),
+    }
+
+
+def random_cube(
+    center: Float[Tensor, "3"], half_side: float, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """Positions uniform in an axis-aligned cube, and uniform colours (HUGS in the paper, 2.9)."""
+    points = center + half_side * (2 * torch.rand(count, 3, generator=generator) - 1)
+    return points, torch.rand(count, 3, generator=generator)
+
+
+def backdrop_depth(
+    camera: Camera, body_points: Float[Tensor, "M 3"], *, up: Float[Tensor, "3"], margin: float
+) -> Float[Tensor, "H W"]:
+    """Depth per pixel, metres, of a floor under the body and a wall behind it.
+
+    With one static camera depth cannot be seen, and for that camera any surface that the person
+    never passes will do. The wall stands ``margin`` (a fraction) behind the deepest body point,
+    facing the camera; the floor is the plane through the lowest body points, orthogonal to ``up``.
+    """
+    _, depth = camera.project(body_points)
+    wall = float(depth.max()) * (1 + margin)
+    height = body_points @ up
+    floor_height = torch.quantile(height, 0.002)
+    rays = pixel_rays(camera)
+    camera_height = camera.center() @ up
+    fall = rays @ up
+    # A ray meets the floor in front of the camera only where it falls.
+    floor = torch.where(fall < -1e-3, (floor_height - camera_height) / fall, torch.inf)
+    return torch.where(floor > 0, floor, torch.inf).clamp_max(wall)
+
+
+def pixel_rays(camera: Camera) -> Float[Tensor, "H W 3"]:
+    """World direction through each pixel centre, scaled to advance one metre in depth."""
+    y, x = torch.meshgrid(
+        torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
+    )
+    pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    return pixels @ torch.linalg.inv(camera.K).T @ camera.world_to_camera[:3, :3]
+
+
+def median_backdrop(
+    camera: Camera,
+    background_srgb: Float[Tensor, "H W 3"],
+    depth: Float[Tensor, "H W"],
+    *,
+    stride: int,
+    edge_points: int,
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """Positions, scales and colours of a sheet that looks like the median of the frames.
+
+    One Gaussian per ``stride`` x ``stride`` pixels and one on each of the ``edge_points`` pixels of
+    strongest gradient, where a coarse sheet would be soft.
+    """
+    height, width = depth.shape
+    rays, center = pixel_rays(camera), camera.center()
+
+    pooled = torch.nn.functional.avg_pool2d(
+        background_srgb.permute(2, 0, 1)[None], stride, ceil_mode=True, count_include_pad=False
+    )[0].permute(1, 2, 0)
+    rows = (torch.arange(pooled.shape[0]) * stride + (stride - 1) / 2).clamp_max(height - 1)
+    columns = (torch.arange(pooled.shape[1]) * stride + (stride - 1) / 2).clamp_max(width - 1)
+    grid_y, grid_x = torch.meshgrid(rows, columns, indexing="ij")
+
+    gray = background_srgb.mean(-1)
+    gradient = torch.hypot(*torch.gradient(gray))
+    strongest = gradient.flatten().topk(min(edge_points, gradient.numel())).indices
+
+    index = torch.cat([(grid_y.round() * width + grid_x.round()).long().flatten(), strongest])
+    spacing = torch.cat([torch.full((grid_y.numel(),), float(stride)), torch.ones(len(strongest))])
+    colours = torch.cat([pooled.reshape(-1, 3), background_srgb.reshape(-1, 3)[strongest]])
+    chosen_depth = depth.flatten()[index]
+    # Half-pixel offsets of an even stride are below what the fit that follows corrects.
+    points = center + chosen_depth[:, None] * rays.reshape(-1, 3)[index]
+    footprint = 0.6 * spacing * chosen_depth / camera.K[0, 0]
+    return points, footprint[:, None].repeat(1, 3), colours

@@ -1,0 +1,67 @@
+"""Adam over the rows of a Gaussian set: moments follow rows when rows are added and removed."""
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor, nn
+
+
+class RowAdam:
+    """One Adam group per attribute, each with its own learning rate (epsilon 1e-15 as 3DGS)."""
+
+    def __init__(
+        self, parameters: dict[str, nn.Parameter], learning_rates: dict[str, float]
+    ) -> None:
+        """Take the attributes by name; a learning rate of 0 freezes one."""
+        self.base_rates = dict(learning_rates)
+        self.adam = torch.optim.Adam(
+            [
+                {"params": [parameter], "lr": learning_rates[name], "name": name}
+                for name, parameter in parameters.items()
+            ],
+            eps=1e-15,
+            fused=True,
+        )
+
+    def set_factor(self, factor: float, only: dict[str, float] | None = None) -> None:
+        """Multiply all base learning rates by ``factor``, or by ``only[name]`` where given."""
+        for group in self.adam.param_groups:
+            name = group["name"]
+            group["lr"] = self.base_rates[name] * (only or {}).get(name, factor)
+
+    def zero_grad(self) -> None:
+        """Drop gradients."""
+        self.adam.zero_grad(set_to_none=True)
+
+    def step(self) -> None:
+        """One Adam step of every attribute that has a gradient."""
+        self.adam.step()
+
+    def move_rows(
+        self,
+        parameters: dict[str, nn.Parameter],
+        source: Int[Tensor, " M"],
+        fresh: Bool[Tensor, " M"],
+    ) -> None:
+        """Take over new parameters whose row ``i`` came from old row ``source[i]``.
+
+        Rows marked ``fresh`` start with zero moments.
+        """
+        for group in self.adam.param_groups:
+            old, new = group["params"][0], parameters[group["name"]]
+            state = self.adam.state.pop(old, None)
+            group["params"] = [new]
+            if not state:
+                continue
+            for key in ("exp_avg", "exp_avg_sq"):
+                moved = state[key][source]
+                moved[fresh] = 0
+                state[key] = moved
+            self.adam.state[new] = state
+
+    def forget(self, name: str, rows: slice) -> None:
+        """Set the moments of some rows of one attribute to zero."""
+        for group in self.adam.param_groups:
+            state = self.adam.state.get(group["params"][0])
+            if group["name"] == name and state:
+                state["exp_avg"][rows] = 0
+                state["exp_avg_sq"][rows] = 0

@@ -1,0 +1,13 @@
+"""From light to what the camera stores: transfer curve, luminance, brightness change."""
+
+from evsplat.imaging.events import log_brightness, log_brightness_change
+from evsplat.imaging.srgb import Transfer, decode, encode, luminance
+
+__all__ = [
+    "Transfer",
+    "decode",
+    "encode",
+    "log_brightness",
+    "log_brightness_change",
+    "luminance",
+]

@@ -1,0 +1,39 @@
+"""Between the coded values of a picture and linear light."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Transfer = Literal["power", "srgb"]
+"""``power``: exponent 2.2 (paper eq. 8); ``srgb``: the exact piecewise curve of IEC 61966-2-1."""
+
+GAMMA = 2.2
+REC709 = (0.2126, 0.7152, 0.0722)
+
+
+def decode(coded: Float[Tensor, "*shape"], transfer: Transfer = "power") -> Float[Tensor, "*shape"]:
+    """Linear light in [0, 1] of coded values in [0, 1]; values below 0 count as 0."""
+    coded = coded.clamp_min(0.0)
+    if transfer == "power":
+        return coded**GAMMA
+    return torch.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def encode(
+    linear: Float[Tensor, "*shape"], transfer: Transfer = "power"
+) -> Float[Tensor, "*shape"]:
+    """Coded values in [0, 1] of linear light in [0, 1]; values below 0 count as 0."""
+    linear = linear.clamp_min(0.0)
+    if transfer == "power":
+        return linear ** (1 / GAMMA)
+    return torch.where(
+        linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp_min(1e-8) ** (1 / 2.4) - 0.055
+    )
+
+
+def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
+    """Rec. 709 luminance of linear RGB, the quantity that an event pixel sees."""
+    red, green, blue = linear_rgb.unbind(-1)
+    return REC709[0] * red + REC709[1] * green + REC709[2] * blue

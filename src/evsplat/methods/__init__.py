@@ -1,0 +1,34 @@
+"""Methods: compositions of model, objectives and schedules, named in a typed configuration."""
+
+import difflib
+from typing import Any
+
+from evsplat.config import from_dict
+from evsplat.errors import ConfigError
+from evsplat.methods.composition import Composition
+from evsplat.methods.config import NOMINAL_ITERATIONS
+from evsplat.methods.paper import PaperConfig, compose
+
+TRAINABLE = {"paper": (PaperConfig, compose)}
+"""Configuration and composition of every method that is trained."""
+
+
+def method_config(method: str, values: dict[str, Any], *, where: str) -> PaperConfig:
+    """The configuration of a method with ``values`` over its defaults."""
+    if method not in TRAINABLE:
+        near = difflib.get_close_matches(method, TRAINABLE, n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise ConfigError(
+            f"--method {method}: unknown; methods are {', '.join(TRAINABLE)}.{hint}"
+        )
+    return from_dict(TRAINABLE[method][0], values, where=where)
+
+
+__all__ = [
+    "NOMINAL_ITERATIONS",
+    "TRAINABLE",
+    "Composition",
+    "PaperConfig",
+    "compose",
+    "method_config",
+]

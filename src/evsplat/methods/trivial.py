@@ -1,0 +1,85 @@
+"""Rows that need no reconstruction: what any method must beat to have done anything."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.capture.camera import Camera
+from evsplat.capture.capture import Capture, Frame
+from evsplat.errors import DataError
+from evsplat.methods.reconstruction import Parts, Rendering
+
+
+class MedianBackground:
+    """The scene without the person: per-pixel temporal median of the training frames."""
+
+    name = "median_background"
+
+    def __init__(self, capture: Capture) -> None:
+        if not capture.is_static_camera:
+            raise DataError(
+                f"{capture.path}: the camera moves, so that a pixel's median over time means "
+                "nothing."
+            )
+        self._image = capture.median_background()
+        self._camera = capture.camera(capture.frames[0])
+
+    def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
+        """The same picture at any time; only for the camera that recorded the capture."""
+        if not _same_view(camera, self._camera):
+            raise DataError("median_background draws the recording camera only, not another one.")
+        return _flat_rendering([self._image] * len(times_us), parts)
+
+
+class NearestFrame:
+    """The blurry training frame nearest in time; of two equally near ones the earlier."""
+
+    name = "nearest_frame"
+
+    def __init__(self, capture: Capture) -> None:
+        if not capture.train_frames:
+            raise DataError(f"{capture.path}: no frame has split 'train'.")
+        self._capture = capture
+
+    def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
+        """Frames of the same view where there are any (several cameras), else of the same size."""
+        capture = self._capture
+        seen = [(frame, capture.camera(frame)) for frame in capture.train_frames]
+        frames = [frame for frame, view in seen if _same_view(camera, view)] or [
+            frame
+            for frame, view in seen
+            if (view.width, view.height) == (camera.width, camera.height)
+        ]
+        if not frames:
+            raise DataError(
+                f"nearest_frame: no training frame has {camera.width}x{camera.height} pixels."
+            )
+        nearest = [nearest_in_time(frames, time) for time in times_us]
+        return _flat_rendering([capture.image(frame) for frame in nearest], parts)
+
+
+def nearest_in_time(frames: Sequence[Frame], time_us: int) -> Frame:
+    """Frame with mid-exposure nearest to ``time_us``; the earlier of two equally near ones."""
+    return min(frames, key=lambda frame: (abs(frame.mid_us - time_us), frame.mid_us))
+
+
+def _same_view(first: Camera, second: Camera) -> bool:
+    return (first.width, first.height) == (second.width, second.height) and all(
+        torch.equal(a.cpu(), b.cpu())
+        for a, b in (
+            (first.K, second.K),
+            (first.world_to_camera, second.world_to_camera),
+        )
+    )
+
+
+def _flat_rendering(images: Sequence[Float[Tensor, "H W 3"]], parts: Parts) -> Rendering:
+    """Pictures in which nothing is known to be the person."""
+    rgb = torch.stack(list(images))
+    alpha = torch.ones(rgb.shape[:3], dtype=rgb.dtype)
+    human = torch.zeros_like(alpha)
+    if parts == "human":
+        return Rendering(torch.zeros_like(rgb), human, human)
+    return Rendering(rgb, alpha, human)

@@ -1,0 +1,20 @@
+"""Losses, each a small object: which times it needs, what it compares."""
+
+from evsplat.objectives.base import Objective, Step
+from evsplat.objectives.event import EventChange, event_loss
+from evsplat.objectives.isometry import Isometry
+from evsplat.objectives.photometric import Photometric
+from evsplat.objectives.semantic import RenderedSemantics, silhouette_bounds
+from evsplat.objectives.skinning import SkinningPrior
+
+__all__ = [
+    "EventChange",
+    "Isometry",
+    "Objective",
+    "Photometric",
+    "RenderedSemantics",
+    "SkinningPrior",
+    "Step",
+    "event_loss",
+    "silhouette_bounds",
+]

@@ -1,0 +1,68 @@
+"""What an objective is: it names the times it needs, and compares what was rendered there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.capture import Capture, Frame
+from evsplat.gaussians import PosedGaussians
+from evsplat.deform.human_scene import HumanSceneModel
+
+
+@dataclass(frozen=True)
+class Step:
+    """One training step: renders of the union of all times that the objectives asked for."""
+
+    capture: Capture
+    model: HumanSceneModel
+    frame: Frame
+    """The drawn training frame."""
+    times_us: tuple[int, ...]
+    """Sorted and distinct; the leading axis of everything below."""
+    rgb: Float[Tensor, "T H W 3"]
+    semantic: Float[Tensor, "T H W"]
+    """The soft attribute composited with the colour's weights, in [0, 1]."""
+    posed: PosedGaussians
+    nominal: float
+    """Progress in nominal iterations (of 15,000)."""
+    generator: torch.Generator
+    """Randomness of the step; part of the checkpoint."""
+
+    def index(self, time_us: int) -> int:
+        """Place of a time on the leading axis."""
+        return self.times_us.index(time_us)
+
+
+class Objective(Protocol):
+    """A loss with one or several named terms, before weighting."""
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """Times, microseconds, whose renders the objective needs for a drawn frame."""
+        ...
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """Named scalar terms, unweighted; a term that does not apply is left out."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """What a checkpoint must hold for a resume to repeat the same steps."""
+        ...
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state` gave."""
+        ...
+
+
+class Stateless:
+    """Base of objectives that remember nothing between steps."""
+
+    def state(self) -> dict[str, Tensor]:
+        """Nothing."""
+        return {}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Nothing to take."""

@@ -1,0 +1,115 @@
+"""The event term: rendered brightness change against the events between two times (eq. 8-9)."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.capture import Capture, Frame
+from evsplat.events import count_map
+from evsplat.imaging import log_brightness_change
+from evsplat.objectives.base import Stateless, Step
+
+CACHED_MAPS = 256
+"""Event maps kept in memory; at 1280x720 about 0.9 GB, at 256x256 64 MB."""
+
+
+def normalised(values: Float[Tensor, "H W"], floor: float) -> Float[Tensor, "H W"]:
+    """A map divided by its Frobenius norm, which is kept from vanishing by ``floor`` (A16).
+
+    The divisor is ``sqrt(|x|^2 + N floor^2)``: a map of pure noise far below the floor stays small
+    instead of being blown up to unit norm.
+    """
+    return values / torch.sqrt(values.square().sum() + values.numel() * floor**2)
+
+
+def event_loss(
+    change: Float[Tensor, "H W"], events: Float[Tensor, "H W"], *, floor: float = 0.03
+) -> Float[Tensor, ""]:
+    """Distance of two maps of unit norm, in 0..2 at any resolution (eq. 9, A15-A16).
+
+    ``change`` is the rendered log-brightness change, ``events`` the signed event count; the contrast
+    threshold cancels. Sum of absolute differences divided by ``sqrt(N)``.
+    """
+    difference = normalised(change, floor) - normalised(events, floor)
+    return difference.abs().sum() / difference.numel() ** 0.5
+
+
+class EventChange(Stateless):
+    """Event loss between consecutive training frames, at their mid-exposures (A13)."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        *,
+        start: float,
+        floor: float,
+        eps: float,
+        across_gaps: bool,
+        weight_by_activity: bool,
+        min_active: float,
+    ) -> None:
+        """``start`` in nominal iterations; ``min_active`` is the least share of active pixels."""
+        assert capture.events is not None
+        self.capture, self.events = capture, capture.events
+        self.start, self.floor, self.eps = start, floor, eps
+        self.min_active = min_active
+        self._maps: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+        self.partner: dict[str, Frame] = {}
+        frames = capture.frames
+        train = capture.train_frames
+        follows = zip(train, train[1:], strict=False)
+        pairs = [(a, b) for a, b in follows if across_gaps or b.index == a.index + 1]
+        for first, second in pairs:
+            if frames[first.index].camera != frames[second.index].camera:
+                continue
+            self.partner.setdefault(first.name, second)
+        for first, second in pairs:
+            # The last frame of a run has no successor: it looks back instead.
+            self.partner.setdefault(second.name, first)
+        activity = {
+            pair: float((self._map(*pair) != 0).float().mean())
+            for pair in {self._pair(frame) for frame in train if frame.name in self.partner}
+        }
+        positive = [share for share in activity.values() if share > 0]
+        median = float(torch.tensor(positive).median()) if positive else 1.0
+        self.weights = {
+            pair: (min(max(share / median, 0.25), 4.0) if weight_by_activity else 1.0)
+            * (share >= min_active)
+            for pair, share in activity.items()
+        }
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """Mid-exposures of the drawn frame and its neighbour, once events are used."""
+        if nominal < self.start or frame.name not in self.partner:
+            return ()
+        return self._pair(frame)
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """``event``: the normalised difference, weighted by how active the pair is (A17)."""
+        if not self.times(step.frame, step.nominal):
+            return {}
+        before, after = self._pair(step.frame)
+        weight = self.weights[(before, after)]
+        if weight == 0.0:
+            return {}
+        change = log_brightness_change(
+            step.rgb[step.index(before)], step.rgb[step.index(after)], eps=self.eps
+        )
+        return {"event": weight * event_loss(change, self._map(before, after), floor=self.floor)}
+
+    def _pair(self, frame: Frame) -> tuple[int, int]:
+        times = sorted((frame.mid_us, self.partner[frame.name].mid_us))
+        return times[0], times[1]
+
+    def _map(self, start_us: int, end_us: int) -> Float[Tensor, "H W"]:
+        """Signed event count between two times, from a bounded cache."""
+        key = (start_us, end_us)
+        if key not in self._maps:
+            window = self.events.between(start_us, end_us)
+            self._maps[key] = count_map(window, self.events.height, self.events.width)
+            if len(self._maps) > CACHED_MAPS:
+                self._maps.popitem(last=False)
+        return self._maps[key]

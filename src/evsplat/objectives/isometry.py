@@ -1,0 +1,84 @@
+"""As isometric as possible: neighbours keep their distances and covariances when posed."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from evsplat.body.rotations import quaternion_to_matrix
+from evsplat.capture import Frame
+from evsplat.objectives.base import Step
+
+NEIGHBOURS = 4
+
+
+def covariance6(matrix: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 6"]:
+    """Upper triangle of ``M M^T``."""
+    covariance = matrix @ matrix.transpose(-1, -2)
+    row, column = torch.triu_indices(3, 3)
+    return covariance[..., row, column]
+
+
+class Isometry:
+    """L1 between pairwise distances in canonical space and posed (3DGS-Avatar, 1.9).
+
+    Four neighbours per Gaussian, found among the canonical centres; the search is repeated only
+    every ``refresh`` steps and after densification, since centres move slowly. Each step looks at
+    ``samples`` random Gaussians, an unbiased estimate of the full mean.
+    """
+
+    def __init__(self, *, refresh: int, samples: int) -> None:
+        """Nothing is searched before the first step."""
+        self.refresh, self.samples = refresh, samples
+        self.neighbours = torch.zeros(0, NEIGHBOURS, dtype=torch.long)
+        self.age = 0
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """None of its own: it looks at whatever is posed."""
+        return ()
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """``isometry_centers`` and ``isometry_covariances``."""
+        gaussians, posed = step.model.gaussians, step.posed.human
+        count = gaussians.human_count
+        if count <= NEIGHBOURS:
+            return {}
+        canonical = gaussians.means[gaussians.human]
+        if self.age == 0 or len(self.neighbours) != count or self.age >= self.refresh:
+            self._search(canonical)
+        self.age += 1
+        chosen = torch.randint(count, (min(self.samples, count),), generator=step.generator)
+        near = self.neighbours[chosen]
+
+        before = (canonical[chosen][:, None] - canonical[near]).norm(dim=-1)
+        after = (posed.means[:, chosen][:, :, None] - posed.means[:, near]).norm(dim=-1)
+        terms = {"isometry_centers": (after - before).abs().mean()}
+
+        rows = torch.cat([chosen[:, None], near], dim=1)
+        rotation = quaternion_to_matrix(gaussians.quaternions[gaussians.human][rows])
+        scales = gaussians.scales_log[gaussians.human][rows].exp()
+        canonical_6 = covariance6(rotation * scales[..., None, :])
+        posed_rotation = posed.transforms[:, rows][..., :3, :3] @ quaternion_to_matrix(
+            posed.quaternions[:, rows]
+        )
+        posed_6 = covariance6(posed_rotation * posed.scales[:, rows][..., None, :])
+        before = (canonical_6[:, :1] - canonical_6[:, 1:]).norm(dim=-1)
+        after = (posed_6[:, :, :1] - posed_6[:, :, 1:]).norm(dim=-1)
+        terms["isometry_covariances"] = (after - before).abs().mean()
+        return terms
+
+    def state(self) -> dict[str, Tensor]:
+        """The neighbours and how many steps ago they were found."""
+        return {"neighbours": self.neighbours, "age": torch.tensor(self.age)}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state` gave."""
+        self.neighbours, self.age = state["neighbours"], int(state["age"])
+
+    def _search(self, canonical: Float[Tensor, "H 3"]) -> None:
+        positions = canonical.detach().cpu().numpy()
+        _, index = cKDTree(positions).query(positions, k=NEIGHBOURS + 1)
+        self.neighbours = torch.from_numpy(index[:, 1:]).long()
+        self.age = 0

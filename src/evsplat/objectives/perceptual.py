@@ -1,0 +1,17 @@
+"""Perceptual distances that a training run may use, chosen by name."""
+
+from typing import Literal
+
+from evsplat.evaluation.lpips import load_lpips
+from evsplat.evaluation.perceptual import PerceptualMetric
+from evsplat.evaluation.st_lpips import load_st_lpips
+
+PerceptualName = Literal["none", "lpips_vgg", "st_lpips"]
+"""``lpips_vgg``: what 3DGS-Avatar trains with; ``st_lpips``: the shift-tolerant AlexNet variant."""
+
+
+def make_perceptual(name: PerceptualName) -> PerceptualMetric | None:
+    """The distance of that name; missing weights are a `WeightsError` that says how to get them."""
+    if name == "none":
+        return None
+    return load_lpips("vgg") if name == "lpips_vgg" else load_st_lpips()

@@ -1,0 +1,60 @@
+"""The picture term: what is rendered at mid-exposure against what the camera recorded."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from evsplat.capture import Capture, Frame
+from evsplat.evaluation.metrics import GAUSSIAN_SSIM, ssim
+from evsplat.evaluation.perceptual import PerceptualMetric
+from evsplat.objectives.base import Stateless, Step
+
+
+class Photometric(Stateless):
+    """L1, D-SSIM and an optional perceptual distance on the person's box (A18, A19).
+
+    The paper's reading: one sharp-time render is compared with the blurry frame. Every rendered
+    time that is the mid-exposure of a training frame counts, not the drawn frame alone, because
+    its render is there already.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        boxes: dict[str, tuple[int, int, int, int]],
+        *,
+        dssim: bool,
+        perceptual: PerceptualMetric | None,
+    ) -> None:
+        """``boxes``: pixel box (x0, y0, x1, y1) of the posed body, of the training frames that show it.
+        """
+        self.frames = {frame.mid_us: frame for frame in capture.train_frames}
+        self.boxes, self.dssim, self.perceptual = boxes, dssim, perceptual
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """The middle of the drawn frame's exposure."""
+        return (frame.mid_us,)
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """``l1``, ``dssim`` and ``perceptual`` as configured, means over pictures and pixels."""
+        observed_at = [i for i, time in enumerate(step.times_us) if time in self.frames]
+        frames = [self.frames[step.times_us[i]] for i in observed_at]
+        rendered = step.rgb[observed_at]
+        observed = torch.stack([step.capture.image(frame) for frame in frames])
+        terms = {"l1": (rendered - observed).abs().mean()}
+        if self.dssim:
+            values = [ssim(a, b, GAUSSIAN_SSIM) for a, b in zip(rendered, observed, strict=True)]
+            terms["dssim"] = 1 - torch.stack(values).mean()
+        if self.perceptual is not None:
+            values = []
+            for a, b, frame in zip(rendered, observed, frames, strict=True):
+                if frame.name not in self.boxes:
+                    continue
+                x0, y0, x1, y1 = self.boxes[frame.name]
+                crops = (a[y0:y1, x0:x1], b[y0:y1, x0:x1])
+                if min(crops[0].shape[:2]) >= self.perceptual.network.min_side:
+                    values.append(self.perceptual(2 * crops[0] - 1, 2 * crops[1] - 1))
+            if values:
+                terms["perceptual"] = torch.stack(values).mean()
+        return terms

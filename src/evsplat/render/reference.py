@@ -1,0 +1,169 @@
+"""The rasteriser in plain torch, any dtype and device: slow, the oracle of the tests."""
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from evsplat.render.api import PinholeCamera, RenderOutput, Splats
+
+# The rules of gsplat 1.5.3 (cuda/csrc/ProjectionEWA3DGSFused.cu, RasterizeToPixels3DGSFwd.cu).
+EPS_2D = 0.3
+MIN_ALPHA = 1 / 255
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4
+MAX_EXTENT = 3.33
+FOV_MARGIN = 0.3
+
+_PAIRS_PER_CHUNK = 1 << 20
+
+
+def render(
+    splats: "Splats",
+    camera: "PinholeCamera",
+    background: Tensor | None,
+    offset: Tensor | None,
+    near: float,
+) -> "RenderOutput":
+    """Draw every Gaussian at every pixel, in chunks of pixels; fields have their axis of times."""
+    from evsplat.render.api import RenderOutput
+
+    s = splats
+    fields = (s.means, s.quats, s.scales, s.opacities, s.channels, s.linear, offset)
+    times = max(f.shape[0] for f in fields if f is not None)
+    drawn = [
+        _draw([None if f is None else f[t if len(f) > 1 else 0] for f in fields], camera, near)
+        for t in range(times)
+    ]
+    image, alpha, radii = (torch.stack(part) for part in zip(*drawn, strict=True))
+    if background is not None:
+        image = image + (1 - alpha)[..., None] * background
+    return RenderOutput(image, alpha, radii)
+
+
+def _draw(
+    fields: list[Tensor | None], camera: "PinholeCamera", near: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Image, alpha and radii of one time, without background."""
+    means, quats, scales, opacities, channels, linear, offset = fields
+    assert means is not None and quats is not None and scales is not None
+    assert opacities is not None and channels is not None
+    centers, covariance, depth = project(means, quats, scales, linear, camera)
+    if offset is not None:
+        centers = centers + offset
+    radii, visible = _extents(centers, covariance, depth, opacities, camera, near)
+
+    # Stable: equal depths keep the order of the Gaussians.
+    order = torch.argsort(torch.where(visible, depth, math.inf).detach(), stable=True)
+    order = order[: int(visible.sum())]
+    centers, covariance = centers[order], covariance[order]
+    opacities, channels = opacities[order], channels[order]
+
+    y, x = torch.meshgrid(
+        torch.arange(camera.height, dtype=means.dtype, device=means.device) + 0.5,
+        torch.arange(camera.width, dtype=means.dtype, device=means.device) + 0.5,
+        indexing="ij",
+    )
+    pixels = torch.stack([x, y], -1).reshape(-1, 2)
+    step = max(1, _PAIRS_PER_CHUNK // max(1, len(order)))
+    parts = [
+        _composite(chunk, centers, covariance, opacities, channels) for chunk in pixels.split(step)
+    ]
+    image = torch.cat([part[0] for part in parts]).view(camera.height, camera.width, -1)
+    alpha = torch.cat([part[1] for part in parts]).view(camera.height, camera.width)
+    return image, alpha, radii
+
+
+def project(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    linear: Float[Tensor, "N 3 3"] | None,
+    camera: "PinholeCamera",
+) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2 2"], Float[Tensor, "N"]]:
+    """Centres in pixels, covariances in px^2 with the low-pass, depths in metres (EWA splatting)."""
+    view = camera.world_to_camera.to(means)
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    local = means @ view[:3, :3].T + view[:3, 3]
+    x, y, z = local.unbind(-1)
+    # A depth of zero must not make NaN, which would spread through the gradients of the rest.
+    z = torch.where(z == 0, torch.ones_like(z), z)
+    x, y = x / z, y / z
+    centers = torch.stack([fx * x + cx, fy * y + cy], -1)
+
+    # The Jacobian is taken at an angle inside the field of view, enlarged by 30 % of its half width.
+    margin_x = FOV_MARGIN * 0.5 * camera.width / fx
+    margin_y = FOV_MARGIN * 0.5 * camera.height / fy
+    x = x.clamp(-cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    y = y.clamp(-cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([fx / z, zero, -fx * x / z, zero, fy / z, -fy * y / z], -1)
+    factor = jacobian.view(-1, 2, 3) @ view[:3, :3]
+    if linear is not None:
+        factor = factor @ linear
+    factor = factor @ _rotation(quats) * scales[:, None, :]
+    low_pass = EPS_2D * torch.eye(2, dtype=means.dtype, device=means.device)
+    return centers, factor @ factor.mT + low_pass, local[:, 2]
+
+
+def _rotation(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        -1,
+    ).view(-1, 3, 3)  # fmt: skip
+
+
+@torch.no_grad()
+def _extents(
+    centers: Tensor,
+    covariance: Tensor,
+    depth: Tensor,
+    opacities: Tensor,
+    camera: "PinholeCamera",
+    near: float,
+) -> tuple[Tensor, Tensor]:
+    """Screen radii in pixels and which Gaussians are drawn."""
+    # Up to 3.33 deviations, or to where alpha falls under 1/255: for opacities up to 1 that is the
+    # nearer one, so no further cut is needed when compositing.
+    extent = (2 * torch.log(opacities / MIN_ALPHA)).clamp(min=0).sqrt().clamp(max=MAX_EXTENT)
+    radius = (extent[:, None] * covariance.diagonal(dim1=-2, dim2=-1).sqrt()).ceil()
+    size = torch.tensor([camera.width, camera.height], dtype=centers.dtype, device=centers.device)
+    on_screen = (centers + radius > 0) & (centers - radius < size)
+    # As NaN fails every comparison, it is not drawn.
+    visible = (
+        (depth >= near)
+        & (opacities >= MIN_ALPHA)
+        & (torch.linalg.det(covariance) > 0)
+        & on_screen.all(-1)
+        & torch.isfinite(radius).all(-1)
+    )
+    radius = torch.where(visible[:, None], radius, 0).amax(-1)
+    return radius.to(torch.int32), visible
+
+
+def _composite(
+    pixels: Tensor, centers: Tensor, covariance: Tensor, opacities: Tensor, channels: Tensor
+) -> tuple[Float[Tensor, "P C"], Float[Tensor, "P"]]:
+    """Front-to-back compositing at the pixels; the Gaussians come sorted by depth."""
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    determinant = a * c - b * b
+    dx, dy = (pixels[:, None] - centers).unbind(-1)
+    distance = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / determinant
+    alpha = opacities * torch.exp(-0.5 * distance)
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp(max=MAX_ALPHA), 0)
+    # The Gaussian that would make the pixel opaque is left out, and all behind it.
+    after = torch.cumprod(1 - alpha, -1)
+    alpha = torch.where(after > MIN_TRANSMITTANCE, alpha, 0)
+    after = torch.cumprod(1 - alpha, -1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], -1)
+    weights = alpha * before
+    left = after[:, -1] if after.shape[1] else torch.ones_like(pixels[:, 0])
+    return weights @ channels, 1 - left

@@ -1,0 +1,81 @@
+"""Checkpoints: every tensor and number of a training run in one safetensors file."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.errors import DataError
+from evsplat.files import atomic_path
+from evsplat.gaussians import ATTRIBUTES
+
+KEEP = 2
+"""Checkpoints kept in a run; the one before the last survives a disk that fills up."""
+
+
+def save_checkpoint(
+    folder: Path, iteration: int, tensors: dict[str, Tensor], state: dict[str, Any]
+) -> Path:
+    """Write one checkpoint atomically and drop all but the newest `KEEP`."""
+    path = folder / f"{iteration:06d}.safetensors"
+    with atomic_path(path) as temporary:
+        save_file(
+            {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
+            temporary,
+            metadata={"state": json.dumps(state)},
+        )
+    for old in sorted(folder.glob("[0-9]*.safetensors"))[:-KEEP]:
+        old.unlink()
+    return path
+
+
+def latest_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint of a run, None where there is none."""
+    found = sorted(folder.glob("[0-9]*.safetensors"))
+    return found[-1] if found else None
+
+
+def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and state of a checkpoint; a damaged file is a `DataError`."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            state = json.loads(file.metadata()["state"])
+    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError, OSError) as error:
+        raise DataError(
+            f"{path}: not a readable checkpoint ({error}); remove it to go on from the one before."
+        ) from None
+    return tensors, state
+
+
+def load_model(model: HumanSceneModel, tensors: dict[str, Tensor], human_count: int) -> None:
+    """Give a model the parameters of a checkpoint, whatever its number of Gaussians was."""
+    entries = below("model", tensors)
+    rows = {name: entries[f"gaussians.{name}"] for name in ATTRIBUTES}
+    model.gaussians.set_rows(rows, human_count)
+    model.load_state_dict(entries)
+
+
+def flatten(prefix: str, state: dict[Any, Any]) -> dict[str, Tensor]:
+    """Tensors of a nested dictionary under dotted names."""
+    flat: dict[str, Tensor] = {}
+    for key, value in state.items():
+        name = f"{prefix}.{key}"
+        if isinstance(value, dict):
+            flat |= flatten(name, value)
+        elif isinstance(value, Tensor):
+            flat[name] = value
+        else:
+            flat[name] = torch.as_tensor(value)
+    return flat
+
+
+def below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Entries of a flat dictionary below ``prefix``, without it."""
+    start = prefix + "."
+    return {name[len(start) :]: value for name, value in tensors.items() if name.startswith(start)}

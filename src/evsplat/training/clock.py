@@ -1,0 +1,73 @@
+"""Where a training run stands in its schedule, by steps or by the time it was given."""
+
+from dataclasses import dataclass
+
+from evsplat.methods.config import NOMINAL_ITERATIONS
+
+SMOOTHING = 0.1
+"""Weight of the newest step in the running mean of the step time."""
+
+
+@dataclass
+class Clock:
+    """Progress of one run, 0 at the start and 1 at the end of every schedule.
+
+    With a step count alone each step advances by ``1 / iterations``. With a time limit as well,
+    steps advance faster when the measured step time says that the schedule would not be finished
+    in time: a run that is given ten minutes goes through its whole schedule in ten minutes instead
+    of stopping in the middle of it with high learning rates.
+    """
+
+    iterations: int
+    max_seconds: float | None = None
+    shrink: bool = False
+    """Whether the schedule may be shortened to fit the time limit."""
+    iteration: int = 0
+    fraction: float = 0.0
+    seconds: float = 0.0
+    """Time spent in training, over all resumes."""
+    step_seconds: float = 0.0
+
+    @property
+    def nominal(self) -> float:
+        """Progress in nominal iterations."""
+        return self.fraction * NOMINAL_ITERATIONS
+
+    @property
+    def done(self) -> bool:
+        """Whether the schedule is finished."""
+        return self.fraction >= 1.0
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether the time limit is reached."""
+        return self.max_seconds is not None and self.seconds >= self.max_seconds
+
+    @property
+    def expected_iterations(self) -> int:
+        """Steps at the end of the schedule, as things stand."""
+        return max(self.iteration, round(self.iteration + self._steps_left()))
+
+    @property
+    def seconds_left(self) -> float:
+        """Expected time to the end."""
+        return self._steps_left() * self.step_seconds
+
+    def advance(self, step_seconds: float) -> None:
+        """Count one finished step that took ``step_seconds``."""
+        first = self.step_seconds == 0.0
+        share = 1.0 if first else SMOOTHING
+        self.step_seconds += share * (step_seconds - self.step_seconds)
+        self.seconds += step_seconds
+        self.iteration += 1
+        if not self.shrink:
+            # From the integer, so that a thousand additions leave no rounding behind.
+            self.fraction = self.iteration / self.iterations
+        else:
+            self.fraction += (1 - self.fraction) / max(self._steps_left(), 1.0)
+
+    def _steps_left(self) -> float:
+        left = (1 - self.fraction) * self.iterations
+        if self.shrink and self.max_seconds is not None and self.step_seconds > 0:
+            left = min(left, max(self.max_seconds - self.seconds, 0.0) / self.step_seconds)
+        return left

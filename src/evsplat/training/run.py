@@ -1,0 +1,177 @@
+"""The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
+
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from evsplat.capture import Camera, Capture, load_capture
+from evsplat.config import load_yaml, to_dict
+from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.errors import DataError
+from evsplat.files import read_json, write_json, write_text
+from evsplat.gaussians import Parts
+from evsplat.methods import TRAINABLE, PaperConfig, method_config
+from evsplat.methods.reconstruction import Reconstruction, Rendering
+from evsplat.render import render
+from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, load_model
+
+PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Where the parts of a run lie."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """Method and its full configuration, YAML."""
+        return self.path / "config.yaml"
+
+    @property
+    def facts(self) -> Path:
+        """Capture, versions, device and threads, JSON."""
+        return self.path / "versions.json"
+
+    @property
+    def log(self) -> Path:
+        """One JSON object per logged step."""
+        return self.path / "log.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of checkpoints."""
+        return self.path / "checkpoints"
+
+    def truncate_log(self, iteration: int) -> None:
+        """Drop log lines after ``iteration``, which a resumed run is going to write again."""
+        if not self.log.exists():
+            return
+        kept = []
+        for line in self.log.read_text(encoding="utf-8").splitlines():
+            try:
+                if json.loads(line)["iteration"] <= iteration:
+                    kept.append(line)
+            except (json.JSONDecodeError, KeyError):
+                continue  # the last line of a killed process may be half written
+        write_text(self.log, "".join(line + "\n" for line in kept))
+
+
+def new_run_folder(capture: Capture, method: str) -> RunFolder:
+    """``runs/<capture>/<method>/<time>`` below the working directory."""
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    return RunFolder(Path("runs") / capture.name / method / stamp)
+
+
+def write_facts(folder: RunFolder, capture: Capture, method: str, device: str, seed: int) -> None:
+    """Record what the run was made with."""
+    versions = {}
+    for package in ("evsplat", *PACKAGES):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "not installed as a package"
+    write_json(
+        folder.facts,
+        {
+            "capture": str(capture.path.resolve()),
+            "capture_name": capture.name,
+            "method": method,
+            "device": device,
+            "threads": torch.get_num_threads(),
+            "seed": seed,
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+            "packages": versions,
+        },
+    )
+
+
+@dataclass(frozen=True)
+class GaussianReconstruction:
+    """A trained model, drawn from any camera at any time of the recording."""
+
+    name: str
+    model: HumanSceneModel
+
+    def render(
+        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
+    ) -> Rendering:
+        """Pictures at the given times; see `Reconstruction`."""
+        with torch.no_grad():
+            posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+            output = render(posed.splats(parts), camera)
+        times = len(times_us)
+
+        def all_times(values: torch.Tensor) -> torch.Tensor:
+            # The scene alone is drawn once.
+            return values.expand(times, *values.shape[1:])
+
+        return Rendering(
+            rgb=all_times(output.image[..., :3].clamp(0, 1)),
+            alpha=all_times(output.alpha),
+            human=all_times(output.image[..., 3].clamp(0, 1)),
+        )
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained run, ready to be drawn."""
+
+    path: Path
+    config: PaperConfig
+    method: str
+    capture: Capture
+    reconstruction: Reconstruction
+    iteration: int
+    train_seconds: float
+    device: str
+    gaussians: dict[str, int]
+    """Number of Gaussians, ``human`` and ``scene``."""
+
+
+def read_config(folder: RunFolder) -> tuple[str, PaperConfig, dict[str, Any]]:
+    """Method, configuration and facts of a run folder."""
+    if not folder.config.exists():
+        raise DataError(f"{folder.path}: not a run folder, config.yaml is missing.")
+    values = load_yaml(folder.config)
+    method = values.pop("method", "paper")
+    return method, method_config(method, values, where=str(folder.config)), read_json(folder.facts)
+
+
+def config_values(method: str, config: PaperConfig) -> dict[str, Any]:
+    """What config.yaml holds."""
+    return {"method": method, **to_dict(config)}
+
+
+def load_run(run_dir: Path | str) -> Run:
+    """Read a run at its last checkpoint; a folder without one is a `DataError`."""
+    folder = RunFolder(Path(run_dir))
+    method, config, facts = read_config(folder)
+    path = latest_checkpoint(folder.checkpoints)
+    if path is None:
+        raise DataError(f"{folder.checkpoints}: no checkpoint; train the run first.")
+    tensors, state = load_checkpoint(path)
+    capture = load_capture(Path(facts["capture"]))
+    composition = TRAINABLE[method][1](config, capture, facts["seed"], fit=False)
+    load_model(composition.model, tensors, state["human_count"])
+    gaussians = composition.model.gaussians
+    return Run(
+        path=folder.path,
+        config=config,
+        method=method,
+        capture=capture,
+        reconstruction=GaussianReconstruction(method, composition.model),
+        iteration=state["clock"]["iteration"],
+        train_seconds=state["clock"]["seconds"],
+        device=facts["device"],
+        gaussians={"human": gaussians.human_count, "scene": gaussians.scene_count},
+    )

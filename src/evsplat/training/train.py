@@ -1,0 +1,220 @@
+"""The verb ``train``: a run folder from a capture, with progress, checkpoints and resume."""
+
+import json
+import logging
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+import torch
+from tqdm import tqdm
+
+from evsplat.capture import load_capture
+from evsplat.config import load_yaml, override, save_yaml
+from evsplat.errors import BackendError, ConfigError, DataError
+from evsplat.methods import TRAINABLE, PaperConfig, method_config
+from evsplat.methods.config import Weight
+from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from evsplat.training.clock import Clock
+from evsplat.training.run import (
+    RunFolder,
+    config_values,
+    new_run_folder,
+    read_config,
+    write_facts,
+)
+from evsplat.training.trainer import StepReport, Trainer
+
+logger = logging.getLogger(__name__)
+
+CHECKPOINT_SECONDS = 30.0
+"""Time between checkpoints; writing one changes nothing in the training."""
+LOG_EVERY = 10
+
+
+class Stopped(KeyboardInterrupt):
+    """Training was interrupted by the user after the step was finished and saved."""
+
+    def __init__(self, run: Path) -> None:
+        super().__init__(f"Stopped and saved. Go on with: evsplat train ... --out {run} --resume")
+        self.run = run
+
+
+def train(
+    capture_path: Path | str,
+    *,
+    method: str = "paper",
+    out: Path | str | None = None,
+    device: str = "auto",
+    iterations: int | None = None,
+    max_minutes: float | None = None,
+    resume: bool = False,
+    config: Path | str | None = None,
+    overrides: Sequence[str] = (),
+    threads: int | None = None,
+    seed: int | None = None,
+) -> Path:
+    """Train ``method`` on a capture and return the run folder.
+
+    ``iterations`` scales every schedule. ``max_minutes`` stops gracefully; without ``iterations`` it
+    also shortens the schedule so that it is finished in time. ``resume`` goes on from the last
+    checkpoint in ``out``. ``config`` is a run's config.yaml; ``overrides`` are ``key=value``
+    settings over it. Raises `Stopped` on Ctrl-C after saving.
+    """
+    _check_device(device)
+    if iterations is not None and iterations < 1:
+        raise ConfigError(f"--iterations {iterations}: expected at least 1.")
+    if max_minutes is not None and max_minutes <= 0:
+        raise ConfigError(f"--max-minutes {max_minutes:g}: expected a time above 0.")
+    if threads is not None:
+        if threads < 1:
+            raise ConfigError(f"--threads {threads}: expected at least 1.")
+        torch.set_num_threads(threads)
+    capture = load_capture(Path(capture_path))
+    if resume:
+        if out is None:
+            raise ConfigError("--resume needs --out RUN, the run to go on with.")
+        if config is not None or overrides or seed is not None:
+            raise ConfigError("--resume takes the run's own settings; leave out --config and --set.")
+        folder = RunFolder(Path(out))
+        method, settings, facts = read_config(folder)
+        seed = int(facts["seed"])
+    else:
+        folder = RunFolder(Path(out)) if out is not None else new_run_folder(capture, method)
+        if folder.path.exists() and any(folder.path.iterdir()):
+            raise ConfigError(
+                f"{folder.path}: the folder is not empty; pass --resume to go on with that run, "
+                "or another --out."
+            )
+        where = str(config) if config is not None else "--set"
+        values = load_yaml(config) if config is not None else {}
+        values.pop("method", None)
+        settings = method_config(method, override(values, overrides), where=where)
+        seed = 0 if seed is None else seed
+
+    checkpoint = latest_checkpoint(folder.checkpoints) if resume else None
+    composition = TRAINABLE[method][1](settings, capture, seed, fit=checkpoint is None)
+    clock = Clock(
+        iterations or settings.optimisation.iterations,
+        None if max_minutes is None else 60 * max_minutes,
+        shrink=max_minutes is not None and iterations is None,
+    )
+    trainer = Trainer(composition, capture, clock)
+    if checkpoint is not None:
+        tensors, state = load_checkpoint(checkpoint)
+        trainer.load_state(tensors, state)
+        if iterations is None and max_minutes is None:
+            clock.iterations = state["clock"]["iterations"]
+        folder.truncate_log(clock.iteration)
+    else:
+        folder.path.mkdir(parents=True, exist_ok=True)
+        save_yaml(folder.config, config_values(method, settings))
+        write_facts(folder, capture, method, "cpu", seed)
+        logger.info("%s", schedule_table(settings, composition.weights))
+    _loop(trainer, folder)
+    return folder.path
+
+
+def schedule_table(settings: PaperConfig, weights: dict[str, Weight]) -> str:
+    """Every weight over nominal iterations, one line each."""
+    lines = [f"schedule of {settings.optimisation.iterations} iterations (nominal units):"]
+    for name, weight in weights.items():
+        if isinstance(weight, tuple):
+            text = ", ".join(f"{value:g} from {start:g}" for start, value in weight)
+        else:
+            text = f"{weight:g}"
+        lines.append(f"  {name:22s} {text}")
+    return "\n".join(lines)
+
+
+def _check_device(device: str) -> None:
+    if device not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"--device {device}: expected auto, cpu or cuda.")
+    if device == "cuda":
+        raise BackendError(
+            "--device cuda: this version trains on the CPU only, its CUDA rasteriser does not "
+            "exist yet; pass --device cpu."
+        )
+
+
+def _loop(trainer: Trainer, folder: RunFolder) -> None:
+    """Step until the schedule or the time is over, saving and logging on the way."""
+    clock = trainer.clock
+
+    def save() -> None:
+        tensors, state = trainer.state()
+        save_checkpoint(folder.checkpoints, clock.iteration, tensors, state)
+
+    saved_at = time.perf_counter()
+    with (
+        _interrupt_flag() as interrupted,
+        folder.log.open("a", encoding="utf-8", buffering=1) as log,
+        tqdm(total=100.0, unit="%", bar_format="{percentage:3.0f}%|{bar:24}| {postfix}") as bar,
+    ):
+        while not clock.done and not clock.out_of_time:
+            started = time.perf_counter()
+            report = trainer.step()
+            clock.advance(time.perf_counter() - started)
+            if report is not None and (clock.iteration % LOG_EVERY == 0 or clock.done):
+                log.write(json.dumps(_log_line(trainer, report)) + "\n")
+                _show(bar, trainer, report)
+            if interrupted:
+                save()
+                raise Stopped(folder.path)
+            if time.perf_counter() - saved_at > CHECKPOINT_SECONDS:
+                save()
+                saved_at = time.perf_counter()
+    save()
+    if clock.iteration == 0:
+        raise DataError(f"{folder.path}: no step was made.")
+
+
+def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
+    clock = trainer.clock
+    rates = {g["name"]: g["lr"] for g in trainer.optimiser.rows.adam.param_groups}
+    return {
+        "iteration": clock.iteration,
+        "nominal": round(clock.nominal, 3),
+        "seconds": round(clock.seconds, 3),
+        "loss": report.loss,
+        "terms": report.terms,
+        "psnr": report.psnr,
+        **trainer.counts(),
+        "skipped": trainer.skipped,
+        "lr": rates,
+    }
+
+
+def _show(bar: "tqdm[None]", trainer: Trainer, report: StepReport) -> None:
+    clock, counts = trainer.clock, trainer.counts()
+    minutes, seconds = divmod(round(clock.seconds_left), 60)
+    bar.update(100 * clock.fraction - bar.n)
+    bar.set_postfix_str(
+        f"step {clock.iteration}/{clock.expected_iterations}  loss {report.loss:.4f}  "
+        f"psnr {report.psnr:.2f}  person {counts['human']}  scene {counts['scene']}  "
+        f"left {minutes}:{seconds:02d}"
+    )
+
+
+@contextmanager
+def _interrupt_flag() -> Iterator[list[bool]]:
+    """A list that becomes non-empty on Ctrl-C; a second Ctrl-C interrupts at once."""
+    pressed: list[bool] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(True)
+
+    try:
+        previous = signal.signal(signal.SIGINT, handle)
+    except ValueError:  # not in the main thread: Ctrl-C goes elsewhere
+        yield pressed
+        return
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,81 @@
+"""The event loss of eq. 8-9 and what makes it well behaved."""
+
+import math
+
+import pytest
+import torch
+
+from evsplat.imaging import decode, encode, log_brightness_change
+from evsplat.objectives import event_loss
+
+
+def blob(size: int, shift: float) -> torch.Tensor:
+    """A bright textured figure before a dark wall, moved by ``shift`` of a 256-pixel picture."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, size), torch.linspace(0, 1, size), indexing="ij")
+    x = x - shift / 256
+    figure = torch.exp(-(((x - 0.5) / 0.08) ** 4) - ((y - 0.5) / 0.25) ** 4)
+    texture = 0.5 + 0.3 * torch.sin(60 * x) * torch.cos(40 * y)
+    return (0.15 + 0.6 * figure * texture)[..., None].repeat(1, 1, 3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_scaling_either_map_changes_the_loss_only_through_the_floor(seed):
+    generator = torch.Generator().manual_seed(seed)
+    change = torch.randn(20, 30, generator=generator)
+    events = torch.randn(20, 30, generator=generator)
+    plain = event_loss(change, events, floor=0.0)
+    assert torch.allclose(event_loss(change, 7 * events, floor=0.0), plain, rtol=1e-5)
+    assert torch.allclose(event_loss(0.2 * change, events, floor=0.0), plain, rtol=1e-5)
+
+
+def test_loss_is_the_closed_form_of_equation_9():
+    change = torch.tensor([[3.0, 0.0], [0.0, 4.0]])
+    events = torch.tensor([[1.0, 0.0], [0.0, 0.0]])
+    expected = (abs(0.6 - 1.0) + 0.8) / math.sqrt(4)
+    assert float(event_loss(change, events, floor=0.0)) == pytest.approx(expected)
+
+
+def test_value_does_not_depend_on_resolution():
+    values = []
+    for size in (64, 128, 256):
+        change = log_brightness_change(blob(size, 0), blob(size, 6))
+        wrong = log_brightness_change(blob(size, 0), blob(size, 3))
+        values.append(float(event_loss(wrong, change / 0.2)))
+    assert max(values) / min(values) < 1.15
+
+
+def test_right_motion_costs_least_and_noise_costs_less_than_unit_norm_would():
+    events = log_brightness_change(blob(128, 0), blob(128, 6)) / 0.2
+    right = event_loss(log_brightness_change(blob(128, 0), blob(128, 6)), events)
+    half = event_loss(log_brightness_change(blob(128, 0), blob(128, 3)), events)
+    back = event_loss(log_brightness_change(blob(128, 6), blob(128, 0)), events)
+    assert float(right) < 0.5 * float(half) < 0.5 * float(back)
+    noise = 1e-3 * torch.randn(128, 128, generator=torch.Generator().manual_seed(0))
+    assert float(event_loss(noise, events)) < 0.7 * float(event_loss(noise, events, floor=0.0))
+
+
+def test_no_change_and_no_events_cost_nothing_and_give_finite_gradients():
+    change = torch.zeros(8, 8, requires_grad=True)
+    loss = event_loss(change, torch.zeros(8, 8))
+    loss.backward()
+    assert float(loss) == 0
+    assert change.grad is not None and bool(change.grad.isfinite().all())
+
+
+def test_brightness_change_of_a_known_factor_is_its_logarithm():
+    dark = torch.full((4, 4, 3), 0.2)
+    bright = encode(2 * decode(dark))
+    change = log_brightness_change(dark, bright, eps=0.0)
+    assert torch.allclose(change, torch.full((4, 4), math.log(2)), atol=1e-5)
+    assert torch.allclose(log_brightness_change(bright, dark, eps=0.0), -change, atol=1e-6)
+
+
+def test_gradient_of_the_loss_agrees_with_finite_differences():
+    generator = torch.Generator().manual_seed(5)
+    before = 0.2 + 0.6 * torch.rand(3, 4, 3, generator=generator, dtype=torch.float64)
+    after = 0.2 + 0.6 * torch.rand(3, 4, 3, generator=generator, dtype=torch.float64)
+    events = torch.randn(3, 4, generator=generator, dtype=torch.float64)
+    after.requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda image: event_loss(log_brightness_change(before, image), events), (after,)
+    )

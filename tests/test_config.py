@@ -1,0 +1,79 @@
+"""Configuration: round trips and errors that help."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+
+from evsplat.config import from_dict, load_yaml, override, save_yaml, to_dict
+from evsplat.errors import ConfigError
+from evsplat.methods import PaperConfig, method_config
+
+
+@dataclass(frozen=True)
+class Inner:
+    rate: float = 0.1
+    kind: Literal["a", "b"] = "a"
+    pairs: float | tuple[tuple[float, float], ...] = 1.0
+    limit: int | None = None
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = field(default_factory=Inner)
+    flag: bool = False
+
+
+def test_every_value_survives_yaml(tmp_path):
+    config = Outer(Inner(rate=3e-5, kind="b", pairs=((0.0, 10.0), (1000.0, 0.1)), limit=7), True)
+    save_yaml(tmp_path / "c.yaml", config)
+    assert from_dict(Outer, load_yaml(tmp_path / "c.yaml"), where="c") == config
+
+
+def test_defaults_of_the_paper_method_survive_yaml(tmp_path):
+    save_yaml(tmp_path / "c.yaml", PaperConfig())
+    assert from_dict(PaperConfig, load_yaml(tmp_path / "c.yaml"), where="c") == PaperConfig()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"inner": {"rat": 1}}, "f.yaml: unknown setting inner.rat. Did you mean inner.rate?"),
+        ({"flagg": True}, "f.yaml: unknown setting flagg. Did you mean flag?"),
+        ({"inner": {"kind": "c"}}, "inner.kind is 'c'; expected one of a, b"),
+        ({"inner": {"rate": "fast"}}, "inner.rate is 'fast'; expected a number"),
+        ({"inner": {"limit": 1.5}}, "inner.limit is 1.5; expected an integer"),
+        ({"inner": 3}, "inner is 3; expected a section with keys"),
+        ({"flag": 1}, "flag is 1; expected true or false"),
+    ],
+)
+def test_wrong_values_are_named_with_what_was_expected(values, message):
+    with pytest.raises(ConfigError) as error:
+        from_dict(Outer, values, where="f.yaml")
+    assert message in str(error.value)
+
+
+def test_overrides_reach_nested_values_and_read_scientific_notation():
+    values = override(to_dict(Outer()), ["inner.rate=1e-3", "flag=true", "inner.limit=null"])
+    assert from_dict(Outer, values, where="--set") == Outer(Inner(rate=1e-3), True)
+
+
+@pytest.mark.parametrize("text", ["inner.rate", "=3", "inner.rate.x=1", "flag=[1"])
+def test_malformed_overrides_are_refused(text):
+    with pytest.raises(ConfigError, match="--set"):
+        override(to_dict(Outer()), [text])
+
+
+def test_unknown_method_names_the_nearest():
+    with pytest.raises(ConfigError, match="Did you mean paper"):
+        method_config("papr", {}, where="x")
+
+
+def test_damaged_yaml_is_named(tmp_path):
+    path = tmp_path / "broken.yaml"
+    path.write_text("a: [1,")
+    with pytest.raises(ConfigError, match="broken.yaml: not valid YAML"):
+        load_yaml(path)
+    path.write_text("- 1\n- 2\n")
+    with pytest.raises(ConfigError, match="expected a mapping"):
+        load_yaml(path)
