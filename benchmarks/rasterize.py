@@ -36,7 +36,10 @@ class Scene:
 
 
 def make_scene(size_px: int, count: int, channels: int, seed: int = 0) -> Scene:
-    """Gaussians uniform over the image and 5 % around it, three deviations 2..8 px, opacity 0.1..0.9."""
+    """Gaussians all over the image and 5 % around it; opacity 0.1..0.9.
+
+    Three deviations of the longest axis are 2..8 px, log-uniform; it is 1..5 times the others.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:

@@ -258,14 +258,14 @@ INLINE void load_plane(const Tile& t, F* patches, int step, const float* plane, 
     if (t.columns == kTile && t.rows == kTile) {
         for (int p = 0; p < kPatches; ++p) {
             const float* in = plane + (t.y0 + p / kPatchesX * kPatchH) * sy + (t.x0 + p % kPatchesX * kPatchW) * sx;
-            float lanes[W];
+            // Not by way of a vector: reading what narrower stores have just written stalls.
+            float* lanes = (float*)&patches[p * step];
             if (sx == 1) {
                 for (int r = 0; r < kPatchH; ++r)
                     __builtin_memcpy(lanes + r * kPatchW, in + r * sy, kPatchW * sizeof(float));
             } else {
                 for (int l = 0; l < W; ++l) lanes[l] = in[l / kPatchW * sy + l % kPatchW * sx];
             }
-            patches[p * step] = load(lanes);
         }
     } else {
         for (int p = 0; p < kPatches; ++p) patches[p * step] = F{};
@@ -280,19 +280,24 @@ struct Chunk {
     uint32_t count;
 };
 
-INLINE void fill_chunk(const ForwardJob& job, uint32_t begin, uint32_t end, Chunk& chunk) {
-    chunk.count = end - begin < kChunk ? end - begin : kChunk;
+// Copies entries [from, to) of a tile and asks for the memory of the chunk that comes next: behind it,
+// or, going back, before it.
+INLINE void fill_chunk(const ForwardJob& job, uint32_t from, uint32_t to, uint32_t next, uint32_t next_end,
+                       Chunk& chunk) {
+    chunk.count = to - from;
     for (uint32_t j = 0; j < chunk.count; ++j) {
-        const uint32_t g = job.entries[begin + j].gaussian;
+        const uint32_t g = job.entries[from + j].gaussian;
         chunk.projected[j] = job.projected[g];
         chunk.values[j] = job.values + size_t(g) * job.value_stride;
-        if (begin + j + kChunk < end) {
-            const uint32_t next = job.entries[begin + j + kChunk].gaussian;
-            __builtin_prefetch(&job.projected[next]);
-            __builtin_prefetch(job.values + size_t(next) * job.value_stride);
-        }
+    }
+    for (uint32_t i = next; i < next_end; ++i) {
+        const uint32_t g = job.entries[i].gaussian;
+        __builtin_prefetch(&job.projected[g]);
+        __builtin_prefetch(job.values + size_t(g) * job.value_stride);
     }
 }
+
+INLINE uint32_t least(uint32_t a, uint32_t b) { return a < b ? a : b; }
 
 struct Alpha {
     F u, v, raw, value;  // value: 0 below 1/255, at most 0.999
@@ -334,10 +339,12 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
     Pixels pixels;
     fill_pixels(tile, pixels);
     F live[kPatches], final[kPatches];  // transmittance, 0 once stopped; what it was when it stopped
+    I last[kPatches];                   // last entry before the stop
     F colour[kPatches * (C ? C : kMaxChannels)];
     for (int p = 0; p < kPatches; ++p) {
         live[p] = select(pixels.inside[p], splat(1.f), F{});
         final[p] = splat(1.f);
+        last[p] = I{} - 1;
     }
     for (int k = 0; k < kPatches * channels; ++k) colour[k] = F{};
 
@@ -350,7 +357,8 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
     }
     Chunk chunk;
     for (uint32_t first = begin; first < end && open; first += kChunk) {
-        fill_chunk(job, first, end, chunk);
+        const uint32_t stop = least(first + kChunk, end);
+        fill_chunk(job, first, stop, stop, least(stop + kChunk, end), chunk);
         uint32_t words[kPatches];
         transpose_masks(job.entries + first, chunk.count, words);
         for (uint64_t left = open; left; left &= left - 1) {
@@ -359,6 +367,7 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
             if (!word) continue;
             const F x = pixels.x[p], y = pixels.y[p];
             F t = live[p], t_final = final[p];
+            I t_last = last[p];
             F* out = colour + p * channels;
             F c[C ? C : 1];
             for (int k = 0; k < C; ++k) c[k] = out[k];
@@ -369,6 +378,7 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
                 const I go = next > kMinTransmittance;
                 const F weight = select(go, t * alpha, F{});
                 t_final = select(go, next, t_final);
+                t_last = go ? I{} + int32_t(first - begin + j) : t_last;
                 t = select(go, next, F{});
                 const float* value = chunk.values[j];
                 if (C) {
@@ -378,7 +388,7 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
                 }
             }
             for (int k = 0; k < C; ++k) out[k] = c[k];
-            live[p] = t, final[p] = t_final;
+            live[p] = t, final[p] = t_final, last[p] = t_last;
             if (!bits(t > 0.f)) {
                 open &= ~(uint64_t(1) << p);
                 patch_end[p] = first - begin + chunk.count;
@@ -386,6 +396,8 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
         }
     }
 
+    __builtin_memcpy(job.final_t + size_t(index) * kTilePixels, final, sizeof final);
+    __builtin_memcpy(job.last + size_t(index) * kTilePixels, last, sizeof last);
     if (job.background) {
         F value[kPatches];
         for (int k = 0; k < channels; ++k) {
@@ -399,8 +411,11 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
     store_plane(tile, final, 1, job.alpha, view.width);
 }
 
-// Front to back, with one running scalar per pixel: `rest` = gradient-weighted light from behind the
-// current Gaussian, so that dL/dalpha_i = T_i s_i - rest_i / (1 - alpha_i), s_i = value_i . dL/dpixel.
+// Back to front, with two running scalars per pixel: the transmittance T_i and the gradient-weighted
+// value `behind` of what lies behind Gaussian i, as if it were alone: with s_i = value_i . dL/dpixel,
+// dL/dalpha_i = T_i (s_i - behind_i) and behind_(i-1) = behind_i + alpha_i (s_i - behind_i).
+// Unlike a front-to-back pass, which gets the light from behind as (total - sum so far), this loses no
+// digits behind nearly opaque Gaussians.
 template <int C>
 void backward_tile(const BackwardJob& back, uint32_t index) {
     const ForwardJob& job = back.forward;
@@ -408,44 +423,39 @@ void backward_tile(const BackwardJob& back, uint32_t index) {
     const int channels = C ? C : job.channels;
     const int stride = slot_stride(channels);
     const Tile tile = tile_of(view, index);
-    const size_t plane = size_t(view.width) * view.height;
     Pixels pixels;
     fill_pixels(tile, pixels);
-    F live[kPatches], rest[kPatches], value[kPatches];
+    F transmittance[kPatches], behind[kPatches], value[kPatches];
+    I last[kPatches];
     F grad[kPatches * (C ? C : kMaxChannels)];
+    __builtin_memcpy(transmittance, job.final_t + size_t(index) * kTilePixels, sizeof transmittance);
+    __builtin_memcpy(last, job.last + size_t(index) * kTilePixels, sizeof last);
 
-    for (int p = 0; p < kPatches; ++p) {
-        live[p] = select(pixels.inside[p], splat(1.f), F{});
-        rest[p] = F{};
-    }
+    if (back.alpha_grad) load_plane(tile, value, 1, back.alpha_grad, back.alpha_grad_x, back.alpha_grad_y);
+    for (int p = 0; p < kPatches; ++p) behind[p] = back.alpha_grad ? -value[p] : F{};
     for (int k = 0; k < channels; ++k) {
         if (back.image_grad) {
             load_plane(tile, grad + k, channels, back.image_grad + k * back.image_grad_c, back.image_grad_x,
                        back.image_grad_y);
-            load_plane(tile, value, 1, job.image + k * plane, 1, view.width);
-            for (int p = 0; p < kPatches; ++p) rest[p] += grad[p * channels + k] * value[p];
         } else {
             for (int p = 0; p < kPatches; ++p) grad[p * channels + k] = F{};
         }
-    }
-    F transparency[kPatches];
-    load_plane(tile, transparency, 1, job.alpha, 1, view.width);
-    for (int p = 0; p < kPatches; ++p) transparency[p] = 1.f - transparency[p];
-    if (back.alpha_grad) {
-        load_plane(tile, value, 1, back.alpha_grad, back.alpha_grad_x, back.alpha_grad_y);
-        for (int p = 0; p < kPatches; ++p) rest[p] -= value[p] * transparency[p];
+        if (job.background) {
+            load_plane(tile, value, 1, job.background + k * job.background_c, job.background_x, job.background_y);
+            for (int p = 0; p < kPatches; ++p) behind[p] += grad[p * channels + k] * value[p];
+        }
     }
     if (back.background_grad) {
         if (back.background_is_image) {
             for (int k = 0; k < channels; ++k)
                 for_pixels(tile, [&](int p, int l, int x, int y) {
                     back.background_grad[(size_t(y) * view.width + x) * job.value_stride + k] +=
-                        grad[p * channels + k][l] * transparency[p][l];
+                        grad[p * channels + k][l] * transmittance[p][l];
                 });
         } else {
             for (int k = 0; k < channels; ++k) {
                 F total = F{};
-                for (int p = 0; p < kPatches; ++p) total += grad[p * channels + k] * transparency[p];
+                for (int p = 0; p < kPatches; ++p) total += grad[p * channels + k] * transmittance[p];
                 back.background_grad[size_t(index) * channels + k] = sum(total);
             }
         }
@@ -454,38 +464,38 @@ void backward_tile(const BackwardJob& back, uint32_t index) {
     const uint32_t begin = job.tile_begin[index], end = job.tile_begin[index + 1];
     const uint32_t* patch_end = job.patch_end + size_t(index) * kPatches;
     Chunk chunk;
-    for (uint32_t first = begin; first < end; first += kChunk) {
+    for (uint32_t stop = end; stop > begin;) {
+        const uint32_t first = begin + (stop - begin - 1) / kChunk * kChunk;
         uint64_t open = 0;
         for (int p = 0; p < kPatches; ++p) open |= uint64_t(first - begin < patch_end[p]) << p;
-        fill_chunk(job, first, end, chunk);
+        fill_chunk(job, first, stop, first > begin ? first - kChunk : begin, first, chunk);
         for (uint32_t j = 0; j < chunk.count; ++j)
             __builtin_prefetch(back.slots + size_t(job.entries[first + j].slot) * stride, 1);
-        for (uint32_t j = 0; j < chunk.count; ++j) {
+        stop = first;
+        for (uint32_t j = chunk.count; j-- > 0;) {
             const Entry& entry = job.entries[first + j];
             const Projected g = chunk.projected[j];
             const float* colour = chunk.values[j];
+            const int32_t index_in_tile = int32_t(first - begin + j);
             F h0 = F{}, hu = F{}, hv = F{}, huu = F{}, huv = F{}, hvv = F{};
             F hc[C ? C : kMaxChannels];
             for (int k = 0; k < channels; ++k) hc[k] = F{};
             for (uint64_t left = entry.patches & open; left; left &= left - 1) {
                 const int p = __builtin_ctzll(left);
                 const Alpha a = alpha_at(g, pixels.x[p], pixels.y[p]);
-                const F t = live[p];
-                const F next = t - t * a.value;
-                const I go = next > kMinTransmittance;
-                const F weight = select(go, t * a.value, F{});
-                live[p] = select(go, next, F{});
+                const F alpha = select(last[p] >= index_in_tile, a.value, F{});
+                const F t = transmittance[p] / (1.f - alpha);
+                const F weight = t * alpha;
+                transmittance[p] = t;
                 const F* v = grad + p * channels;
                 F shade = F{};
                 for (int k = 0; k < channels; ++k) {
                     shade += colour[k] * v[k];
                     hc[k] += weight * v[k];
                 }
-                const F lit = weight * shade;
-                const F behind = rest[p] - lit;
-                rest[p] = behind;
-                const F passes = 1.f - a.value;
-                const F h = select(go & (a.raw <= kMaxAlpha), lit - behind * (a.value / passes), F{});
+                const F differs = shade - behind[p];
+                behind[p] += alpha * differs;
+                const F h = select(a.raw <= kMaxAlpha, weight * differs, F{});
                 const F h_u = h * a.u, h_v = h * a.v;
                 h0 += h, hu += h_u, hv += h_v;
                 huu += h_u * a.u, huv += h_u * a.v, hvv += h_v * a.v;

@@ -64,7 +64,10 @@ struct ForwardJob {
     const float* background;      // null, or value of channel k at pixel (x, y): k*bc + x*bx + y*by
     ptrdiff_t background_c, background_x, background_y;
     float *image, *alpha;         // planar (C, H, W) and (H, W)
-    uint32_t* patch_end;          // (tiles, patches): entries of the tile after which a patch is opaque
+    // What the backward pass starts from, by tile and patch, not by row:
+    float* final_t;               // (tiles, 256) transmittance behind the last entry
+    int32_t* last;                // (tiles, 256) last entry of the tile before compositing stopped
+    uint32_t* patch_end;          // (tiles, patches) entries of the tile after which a patch is opaque
 };
 
 struct BackwardJob {

@@ -81,13 +81,12 @@ class Render {
         record_ = render_forward(scene_, threads_, image.data(), alpha.data(), radii.data());
     }
 
-    void backward(In image, In alpha, std::optional<Strided> image_grad, std::optional<Strided> alpha_grad,
+    void backward(std::optional<Strided> image_grad, std::optional<Strided> alpha_grad,
                   std::optional<Out> means, std::optional<Out> quats, std::optional<Out> scales,
                   std::optional<Out> opacities, std::optional<Out> values, std::optional<Out> linear,
                   std::optional<Out> offset, std::optional<Out> view, std::optional<Out> background) {
         if (!record_) throw std::runtime_error("evsplat._native: backward before forward");
         const size_t h = scene_.view.height, w = scene_.view.width, t = scene_.times, c = scene_.channels;
-        require(image.size() == t * c * h * w && alpha.size() == t * h * w, "image");
         OutputGrads out;
         if (image_grad) {
             require(image_grad->ndim() == 4 && image_grad->shape(0) == t && image_grad->shape(1) == h &&
@@ -126,7 +125,7 @@ class Render {
             in.background = background->data();
         }
         nb::gil_scoped_release release;
-        render_backward(scene_, *record_, threads_, image.data(), alpha.data(), out, in);
+        render_backward(scene_, *record_, threads_, out, in);
     }
 
     size_t bytes() const { return record_ ? record_->bytes() : 0; }
@@ -174,7 +173,7 @@ NB_MODULE(_native, m) {
              nb::arg("linear").none(), nb::arg("offset").none(), nb::arg("background").none(), nb::arg("times"),
              nb::arg("threads"))
         .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"))
-        .def("backward", &Render::backward, nb::arg("image"), nb::arg("alpha"), nb::arg("image_grad").none(),
+        .def("backward", &Render::backward, nb::arg("image_grad").none(),
              nb::arg("alpha_grad").none(), nb::arg("means").none(), nb::arg("quats").none(), nb::arg("scales").none(),
              nb::arg("opacities").none(), nb::arg("channels").none(), nb::arg("linear").none(),
              nb::arg("offset").none(), nb::arg("view").none(), nb::arg("background").none())

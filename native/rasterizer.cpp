@@ -85,6 +85,12 @@ struct TileSorter {
 struct BlockSlots : SlotList {
     Buffer<Slot> memory;
 
+    void take(BlockSlots& other) {
+        memory.swap(other.memory);
+        data = memory.data();
+        size = other.size;
+    }
+
     void start(size_t expected) {
         memory.reset(expected);
         data = memory.data();
@@ -138,8 +144,12 @@ ForwardJob forward_job(const Scene& s, const Drawn& d, size_t t, int first_chann
         job.background_x = s.background_is_image ? s.channels : 0;
         job.background_y = job.background_x * s.view.width;
     }
-    job.image = image + (t * s.channels + first_channel) * pixels;
-    job.alpha = alpha + t * pixels;
+    if (image) {  // not for the backward pass
+        job.image = image + (t * s.channels + first_channel) * pixels;
+        job.alpha = alpha + t * pixels;
+    }
+    job.final_t = const_cast<float*>(d.final_t.data());
+    job.last = const_cast<int32_t*>(d.last.data());
     job.patch_end = const_cast<uint32_t*>(d.patch_end.data());
     return job;
 }
@@ -153,12 +163,16 @@ void project_and_bin(const Kernels& kernels, const Scene& s, size_t t, int threa
     d.first_slot.reset(size_t(s.count) + 1);
     d.tile_begin.reset(tiles + 1);
     d.patch_end.reset(tiles * kernels.patches);
+    d.final_t.reset(tiles * kTilePixels);
+    d.last.reset(tiles * kTilePixels);
 
     std::vector<BlockSlots> slots(blocks);
     run(threads, blocks, [&](size_t b) {
         const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, s.count);
-        slots[b].start(2 * kBlock);
-        kernels.project(s.view, g, begin, end, d.projected.data(), radii, d.first_slot.data(), slots[b]);
+        BlockSlots list;  // on this thread's stack: its size changes with every slot
+        list.start(3 * kBlock);
+        kernels.project(s.view, g, begin, end, d.projected.data(), radii, d.first_slot.data(), list);
+        slots[b].take(list);
     });
     std::vector<size_t> base(blocks + 1, 0);
     for (size_t b = 0; b < blocks; ++b) base[b + 1] = base[b] + slots[b].size;
@@ -213,7 +227,7 @@ size_t Record::bytes() const {
     size_t total = 0;
     for (const Drawn& d : times)
         total += d.projected.bytes() + d.first_slot.bytes() + d.entries.bytes() + d.tile_begin.bytes() +
-                 d.patch_end.bytes();
+                 d.patch_end.bytes() + d.final_t.bytes() + d.last.bytes();
     return total;
 }
 
@@ -240,8 +254,8 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image
     return record;
 }
 
-void render_backward(const Scene& s, const Record& record, int threads, const float* image, const float* alpha,
-                     const OutputGrads& out, const InputGrads& in) {
+void render_backward(const Scene& s, const Record& record, int threads, const OutputGrads& out,
+                     const InputGrads& in) {
     const Kernels& kernels = *record.kernels;
     const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y;
     const size_t blocks = (size_t(s.count) + kBlock - 1) / kBlock;
@@ -256,7 +270,7 @@ void render_backward(const Scene& s, const Record& record, int threads, const fl
         for (int c = 0; c < s.channels; c += kMaxChannels) {
             BackwardJob job = {};
             const int channels = std::min(kMaxChannels, s.channels - c);
-            job.forward = forward_job(s, d, t, c, channels, const_cast<float*>(image), const_cast<float*>(alpha));
+            job.forward = forward_job(s, d, t, c, channels, nullptr, nullptr);
             if (out.image_data) {
                 job.image_grad = out.image_data + t * out.image[0] + c * out.image[3];
                 job.image_grad_y = out.image[1], job.image_grad_x = out.image[2], job.image_grad_c = out.image[3];

@@ -42,6 +42,8 @@ struct Drawn {
     Buffer<Entry> entries;
     Buffer<uint32_t> tile_begin;   // (tiles + 1)
     Buffer<uint32_t> patch_end;
+    Buffer<float> final_t;
+    Buffer<int32_t> last;
 };
 
 struct Record {
@@ -65,7 +67,6 @@ struct InputGrads {
     float* background = nullptr;  // (C) or (H, W, C)
 };
 
-void render_backward(const Scene&, const Record&, int threads, const float* image, const float* alpha,
-                     const OutputGrads&, const InputGrads&);
+void render_backward(const Scene&, const Record&, int threads, const OutputGrads&, const InputGrads&);
 
 }  // namespace evsplat

@@ -63,19 +63,19 @@ INLINE uint64_t bits(I mask) {
 #endif
 }
 
-// 2^e for e <= 1, 1e-7 relative; below -60 it gives 2^-60. The magic number rounds to nearest, which
-// -ffast-math would break.
+// 2^e for e <= 1, 1.5e-7 relative, but exact at 0, since 1 - 2^e matters there; below -60 it gives
+// 2^-60. The magic number rounds to nearest, which -ffast-math would break.
 INLINE F exp2(F e) {
     e = max(e, splat(-60.f));
     const F magic = splat(12582912.f);
     const F shifted = e + magic;
     const F f = e - (shifted - magic);
-    F p = splat(1.3276472e-3f);
-    p = p * f + 9.6755419e-3f;
-    p = p * f + 5.5507131e-2f;
-    p = p * f + 2.4022120e-1f;
-    p = p * f + 6.9314694e-1f;
-    p = p * f + 1.0000001f;
+    F p = splat(0.0013264727f);
+    p = p * f + 0.009671513f;
+    p = p * f + 0.055507336f;
+    p = p * f + 0.24022242f;
+    p = p * f + 0.693147f;
+    p = p * f + 1.f;
     return (F)((I)p + ((I)shifted << 23));
 }
 

@@ -23,12 +23,15 @@ class Pool {
                 workers_.emplace_back([this, id] { work(id); });
             }
             task_ = &task, count_ = count, next_ = 0;
-            helpers_ = threads - 1, running_ = helpers_;
+            helpers_ = threads - 1;
             ++generation_;
         }
         wake_.notify_all();
         take(task, count);
+        // Helpers that have not started by now are not waited for: on a busy machine one may get its
+        // first time slice only milliseconds later.
         std::unique_lock<std::mutex> lock(mutex_);
+        task_ = nullptr;
         done_.wait(lock, [this] { return running_ == 0; });
     }
 
@@ -45,9 +48,10 @@ class Pool {
             std::unique_lock<std::mutex> lock(mutex_);
             wake_.wait(lock, [&] { return generation_ != seen; });
             seen = generation_;
-            if (id >= helpers_) continue;
+            if (id >= helpers_ || !task_) continue;
             const auto& task = *task_;
             const size_t count = count_;
+            ++running_;
             lock.unlock();
             take(task, count);
             lock.lock();

@@ -100,9 +100,7 @@ def _convert(kind: Any, value: Any, where: str, key: str) -> Any:
             return tuple(_convert(arguments[0], v, where, key) for v in value)
         if len(value) != len(arguments):
             raise _wrong(where, key, value, f"{len(arguments)} values")
-        return tuple(
-            _convert(a, v, where, key) for a, v in zip(arguments, value, strict=True)
-        )
+        return tuple(_convert(a, v, where, key) for a, v in zip(arguments, value, strict=True))
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
     if kind is float and isinstance(value, str):

@@ -103,9 +103,7 @@ def make_body(
     return body, order
 
 
-def default_body(
-    betas: Float[np.ndarray, "B"] | None = None, *, source: str = "betas"
-) -> Body:
+def default_body(betas: Float[np.ndarray, "B"] | None = None, *, source: str = "betas") -> Body:
     """The shipped parametric body (CC0) with up to 10 shape coefficients, each about -3..3."""
     data = _default_arrays()
     shape = fit_betas(betas, len(data["shapedirs"]), source)

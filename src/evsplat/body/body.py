@@ -63,7 +63,9 @@ class Body:
         bones = self.bone_transforms(rotations, transl)
         return bones @ self._inverse_canonical_bones.to(bones.dtype)
 
-    def sample_surface(self, count: int, generator: torch.Generator | None = None) -> SurfaceSamples:
+    def sample_surface(
+        self, count: int, generator: torch.Generator | None = None
+    ) -> SurfaceSamples:
         """Points spread evenly by area over the canonical mesh, with normals and weights."""
         return sample_mesh(self._canonical_vertices, self.faces, self.weights, count, generator)
 
@@ -83,7 +85,9 @@ class Body:
     def _bone_vectors(self) -> Float[Tensor, "J 3 1"]:
         """Rest joint minus rest joint of its parent; the root's own place for the root."""
         above = self.rest_joints[self.parents.clamp_min(0)]
-        bones = torch.where((self.parents >= 0)[:, None], self.rest_joints - above, self.rest_joints)
+        bones = torch.where(
+            (self.parents >= 0)[:, None], self.rest_joints - above, self.rest_joints
+        )
         return bones[:, :, None]
 
     @cached_property

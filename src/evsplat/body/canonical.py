@@ -1,4 +1,4 @@
-"""Canonical pose: the shaped rest pose with the legs apart, for any skeleton whose legs are found."""
+"""Canonical pose: the shaped rest pose with the legs apart, where a skeleton's legs are found."""
 
 import logging
 import re
@@ -19,8 +19,8 @@ SMPL_SPREAD_DEG = 45.0
 """Rotation of each leg of the SMPL family (3DGS-Avatar; method.md 1.2)."""
 THIGH_DEG = 30.0
 """Other rigs: angle between thigh and straight down, seen from the front. Their rest poses differ
-(A-poses already have the legs apart), so the angle reached is fixed and not the rotation. 30 degrees
-keeps the knees two thigh widths apart and the feet no wider than the hands of an A-pose."""
+(A-poses already have the legs apart), so the angle reached is fixed and not the rotation. At 30
+degrees the thighs are well apart and the feet about as wide as the hands of an A-pose."""
 
 _THIGH_NAMES = ("upleg", "upperleg", "legupper", "thigh", "femur")
 _HIP_NAMES = ("hip", "hipjoint")
@@ -101,7 +101,7 @@ def _is_smpl(parents: Sequence[int], joint_names: Sequence[str]) -> bool:
 
 
 def _parse(name: str) -> tuple[str | None, str]:
-    """Side and lower-case rest of a joint name: 'mixamorig:LeftUpLeg' -> ('left', 'mixamorigupleg')."""
+    """Side and lower-case rest of a name: 'mixamorig:LeftUpLeg' -> ('left', 'mixamorigupleg')."""
     words = [word.lower() for word in _WORD.findall(name)]
     sides = [_SIDES[word] for word in words if word in _SIDES]
     core = "".join(word for word in words if word not in _SIDES)

@@ -20,8 +20,9 @@ def silhouette(
     """Pixels whose centre lies inside a projected triangle of the mesh (world coordinates)."""
     height, width = camera.height, camera.width
     pixels, depth = camera.project(vertices.detach())
-    corners = pixels.double().cpu().numpy()[faces.cpu().numpy()]
-    corners = corners[(depth > NEAR).cpu().numpy()[faces.cpu().numpy()].all(1)]
+    triangles = faces.cpu().numpy()
+    corners = pixels.double().cpu().numpy()[triangles]
+    corners = corners[(depth > NEAR).cpu().numpy()[triangles].all(1)]
     # First and one-past-last pixel whose centre (index + 0.5) can lie inside.
     size = np.array([width, height])
     first = np.clip(np.ceil(corners.min(1) - 0.5), 0, size).astype(np.int64)
@@ -47,10 +48,10 @@ def body_box(
     ``margin`` is a share of the box's own extent. None where the body is out of view.
     """
     pixels, depth = camera.project(vertices.detach())
-    pixels = pixels[depth > NEAR].double().cpu().numpy()
-    if len(pixels) == 0:
+    seen = pixels[depth > NEAR].double().cpu().numpy()
+    if len(seen) == 0:
         return None
-    low, high = pixels.min(0), pixels.max(0)
+    low, high = seen.min(0), seen.max(0)
     size = np.array([camera.width, camera.height])
     start = np.clip(np.floor(low - margin * (high - low)), 0, size).astype(int)
     stop = np.clip(np.ceil(high + margin * (high - low)), 0, size).astype(int)

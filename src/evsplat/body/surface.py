@@ -17,6 +17,12 @@ class SurfaceSamples:
     weights: Float[Tensor, "N J"]
     """Skinning weights, interpolated from the vertices; rows sum to one."""
 
+    def to(self, device: torch.device | str) -> "SurfaceSamples":
+        """The same samples on ``device``."""
+        return SurfaceSamples(
+            self.points.to(device), self.normals.to(device), self.weights.to(device)
+        )
+
 
 def vertex_normals(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
@@ -37,7 +43,7 @@ def sample_mesh(
     count: int,
     generator: torch.Generator | None = None,
 ) -> SurfaceSamples:
-    """Draw ``count`` independent points, uniform by area; the generator lives on the mesh's device."""
+    """Draw ``count`` independent points, uniform by area; the generator is on the mesh's device."""
     a, b, c = vertices[faces].unbind(1)
     area = torch.linalg.cross(b - a, c - a).norm(dim=-1)
     # Inverse of the cumulative area in float64: no limit on faces, no bias of float32 sums.

@@ -1,5 +1,6 @@
 """The body's pose at any time: smooth rotation and translation splines through the key poses."""
 
+import copy
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -52,6 +53,14 @@ class BodyTrack:
         polynomials = np.concatenate((rates, shifts[:, None]), axis=1)
         self._polynomials = torch.from_numpy(polynomials).to(device)
 
+    def to(self, device: torch.device | str) -> "BodyTrack":
+        """The same track computing on ``device``."""
+        moved = copy.copy(self)
+        moved.body = self.body.to(device)
+        for name in ("_seconds", "_keys", "_polynomials"):
+            setattr(moved, name, getattr(self, name).to(device))
+        return moved
+
     def at(
         self, times_us: Int[Tensor, "T"] | Sequence[int]
     ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
@@ -87,7 +96,9 @@ def load_body_track(capture: "Capture", *, dense: bool = False) -> BodyTrack:
     file = capture.body_file
     if dense:
         if capture.dense_body_file is None:
-            raise DataError(f"{capture.path}: body_dense.npz not found, but dense poses were asked for.")
+            raise DataError(
+                f"{capture.path}: body_dense.npz not found, but dense poses were asked for."
+            )
         file = capture.dense_body_file
     poses = np.asarray(file.poses)
     if poses.ndim != 3 or poses.shape[1] != len(order):
@@ -137,7 +148,9 @@ def _check(
             raise DataError(f"{source}: {name} has shape {value.shape}, expected {expected[name]}.")
         if not np.isfinite(value).all():
             key = int(np.argwhere(~np.isfinite(value))[0, 0])
-            raise DataError(f"{source}: {name}[{key}] is not finite; remove or repair that key pose.")
+            raise DataError(
+                f"{source}: {name}[{key}] is not finite; remove or repair that key pose."
+            )
     if (np.diff(times) <= 0).any():
         key = int(np.argmax(np.diff(times) <= 0)) + 1
         raise DataError(

@@ -42,7 +42,8 @@ def joint_depths(parents: Sequence[int], source: str = "kinematic tree") -> list
         while depths[joint] < 0:
             if not 0 <= parents[joint] < count:
                 raise DataError(
-                    f"{source}: parents[{joint}] is {parents[joint]}, expected -1 or 0..{count - 1}."
+                    f"{source}: parents[{joint}] is {parents[joint]}, "
+                    f"expected -1 or 0..{count - 1}."
                 )
             chain.append(joint)
             if len(chain) > count:
@@ -54,7 +55,7 @@ def joint_depths(parents: Sequence[int], source: str = "kinematic tree") -> list
 
 
 def topological_order(parents: Sequence[int], source: str = "kinematic tree") -> list[int]:
-    """Order of joints in which every parent precedes its children; unchanged where it already does."""
+    """Joints in an order where parents precede their children; unchanged where they already do."""
     depths = joint_depths(parents, source)
     if all(parent < joint for joint, parent in enumerate(parents)):
         return list(range(len(parents)))

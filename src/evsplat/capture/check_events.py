@@ -1,5 +1,6 @@
 """Checks of the event file; the deep ones read it in pieces."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -181,7 +182,7 @@ class _Scan:
         if "t" not in self.count:
             self.piece_of_index(start, t)
 
-    def note(self, column: str, start: int, wrong: np.ndarray, words) -> None:  # type: ignore[no-untyped-def]
+    def note(self, column: str, start: int, wrong: np.ndarray, words: Callable[[int], str]) -> None:
         if wrong.any():
             at = int(np.argmax(wrong))
             self.first.setdefault(column, (start + at, words(at)))

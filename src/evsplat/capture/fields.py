@@ -1,6 +1,5 @@
 """Typed access to JSON objects, with findings that say where a value is wrong."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,8 @@ import numpy as np
 from evsplat.capture.finding import Findings, nearest
 
 MISSING = object()
+# Integers up to here are exact as doubles.
+_LARGEST = 2**53
 
 
 class Fields:
@@ -68,8 +69,7 @@ class Fields:
         value = self.get(key, default)
         if value is None:
             return 0
-        whole = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not whole or value != value or math.isinf(value) or int(value) != value:
+        if not is_whole(value):
             self.fail(key, brief(value), "a whole number", "Correct it.")
             return 0
         if minimum is not None and value < minimum:
@@ -84,9 +84,10 @@ class Fields:
         expected = f"{'x'.join(map(str, shape))} finite numbers"
         try:
             array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             array = np.empty(0)
-        if array.shape != shape or not np.isfinite(array).all():
+        # also refuses NaN, and numbers that would overflow further on
+        if array.shape != shape or not (np.abs(array) <= _LARGEST).all():
             self.fail(key, brief(value), expected, "Correct it.")
             return None
         return array
@@ -97,6 +98,12 @@ class Fields:
         if value is not None and not isinstance(value, list):
             self.fail(key, brief(value), "a list", "Write it as [ ... ].")
         return value if isinstance(value, list) else []
+
+
+def is_whole(value: Any) -> bool:
+    """Whether a JSON value is an integer that a double holds exactly."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and abs(value) <= _LARGEST and int(value) == value
 
 
 def brief(value: Any, limit: int = 80) -> str:

@@ -45,5 +45,6 @@ class Findings:
 
 def nearest(key: str, known: tuple[str, ...]) -> str:
     """A hint with the known key that looks most like ``key``."""
-    matches = get_close_matches(key, known, n=1, cutoff=0.0)
-    return f"Did you mean {matches[0]!r}? Otherwise remove it." if matches else "Remove it."
+    by_lower_case = {name.lower(): name for name in known}
+    closest = get_close_matches(key.lower(), by_lower_case, n=1, cutoff=0.0)[0]
+    return f"Did you mean {by_lower_case[closest]!r}? Otherwise remove it."

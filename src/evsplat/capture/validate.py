@@ -6,7 +6,8 @@ from evsplat.capture.check_body import check_body
 from evsplat.capture.check_events import check_events
 from evsplat.capture.check_images import check_images
 from evsplat.capture.finding import Finding, Findings
-from evsplat.capture.metadata import Metadata, read_metadata
+from evsplat.capture.metadata import Metadata
+from evsplat.capture.parse import read_metadata
 
 
 def validate_capture(path: Path | str, *, deep: bool = True) -> list[Finding]:

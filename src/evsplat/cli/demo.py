@@ -24,9 +24,9 @@ def demo(
     device: Device = "auto",
     threads: Threads = None,
 ) -> None:
-    """Train on the packaged capture, evaluate and write a report, in about ten minutes.
+    """Train on the packaged capture, evaluate it and write a report.
 
-    A synthetic dancer in a room, 72 ms of blur per frame, with events and ground truth.
+    A synthetic dancer, 72 ms of blur per frame, with events and ground truth.
 
     Args:
         out: Folder of the run.

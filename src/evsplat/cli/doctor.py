@@ -1,10 +1,164 @@
 """``evsplat doctor``: what is installed, what is missing and where to get it."""
 
+import json as json_format
+import os
+import platform
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from typing import Literal
 
-def doctor(*, json: bool = False) -> None:
+import evsplat
+from evsplat.cli.demo import demo_capture
+from evsplat.cli.options import Flag
+from evsplat.errors import DataError, WeightsError
+
+_MARKS = {"ok": "ok", "missing": "MISSING", "optional": "-"}
+
+
+@dataclass(frozen=True)
+class Check:
+    """What was found of one thing that evsplat can use."""
+
+    name: str
+    status: Literal["ok", "missing", "optional"]
+    """missing: evsplat does not work without it; optional: it does, with less."""
+    detail: str
+    remedy: str = ""
+    """How to get it, where it is not there."""
+
+
+def doctor(*, json: Flag = False) -> None:
     """Say what is installed, what is missing and where to get it.
 
     Args:
         json: Print one JSON object instead of lines.
     """
-    raise NotImplementedError
+    checks = list(run_checks())
+    if json:
+        found = {check.name: asdict(check) for check in checks}
+        print(json_format.dumps(found, indent=1))
+        return
+    width = max(len(check.name) for check in checks)
+    for check in checks:
+        remedy = f" {check.remedy}" if check.remedy else ""
+        print(f"{check.name:{width}}  {_MARKS[check.status]:7}  {check.detail}{remedy}")
+
+
+def run_checks() -> Iterator[Check]:
+    """Look at the installation, one check after the other; none of them raises."""
+    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores"
+    yield Check("evsplat", "ok", evsplat.__version__)
+    yield Check("python", "ok", f"{platform.python_version()} on {machine}")
+    checks: tuple[Callable[[], Check], ...] = (
+        _torch,
+        _native,
+        _cuda,
+        _gsplat,
+        _video,
+        _demo,
+        _body_models,
+        _st_lpips,
+        lambda: _lpips("alex"),
+        lambda: _lpips("vgg"),
+    )
+    for check in checks:
+        yield check()
+
+
+def _torch() -> Check:
+    try:
+        torch = import_module("torch")
+    except ImportError as error:
+        return Check("torch", "missing", f"{error}.", "Get it with: pip install 'torch>=2.11'.")
+    return Check("torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads")
+
+
+def _native() -> Check:
+    name = "native rasteriser"
+    try:
+        native = import_module("evsplat._native")
+    except ImportError as error:
+        remedy = "Reinstall evsplat with a C++17 compiler (GCC 9+, Clang 12+) present."
+        return Check(name, "missing", f"{error}.", remedy)
+    levels = ", ".join(native.levels())
+    return Check(name, "ok", f"uses {native.level()} (this CPU runs {levels})")
+
+
+def _cuda() -> Check:
+    try:
+        torch = import_module("torch")
+    except ImportError:
+        return Check("CUDA", "optional", "unknown without torch.")
+    unused = "Not needed: this version trains on the CPU only."
+    if torch.version.cuda is None:
+        return Check("CUDA", "optional", "the installed torch is a build without CUDA.", unused)
+    if not torch.cuda.is_available():
+        detail = f"torch is built for CUDA {torch.version.cuda}, but finds no usable GPU or driver."
+        return Check("CUDA", "optional", detail, unused)
+    detail = f"{torch.cuda.get_device_name()} with CUDA {torch.version.cuda}."
+    return Check("CUDA", "optional", detail, unused)
+
+
+def _gsplat() -> Check:
+    found = _version("gsplat")
+    detail = "not installed." if found is None else f"{found} is installed but not connected."
+    return Check(
+        "gsplat", "optional", detail, "This version has no CUDA backend that could use it."
+    )
+
+
+def _video() -> Check:
+    try:
+        av = import_module("av")
+    except ImportError as error:
+        return Check("video (PyAV)", "missing", f"{error}.", "Get it with: pip install av.")
+    if "libx264" not in av.codecs_available:
+        remedy = "Get it with: pip install --force-reinstall --only-binary av av."
+        return Check("video (PyAV)", "optional", f"{av.__version__}, no H.264 encoder.", remedy)
+    return Check("video (PyAV)", "ok", f"{av.__version__} with H.264")
+
+
+def _demo() -> Check:
+    try:
+        return Check("demo capture", "ok", str(demo_capture()))
+    except DataError as error:
+        return Check("demo capture", "missing", str(error))
+
+
+def _body_models() -> Check:
+    name = "SMPL bodies"
+    found = _version("body-models")
+    if found is None:
+        remedy = "Get it with: pip install 'evsplat[body-models]' (and your own SMPL files)."
+        return Check(name, "optional", "package body-models is not installed.", remedy)
+    folder = os.environ.get("EVSPLAT_BODY_MODELS")
+    files = f"files in {folder}" if folder else "set EVSPLAT_BODY_MODELS to your SMPL files"
+    return Check(name, "ok", f"body-models {found}, {files}")
+
+
+def _st_lpips() -> Check:
+    if find_spec("stlpips_pytorch") is None:
+        remedy = "Get it with: pip install 'evsplat[perceptual]' (64 MB)."
+        return Check("ST-LPIPS", "optional", "weights are not installed.", remedy)
+    return Check("ST-LPIPS", "ok", f"weights of stlpips-pytorch {_version('stlpips-pytorch')}")
+
+
+def _lpips(network: Literal["alex", "vgg"]) -> Check:
+    from evsplat.evaluation.lpips import load_lpips
+
+    name = f"LPIPS {network}"
+    try:
+        load_lpips(network)
+    except WeightsError as error:
+        return Check(name, "optional", str(error))
+    return Check(name, "ok", "weights found")
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None

@@ -19,6 +19,11 @@ def evaluate(
         run: Run folder written by 'evsplat train'.
         lpips_weights: Backbone weights for LPIPS; without any it stays empty, with the reason.
     """
+    evaluate_and_report(run, lpips_weights)
+
+
+def evaluate_and_report(run: Path, lpips_weights: Path | None = None) -> None:
+    """Measure a run, write its report and print the table."""
     from evsplat.evaluation import evaluate_run
     from evsplat.evaluation.report import write_report
 

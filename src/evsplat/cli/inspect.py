@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from evsplat.cli.options import CaptureFolder, option
+from evsplat.errors import DataError
 
 
 def inspect(
@@ -22,4 +23,7 @@ def inspect(
     """
     from evsplat.capture.inspect import inspect_capture
 
-    inspect_capture(capture, out=out)
+    report = inspect_capture(capture, out or Path("inspect") / capture.resolve().name)
+    if not report.usable:
+        raise DataError(report.summary)
+    print(report.summary)

@@ -1,5 +1,6 @@
 """Reading the command line, and turning what goes wrong into a message and an exit code."""
 
+import logging
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,7 +21,7 @@ _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__: verb for verb in (demo, doctor, inspect, train, evaluate, report, render)
 }
 _DESCRIPTION = (
-    "A sharp, animatable 3D Gaussian person in a scene, from a blurry video and events.\n\n"
+    "A sharp 3D Gaussian person in a scene, from a blurry video and events.\n\n"
     "Start with 'evsplat demo'; 'evsplat VERB --help' tells more."
 )
 _CODE_BAD_INPUT = 2
@@ -37,6 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"evsplat {evsplat.__version__}")
         return 0
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("evsplat").setLevel(logging.INFO)
     try:
         tyro.extras.subcommand_cli_from_dict(
             _VERBS,
@@ -49,6 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"evsplat: {error}", file=sys.stderr)
         return _CODE_BAD_INPUT
     except KeyboardInterrupt as stop:
-        print(f"\nevsplat: stopped. {stop}".rstrip(), file=sys.stderr)
+        print(f"\nevsplat: {stop or 'Stopped.'}", file=sys.stderr)
         return _CODE_INTERRUPTED
     return 0

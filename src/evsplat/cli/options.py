@@ -15,4 +15,5 @@ CaptureFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAP
 RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
 Device = Literal["auto", "cpu", "cuda"]
 NewRunFolder = Annotated[Path | None, option("RUN", default="runs/CAPTURE/METHOD/TIME")]
+Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 Threads = Annotated[int | None, option("N", default="all cores")]

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from evsplat.cli.options import RunFolder, option
+from evsplat.cli.options import Flag, RunFolder, option
 
 
 def render(
@@ -16,7 +16,7 @@ def render(
     slow: Annotated[float, option("FACTOR", default="1")] = 1.0,
     parts: Literal["all", "human", "scene"] = "all",
     camera: Annotated[str | None, option("NAME", default="the recording one")] = None,
-    beside: bool = False,
+    beside: Flag = False,
 ) -> None:
     """Draw a run: the whole recording at any frame rate, or its test frames.
 

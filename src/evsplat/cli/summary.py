@@ -28,6 +28,4 @@ def _cell(values: dict[str, float | None] | None) -> str:
     """Format one region; a figure that could not be measured is a dash."""
     values = values or {}
     psnr, ssim = values.get("psnr"), values.get("ssim")
-    return (
-        f"{'-' if psnr is None else f'{psnr:.2f}'} / {'-' if ssim is None else f'{ssim:.3f}'}"
-    )
+    return f"{'-' if psnr is None else f'{psnr:.2f}'} / {'-' if ssim is None else f'{ssim:.3f}'}"

@@ -1,10 +1,11 @@
 """``evsplat train``: fit a method to a capture, then evaluate it and write the report."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
-from evsplat.cli.options import CaptureFolder, Device, NewRunFolder, Threads, option
-from evsplat.cli.summary import print_summary
+from evsplat.cli.evaluate import evaluate_and_report
+from evsplat.cli.options import CaptureFolder, Device, Flag, NewRunFolder, Threads, option
 
 
 def train(
@@ -16,14 +17,14 @@ def train(
     device: Device = "auto",
     iterations: Annotated[int | None, option("N", default="the method's")] = None,
     max_minutes: Annotated[float | None, option("M", default="no limit")] = None,
-    resume: bool = False,
+    resume: Flag = False,
     config: Annotated[Path | None, option("FILE", default="the method's")] = None,
     overrides: Annotated[
         tuple[str, ...], option("[KEY=VALUE ...]", default="none", name="set")
     ] = (),
     threads: Threads = None,
     seed: Annotated[int | None, option("S", default="the method's")] = None,
-    evaluate: bool = True,
+    evaluate: Flag = True,
 ) -> None:
     """Train a method on a capture, then evaluate it and write report.html.
 
@@ -44,25 +45,32 @@ def train(
         evaluate: Skip the evaluation and the report at the end.
     """
     from evsplat.training import train as train_run
+    from evsplat.training.train import Stopped
 
-    run = train_run(
-        capture,
-        method=method,
-        out=out,
-        device=device,
-        iterations=iterations,
-        max_minutes=max_minutes,
-        resume=resume,
-        config=config,
-        overrides=overrides,
-        threads=threads,
-        seed=seed,
-    )
+    try:
+        run = train_run(
+            capture,
+            method=method,
+            out=out,
+            device=device,
+            iterations=iterations,
+            max_minutes=max_minutes,
+            resume=resume,
+            config=config,
+            overrides=overrides,
+            threads=threads,
+            seed=seed,
+        )
+    except Stopped as stop:
+        command = shlex.join(["evsplat", "train", str(capture), "--out", str(stop.run), "--resume"])
+        raise KeyboardInterrupt(f"Stopped and saved. Go on with: {command}") from None
     if not evaluate:
         print(f"run: {run}")
         return
-    from evsplat.evaluation import evaluate_run
-    from evsplat.evaluation.report import write_report
-
-    metrics = evaluate_run(run)
-    print_summary(metrics, run=run, report=write_report(run))
+    try:
+        evaluate_and_report(run)
+    except KeyboardInterrupt:
+        command = shlex.join(["evsplat", "evaluate", str(run)])
+        raise KeyboardInterrupt(
+            f"Stopped; the training is finished and saved. Go on with: {command}"
+        ) from None

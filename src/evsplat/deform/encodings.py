@@ -63,8 +63,8 @@ class HashGridEncoding(nn.Module):
     """Multi-resolution hash grid (Instant-NGP), trilinear, gradients to table and positions.
 
     Defaults as configured for the non-rigid network of 3DGS-Avatar (method.md 1.5): 16 levels of 2
-    features, tables of 2^16, resolutions 16 to 2048. Level l has ``floor(base b^l)`` cells per axis;
-    it is stored densely while its vertices fit in the table, and hashed from there on.
+    features, tables of 2^16, resolutions 16 to 2048. Level l has ``floor(base b^l)`` cells per
+    axis; it is stored densely while its vertices fit in the table, and hashed from there on.
     """
 
     def __init__(
@@ -86,96 +86,103 @@ class HashGridEncoding(nn.Module):
         self.table_mask = 2**log2_table - 1
         sizes = [min((cells + 1) ** 3, 2**log2_table) for cells in self.resolutions]
         self.offsets = tuple(sum(sizes[:level]) for level in range(levels + 1))
-        self.table = nn.Parameter(torch.empty(sum(sizes), features).uniform_(-1e-4, 1e-4))
+        # One row per feature: gathers and sums then run along contiguous memory.
+        self.table = nn.Parameter(torch.empty(features, sum(sizes)).uniform_(-1e-4, 1e-4))
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch D"]:
         """Encode positions in [0, 1]."""
         clamped = positions.clamp(0, 1).reshape(-1, 3)
         encoded: Tensor = _HashGridLookup.apply(clamped, self.table, self)
-        return encoded.unflatten(0, positions.shape[:-1])
+        return encoded.T.unflatten(0, positions.shape[:-1])
 
     def cell(
-        self, positions: Float[Tensor, "N 3"], level: int
-    ) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 3"]]:
-        """Table rows of the eight corners around each position (x slowest), and place in the cell."""
+        self, positions: Float[Tensor, "3 N"], level: int
+    ) -> tuple[Int[Tensor, "2 2 2 N"], Float[Tensor, "3 N"]]:
+        """Table entries of the eight corners (x, y, z) of each position's cell, and place in it."""
         cells = self.resolutions[level]
         scaled = positions * cells
-        corner = scaled.floor().clamp_max(cells - 1)
+        corner = scaled.floor().clamp_max_(cells - 1)
         low = corner.long()
         dense = self.offsets[level + 1] - self.offsets[level] == (cells + 1) ** 3
         strides = (1, cells + 1, (cells + 1) ** 2) if dense else _HASH_PRIMES
-        x, y, z = (torch.stack((axis, axis + 1), -1) for axis in low.unbind(-1))
-        x, y, z = x[:, :, None, None] * strides[0], y[:, None, :, None] * strides[1], z * strides[2]
-        if dense:
-            rows = x + y + z[:, None, None, :]
-        else:
-            rows = (x ^ y ^ z[:, None, None, :]) & self.table_mask
-        return rows.flatten(1) + self.offsets[level], scaled - corner
+        x, y, z = (
+            torch.stack((axis, axis + 1)).mul_(stride)
+            for axis, stride in zip(low, strides, strict=True)
+        )
+        x, y = x[:, None, None], y[:, None]
+        entries = x + (y + z) if dense else (x ^ (y ^ z)).bitwise_and_(self.table_mask)
+        return entries.add_(self.offsets[level]), scaled.sub_(corner)
 
 
 class _HashGridLookup(torch.autograd.Function):
-    """Per level: gather eight rows and blend. Level by level, so that indices stay in cache."""
+    """Per level: gather the eight corners and blend. Points are the last axis, for speed."""
 
     @staticmethod
     def forward(
         ctx: Any, positions: Tensor, table: Tensor, grid: HashGridEncoding
-    ) -> Float[Tensor, "N D"]:
-        encoded = []
-        ctx.cells = []
-        for level in range(len(grid.resolutions)):
-            rows, inside = grid.cell(positions, level)
-            shares = _corner_shares(*_axis_shares(inside))
-            encoded.append(
-                nn.functional.embedding_bag(rows, table, per_sample_weights=shares, mode="sum")
-            )
-            ctx.cells.append((rows, inside))
+    ) -> Float[Tensor, "D N"]:
+        transposed = positions.T.contiguous()
+        encoded = positions.new_empty(grid.dim, len(positions))
+        cells = [grid.cell(transposed, level) for level in range(len(grid.resolutions))]
+        rows = iter(encoded)
+        for entries, inside in cells:
+            shares = _corner_shares(inside)
+            for feature in table:
+                corners = feature.index_select(0, entries.view(-1)).view_as(shares)
+                torch.sum(corners.mul_(shares).flatten(0, 2), 0, out=next(rows))
+        ctx.cells = cells
         ctx.save_for_backward(table)
         ctx.resolutions = grid.resolutions
-        return torch.cat(encoded, -1)
+        return encoded
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         (table,) = ctx.saved_tensors
-        features = table.shape[1]
-        place = torch.arange(features, device=table.device)
-        table_gradient = torch.zeros_like(table).view(-1) if ctx.needs_input_grad[1] else None
-        position_gradient = None
-        by_level = gradients[0].split(features, -1)
-        for (rows, inside), cells, gradient in zip(
+        need_positions, need_table = ctx.needs_input_grad[:2]
+        table_gradient = torch.zeros_like(table) if need_table else None
+        position_gradient = torch.zeros_like(ctx.cells[0][1]) if need_positions else None
+        by_level = gradients[0].contiguous().split(len(table))
+        for (entries, inside), cells, gradient in zip(
             ctx.cells, ctx.resolutions, by_level, strict=True
         ):
-            axes = _axis_shares(inside)
+            flat = entries.view(-1)
             if table_gradient is not None:
-                flat = (rows[..., None] * features + place).view(-1)
-                spread = _corner_shares(*axes)[..., None] * gradient[:, None, :]
-                table_gradient.scatter_add_(0, flat, spread.view(-1))
-            if ctx.needs_input_grad[0]:
-                corners = table.index_select(0, rows.view(-1)).view(*rows.shape, features)
-                pull = (corners * gradient[:, None, :]).sum(-1)
-                slope = torch.stack(
-                    [(pull * _corner_shares(*_replace(axes, axis))).sum(-1) for axis in range(3)], -1
-                )
-                step = slope * cells
-                position_gradient = step if position_gradient is None else position_gradient + step
-        shaped = None if table_gradient is None else table_gradient.view_as(table)
-        return position_gradient, shaped, None
+                shares = _corner_shares(inside)
+                for row, step in zip(table_gradient, gradient, strict=True):
+                    row.scatter_add_(0, flat, (shares * step).view(-1))
+            if position_gradient is not None:
+                pull = torch.zeros_like(entries, dtype=table.dtype)
+                for feature, step in zip(table, gradient, strict=True):
+                    pull.addcmul_(feature.index_select(0, flat).view_as(pull), step)
+                position_gradient += cells * _blend_slopes(pull, inside)
+        transposed = None if position_gradient is None else position_gradient.T
+        return transposed, table_gradient, None
 
 
-def _axis_shares(inside: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    x, y, z = (torch.stack((1 - axis, axis), -1) for axis in inside.unbind(-1))
-    return x, y, z
+def _corner_shares(inside: Float[Tensor, "3 N"]) -> Float[Tensor, "2 2 2 N"]:
+    """Trilinear weights of the corners of a cell."""
+    x, y, z = torch.stack((1 - inside, inside), 1)
+    return x[:, None, None] * (y[:, None] * z)
 
 
-def _replace(axes: tuple[Tensor, Tensor, Tensor], axis: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The shares with those of one axis replaced by their derivative, (-1, +1)."""
-    slope = axes[axis].new_tensor([-1.0, 1.0]).expand_as(axes[axis])
-    x, y, z = (slope if index == axis else share for index, share in enumerate(axes))
-    return x, y, z
-
-
-def _corner_shares(x: Tensor, y: Tensor, z: Tensor) -> Float[Tensor, "N 8"]:
-    return (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).flatten(1)
+def _blend_slopes(
+    corners: Float[Tensor, "2 2 2 N"], inside: Float[Tensor, "3 N"]
+) -> Float[Tensor, "3 N"]:
+    """Derivatives of the trilinear blend of ``corners`` along x, y, z of the cell."""
+    x, y, z = inside
+    along_z = corners[:, :, 1] - corners[:, :, 0]
+    at_z = torch.addcmul(corners[:, :, 0], z, along_z)
+    along_y = at_z[:, 1] - at_z[:, 0]
+    at_yz = torch.addcmul(at_z[:, 0], y, along_y)
+    slope_z = torch.lerp(along_z[:, 0], along_z[:, 1], y)
+    return torch.stack(
+        (
+            at_yz[1] - at_yz[0],
+            torch.lerp(along_y[0], along_y[1], x),
+            torch.lerp(slope_z[0], slope_z[1], x),
+        )
+    )
 
 
 def _quartic_cdf(u: Tensor) -> Tensor:

@@ -206,17 +206,17 @@ class HumanSceneModel(nn.Module):
         rotations = None
         if float(torch.rand((), generator=generator)) < config.pose_noise_probability:
             rotations = config.pose_noise * torch.randn(1, joints, 3, 3, generator=generator)
-            rotations = rotations.expand(times, -1, -1, -1)
+            rotations = rotations.expand(times, -1, -1, -1).to(self.box_low.device)
         turn = view_jitter(generator, symmetric=True) if config.view_noise else torch.eye(3)
         hide = float(torch.rand((), generator=generator)) < config.scene_direction_dropout
-        return Noise(rotations, turn, hide)
+        return Noise(rotations, turn.to(self.box_low.device), hide)
 
     def _moving_rows(self) -> Tensor | slice:
         """Rows that the networks see: the person's, and with ``ste`` scene rows inside the box."""
         if self.semantics != "ste":
             return self.gaussians.human
         inside = self._scene_inside_box()
-        people = torch.arange(self.gaussians.human_count)
+        people = torch.arange(self.gaussians.human_count, device=inside.device)
         return torch.cat([people, torch.nonzero(inside)[:, 0] + self.gaussians.human_count])
 
     def _scene_inside_box(self) -> Bool[Tensor, " S"]:
@@ -255,9 +255,13 @@ class HumanSceneModel(nn.Module):
         log_scales = self.gaussians.scales_log[rows][None]
         quaternions = self.gaussians.quaternions[rows][None]
         if not self.non_rigid_active:
-            feature = canonical.new_zeros(len(rotations), len(canonical), self.non_rigid.feature_dim)
+            feature = canonical.new_zeros(
+                len(rotations), len(canonical), self.non_rigid.feature_dim
+            )
             return canonical[None], log_scales, quaternions, feature
-        seen = rotations if noise is None or noise.rotations is None else rotations + noise.rotations
+        seen = (
+            rotations if noise is None or noise.rotations is None else rotations + noise.rotations
+        )
         delta = self.non_rigid(self.normalise(canonical), self.pose_encoder(seen))
         return (
             canonical + delta.offset,
@@ -289,13 +293,15 @@ class HumanSceneModel(nn.Module):
     def _time_weights(self, times_us: Sequence[int]) -> Float[Tensor, "T F"]:
         """Linear interpolation between the training frames around each time; held at the ends."""
         anchors = self.get_buffer("frame_times")
-        times = torch.as_tensor(list(times_us), dtype=torch.float64).clamp(anchors[0], anchors[-1])
+        times = torch.tensor(list(times_us), dtype=torch.float64, device=anchors.device).clamp(
+            anchors[0], anchors[-1]
+        )
         after = torch.searchsorted(anchors, times).clamp(1, max(len(anchors) - 1, 1))
         if len(anchors) == 1:
-            return torch.ones(len(times), 1)
+            return torch.ones(len(times), 1, device=anchors.device)
         before = after - 1
         share = (times - anchors[before]) / (anchors[after] - anchors[before])
-        weights = torch.zeros(len(times), len(anchors), dtype=torch.float64)
+        weights = torch.zeros(len(times), len(anchors), dtype=torch.float64, device=anchors.device)
         weights.scatter_(1, before[:, None], (1 - share)[:, None])
         weights.scatter_(1, after[:, None], share[:, None])
         return weights.float()

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.deform.encodings import HashGridEncoding, OneBlobEncoding
-from evsplat.deform.mlp import PointMLP
+from evsplat.deform.mlp import PointMLP, Precision
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class NonRigid:
 class NonRigidNetwork(nn.Module):
     """Encoded position and pose vector to deformation (method.md 1.5, A9).
 
-    Defaults: 3 hidden layers of 128, 16 features. The first quaternion component is always 1, so the
-    network gives three (the released code computes and overwrites a fourth).
+    Defaults: 3 hidden layers of 128, 16 features. The first quaternion component is always 1, so
+    the network gives three (the released code computes and overwrites a fourth).
     """
 
     def __init__(
@@ -39,6 +39,7 @@ class NonRigidNetwork(nn.Module):
         depth: int = 3,
         feature_dim: int = 16,
         last_layer_std: float | None = 1e-3,
+        precision: Precision = "float32",
     ) -> None:
         """``last_layer_std`` None starts the last layer as any other, as the released code does.
 
@@ -49,7 +50,14 @@ class NonRigidNetwork(nn.Module):
         self.encoding = encoding
         self.feature_dim = feature_dim
         self.mlp = PointMLP(
-            encoding.dim, pose_dim, 0, width, depth, 9 + feature_dim, last_std=last_layer_std
+            encoding.dim,
+            pose_dim,
+            0,
+            width,
+            depth,
+            9 + feature_dim,
+            last_std=last_layer_std,
+            precision=precision,
         )
 
     def forward(self, positions: Float[Tensor, "N 3"], pose: Float[Tensor, "T P"]) -> NonRigid:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.body.tree import joint_depths
-from evsplat.deform.mlp import PointMLP
+from evsplat.deform.mlp import PointMLP, Precision
 
 
 class HierarchicalSoftmax(nn.Module):
@@ -93,10 +93,16 @@ class SkinningNetwork(nn.Module):
     Defaults: 4 hidden layers of 128, no position encoding, no temperature.
     """
 
-    def __init__(self, parents: Sequence[int], width: int = 128, depth: int = 4) -> None:
+    def __init__(
+        self,
+        parents: Sequence[int],
+        width: int = 128,
+        depth: int = 4,
+        precision: Precision = "float32",
+    ) -> None:
         super().__init__()
         self.softmax = HierarchicalSoftmax([int(parent) for parent in parents])
-        self.mlp = PointMLP(3, 0, 0, width, depth, self.softmax.logits)
+        self.mlp = PointMLP(3, 0, 0, width, depth, self.softmax.logits, precision=precision)
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch J"]:
         """Weights at positions in [-1, 1]; each sums to one."""

@@ -8,10 +8,11 @@ from torch import Tensor
 def sh_basis(
     directions: Float[Tensor, "*batch 3"], degree: int = 3, constant: bool = False
 ) -> Float[Tensor, "*batch K"]:
-    """Basis values up to ``degree`` (0..3) of unit directions; K = (degree + 1)^2, less the constant.
+    """Basis values up to ``degree`` (0..3) of unit directions.
 
-    Order l, then m = -l..l; signs as in 3DGS (with the Condon-Shortley phase). Without the constant
-    degree 3 gives the 15 values of the colour networks (method.md 1.7).
+    K = (degree + 1)^2, less the constant. Order l, then m = -l..l; signs as in 3DGS (with the
+    Condon-Shortley phase). Degree 3 without the constant gives the 15 values of the colour networks
+    (method.md 1.7).
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"degree is {degree}, expected 0..3")

@@ -34,6 +34,7 @@ from evsplat.evaluation.tally import Tally, all_absent, without_reasons
 from evsplat.files import write_json
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
+from evsplat.render import choose_device
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +66,9 @@ def evaluate(
     protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
     people = People(capture)
     test = _TestFrames(capture, reconstruction, protocols, networks, people, out_dir)
-    for frame in tqdm(capture.test_frames, desc="test frames", unit="frame", leave=False):
+    for frame in tqdm(
+        capture.test_frames, desc="test frames", unit="frame", leave=False, disable=None
+    ):
         test.measure(frame)
     result = {
         "capture": capture.name,
@@ -96,14 +99,15 @@ def evaluate_run(run_dir: Path | str, *, lpips_weights: Path | str | None = None
         run.reconstruction,
         out_dir=run.path,
         lpips_weights=lpips_weights,
-        device=run.device,
+        # run.device is where it was trained, which may be another machine
+        device=choose_device("auto"),
     )
     metrics = {
         "capture": measured.pop("capture"),
         "method": measured.pop("method"),
         "iteration": run.iteration,
         "train_seconds": run.train_seconds,
-        "device": str(run.device),
+        "device": run.device,
         "gaussians": run.gaussians,
         **measured,
     }
@@ -231,31 +235,37 @@ def _novel_views(
     reasons: dict[str, str],
 ) -> dict[str, Any]:
     """Standard figures of cameras that took no part in the training; empty where there are none."""
-    result: dict[str, Any] = {}
-    for name in dict.fromkeys(view.camera for view in capture.novel_views):
-        tally = Tally(("full", "person_crop"))
-        views = [view for view in capture.novel_views if view.camera == name]
-        per_view = []
-        for view in tqdm(views, desc=f"novel view {name}", unit="picture", leave=False):
-            person = people.in_view(capture.cameras[name], view.time_us)
+    tallies: dict[str, Tally] = {}
+    per_view: dict[str, list[dict[str, Any]]] = {}
+    for view in tqdm(
+        capture.novel_views, desc="novel views", unit="picture", leave=False, disable=None
+    ):
+        ours = _render_view(capture, reconstruction, view)
+        if isinstance(ours, Absent):
+            measured = all_absent(ours.reason)
+        else:
+            person = people.in_view(capture.cameras[view.camera], view.time_us)
             truth = Truth(STANDARD, capture.novel_image(view), None, person, networks)
-            ours = _render_view(capture, reconstruction, view)
             measured = truth.measure(ours)
-            tally.add(measured)
-            path = f"pictures/{file_stem('novel', name, view.frame)}_render.png"
+        tallies.setdefault(view.camera, Tally(("full", "person_crop"))).add(measured)
+        entry = {
+            "index": view.index,
+            "frame": view.frame,
+            "time_us": view.time_us,
+            "psnr": without_reasons(measured)["full"]["psnr"],
+            "psnr_person_crop": without_reasons(measured)["person_crop"]["psnr"],
+            "pictures": {},
+        }
+        if not isinstance(ours, Absent):
+            path = f"pictures/{file_stem('novel', view.camera, f'{view.index:04d}')}_render.png"
             save_png(out_dir / path, to_bytes(ours))
-            per_view.append(
-                {
-                    "frame": view.frame,
-                    "time_us": view.time_us,
-                    "psnr": without_reasons(measured)["full"]["psnr"],
-                    "psnr_person_crop": without_reasons(measured)["person_crop"]["psnr"],
-                    "pictures": {"render": path},
-                }
-            )
+            entry["pictures"] = {"render": path}
+        per_view.setdefault(view.camera, []).append(entry)
+    result = {}
+    for name, tally in tallies.items():
         means, why = tally.means()
         reasons.update({f"novel_views.{name}.{key}": reason for key, reason in why.items()})
-        result[name] = {**means, "per_view": per_view}
+        result[name] = {**means, "per_view": per_view[name]}
     if not result:
         reasons["novel_views"] = "the capture has no novel views"
     return result
@@ -269,8 +279,12 @@ def _render(capture: Capture, source: Reconstruction, frame: Frame) -> Float[Ten
 @torch.no_grad()
 def _render_view(
     capture: Capture, source: Reconstruction, view: NovelView
-) -> Float[Tensor, "H W 3"]:
-    return source.render(capture.cameras[view.camera], [view.time_us]).rgb[0].cpu()
+) -> Float[Tensor, "H W 3"] | Absent:
+    """The view as the method draws it; trivial methods know the recording camera only."""
+    try:
+        return source.render(capture.cameras[view.camera], [view.time_us]).rgb[0].cpu()
+    except DataError as error:
+        return Absent(str(error))
 
 
 def _trivial(

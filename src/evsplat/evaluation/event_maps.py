@@ -32,7 +32,7 @@ class EventPair:
 
     @property
     def split(self) -> str:
-        """ "test" where one of the two frames was held out."""
+        """Split of the pair: test where one of the two frames was held out."""
         return "test" if "test" in (self.before.split, self.after.split) else "train"
 
     @property

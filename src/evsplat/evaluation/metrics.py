@@ -1,5 +1,6 @@
 """Peak signal-to-noise ratio and structural similarity of two images, every choice explicit."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,7 +44,7 @@ def psnr_channel_mean(
 
 @dataclass(frozen=True)
 class Ssim:
-    """One definition of structural similarity (Wang et al. 2004); the value depends on all of it."""
+    """One definition of structural similarity (Wang et al. 2004); each field changes the value."""
 
     window: Literal["gaussian", "uniform"] = "gaussian"
     size: int = 11
@@ -51,7 +52,7 @@ class Ssim:
     sigma: float = 1.5
     """Standard deviation of the Gaussian window in pixels; not read by the uniform one."""
     padding: Literal["valid", "zero"] = "valid"
-    """valid: only windows inside the image count. zero: windows reach over the border into zeros."""
+    """valid: only windows inside the image count. zero: they reach over its border into zeros."""
     data_range: float = 1.0
     """Largest minus smallest possible value; the stabilising constants scale with its square."""
     sample_covariance: bool = False
@@ -80,16 +81,24 @@ def ssim_map(
         raise ValueError(f"the {size}-pixel window is larger than the image")
 
     if settings.window == "gaussian":
-        position = torch.arange(size, dtype=image.dtype, device=image.device) - size // 2
-        kernel = torch.exp(-0.5 * (position / settings.sigma) ** 2)
-        kernel = kernel / kernel.sum()
+        offsets = range(-(size // 2), size // 2 + 1)
+        bell = [math.exp(-0.5 * (offset / settings.sigma) ** 2) for offset in offsets]
+        kernel = [weight / sum(bell) for weight in bell]
     else:
-        kernel = torch.full((size,), 1.0 / size, dtype=image.dtype, device=image.device)
+        kernel = [1.0 / size] * size
     pad = size // 2 if settings.padding == "zero" else 0
 
     def smooth(planes: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
-        rows = F.conv2d(planes[:, None], kernel.view(1, 1, -1, 1), padding=(pad, 0))
-        return F.conv2d(rows, kernel.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
+        # Shifted sums: torch's convolution is many times slower in float64.
+        padded = F.pad(planes, (pad, pad, pad, pad))
+        rows, columns = padded.shape[1] - size + 1, padded.shape[2] - size + 1
+        down = kernel[0] * padded[:, :rows]
+        for k in range(1, size):
+            down = torch.add(down, padded[:, k : k + rows], alpha=kernel[k])
+        across = kernel[0] * down[:, :, :columns]
+        for k in range(1, size):
+            across = torch.add(across, down[:, :, k : k + columns], alpha=kernel[k])
+        return across
 
     x, y = image.movedim(-1, 0), reference.movedim(-1, 0)
     mean_x, mean_y = smooth(x), smooth(y)

@@ -1,6 +1,7 @@
 """Pictures of what was measured: error maps, signed event maps, PNG files."""
 
 import re
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -64,5 +65,12 @@ def save_png(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
 
 
 def file_stem(*parts: str) -> str:
-    """Names joined with "_", reduced to letters, digits, dot and dash."""
-    return "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", part) for part in parts)
+    """Names joined with "_", reduced to letters, digits, dot, dash and underscore.
+
+    A name that loses something gets a checksum, so that two such names stay apart.
+    """
+    stems = []
+    for part in parts:
+        safe = re.sub(r"[^A-Za-z0-9._-]+", "-", part)
+        stems.append(safe if safe == part else f"{safe}-{zlib.crc32(part.encode()):08x}")
+    return "_".join(stems)

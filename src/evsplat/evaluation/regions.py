@@ -1,9 +1,11 @@
 """The parts of a picture that are measured by themselves: the person's box, the person's pixels."""
 
 from dataclasses import dataclass
+from typing import TypeVar
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from evsplat.body import BodyTrack, skin
@@ -11,6 +13,8 @@ from evsplat.body import body_box as projected_box
 from evsplat.capture.camera import Camera
 
 CROP_MARGIN = 0.1
+
+Picture = TypeVar("Picture", Tensor, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -22,8 +26,8 @@ class Box:
     left: int
     right: int
 
-    def crop(self, image: Float[Tensor, "H W *C"]) -> Float[Tensor, "h w *C"]:
-        """The part of ``image`` inside the box."""
+    def crop(self, image: Picture) -> Picture:
+        """The part of ``image`` (H, W, ...) inside the box."""
         return image[self.top : self.bottom, self.left : self.right]
 
     def enlarged(self, margin: float, height: int, width: int) -> "Box":
@@ -36,6 +40,13 @@ class Box:
             max(self.left - columns, 0),
             min(self.right + columns, width),
         )
+
+    def at_least(self, aspect: float, height: int, width: int) -> "Box":
+        """Widened to ``aspect`` times its height, about its centre but inside the picture."""
+        columns = min(width, max(self.right - self.left, round(aspect * (self.bottom - self.top))))
+        left = (self.left + self.right - columns) // 2
+        left = min(max(left, 0), width - columns)
+        return Box(self.top, self.bottom, left, left + columns)
 
     def without_last(self) -> "Box":
         """Without its last row and column."""
@@ -52,7 +63,7 @@ def mask_box(mask: Bool[Tensor, "H W"]) -> Box | None:
 
 
 def body_box(track: BodyTrack, camera: Camera, time_us: int) -> Box | None:
-    """Smallest box around the posed body as ``camera`` sees it at ``time_us``; None if out of view."""
+    """Smallest box around the posed body as ``camera`` sees it; None where it is out of view."""
     rotations, translation = track.at([time_us])
     bones = track.body.bone_transforms(rotations, translation)
     vertices, _ = skin(track.body.rest_vertices, track.body.weights, bones)

@@ -12,7 +12,7 @@ ROW_TITLES = {
     "nearest_frame": "nearest training frame (trivial)",
     "blurry_input": "blurry input itself (no method sees it)",
 }
-REGION_TITLES = {"full": "full", "person_crop": "person crop", "person_mask": "person mask"}
+REGION_TITLES = {"full": "full frame", "person_crop": "person crop", "person_mask": "person mask"}
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,11 @@ class Column:
     def higher_is_better(self) -> bool:
         """PSNR and SSIM grow with likeness, distances shrink."""
         return self.metric in ("psnr", "ssim")
+
+    @property
+    def arrow(self) -> str:
+        """Where better is."""
+        return "↑" if self.higher_is_better else "↓"
 
     @property
     def decimals(self) -> int:
@@ -182,8 +187,7 @@ def latex(metrics: dict[str, Any]) -> str:
 
 
 def _heading(column: Column) -> str:
-    arrow = "↑" if column.higher_is_better else "↓"
-    return f"{REGION_TITLES[column.region]} {METRIC_TITLES[column.metric]} {arrow}"
+    return f"{REGION_TITLES[column.region]} {METRIC_TITLES[column.metric]} {column.arrow}"
 
 
 _LATEX_SPECIAL = {

@@ -186,16 +186,16 @@ def write_events(path: Path | str, stream: EventStream, *, compression_level: in
         "y": stream.y.astype(np.uint16),
         "p": (stream.p > 0).astype(np.uint8),
     }
+    packing: dict[str, Any] = {
+        "chunks": (min(CHUNK_EVENTS, len(stream)),),
+        "compression": "gzip",
+        "compression_opts": compression_level,
+        # bytes of equal weight together: neighbouring times share their high bytes
+        "shuffle": True,
+    }
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         for name, values in columns.items():
-            file.create_dataset(
-                f"events/{name}",
-                data=values,
-                chunks=(min(CHUNK_EVENTS, max(1, len(values))),),
-                compression="gzip",
-                compression_opts=compression_level,
-                # bytes of equal weight together: neighbouring times share their high bytes
-                shuffle=True,
-            )
+            # HDF5 has no chunks of nothing
+            file.create_dataset(f"events/{name}", data=values, **(packing if len(t) else {}))
         file["ms_to_idx"] = milliseconds_to_index(t)
         file["t_offset"] = np.int64(offset)

@@ -1,4 +1,4 @@
-"""Writing a stream of pictures as an H.264 video or as a folder of PNG files, whole or not at all."""
+"""Writing pictures as an H.264 video or as a folder of PNG files, whole or not at all."""
 
 import shutil
 import tempfile

@@ -2,7 +2,7 @@
 
 from evsplat.gaussians.densify import DensifyConfig, Edit, ScreenStatistics, densify
 from evsplat.gaussians.flip import BodyFrames, flip_labels
-from evsplat.gaussians.gaussian_set import ATTRIBUTES, FEATURE_DIM, GaussianSet
+from evsplat.gaussians.gaussian_set import ATTRIBUTES, FEATURE_DIM, GaussianSet, Part
 from evsplat.gaussians.posed import Parts, PosedGaussians, PosedHuman, StaticScene
 from evsplat.gaussians.row_adam import RowAdam
 
@@ -13,6 +13,7 @@ __all__ = [
     "DensifyConfig",
     "Edit",
     "GaussianSet",
+    "Part",
     "Parts",
     "PosedGaussians",
     "PosedHuman",

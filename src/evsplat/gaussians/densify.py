@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from evsplat.gaussians.gaussian_set import ATTRIBUTES, GaussianSet, person_first
-from evsplat.gaussians.initialise import logit
 from evsplat.body.rotations import quaternion_to_matrix
+from evsplat.gaussians.gaussian_set import ATTRIBUTES, GaussianSet, Part, person_first
+from evsplat.gaussians.initialise import logit
 from evsplat.gaussians.row_adam import RowAdam
 
 
@@ -93,17 +93,19 @@ def densify(
     gaussians: GaussianSet,
     optimiser: RowAdam,
     statistics: ScreenStatistics,
-    limits: dict[str, DensifyConfig],
+    limits: dict[Part, DensifyConfig],
     nominal: float,
     generator: torch.Generator,
 ) -> Edit:
     """Clone, split and prune every class that is in its window; labels are inherited exactly.
 
-    Optimiser moments follow kept rows and start at zero for new ones.
+    ``limits`` may name ``human`` and ``scene``; a class without limits is left alone. Optimiser
+    moments follow kept rows and start at zero for new ones.
     """
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     clone, split = torch.zeros_like(keep), torch.zeros_like(keep)
-    for rows, limit in ((gaussians.human, limits["human"]), (gaussians.scene, limits["scene"])):
+    for part, limit in limits.items():
+        rows = gaussians.rows_of(part)
         if limit.start <= nominal < limit.end:
             keep[rows], clone[rows], split[rows] = _decide(
                 gaussians, statistics, rows, limit, nominal
@@ -140,9 +142,7 @@ def rebuild(
     ``values`` holds the new rows, ``source`` the old row each comes from, ``fresh`` whether its
     moments restart, ``is_human`` its class.
     """
-    order, human_count = person_first(
-        is_human, torch.arange(len(source), device=source.device)
-    )
+    order, human_count = person_first(is_human, torch.arange(len(source), device=source.device))
     gaussians.set_rows({name: value[order] for name, value in values.items()}, human_count)
     parameters = {name: getattr(gaussians, name) for name in ATTRIBUTES}
     optimiser.move_rows(parameters, source[order], fresh[order])

@@ -81,7 +81,8 @@ def _nearest(
     vertices: Float[Tensor, "V 3"], points: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, " M"], Int[Tensor, " M"]]:
     distance, index = cKDTree(vertices.cpu().numpy()).query(points.cpu().numpy())
-    return torch.from_numpy(distance).float(), torch.from_numpy(index).long()
+    device = points.device
+    return torch.from_numpy(distance).float().to(device), torch.from_numpy(index).to(device)
 
 
 def _nearest_over_frames(
@@ -89,9 +90,9 @@ def _nearest_over_frames(
 ) -> tuple[Float[Tensor, " M"], Int[Tensor, " M"], Int[Tensor, " M"]]:
     """Distance, frame and vertex of the nearest posed body vertex over all frames."""
     canonical = frames.body.canonical_vertices()
-    best = torch.full((len(points),), torch.inf)
-    best_frame = torch.zeros(len(points), dtype=torch.long)
-    best_vertex = torch.zeros(len(points), dtype=torch.long)
+    best = torch.full((len(points),), torch.inf, device=points.device)
+    best_frame = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    best_vertex = torch.zeros_like(best_frame)
     for number in range(len(frames.bones)):
         transforms = torch.einsum("vj,jab->vab", frames.body.weights, frames.bones[number])
         posed = (transforms[:, :3, :3] @ canonical[..., None])[..., 0] + transforms[:, :3, 3]

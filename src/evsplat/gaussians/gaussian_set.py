@@ -1,6 +1,7 @@
 """The one set of Gaussians: person and scene together, told apart by a semantic attribute."""
 
 from collections.abc import Mapping
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,6 +16,9 @@ ATTRIBUTES = (
     "semantic_logits",
 )
 FEATURE_DIM = 32
+
+Part = Literal["human", "scene"]
+"""The two classes."""
 
 
 class GaussianSet(nn.Module):
@@ -64,6 +68,10 @@ class GaussianSet(nn.Module):
     def scene(self) -> slice:
         """Rows of the scene."""
         return slice(self.human_count, len(self))
+
+    def rows_of(self, part: Part) -> slice:
+        """Rows of one class by its name."""
+        return self.human if part == "human" else self.scene
 
     def opacities(self) -> Float[Tensor, " N"]:
         """Opacity in (0, 1)."""

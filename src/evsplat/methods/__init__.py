@@ -18,9 +18,7 @@ def method_config(method: str, values: dict[str, Any], *, where: str) -> PaperCo
     if method not in TRAINABLE:
         near = difflib.get_close_matches(method, TRAINABLE, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
-        raise ConfigError(
-            f"--method {method}: unknown; methods are {', '.join(TRAINABLE)}.{hint}"
-        )
+        raise ConfigError(f"--method {method}: unknown; methods are {', '.join(TRAINABLE)}.{hint}")
     return from_dict(TRAINABLE[method][0], values, where=where)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from evsplat.deform.human_scene import HumanSceneModel
-from evsplat.gaussians import BodyFrames, DensifyConfig
+from evsplat.gaussians import BodyFrames, DensifyConfig, Part
 from evsplat.methods.config import OptimisationConfig, Weight
 from evsplat.objectives import Objective
 
@@ -19,7 +19,7 @@ class Composition:
     weights: dict[str, Weight]
     """Weight per named term; a term without one is an error of the method."""
     optimisation: OptimisationConfig
-    densify: dict[str, DensifyConfig]
+    densify: dict[Part, DensifyConfig]
     """Limits for ``human`` and ``scene``."""
     body_frames: BodyFrames
     """The body at the training frames, for Gaussians that change class."""

@@ -16,7 +16,7 @@ from evsplat.body.canonical import find_legs
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
 from evsplat.errors import ConfigError, DataError
-from evsplat.gaussians import BodyFrames, DensifyConfig, GaussianSet
+from evsplat.gaussians import BodyFrames, DensifyConfig, GaussianSet, Part
 from evsplat.gaussians.initialise import (
     backdrop_depth,
     gaussians_at,
@@ -144,20 +144,26 @@ class PaperConfig:
     skinning_prefit_steps: int = 400
     """Steps of fitting the skinning network alone before training proper."""
     optimisation: OptimisationConfig = field(default_factory=OptimisationConfig)
-    densify_human: DensifyConfig = field(
-        default_factory=lambda: DensifyConfig(max_count=30_000)
-    )
-    densify_scene: DensifyConfig = field(
-        default_factory=lambda: DensifyConfig(
-            prune_opacity=0.005,
-            prune_screen_px=None,
-            prune_scale_m=None,
-            max_count=150_000,
-        )
-    )
+    densify_human: DensifyConfig = field(default_factory=lambda: DensifyConfig(max_count=14_000))
+    densify_scene: DensifyConfig | None = None
+    """Limits of the scene. Null: 3DGS's for a random cube; none for the median backdrop, which has
+    a Gaussian for every 2x2 pixels already and would only grow where the person passes."""
 
 
-def compose(config: PaperConfig, capture: Capture, seed: int, *, fit: bool = True) -> Composition:
+RANDOM_CUBE_DENSIFY = DensifyConfig(
+    prune_opacity=0.005, prune_screen_px=None, prune_scale_m=None, max_count=150_000
+)
+"""3DGS's limits for a scene (A20): neither the 20-pixel nor the 0.05-opacity rule of a person."""
+
+
+def compose(
+    config: PaperConfig,
+    capture: Capture,
+    seed: int,
+    *,
+    device: torch.device | str = "cpu",
+    fit: bool = True,
+) -> Composition:
     """Model, objectives and limits for one capture.
 
     ``fit=False`` skips the cheap fits, for a model whose parameters are loaded afterwards.
@@ -174,19 +180,24 @@ def compose(config: PaperConfig, capture: Capture, seed: int, *, fit: bool = Tru
     human = _human_start(config, capture, track, generator)
     scene, colours = _scene_start(config, capture, track, generator)
     gaussians = GaussianSet(human, scene)
-    model = HumanSceneModel(config.deform, config.semantics, track, times, gaussians)
+    objectives_track, track = track, track.to(device)
+    model = HumanSceneModel(config.deform, config.semantics, track, times, gaussians).to(device)
 
-    prior = SkinningPrior(surface, config.skinning_points)
+    prior = SkinningPrior(surface.to(device), config.skinning_points)
     if fit:
         fit_skinning(model, prior, config.skinning_prefit_steps, generator)
         if config.scene.kind == "median_backdrop":
-            camera = capture.camera(frames[0])
-            fit_scene_colours(model, camera, colours, config.scene.prefit_steps)
-            fit_scene(model, camera, capture.median_background(), config.scene.prefit_steps)
+            camera = capture.camera(frames[0]).to(device)
+            fit_scene_colours(
+                model, camera, colours.to(device), config.scene.prefit_steps, generator
+            )
+            fit_scene(
+                model, camera, capture.median_background().to(device), config.scene.prefit_steps
+            )
 
     return Composition(
         model=model,
-        objectives=_objectives(config, capture, track, prior),
+        objectives=_objectives(config, capture, objectives_track, prior),
         weights={
             "l1": config.loss.l1,
             "dssim": config.loss.dssim,
@@ -199,10 +210,16 @@ def compose(config: PaperConfig, capture: Capture, seed: int, *, fit: bool = Tru
             "event": config.event.weight,
         },
         optimisation=config.optimisation,
-        densify={"human": config.densify_human, "scene": config.densify_scene},
+        densify={"human": config.densify_human} | _scene_limits(config),
         body_frames=BodyFrames(track.body, track.bones(torch.tensor(times))),
         generator=generator,
     )
+
+
+def _scene_limits(config: PaperConfig) -> dict[Part, DensifyConfig]:
+    if config.densify_scene is not None:
+        return {"scene": config.densify_scene}
+    return {"scene": RANDOM_CUBE_DENSIFY} if config.scene.kind == "random_cube" else {}
 
 
 def _human_start(
@@ -256,9 +273,7 @@ def _scene_start(
                 "this capture's camera moves. Pass --set scene.kind=random_cube."
             )
         body = torch.cat([track.vertices(frame.mid_us)[::7] for frame in frames])
-        depth = backdrop_depth(
-            camera, body, up=_up_axis(track), margin=start.backdrop_margin
-        )
+        depth = backdrop_depth(camera, body, up=_up_axis(track), margin=start.backdrop_margin)
         points, scales, colours = median_backdrop(
             camera,
             capture.median_background(),

@@ -10,6 +10,9 @@ from evsplat.gaussians import StaticScene
 from evsplat.objectives import SkinningPrior
 from evsplat.render import Splats, render
 
+COLOUR_BATCH = 2_048
+"""Scene Gaussians per step of teaching their colour network."""
+
 
 def fit_skinning(
     model: HumanSceneModel, prior: SkinningPrior, steps: int, generator: torch.Generator
@@ -25,7 +28,11 @@ def fit_skinning(
 
 
 def fit_scene_colours(
-    model: HumanSceneModel, camera: Camera, colours: Float[Tensor, "S 3"], steps: int
+    model: HumanSceneModel,
+    camera: Camera,
+    colours: Float[Tensor, "S 3"],
+    steps: int,
+    generator: torch.Generator,
 ) -> None:
     """Teach the scene's colour network to read the colour that the features start with."""
     gaussians = model.gaussians
@@ -37,8 +44,9 @@ def fit_scene_colours(
         for group in adam.param_groups:
             group["lr"] = 1e-2 * 0.1 ** (step / steps)
         adam.zero_grad()
-        shown = directions if step % 2 else torch.zeros_like(directions)
-        (model.scene_colour(features, shown) - colours).square().mean().backward()
+        some = torch.randint(len(features), (COLOUR_BATCH,), generator=generator).to(colours.device)
+        shown = directions[some] * (step % 2)
+        (model.scene_colour(features[some], shown) - colours[some]).square().mean().backward()
         adam.step()
 
 

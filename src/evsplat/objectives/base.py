@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.gaussians import PosedGaussians
 from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.gaussians import PosedGaussians
 
 
 @dataclass(frozen=True)

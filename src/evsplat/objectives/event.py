@@ -98,7 +98,8 @@ class EventChange(Stateless):
         change = log_brightness_change(
             step.rgb[step.index(before)], step.rgb[step.index(after)], eps=self.eps
         )
-        return {"event": weight * event_loss(change, self._map(before, after), floor=self.floor)}
+        events = self._map(before, after).to(change)
+        return {"event": weight * event_loss(change, events, floor=self.floor)}
 
     def _pair(self, frame: Frame) -> tuple[int, int]:
         times = sorted((frame.mid_us, self.partner[frame.name].mid_us))

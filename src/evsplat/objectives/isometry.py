@@ -17,7 +17,7 @@ NEIGHBOURS = 4
 def covariance6(matrix: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 6"]:
     """Upper triangle of ``M M^T``."""
     covariance = matrix @ matrix.transpose(-1, -2)
-    row, column = torch.triu_indices(3, 3)
+    row, column = torch.triu_indices(3, 3, device=matrix.device)
     return covariance[..., row, column]
 
 
@@ -50,7 +50,8 @@ class Isometry:
             self._search(canonical)
         self.age += 1
         chosen = torch.randint(count, (min(self.samples, count),), generator=step.generator)
-        near = self.neighbours[chosen]
+        near = self.neighbours[chosen].to(canonical.device)
+        chosen = chosen.to(canonical.device)
 
         before = (canonical[chosen][:, None] - canonical[near]).norm(dim=-1)
         after = (posed.means[:, chosen][:, :, None] - posed.means[:, near]).norm(dim=-1)

@@ -27,8 +27,7 @@ class Photometric(Stateless):
         dssim: bool,
         perceptual: PerceptualMetric | None,
     ) -> None:
-        """``boxes``: pixel box (x0, y0, x1, y1) of the posed body, of the training frames that show it.
-        """
+        """``boxes``: pixel box (x0, y0, x1, y1) of the posed body, of the training frames that show it."""
         self.frames = {frame.mid_us: frame for frame in capture.train_frames}
         self.boxes, self.dssim, self.perceptual = boxes, dssim, perceptual
 
@@ -41,7 +40,7 @@ class Photometric(Stateless):
         observed_at = [i for i, time in enumerate(step.times_us) if time in self.frames]
         frames = [self.frames[step.times_us[i]] for i in observed_at]
         rendered = step.rgb[observed_at]
-        observed = torch.stack([step.capture.image(frame) for frame in frames])
+        observed = torch.stack([step.capture.image(frame) for frame in frames]).to(rendered)
         terms = {"l1": (rendered - observed).abs().mean()}
         if self.dssim:
             values = [ssim(a, b, GAUSSIAN_SSIM) for a, b in zip(rendered, observed, strict=True)]

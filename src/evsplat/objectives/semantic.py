@@ -46,7 +46,7 @@ class RenderedSemantics(Stateless):
         for index, time in enumerate(step.times_us):
             if time not in self.bounds:
                 continue
-            inside, outside = self.bounds[time]
+            inside, outside = (mask.to(step.semantic.device) for mask in self.bounds[time])
             probability = step.semantic[index].clamp(1e-4, 1 - 1e-4)
             error = -torch.where(
                 inside, probability.log(), torch.where(outside, (1 - probability).log(), 0.0)

@@ -30,6 +30,6 @@ class SkinningPrior(Stateless):
         """The prior of a model at random surface points."""
         chosen = torch.randint(
             len(self.surface.points), (self.points_per_step,), generator=generator
-        )
+        ).to(self.surface.points.device)
         weights = model.skinning(model.normalise(self.surface.points[chosen]))
         return (weights - self.surface.weights[chosen]).square().sum(-1).mean()

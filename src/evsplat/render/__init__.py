@@ -1,5 +1,6 @@
 """Drawing posed Gaussians: one function, several backends that give the same numbers."""
 
-from evsplat.render.api import BackendName, PinholeCamera, RenderOutput, Splats, render
+from evsplat.render.api import BackendName, choose_device, render
+from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
-__all__ = ["BackendName", "PinholeCamera", "RenderOutput", "Splats", "render"]
+__all__ = ["BackendName", "PinholeCamera", "RenderOutput", "Splats", "choose_device", "render"]

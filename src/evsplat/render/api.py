@@ -1,64 +1,15 @@
 """`render`: checks its input, picks the backend and hands over."""
 
-from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Literal, get_args
 
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.errors import BackendError
+from evsplat.errors import BackendError, ConfigError
+from evsplat.render import native, reference
+from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
 BackendName = Literal["auto", "native", "reference"]
-
-
-class PinholeCamera(Protocol):
-    """What rendering reads of a camera (`evsplat.capture.Camera` has it)."""
-
-    @property
-    def width(self) -> int:
-        """Image width, pixels."""
-
-    @property
-    def height(self) -> int:
-        """Image height, pixels."""
-
-    @property
-    def K(self) -> Float[Tensor, "3 3"]:
-        """Focal lengths and principal point in pixels; pixel centres at +0.5, no skew."""
-
-    @property
-    def world_to_camera(self) -> Float[Tensor, "4 4"]:
-        """Rigid transform, OpenCV axes; may require a gradient."""
-
-
-@dataclass(frozen=True)
-class Splats:
-    """Gaussians drawn at T times. A leading T of 1, or none, serves all times."""
-
-    means: Float[Tensor, "T N 3"]
-    """Centres in the world, metres."""
-    quats: Float[Tensor, "*T N 4"]
-    """Rotations wxyz, of any length but zero."""
-    scales: Float[Tensor, "*T N 3"]
-    """Standard deviations along the rotated axes, metres."""
-    opacities: Float[Tensor, "*T N"]
-    """In [0, 1]."""
-    channels: Float[Tensor, "T N C"]
-    """What is composited, any number of channels."""
-    linear: Float[Tensor, "T N 3 3"] | None = None
-    """L in covariance = (L R S)(L R S)^T: a skinning matrix with its shear. None is the identity."""
-
-
-@dataclass(frozen=True)
-class RenderOutput:
-    """Images of T times."""
-
-    image: Float[Tensor, "T H W C"]
-    """Composited channels over the background."""
-    alpha: Float[Tensor, "T H W"]
-    """Coverage in [0, 1)."""
-    radii: Int[Tensor, "T N"]
-    """Radius on the screen in pixels, rounded up; 0 = not drawn."""
 
 
 def render(
@@ -90,15 +41,11 @@ def render(
     device = splats.means.device
     if backend == "auto" and device.type != "cpu":
         raise BackendError(
-            f"No render backend for device {device} in this version (gsplat is not connected yet); "
-            "move the tensors to the CPU, or ask for backend='reference', which is slow."
+            f"No render backend for device {device} in this version; move the tensors to the CPU, "
+            "or ask for backend='reference', which is slow."
         )
     if backend == "reference":
-        from evsplat.render import reference
-
         return reference.render(fields, camera, background, centers2d_offset, near)
-    from evsplat.render import native
-
     return native.render(fields, camera, background, centers2d_offset, near)
 
 
@@ -133,8 +80,10 @@ def _check(
         "opacities": (splats.opacities, (count,)),
         "channels": (splats.channels, (count, max(1, splats.channels.shape[-1]))),
         "linear": (splats.linear, (count, 3, 3)),
-        "centers2d_offset": (offset[None] if offset is not None and offset.ndim == 2 else offset,
-                             (count, 2)),
+        "centers2d_offset": (
+            offset[None] if offset is not None and offset.ndim == 2 else offset,
+            (count, 2),
+        ),
     }
     times = max(value.shape[0] for value, _ in inner.values() if value is not None)
     for name, (value, shape) in inner.items():
@@ -150,7 +99,8 @@ def _check(
     if width < 1 or height < 1:
         raise BackendError(f"render: the camera's image is {width} x {height} pixels.")
     if background is not None and tuple(background.shape) not in (
-        (channels,), (height, width, channels)
+        (channels,),
+        (height, width, channels),
     ):
         raise BackendError(
             f"render: background has shape {tuple(background.shape)}, "
@@ -174,3 +124,14 @@ def _check(
         raise BackendError(f"render: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], not {rows}.")
     if not (rows[0][0] > 0 and rows[1][1] > 0):
         raise BackendError(f"render: the focal lengths in K must be positive, not {rows}.")
+
+
+def choose_device(asked: str) -> str:
+    """The device for what was asked for; what cannot run is an error with the reason."""
+    if asked not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"--device {asked}: expected auto, cpu or cuda.")
+    if asked == "cuda":
+        raise BackendError(
+            "--device cuda: this version rasterises on the CPU only; pass --device cpu or auto."
+        )
+    return "cpu"

@@ -1,15 +1,13 @@
 """The compiled CPU backend: float32, any number of times and channels, gradients in C++."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from evsplat.errors import BackendError
-
-if TYPE_CHECKING:
-    from evsplat.render.api import PinholeCamera, RenderOutput, Splats
+from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
 _IMPORT_ERROR: ImportError | None = None
 try:
@@ -19,15 +17,13 @@ except ImportError as error:  # told when the backend is asked for
 
 
 def render(
-    splats: "Splats",
-    camera: "PinholeCamera",
+    splats: Splats,
+    camera: PinholeCamera,
     background: Tensor | None,
     offset: Tensor | None,
     near: float,
-) -> "RenderOutput":
+) -> RenderOutput:
     """Draw with the native kernels; fields have their leading axis of times."""
-    from evsplat.render.api import RenderOutput
-
     if _IMPORT_ERROR is not None:
         raise BackendError(
             f"The native render backend is not built ({_IMPORT_ERROR}); install evsplat with pip, "
@@ -55,13 +51,14 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
         *fields, pose, K, width, height, near = inputs
-        *gaussians, linear, offset, background = [f if f is None else _plain(f) for f in fields]
-        times = max(f.shape[0] for f in (*gaussians, linear, offset) if f is not None)
-        count, channels = gaussians[0].shape[1], gaussians[4].shape[2]
+        means, quats, scales, opacities, values = (_plain(f) for f in fields[:5])
+        linear, offset, background = (None if f is None else _plain(f) for f in fields[5:])
+        times = max(f.shape[0] for f in fields[:-1] if f is not None)
+        count, channels = means.shape[1], values.shape[2]
         try:
             job = _native.Render(
-                width, height, _plain(K), _plain(pose), near, *gaussians, linear, offset, background,
-                times, torch.get_num_threads(),
+                width, height, _plain(K), _plain(pose), near, means, quats, scales, opacities,
+                values, linear, offset, background, times, torch.get_num_threads(),
             )  # fmt: skip
             image = torch.empty(times, channels, height, width, dtype=torch.float32)
             alpha = torch.empty(times, height, width, dtype=torch.float32)
@@ -74,14 +71,14 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         ctx.job = job
-        ctx.save_for_backward(*fields, pose, image, alpha)
+        ctx.save_for_backward(*fields, pose)
         return image, alpha, radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, image_grad: Tensor | None, alpha_grad: Tensor | None, _: None) -> Any:
         # Reading saved_tensors also refuses inputs that were changed in place since.
-        *fields, pose, image, alpha = ctx.saved_tensors
+        *fields, pose = ctx.saved_tensors
         if image_grad is None and alpha_grad is None:
             return (None,) * 13
         needed = ctx.needs_input_grad
@@ -91,9 +88,7 @@ class _Rasterize(torch.autograd.Function):
         ]
         view = torch.zeros(12, dtype=torch.float32) if needed[8] else None
         *gaussians, background = grads
-        ctx.job.backward(
-            image.permute(0, 3, 1, 2), alpha, image_grad, alpha_grad, *gaussians, view, background
-        )
+        ctx.job.backward(image_grad, alpha_grad, *gaussians, view, background)
         pose_grad = None
         if view is not None:
             pose_grad = torch.zeros(4, 4, dtype=torch.float32)

@@ -1,14 +1,12 @@
 """The rasteriser in plain torch, any dtype and device: slow, the oracle of the tests."""
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from evsplat.render.api import PinholeCamera, RenderOutput, Splats
+from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
 # The rules of gsplat 1.5.3 (cuda/csrc/ProjectionEWA3DGSFused.cu, RasterizeToPixels3DGSFwd.cu).
 EPS_2D = 0.3
@@ -17,20 +15,20 @@ MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
 MAX_EXTENT = 3.33
 FOV_MARGIN = 0.3
+MAX_PIXEL = 1e6  # farther from the image, or larger, is not drawn
 
-_PAIRS_PER_CHUNK = 1 << 20
+_TILE = 32
+_PAIRS_PER_CHUNK = 1 << 19
 
 
 def render(
-    splats: "Splats",
-    camera: "PinholeCamera",
+    splats: Splats,
+    camera: PinholeCamera,
     background: Tensor | None,
     offset: Tensor | None,
     near: float,
-) -> "RenderOutput":
-    """Draw every Gaussian at every pixel, in chunks of pixels; fields have their axis of times."""
-    from evsplat.render.api import RenderOutput
-
+) -> RenderOutput:
+    """Draw tile by tile, all pairs of a tile's pixels and Gaussians at once."""
     s = splats
     fields = (s.means, s.quats, s.scales, s.opacities, s.channels, s.linear, offset)
     times = max(f.shape[0] for f in fields if f is not None)
@@ -38,14 +36,15 @@ def render(
         _draw([None if f is None else f[t if len(f) > 1 else 0] for f in fields], camera, near)
         for t in range(times)
     ]
-    image, alpha, radii = (torch.stack(part) for part in zip(*drawn, strict=True))
+    images, alphas, all_radii = zip(*drawn, strict=True)
+    image, alpha, radii = torch.stack(images), torch.stack(alphas), torch.stack(all_radii)
     if background is not None:
         image = image + (1 - alpha)[..., None] * background
     return RenderOutput(image, alpha, radii)
 
 
 def _draw(
-    fields: list[Tensor | None], camera: "PinholeCamera", near: float
+    fields: list[Tensor | None], camera: PinholeCamera, near: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image, alpha and radii of one time, without background."""
     means, quats, scales, opacities, channels, linear, offset = fields
@@ -54,27 +53,36 @@ def _draw(
     centers, covariance, depth = project(means, quats, scales, linear, camera)
     if offset is not None:
         centers = centers + offset
-    radii, visible = _extents(centers, covariance, depth, opacities, camera, near)
+    reach, visible = _extents(centers, covariance, depth, opacities, camera, near)
 
     # Stable: equal depths keep the order of the Gaussians.
     order = torch.argsort(torch.where(visible, depth, math.inf).detach(), stable=True)
     order = order[: int(visible.sum())]
-    centers, covariance = centers[order], covariance[order]
-    opacities, channels = opacities[order], channels[order]
+    near_to_far = centers[order], covariance[order], opacities[order], channels[order]
+    low, high = (centers - reach).detach()[order] - 1, (centers + reach).detach()[order] + 1
 
-    y, x = torch.meshgrid(
-        torch.arange(camera.height, dtype=means.dtype, device=means.device) + 0.5,
-        torch.arange(camera.width, dtype=means.dtype, device=means.device) + 0.5,
-        indexing="ij",
-    )
-    pixels = torch.stack([x, y], -1).reshape(-1, 2)
-    step = max(1, _PAIRS_PER_CHUNK // max(1, len(order)))
-    parts = [
-        _composite(chunk, centers, covariance, opacities, channels) for chunk in pixels.split(step)
-    ]
-    image = torch.cat([part[0] for part in parts]).view(camera.height, camera.width, -1)
-    alpha = torch.cat([part[1] for part in parts]).view(camera.height, camera.width)
-    return image, alpha, radii
+    rows = []
+    for top in range(0, camera.height, _TILE):
+        bottom = min(top + _TILE, camera.height)
+        tiles = []
+        for left in range(0, camera.width, _TILE):
+            right = min(left + _TILE, camera.width)
+            touch = (low[:, 0] < right) & (high[:, 0] > left)
+            touch &= (low[:, 1] < bottom) & (high[:, 1] > top)
+            y, x = torch.meshgrid(
+                torch.arange(top, bottom).to(means) + 0.5,
+                torch.arange(left, right).to(means) + 0.5,
+                indexing="ij",
+            )
+            pixels = torch.stack([x, y], -1).view(-1, 2)
+            some = [part[touch] for part in near_to_far]
+            step = max(1, _PAIRS_PER_CHUNK // max(1, len(some[0])))
+            tile = torch.cat([_composite(chunk, *some) for chunk in pixels.split(step)])
+            tiles.append(tile.view(bottom - top, right - left, -1))
+        rows.append(torch.cat(tiles, 1))
+    image = torch.cat(rows)
+    radii = torch.where(visible[:, None], reach, 0).amax(-1).to(torch.int32)
+    return image[..., :-1], image[..., -1], radii
 
 
 def project(
@@ -82,9 +90,9 @@ def project(
     quats: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
     linear: Float[Tensor, "N 3 3"] | None,
-    camera: "PinholeCamera",
+    camera: PinholeCamera,
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2 2"], Float[Tensor, "N"]]:
-    """Centres in pixels, covariances in px^2 with the low-pass, depths in metres (EWA splatting)."""
+    """EWA splatting: centres in px, covariances in px^2 with the low-pass, depths in metres."""
     view = camera.world_to_camera.to(means)
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     local = means @ view[:3, :3].T + view[:3, 3]
@@ -94,7 +102,7 @@ def project(
     x, y = x / z, y / z
     centers = torch.stack([fx * x + cx, fy * y + cy], -1)
 
-    # The Jacobian is taken at an angle inside the field of view, enlarged by 30 % of its half width.
+    # The Jacobian is taken inside the field of view, enlarged by 30 % of its half width.
     margin_x = FOV_MARGIN * 0.5 * camera.width / fx
     margin_y = FOV_MARGIN * 0.5 * camera.height / fy
     x = x.clamp(-cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
@@ -127,32 +135,32 @@ def _extents(
     covariance: Tensor,
     depth: Tensor,
     opacities: Tensor,
-    camera: "PinholeCamera",
+    camera: PinholeCamera,
     near: float,
 ) -> tuple[Tensor, Tensor]:
-    """Screen radii in pixels and which Gaussians are drawn."""
-    # Up to 3.33 deviations, or to where alpha falls under 1/255: for opacities up to 1 that is the
-    # nearer one, so no further cut is needed when compositing.
+    """Reach of each Gaussian in x and y, whole pixels, and which Gaussians are drawn."""
+    # Up to 3.33 deviations, or to where alpha falls under 1/255. For opacities up to 1 that is the
+    # nearer one, so that compositing needs no cut but the one at 1/255.
     extent = (2 * torch.log(opacities / MIN_ALPHA)).clamp(min=0).sqrt().clamp(max=MAX_EXTENT)
-    radius = (extent[:, None] * covariance.diagonal(dim1=-2, dim2=-1).sqrt()).ceil()
+    reach = (extent[:, None] * covariance.diagonal(dim1=-2, dim2=-1).sqrt()).ceil()
     size = torch.tensor([camera.width, camera.height], dtype=centers.dtype, device=centers.device)
-    on_screen = (centers + radius > 0) & (centers - radius < size)
+    on_screen = (centers + reach > 0) & (centers - reach < size)
     # As NaN fails every comparison, it is not drawn.
     visible = (
         (depth >= near)
         & (opacities >= MIN_ALPHA)
-        & (torch.linalg.det(covariance) > 0)
+        & (covariance.det() > 0)
         & on_screen.all(-1)
-        & torch.isfinite(radius).all(-1)
+        & (reach < MAX_PIXEL).all(-1)
+        & (centers.abs() < MAX_PIXEL).all(-1)
     )
-    radius = torch.where(visible[:, None], radius, 0).amax(-1)
-    return radius.to(torch.int32), visible
+    return reach, visible
 
 
 def _composite(
     pixels: Tensor, centers: Tensor, covariance: Tensor, opacities: Tensor, channels: Tensor
-) -> tuple[Float[Tensor, "P C"], Float[Tensor, "P"]]:
-    """Front-to-back compositing at the pixels; the Gaussians come sorted by depth."""
+) -> Float[Tensor, "P C+1"]:
+    """Channels and, last, alpha at the pixels; the Gaussians come sorted by depth."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     determinant = a * c - b * b
     dx, dy = (pixels[:, None] - centers).unbind(-1)
@@ -163,7 +171,7 @@ def _composite(
     after = torch.cumprod(1 - alpha, -1)
     alpha = torch.where(after > MIN_TRANSMITTANCE, alpha, 0)
     after = torch.cumprod(1 - alpha, -1)
-    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], -1)
+    before = torch.cat([torch.ones_like(pixels[:, :1]), after[:, :-1]], -1)
     weights = alpha * before
-    left = after[:, -1] if after.shape[1] else torch.ones_like(pixels[:, 0])
-    return weights @ channels, 1 - left
+    # The sum of the weights is 1 - final transmittance.
+    return torch.cat([weights @ channels, weights.sum(-1, keepdim=True)], -1)

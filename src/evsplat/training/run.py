@@ -19,7 +19,7 @@ from evsplat.files import read_json, write_json, write_text
 from evsplat.gaussians import Parts
 from evsplat.methods import TRAINABLE, PaperConfig, method_config
 from evsplat.methods.reconstruction import Reconstruction, Rendering
-from evsplat.render import render
+from evsplat.render import choose_device, render
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, load_model
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
@@ -102,18 +102,17 @@ class GaussianReconstruction:
     name: str
     model: HumanSceneModel
 
-    def render(
-        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
-    ) -> Rendering:
+    def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
         with torch.no_grad():
+            camera = camera.to(self.model.box_low.device)
             posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
             output = render(posed.splats(parts), camera)
         times = len(times_us)
 
         def all_times(values: torch.Tensor) -> torch.Tensor:
             # The scene alone is drawn once.
-            return values.expand(times, *values.shape[1:])
+            return values.cpu().expand(times, *values.shape[1:])
 
         return Rendering(
             rgb=all_times(output.image[..., :3].clamp(0, 1)),
@@ -152,8 +151,9 @@ def config_values(method: str, config: PaperConfig) -> dict[str, Any]:
     return {"method": method, **to_dict(config)}
 
 
-def load_run(run_dir: Path | str) -> Run:
+def load_run(run_dir: Path | str, *, device: str = "auto") -> Run:
     """Read a run at its last checkpoint; a folder without one is a `DataError`."""
+    device = choose_device(device)
     folder = RunFolder(Path(run_dir))
     method, config, facts = read_config(folder)
     path = latest_checkpoint(folder.checkpoints)
@@ -161,7 +161,8 @@ def load_run(run_dir: Path | str) -> Run:
         raise DataError(f"{folder.checkpoints}: no checkpoint; train the run first.")
     tensors, state = load_checkpoint(path)
     capture = load_capture(Path(facts["capture"]))
-    composition = TRAINABLE[method][1](config, capture, facts["seed"], fit=False)
+    compose = TRAINABLE[method][1]
+    composition = compose(config, capture, facts["seed"], device=device, fit=False)
     load_model(composition.model, tensors, state["human_count"])
     gaussians = composition.model.gaussians
     return Run(

@@ -14,9 +14,10 @@ from tqdm import tqdm
 
 from evsplat.capture import load_capture
 from evsplat.config import load_yaml, override, save_yaml
-from evsplat.errors import BackendError, ConfigError, DataError
+from evsplat.errors import ConfigError, DataError
 from evsplat.methods import TRAINABLE, PaperConfig, method_config
 from evsplat.methods.config import Weight
+from evsplat.render import choose_device
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from evsplat.training.clock import Clock
 from evsplat.training.run import (
@@ -64,7 +65,7 @@ def train(
     checkpoint in ``out``. ``config`` is a run's config.yaml; ``overrides`` are ``key=value``
     settings over it. Raises `Stopped` on Ctrl-C after saving.
     """
-    _check_device(device)
+    device = choose_device(device)
     if iterations is not None and iterations < 1:
         raise ConfigError(f"--iterations {iterations}: expected at least 1.")
     if max_minutes is not None and max_minutes <= 0:
@@ -78,7 +79,9 @@ def train(
         if out is None:
             raise ConfigError("--resume needs --out RUN, the run to go on with.")
         if config is not None or overrides or seed is not None:
-            raise ConfigError("--resume takes the run's own settings; leave out --config and --set.")
+            raise ConfigError(
+                "--resume takes the run's own settings; leave out --config and --set."
+            )
         folder = RunFolder(Path(out))
         method, settings, facts = read_config(folder)
         seed = int(facts["seed"])
@@ -96,7 +99,8 @@ def train(
         seed = 0 if seed is None else seed
 
     checkpoint = latest_checkpoint(folder.checkpoints) if resume else None
-    composition = TRAINABLE[method][1](settings, capture, seed, fit=checkpoint is None)
+    compose = TRAINABLE[method][1]
+    composition = compose(settings, capture, seed, device=device, fit=checkpoint is None)
     clock = Clock(
         iterations or settings.optimisation.iterations,
         None if max_minutes is None else 60 * max_minutes,
@@ -112,7 +116,7 @@ def train(
     else:
         folder.path.mkdir(parents=True, exist_ok=True)
         save_yaml(folder.config, config_values(method, settings))
-        write_facts(folder, capture, method, "cpu", seed)
+        write_facts(folder, capture, method, device, seed)
         logger.info("%s", schedule_table(settings, composition.weights))
     _loop(trainer, folder)
     return folder.path
@@ -128,16 +132,6 @@ def schedule_table(settings: PaperConfig, weights: dict[str, Weight]) -> str:
             text = f"{weight:g}"
         lines.append(f"  {name:22s} {text}")
     return "\n".join(lines)
-
-
-def _check_device(device: str) -> None:
-    if device not in ("auto", "cpu", "cuda"):
-        raise ConfigError(f"--device {device}: expected auto, cpu or cuda.")
-    if device == "cuda":
-        raise BackendError(
-            "--device cuda: this version trains on the CPU only, its CUDA rasteriser does not "
-            "exist yet; pass --device cpu."
-        )
 
 
 def _loop(trainer: Trainer, folder: RunFolder) -> None:

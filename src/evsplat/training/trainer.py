@@ -43,6 +43,7 @@ class Trainer:
         """Start at the beginning of the schedule."""
         self.composition, self.capture, self.clock = composition, capture, clock
         self.model = composition.model
+        self.device = self.model.box_low.device
         self.optimiser = Optimiser(self.model, composition.optimisation)
         self.queue: list[int] = []
         self.bad_steps = 0
@@ -59,11 +60,12 @@ class Trainer:
         generator = self.composition.generator
         times = sorted({t for o in self.composition.objectives for t in o.times(frame, nominal)})
 
-        camera = self.capture.camera(frame)
+        camera = self.capture.camera(frame).to(self.device)
         noise = self.model.draw_noise(len(times), generator)
         posed = self.model.at(times, camera.center(), noise=noise)
         splats = posed.splats()
-        centers = torch.zeros(len(times), splats.means.shape[1], 2, requires_grad=True)
+        shape = (len(times), splats.means.shape[1], 2)
+        centers = torch.zeros(shape, device=self.device, requires_grad=True)
         output = render(splats, camera, centers2d_offset=centers)
         rgb, semantic = output.image[..., :3], output.image[..., 3]
         step = Step(
@@ -90,7 +92,7 @@ class Trainer:
         self.optimiser.step(nominal)
         self._after_step(centers, output, frame, nominal)
         drawn = rgb.detach()[step.index(frame.mid_us)]
-        error = (drawn.clamp(0, 1) - self.capture.image(frame)).square().mean()
+        error = (drawn.clamp(0, 1) - self.capture.image(frame).to(drawn)).square().mean()
         return StepReport(float(loss.detach()), values, float(-10 * torch.log10(error)))
 
     def counts(self) -> dict[str, int]:
@@ -148,9 +150,9 @@ class Trainer:
         gaussians, rows = self.model.gaussians, self.optimiser.rows
         limits = self.composition.densify
         previous, self.previous_nominal = self.previous_nominal, nominal
-        for limit, part in ((limits["human"], "human"), (limits["scene"], "scene")):
+        for part, limit in limits.items():
             if any(previous < reset <= nominal for reset in limit.opacity_reset):
-                reset_opacities(gaussians, rows, getattr(gaussians, part))
+                reset_opacities(gaussians, rows, gaussians.rows_of(part))
         every = limits["human"].every
         if nominal // every == previous // every:
             return

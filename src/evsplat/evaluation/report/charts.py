@@ -7,8 +7,8 @@ from html import escape
 
 import numpy as np
 
-_WIDTH, _HEIGHT = 560, 300
-_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 12, 34
+_WIDTH, _HEIGHT = 380, 240
+_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 12, 10, 36
 _MOST_POINTS = 240
 SERIES_COLOURS = 8
 """How many line colours the style sheet has."""
@@ -50,15 +50,25 @@ def line_chart(series: Sequence[Series], *, x_title: str, y_title: str, log: boo
     y_ticks = _log_ticks(y_low, y_high) if log else _ticks(y_low, y_high)
     for value, label in y_ticks:
         y = place_y(value)
-        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text class="tick" x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+        parts.append(
+            f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
+        )
+        parts.append(
+            f'<text class="tick" x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>'
+        )
     for value, label in _ticks(x_low, x_high):
-        x = place_x(value)
-        parts.append(f'<text class="tick" x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 18}" text-anchor="middle">{label}</text>')
+        x, y = place_x(value), _HEIGHT - _BOTTOM + 18
+        parts.append(f'<text class="tick" x="{x:.1f}" y="{y}" text-anchor="middle">{label}</text>')
     base = _HEIGHT - _BOTTOM
-    parts.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{base}" y2="{base}"/>')
-    for number, (name, x, y) in enumerate(prepared):
-        points = " ".join(f"{place_x(a):.1f},{place_y(b):.1f}" for a, b in zip(x, y, strict=True))
+    parts.append(
+        f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{base}" y2="{base}"/>'
+    )
+    # A single line takes the accent colour; the first of several is the sum, in the text colour.
+    first = 1 if len(prepared) == 1 else 0
+    for number, (name, xs, ys) in enumerate(prepared, start=first):
+        points = " ".join(
+            f"{place_x(float(a)):.1f},{place_y(float(b)):.1f}" for a, b in zip(xs, ys, strict=True)
+        )
         parts.append(
             f'<polyline class="line c{number % SERIES_COLOURS}" points="{points}">'
             f"<title>{escape(name)}</title></polyline>"

@@ -16,7 +16,7 @@ from evsplat.methods.trivial import nearest_in_time
 
 _PLAYED_HZ = 25
 _SLOWER = 5.0
-_LONGEST_SECONDS = 10.0
+_LONGEST_SECONDS = 8.0
 _TIMES_AT_ONCE = 8
 _WIDE = 640
 """Small pictures are enlarged by whole factors up to this width, so that pixels stay pixels."""

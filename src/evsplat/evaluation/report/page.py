@@ -3,34 +3,20 @@
 from collections.abc import Sequence
 from html import escape
 from importlib import resources
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
-from jaxtyping import UInt8
-
-from evsplat.evaluation.pictures import (
-    ERROR_FULL_SCALE,
-    css_gradient,
-    error_map,
-    to_bytes,
-)
-from evsplat.evaluation.regions import Box
+from evsplat.evaluation.pictures import css_gradient, to_bytes
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
+from evsplat.evaluation.report.configuration import configuration
 from evsplat.evaluation.report.embed import Embedder, data_uri
+from evsplat.evaluation.report.figures import figures
+from evsplat.evaluation.report.html import figure, folded, frame_figures, legend, section, spread
+from evsplat.evaluation.report.shots import test_frames
 from evsplat.evaluation.report.source import Source
-from evsplat.evaluation.tables import (
-    METRIC_TITLES,
-    REGION_TITLES,
-    Table,
-    missing_networks,
-    tables_of,
-)
 
-_FRAMES_OPEN = 6
-"""Test frames shown at once; the others are folded."""
-_T = TypeVar("_T")
-
+_PAIRS_OPEN = {"test": 4, "train": 2}
+"""Event map pairs shown at once per split; the others are folded."""
 _NOVEL_SHOWN = 4
 """Novel views shown per camera, evenly spread over time."""
 
@@ -39,12 +25,12 @@ def page(source: Source) -> str:
     """The whole page as HTML; everything that the user's files contributed is escaped."""
     sections = [
         _clip(source),
-        _figures(source),
-        _test_frames(source),
+        figures(source),
+        test_frames(source),
         _event_maps(source),
         _novel_views(source),
         _curves(source),
-        _configuration(source),
+        configuration(source),
     ]
     title = f"{source.metrics['capture']} · {source.metrics['method']}"
     style = (resources.files("evsplat") / "data" / "report.css").read_text(encoding="utf-8")
@@ -111,167 +97,23 @@ def _clip(source: Source) -> str:
         f'<video autoplay loop muted playsinline controls src="{data_uri(clip.mp4, "video/mp4")}">'
         "</video>"
         f'<p class="note">{seconds:.2f} s of the recording, {clip.slower:.1f} times slower than '
-        f"life: {clip.pictures} sharp pictures drawn for instants of which the camera only kept "
-        "the average.</p></section>"
+        f"life: {clip.pictures} pictures drawn, where the camera kept only the average of each "
+        "exposure.</p></section>"
     )
-
-
-def _figures(source: Source) -> str:
-    first, *others = tables_of(source.metrics)
-    folded = "".join(
-        f"<details><summary>Protocol <code>{escape(table.protocol)}</code></summary>"
-        f"{_table(table)}</details>"
-        for table in others
-    )
-    missing = "".join(f"<li>{escape(reason)}</li>" for reason in missing_networks(source.metrics))
-    against = source.metrics["blurry_ground_truth"]["full"]["psnr"]
-    blurry = (
-        f"<li>Against the blurry pictures instead of the sharp truth (no measure of deblurring): "
-        f"{against:.2f} dB full frame.</li>"
-        if against is not None
-        else ""
-    )
-    return _section(
-        "Figures",
-        f"Means over {source.metrics['frames']['test']} held-out frames against the sharp picture "
-        "at mid-exposure.",
-        f'{_cards(first)}{_table(first)}{folded}<ul class="note">{blurry}{missing}</ul>',
-    )
-
-
-def _cards(table: Table) -> str:
-    """Large PSNR figures with the distance to the better trivial row."""
-    cards = []
-    for column in table.columns:
-        value = table.value(table.method, column)
-        if column.metric != "psnr" or value is None:
-            continue
-        trivial = [
-            other
-            for row in table.rows
-            if row not in (table.method, "blurry_input")
-            and (other := table.value(row, column)) is not None
-        ]
-        gain = ""
-        if trivial:
-            difference = value - max(trivial)
-            kind = "up" if difference >= 0 else "down"
-            gain = f'<p class="{kind}">{difference:+.2f} dB over the best trivial row</p>'
-        cards.append(
-            f'<div class="card"><p>{REGION_TITLES[column.region]}</p>'
-            f'<p class="big">{value:.2f}<small> dB</small></p>{gain}</div>'
-        )
-    return f'<div class="cards">{"".join(cards)}</div>'
-
-
-def _table(table: Table) -> str:
-    groups = "".join(
-        f'<th colspan="{span}" scope="colgroup">{title}</th>'
-        for region, title in REGION_TITLES.items()
-        if (span := sum(column.region == region for column in table.columns))
-    )
-    names = "".join(
-        f'<th scope="col">{METRIC_TITLES[c.metric]}&thinsp;{"↑" if c.higher_is_better else "↓"}</th>'
-        for c in table.columns
-    )
-    rows = []
-    for row in table.rows:
-        cells = "".join(
-            f"<td{' class=best' if table.is_best(row, c) else ''}>{table.text(row, c)}</td>"
-            for c in table.columns
-        )
-        kind = "ours" if row == table.method else "other"
-        if row == "blurry_input":
-            kind = "aside"
-        rows.append(f'<tr class="{kind}"><th scope="row">{escape(table.title(row))}</th>{cells}</tr>')
-    return (
-        f'<div class="scroll"><table><thead><tr><th rowspan="2" class="corner">protocol '
-        f"<code>{escape(table.protocol)}</code></th>{groups}</tr><tr>{names}</tr></thead>"
-        f'<tbody>{"".join(rows)}</tbody></table></div><p class="note">{escape(table.note)}.</p>'
-    )
-
-
-def _test_frames(source: Source) -> str:
-    frames = source.metrics["per_frame"]
-    if not frames:
-        return _section("Test frames", "", '<p class="note">No frame has split “test”.</p>')
-    first = source.capture.camera(source.capture.frame(frames[0]["frame"]))
-    # Four full pictures and four crops of about a third of the area per frame.
-    embed = Embedder.for_pixels(int(len(frames) * first.width * first.height * 5.3))
-    cards = [_test_frame(source, entry, embed) for entry in frames]
-    more = ""
-    if len(cards) > _FRAMES_OPEN:
-        more = (
-            f"<details><summary>{len(cards) - _FRAMES_OPEN} more test frames</summary>"
-            f"{''.join(cards[_FRAMES_OPEN:])}</details>"
-        )
-    legend = _legend(
-        css_gradient(signed=False), "0", f"{ERROR_FULL_SCALE} levels of 255 and more", "error"
-    )
-    intro = "Held out of the training. Below each frame: the person, enlarged."
-    return _section("Test frames", intro, legend + "".join(cards[:_FRAMES_OPEN]) + more)
-
-
-def _test_frame(source: Source, entry: dict[str, Any], embed: Embedder) -> str:
-    frame = source.capture.frame(entry["frame"])
-    pictures: dict[str, UInt8[np.ndarray, "H W 3"]] = {
-        "blurry input": to_bytes(source.capture.image(frame)),
-        "our render": source.picture(entry["pictures"]["render"]),
-    }
-    if frame.sharp is not None:
-        pictures["sharp truth"] = to_bytes(source.capture.sharp(frame))
-        pictures["error"] = source.picture(entry["pictures"]["error"])
-    name = frame.name
-    figures = entry["protocols"]["standard"]
-    person = source.person(name)
-    full = "".join(_figure(embed.image(p, f"{title}, frame {name}"), title) for title, p in pictures.items())
-    crops = ""
-    if person is not None:
-        crops = "".join(
-            _figure(embed.image(np.ascontiguousarray(person.crop(p)), f"{title}, person in frame {name}"))
-            for title, p in pictures.items()
-        )
-    count = len(pictures)
-    return (
-        f'<article class="frame"><h3>Frame {escape(name)} '
-        f"<small>{frame.mid_us / 1e6:.3f} s · exposure "
-        f"{(frame.exposure_us[1] - frame.exposure_us[0]) / 1000:g} ms{_frame_figures(figures)}"
-        f'</small></h3><div class="grid n{count}">{full}</div>'
-        f'<div class="grid n{count} crops">{crops}</div></article>'
-    )
-
-
-def _frame_figures(figures: dict[str, dict[str, float | None]]) -> str:
-    parts = [
-        f"{title} {value:.2f} dB"
-        for region, title in REGION_TITLES.items()
-        if (value := figures[region]["psnr"]) is not None
-    ]
-    return " · " + " · ".join(parts) if parts else ""
 
 
 def _event_maps(source: Source) -> str:
     events = source.metrics["events"]
     if events is None:
         reason = source.metrics["reasons"]["events"]
-        return _section("Event maps", "", f'<p class="note">None: {escape(reason)}.</p>')
+        return section("Event maps", "", f'<p class="note">None: {escape(reason)}.</p>')
     embed = Embedder(lossless=True)
-    pairs = []
-    for pair in events["pairs"]:
-        before, after = pair["frames"]
-        similarity = pair["similarity"]
-        shown = "–" if similarity is None else f"{similarity:.2f}"
-        images = "".join(
-            _figure(
-                embed.image(source.picture(path), f"{kind} events, frames {before} to {after}"), kind
-            )
-            for kind, path in pair["pictures"].items()
-        )
-        pairs.append(
-            f'<article class="pair"><h3>{escape(before)} → {escape(after)} <small>{pair["split"]}'
-            f" · similarity {shown} · full colour at {pair['full_scale']:g} events</small></h3>"
-            f'<div class="grid n2">{images}</div></article>'
-        )
+    shown = [
+        pair
+        for split, count in _PAIRS_OPEN.items()
+        for pair in spread([p for p in events["pairs"] if p["split"] == split], count)
+    ]
+    others = [pair for pair in events["pairs"] if pair not in shown]
     scale = (
         "the rendered change of log brightness over the sensor’s contrast threshold"
         if events["threshold_known"]
@@ -283,52 +125,77 @@ def _event_maps(source: Source) -> str:
         for split, value in events["mean_similarity"].items()
         if value is not None
     )
-    return _section(
+    return section(
         "Event maps",
         f"Given: recorded events between two mid-exposures, summed with their sign. Rendered: "
         f"{scale}. Both of a pair in the same colours. Similarity is the cosine of the two maps: "
         f"{means}.",
-        _legend(css_gradient(signed=True), "darker", "brighter", "events")
-        + f'<div class="pairs">{"".join(pairs)}</div>',
+        legend(css_gradient(signed=True), "darker", "brighter", "events")
+        + _event_pairs(source, shown, embed)
+        + folded(f"{len(others)} more pairs", _event_pairs(source, others, embed)),
     )
+
+
+def _event_pairs(source: Source, pairs: list[dict[str, Any]], embed: Embedder) -> str:
+    blocks = []
+    for pair in pairs:
+        before, after = pair["frames"]
+        similarity = "–" if pair["similarity"] is None else f"{pair['similarity']:.2f}"
+        images = "".join(
+            figure(
+                embed.image(source.picture(path), f"{kind} events, frames {before} to {after}"),
+                kind,
+            )
+            for kind, path in pair["pictures"].items()
+        )
+        blocks.append(
+            f'<article class="pair"><h3>{escape(before)} → {escape(after)} <small>'
+            f"{escape(pair['split'])} · similarity {similarity} · full colour at "
+            f'{pair["full_scale"]:g} events</small></h3><div class="grid n2">{images}</div>'
+            "</article>"
+        )
+    return f'<div class="pairs">{"".join(blocks)}</div>' if blocks else ""
 
 
 def _novel_views(source: Source) -> str:
     cameras = source.metrics["novel_views"]
     if not cameras:
         return ""
-    camera_pixels = sum(source.capture.cameras[c].width * source.capture.cameras[c].height for c in cameras)
+    camera_pixels = sum(
+        source.capture.cameras[c].width * source.capture.cameras[c].height for c in cameras
+    )
     embed = Embedder.for_pixels(camera_pixels * _NOVEL_SHOWN * 2)
+    views = {view.index: view for view in source.capture.novel_views}
     blocks = []
     for name, values in cameras.items():
-        views = [view for view in source.capture.novel_views if view.camera == name]
-        per_view = {entry["frame"]: entry for entry in values["per_view"]}
+        drawn = [entry for entry in values["per_view"] if entry["pictures"]]
         pairs = []
-        for view in _spread(views, _NOVEL_SHOWN):
-            entry = per_view[view.frame]
+        for entry in spread(drawn, _NOVEL_SHOWN):
             render = source.picture(entry["pictures"]["render"])
-            truth = to_bytes(source.capture.novel_image(view))
-            label = f"{name}, frame {view.frame}"
+            truth = to_bytes(source.capture.novel_image(views[entry["index"]]))
+            label = f"{name}, frame {entry['frame']}"
             pairs.append(
                 '<article class="pair"><div class="grid n2">'
-                + _figure(embed.image(render, f"render of {label}"), f"render · {entry['psnr']:.2f} dB")
-                + _figure(embed.image(truth, f"truth of {label}"), f"truth · frame {view.frame}")
+                + figure(
+                    embed.image(render, f"render of {label}"), f"render · {entry['psnr']:.2f} dB"
+                )
+                + figure(embed.image(truth, f"truth of {label}"), f"truth · frame {entry['frame']}")
                 + "</div></article>"
             )
+        if not pairs:
+            continue
         blocks.append(
-            f"<h3>{escape(name)} <small>mean of {len(views)} views{_frame_figures(_with_mask(values))}"
+            f"<h3>{escape(name)} <small>mean of {len(drawn)} views{frame_figures(values)}"
             f'</small></h3><div class="pairs">{"".join(pairs)}</div>'
         )
-    return _section(
+    if not blocks:
+        return ""
+    return section(
         "Novel views",
         "Cameras that took no part in the training. One camera does not see what is behind the "
         "person or outside of its own picture, so that large errors there are expected.",
         "".join(blocks),
     )
-
-
-def _with_mask(values: dict[str, Any]) -> dict[str, dict[str, float | None]]:
-    return {**values, "person_mask": {"psnr": None}}
 
 
 def _curves(source: Source) -> str:
@@ -357,29 +224,7 @@ def _curves(source: Source) -> str:
         ),
         line_chart(counts, x_title="iteration", y_title="Gaussians"),
     ]
-    return _section("Curves", "", f'<div class="charts">{"".join(charts)}</div>')
-
-
-def _configuration(source: Source) -> str:
-    blocks = []
-    loose = {k: v for k, v in source.config.items() if not isinstance(v, dict)}
-    groups = {"run": loose} | {k: v for k, v in source.config.items() if isinstance(v, dict)}
-    for group, values in groups.items():
-        rows = "".join(
-            f"<div><dt>{escape(key)}</dt><dd>{escape(_plain(value))}</dd></div>"
-            for key, value in _flat(values)
-        )
-        if rows:
-            blocks.append(f"<div class=group><h3>{escape(str(group))}</h3><dl>{rows}</dl></div>")
-    versions = "".join(
-        f"<div><dt>{escape(key)}</dt><dd>{escape(_plain(value))}</dd></div>"
-        for key, value in _flat(source.versions)
-    )
-    if versions:
-        blocks.append(f"<div class=group><h3>versions</h3><dl>{versions}</dl></div>")
-    if not blocks:
-        return ""
-    return _section("Configuration", "", f'<div class="config">{"".join(blocks)}</div>')
+    return section("Curves", "", f'<div class="charts">{"".join(charts)}</div>')
 
 
 def _footer(source: Source) -> str:
@@ -394,50 +239,8 @@ def _provenance(source: Source) -> str:
     return str(text) if text else "no provenance given."
 
 
-def _section(title: str, intro: str, body: str) -> str:
-    lead = f'<p class="intro">{intro}</p>' if intro else ""
-    return f"<section><h2>{title}</h2>{lead}{body}</section>"
-
-
-def _figure(image: str, caption: str = "") -> str:
-    text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{image}{text}</figure>"
-
-
-def _legend(gradient: str, low: str, high: str, what: str) -> str:
-    return (
-        f'<p class="scale"><span>{escape(what)}:</span><span>{escape(low)}</span>'
-        f'<i style="background:{gradient}"></i><span>{escape(high)}</span></p>'
-    )
-
-
-def _spread(items: Sequence[_T], count: int) -> list[_T]:
-    """At most ``count`` items, evenly spread, the first and the last among them."""
-    if len(items) <= count:
-        return list(items)
-    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Nested settings as dotted keys."""
-    result: list[tuple[str, Any]] = []
-    for key, value in values.items():
-        if isinstance(value, dict):
-            result += _flat(value, f"{prefix}{key}.")
-        else:
-            result.append((f"{prefix}{key}", value))
-    return result
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, list | tuple):
-        return ", ".join(_plain(item) if not isinstance(item, list) else f"({_plain(item)})" for item in value)
-    return "–" if value is None else str(value)
-
-
 def _count(value: Any) -> str | None:
+    """A count with narrow spaces between thousands."""
     return None if value is None else f"{value:,}".replace(",", "\u202f")
 
 

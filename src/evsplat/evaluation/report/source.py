@@ -36,7 +36,9 @@ class Source:
         """Read the files of an evaluated run; only metrics.json must be there."""
         metrics_file = folder / "metrics.json"
         if not metrics_file.is_file():
-            raise DataError(f"{metrics_file}: file not found; run `evsplat evaluate {folder}` first.")
+            raise DataError(
+                f"{metrics_file}: file not found; run `evsplat evaluate {folder}` first."
+            )
         versions = folder / "versions.json"
         return cls(
             folder,

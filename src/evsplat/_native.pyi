@@ -1,0 +1,51 @@
+"""Types of the extension module; see native/module.cpp."""
+
+from torch import Tensor
+
+class Render:
+    """One render of T times; keeps what its backward pass needs."""
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        K: Tensor,
+        world_to_camera: Tensor,
+        near: float,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        channels: Tensor,
+        linear: Tensor | None,
+        offset: Tensor | None,
+        background: Tensor | None,
+        times: int,
+        threads: int,
+    ) -> None: ...
+    def forward(self, image: Tensor, alpha: Tensor, radii: Tensor) -> None: ...
+    def backward(
+        self,
+        image_grad: Tensor | None,
+        alpha_grad: Tensor | None,
+        means: Tensor | None,
+        quats: Tensor | None,
+        scales: Tensor | None,
+        opacities: Tensor | None,
+        channels: Tensor | None,
+        linear: Tensor | None,
+        offset: Tensor | None,
+        view: Tensor | None,
+        background: Tensor | None,
+    ) -> None: ...
+    @property
+    def bytes(self) -> int: ...
+    @property
+    def intersections(self) -> int: ...
+    @property
+    def patch_steps(self) -> int: ...
+
+def lanes() -> int: ...
+def levels() -> list[str]: ...
+def level() -> str: ...
+def multiply_add(rounds: int) -> float: ...

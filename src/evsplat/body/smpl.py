@@ -1,0 +1,125 @@
+"""SMPL, SMPL-H and SMPL-X from the user's own licensed files, through the body-models package."""
+
+import os
+import pickle
+import tempfile
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from evsplat.body.adapters import fit_betas, make_body
+from evsplat.body.body import Body
+from evsplat.body.model_files import read_model_file
+from evsplat.errors import DataError, WeightsError
+
+ENVIRONMENT = "EVSPLAT_BODY_MODELS"
+_SITES = {
+    "smpl": "https://smpl.is.tue.mpg.de",
+    "smplh": "https://mano.is.tue.mpg.de",
+    "smplx": "https://smpl-x.is.tue.mpg.de",
+}
+_LEGACY = {"neutral": "neutral", "male": "m", "female": "f"}
+"""How SMPL 1.0 and 1.1 name the genders: basicModel_m_lbs_10_207_0_v1.0.0.pkl, basicmodel_m_..."""
+
+
+def smpl_body(
+    family: str,
+    betas: Float[np.ndarray, "B"] | None = None,
+    *,
+    gender: str = "neutral",
+    path: Path | str | None = None,
+    source: str = "betas",
+) -> Body:
+    """A subject's shaped body of the SMPL family, without pose blend shapes (as 3DGS-Avatar).
+
+    ``family`` is smpl, smplh or smplx. ``path`` is the model's file or the folder to search, by
+    default the folder that the environment variable EVSPLAT_BODY_MODELS names. Hands are flat at
+    zero pose, the face is neutral.
+
+    Raises:
+        WeightsError: the optional package, the folder or the file is missing.
+        DataError: the file is not such a model, or there are too many shape coefficients.
+    """
+    file = find_model_file(family, gender, path)
+    model = _open(family, file)
+    shape = fit_betas(betas, model.NUM_SHAPE_COEFFS, source)
+    coefficients = [torch.from_numpy(shape).float()[None]]
+    if family == "smplx":
+        coefficients.append(torch.zeros(1, model.NUM_EXPR_COEFFS))
+    identity = model.prepare_identity(*coefficients)
+    body, _ = make_body(
+        identity["rest_vertices"][0].numpy(),
+        np.asarray(model.faces),
+        np.asarray(model.skin_weights),
+        np.asarray(model.parents),
+        identity["rest_joints"][0].numpy(),
+        tuple(model.joint_names),
+        source=str(file),
+    )
+    return body
+
+
+def find_model_file(family: str, gender: str, path: Path | str | None = None) -> Path:
+    """The model's file at ``path`` or under the folder that it or the environment names."""
+    if gender not in _LEGACY:
+        raise DataError(f"gender is '{gender}', expected neutral, male or female.")
+    place = path if path is not None else os.environ.get(ENVIRONMENT)
+    upper = gender.upper()
+    stems = {
+        "smpl": [f"SMPL_{upper}", f"basicModel_{_LEGACY[gender]}_lbs_10_207_0_v1.0.0"]
+        + [f"basicmodel_{_LEGACY[gender]}_lbs_10_207_0_v1.{minor}.0" for minor in (1, 0)],
+        "smplh": [f"SMPLH_{upper}", f"{gender}/model"],
+        "smplx": [f"SMPLX_{upper}"],
+    }[family]
+    wanted = f"{family.upper()} ({gender}): download it from {_SITES[family]} (licence needed)"
+    if not place:
+        raise WeightsError(
+            f"No folder for body models is set for {wanted}, put it at "
+            f"<folder>/{family}/{stems[0]}.npz or .pkl and set {ENVIRONMENT}=<folder>."
+        )
+    place = Path(place)
+    if place.is_file():
+        return place
+    candidates = [
+        folder / f"{stem}{suffix}"
+        for folder in (place / family, place)
+        for stem in stems
+        for suffix in (".npz", ".pkl")
+    ]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise WeightsError(
+        f"{place}: holds no file of {wanted} and put it at {candidates[0]} (or .pkl)."
+    )
+
+
+def _open(family: str, file: Path) -> Any:
+    """The body-models object of a file, given to it as a clean copy of the file's arrays.
+
+    body-models would unpickle the user's file without restriction; the pickle that it reads here
+    was written by ourselves a moment before, from arrays that `read_model_file` let through.
+    """
+    try:
+        module = import_module(f"body_models.{family}.torch")
+    except ModuleNotFoundError as error:
+        raise WeightsError(
+            f"The {family.upper()} body needs the package '{error.name}', which is not installed: "
+            "pip install 'evsplat[body-models]'."
+        ) from None
+    arrays = read_model_file(file)
+    missing = [key for key in ("v_template", "shapedirs", "J_regressor") if key not in arrays]
+    if missing:
+        raise DataError(f"{file}: not a {family.upper()} model, {', '.join(missing)} is missing.")
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "model.pkl"
+        with copy.open("wb") as stream:
+            pickle.dump(arrays, stream, protocol=pickle.HIGHEST_PROTOCOL)
+        try:
+            return getattr(module, family.upper())(model_path=copy)
+        except (KeyError, ValueError, TypeError, IndexError) as error:
+            raise DataError(f"{file}: not a {family.upper()} model ({error}).") from error

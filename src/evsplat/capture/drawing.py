@@ -1,0 +1,98 @@
+"""Small Pillow helpers: sheets of labelled tiles, outlines, colours."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import binary_dilation, binary_erosion
+from torch import Tensor
+
+PAPER, INK, FAINT = (255, 255, 255), (38, 43, 51), (128, 136, 148)
+TRAIN, TEST = (38, 124, 160), (226, 114, 38)
+BRIGHTER, DARKER = (235, 40, 40), (40, 90, 245)
+_GAP, _LABEL_HEIGHT, _HEADER_HEIGHT, _BORDER = 10, 20, 62, 4
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A picture with a frame of the split's colour and a line of text below."""
+
+    image: Image.Image
+    label: str
+    split: str
+
+
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Pillow's own font."""
+    return ImageFont.load_default(size)
+
+
+def split_colour(split: str) -> tuple[int, int, int]:
+    """One colour for train, another for test."""
+    return TRAIN if split == "train" else TEST
+
+
+def to_picture(image: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Image.Image:
+    """8-bit picture of sRGB in [0, 1], resampled to ``size`` (width, height)."""
+    pixels = (image.clamp(0, 1) * 255 + 0.5).byte().numpy()
+    return Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
+
+
+def fit(width: int, height: int, longest: int) -> tuple[int, int]:
+    """Size with the same shape whose longer side is ``longest``."""
+    scale = longest / max(width, height)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def sheet(title: str, subtitle: str, tiles: list[Tile], columns: int) -> Image.Image:
+    """Tiles in rows below a title and a legend of the splits."""
+    columns = min(columns, len(tiles))
+    cell_width = max(tile.image.width for tile in tiles) + 2 * _BORDER + _GAP
+    cell_height = max(tile.image.height for tile in tiles) + 2 * _BORDER + _LABEL_HEIGHT + _GAP
+    rows = -(-len(tiles) // columns)
+    # wide enough for the header even with few tiles
+    width = max(columns * cell_width + _GAP, 720)
+    page = Image.new("RGB", (width, _HEADER_HEIGHT + rows * cell_height + _GAP), PAPER)
+    draw = ImageDraw.Draw(page)
+    header(draw, title, subtitle, page.width, {tile.split for tile in tiles})
+    for index, tile in enumerate(tiles):
+        x = _GAP + index % columns * cell_width
+        y = _HEADER_HEIGHT + index // columns * cell_height
+        colour = split_colour(tile.split)
+        outer = (x + tile.image.width + 2 * _BORDER - 1, y + tile.image.height + 2 * _BORDER - 1)
+        draw.rectangle(((x, y), outer), fill=colour)
+        page.paste(tile.image, (x + _BORDER, y + _BORDER))
+        draw.text((x + 1, outer[1] + 4), tile.label, fill=INK, font=font(13))
+    return page
+
+
+def header(
+    draw: ImageDraw.ImageDraw, title: str, subtitle: str, width: int, splits: set[str]
+) -> None:
+    """Title, subtitle and, at the right, which colour is which split."""
+    draw.text((_GAP, 8), title, fill=INK, font=font(22))
+    draw.text((_GAP, 36), subtitle, fill=FAINT, font=font(14))
+    x = width - _GAP
+    for split in sorted(splits):
+        x -= int(draw.textlength(split, font=font(14)))
+        draw.text((x, 11), split, fill=INK, font=font(14))
+        x -= 18
+        draw.rectangle((x, 13, x + 12, 25), fill=split_colour(split))
+        x -= 14
+
+
+def draw_outline(
+    picture: Image.Image,
+    mask: Bool[np.ndarray, "H W"],
+    colour: tuple[int, int, int],
+    *,
+    halo: bool = True,
+) -> None:
+    """Draw the inner edge of ``mask`` on a picture of the same size, over a dark halo."""
+    edge = mask & ~binary_erosion(mask, border_value=1)
+    if halo:
+        edge = binary_dilation(edge)
+        around = binary_dilation(edge, iterations=1)
+        picture.paste((0, 0, 0), mask=Image.fromarray(around).convert("L"))
+    picture.paste(colour, mask=Image.fromarray(edge).convert("L"))

@@ -1,0 +1,225 @@
+"""`evsplat inspect`: check a capture, sum it up in words and draw it."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from evsplat.body import BodyTrack, load_body_track, silhouette
+from evsplat.capture.camera import Camera
+from evsplat.capture.capture import Capture
+from evsplat.capture.drawing import (
+    BRIGHTER,
+    DARKER,
+    Tile,
+    draw_outline,
+    fit,
+    sheet,
+    to_picture,
+)
+from evsplat.capture.finding import Finding
+from evsplat.capture.metadata import Frame
+from evsplat.capture.timeline import draw_timeline, short_number
+from evsplat.capture.validate import check_capture
+from evsplat.events import count_map
+from evsplat.files import atomic_path
+
+CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
+# Longer windows cover the person so densely that single edges cannot be told apart.
+EVENT_WINDOW_US = 20_000
+_OUTLINE, _OUTLINE_ENDS = (60, 255, 120), (255, 225, 80)
+
+
+@dataclass(frozen=True)
+class InspectReport:
+    """What `inspect_capture` found out."""
+
+    path: Path
+    findings: tuple[Finding, ...]
+    summary: str
+    """Text of several lines, to be printed."""
+    pictures: tuple[Path, ...]
+
+    @property
+    def usable(self) -> bool:
+        """Whether there are no errors (warnings are allowed)."""
+        return not any(finding.severity == "error" for finding in self.findings)
+
+
+def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
+    """Validate the capture fully and, where it has no errors, draw it into ``out_dir``.
+
+    Writes contact_sheet.png, events.png, body.png and timeline.png.
+    """
+    path, out_dir = Path(path), Path(out_dir)
+    metadata, found = check_capture(path, deep=True)
+    findings = tuple(found)
+    report = InspectReport(path, findings, "", ())
+    if metadata is None or not report.usable:
+        return replace(report, summary=f"{path}\n{_findings_text(findings)}")
+    capture = Capture(metadata)
+    track = load_body_track(capture)
+    drawings = {"contact_sheet": _contact_sheet(capture), "body": _body_sheet(capture, track)}
+    if capture.events is not None and len(capture.events):
+        drawings["events"] = _events_sheet(capture)
+    drawings["timeline"] = draw_timeline(capture)
+    pictures = []
+    for name, drawing in drawings.items():
+        pictures.append(out_dir / f"{name}.png")
+        with atomic_path(pictures[-1]) as temporary:
+            drawing.save(temporary)
+    summary = f"{_summary(capture, track)}\n{_findings_text(findings)}\npictures   {out_dir}: "
+    summary += ", ".join(picture.name for picture in pictures)
+    return replace(report, summary=summary, pictures=tuple(pictures))
+
+
+def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, ...]) -> list[float]:
+    """Intersection over union of posed body and person mask, for the frames that have a mask."""
+    overlaps = []
+    for frame in frames:
+        mask = capture.mask(frame)
+        if mask is not None:
+            body = _silhouette(track, frame.mid_us, capture.camera(frame))
+            person = mask.numpy() > 0.5
+            overlaps.append(float((body & person).sum() / max(1, (body | person).sum())))
+    return overlaps
+
+
+def _summary(capture: Capture, track: BodyTrack) -> str:
+    frames = capture.frames
+    cameras = ", ".join(
+        f"{name} {capture.cameras[name].width}x{capture.cameras[name].height}"
+        for name in sorted({frame.camera for frame in frames})
+    )
+    start, end = frames[0].exposure_us[0], frames[-1].exposure_us[1]
+    exposure = float(np.median([frame.exposure_us[1] - frame.exposure_us[0] for frame in frames]))
+    starts = [frame.exposure_us[0] for frame in frames]
+    rate = f", {1e6 / np.median(np.diff(starts)):.4g} frames/s" if len(frames) > 1 else ""
+    body, key_times = track.body, capture.body_file.times_us
+    dense = capture.dense_body_file
+    lines = [
+        f"{capture.name}   {capture.path}",
+        f"frames     {len(frames)}: {len(capture.train_frames)} train, {len(capture.test_frames)} "
+        f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera",
+        f"time       {(end - start) / 1e6:.3f} s{rate}, exposure {exposure / 1000:.4g} ms",
+        f"events     {_events_text(capture)}",
+        f"body       {capture.body_file.model}: {len(body.parents)} joints, "
+        f"{len(body.rest_vertices):,} vertices; {len(key_times)} key poses from "
+        f"{key_times[0] / 1e6:.3f} to {key_times[-1] / 1e6:.3f} s"
+        + (f"; {len(dense.times_us)} dense true poses" if dense is not None else ""),
+        f"truth      {_truth_text(capture)}",
+    ]
+    overlaps = body_mask_overlap(capture, track, _spread(frames, DETAIL_FRAMES))
+    if overlaps:
+        lines.append(
+            f"fit        posed body over masks: IoU {np.mean(overlaps):.2f} "
+            f"(least {min(overlaps):.2f}; clothes and hair are not part of the body)"
+        )
+    if "text" in capture.provenance:
+        lines.append(f"made       {capture.provenance['text']}")
+    return "\n".join(lines)
+
+
+def _events_text(capture: Capture) -> str:
+    events = capture.events
+    if events is None:
+        return "none"
+    first, last = events.time_range_us
+    seconds = max(last - first, 1) / 1e6
+    thresholds = capture.contrast_threshold
+    return (
+        f"{len(events):,} over {seconds:.3f} s ({short_number(len(events) / seconds)}/s), "
+        f"{'simulated' if capture.events_simulated else 'recorded'}, "
+        + (f"C+ {thresholds[0]:g}, C- {thresholds[1]:g}" if thresholds else "C unknown")
+        + (f", clock offset {capture.clock_offset_us} us" if capture.clock_offset_us else "")
+    )
+
+
+def _truth_text(capture: Capture) -> str:
+    sharp = sum(frame.sharp is not None for frame in capture.frames)
+    masks = sum(frame.mask is not None for frame in capture.frames)
+    novel = [view.camera for view in capture.novel_views]
+    by_camera = ", ".join(f"{name} {novel.count(name)}" for name in sorted(set(novel)))
+    views = f"{len(novel)} novel views" + (f" ({by_camera})" if novel else "")
+    return f"{sharp} sharp, {masks} masks, {views}"
+
+
+def _findings_text(findings: tuple[Finding, ...]) -> str:
+    if not findings:
+        return "findings   none"
+    errors = sum(finding.severity == "error" for finding in findings)
+    lines = [f"findings   errors: {errors}, warnings: {len(findings) - errors}"]
+    return "\n".join([*lines, *(f"{finding.severity}: {finding}" for finding in findings)])
+
+
+def _spread(frames: tuple[Frame, ...], count: int) -> tuple[Frame, ...]:
+    """At most ``count`` frames, evenly spread."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
+    return tuple(frames[i] for i in chosen)
+
+
+def _label(frame: Frame) -> str:
+    return f"{frame.name}   {frame.mid_us / 1e6:.3f} s"
+
+
+def _contact_sheet(capture: Capture) -> Image.Image:
+    chosen = _spread(capture.frames, CONTACT_FRAMES)
+    tiles = []
+    for frame in chosen:
+        camera = capture.camera(frame)
+        picture = to_picture(capture.image(frame), fit(camera.width, camera.height, 170))
+        tiles.append(Tile(picture, _label(frame), frame.split))
+    some = "" if len(chosen) == len(capture.frames) else f"{len(chosen)} of "
+    subtitle = f"{some}{len(capture.frames)} frames as the camera saw them"
+    return sheet(f"{capture.name}: frames", subtitle, tiles, columns=8)
+
+
+def _events_sheet(capture: Capture) -> Image.Image:
+    """Events in the middle of the exposure over the greyed picture."""
+    assert capture.events is not None
+    tiles = []
+    window = EVENT_WINDOW_US
+    for frame in _spread(capture.frames, DETAIL_FRAMES):
+        window = min(EVENT_WINDOW_US, frame.exposure_us[1] - frame.exposure_us[0])
+        start = frame.mid_us - window // 2
+        camera = capture.camera(frame)
+        stream = capture.events.between(start, start + window)
+        counts = count_map(stream, camera.height, camera.width)
+        grey = capture.image(frame).mean(-1, keepdim=True).expand(-1, -1, 3)
+        strength = (counts.abs() / 3).clamp(0, 1).sqrt()[..., None]
+        colour = torch.where(
+            counts[..., None] > 0, torch.tensor(BRIGHTER) / 255, torch.tensor(DARKER) / 255
+        )
+        mixed = (0.25 + 0.6 * grey) * (1 - strength) + colour * strength
+        picture = to_picture(mixed, fit(camera.width, camera.height, 380))
+        tiles.append(Tile(picture, f"{_label(frame)}   {len(stream):,} events", frame.split))
+    subtitle = f"{window / 1000:g} ms about mid-exposure; red: brighter, blue: darker"
+    return sheet(f"{capture.name}: events", subtitle, tiles, columns=4)
+
+
+def _body_sheet(capture: Capture, track: BodyTrack) -> Image.Image:
+    """Outline of the posed body at mid-exposure, thin lines where it is at the exposure's ends."""
+    tiles = []
+    for frame in _spread(capture.frames, DETAIL_FRAMES):
+        camera = capture.camera(frame)
+        size = fit(camera.width, camera.height, 380)
+        picture = to_picture(capture.image(frame), size)
+        large = _resized(camera, size)
+        for time_us in frame.exposure_us:
+            draw_outline(picture, _silhouette(track, time_us, large), _OUTLINE_ENDS, halo=False)
+        draw_outline(picture, _silhouette(track, frame.mid_us, large), _OUTLINE)
+        tiles.append(Tile(picture, _label(frame), frame.split))
+    subtitle = "posed body at mid-exposure (green) and at the exposure's ends (yellow)"
+    return sheet(f"{capture.name}: body", subtitle, tiles, columns=4)
+
+
+def _silhouette(track: BodyTrack, time_us: int, camera: Camera) -> np.ndarray:
+    return silhouette(track.vertices(time_us), track.body.faces, camera).numpy()
+
+
+def _resized(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The camera of the picture resampled to ``size`` (pixel centres at +0.5: K just scales)."""
+    factors = torch.tensor([size[0] / camera.width, size[1] / camera.height, 1.0])
+    return Camera(size[0], size[1], camera.K * factors[:, None], camera.world_to_camera)

@@ -1,0 +1,100 @@
+"""Projection and lens distortion, against OpenCV."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from evsplat.capture import Camera
+from evsplat.capture.distortion import Distortion
+
+WIDTH, HEIGHT = 64, 48
+K = np.array([[70.0, 0, 30.5], [0, 66.0, 25.0], [0, 0, 1]])
+LENSES = {
+    "barrel": (-0.25, 0.06, 0.0, 0.0),
+    "pincushion": (0.18, -0.02, 0.004, -0.003, 0.01),
+    "rational": (0.3, 0.1, 0.002, 0.001, 0.02, 0.35, 0.05, 0.01),
+}
+# OpenCV puts pixel centres at whole numbers, we at +0.5
+K_OPENCV = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+
+
+def random_camera(seed: int) -> Camera:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(rng=seed).as_matrix()
+    pose[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    return Camera(WIDTH, HEIGHT, torch.tensor(K).float(), torch.tensor(pose).float())
+
+
+def test_point_on_the_axis_meets_the_principal_point() -> None:
+    camera = Camera(WIDTH, HEIGHT, torch.tensor(K).float(), torch.eye(4))
+    pixels, depth = camera.project(torch.tensor([0.0, 0.0, 2.0]))
+    assert pixels.tolist() == [30.5, 25.0] and depth == 2
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_projection_agrees_with_opencv(seed: int) -> None:
+    cv2 = pytest.importorskip("cv2")
+    camera = random_camera(seed)
+    in_camera = np.random.default_rng(seed).uniform((-2, -2, 1), (2, 2, 6), (4, 5, 3))
+    pose = camera.world_to_camera.double().numpy()
+    points = (in_camera - pose[:3, 3]) @ pose[:3, :3]
+    rotation = cv2.Rodrigues(pose[:3, :3])[0]
+    expected = cv2.projectPoints(points.reshape(-1, 3), rotation, pose[:3, 3], K, None)[0]
+    pixels, depth = camera.project(torch.tensor(points))
+    assert np.allclose(pixels.numpy(), expected.reshape(4, 5, 2), atol=1e-3)
+    assert np.allclose(depth.numpy(), in_camera[..., 2], atol=1e-5)
+    assert camera.center().numpy() == pytest.approx(-pose[:3, :3].T @ pose[:3, 3], abs=1e-5)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_distortion_agrees_with_opencv(lens: str) -> None:
+    cv2 = pytest.importorskip("cv2")
+    ours = Distortion(WIDTH, HEIGHT, K, LENSES[lens])
+    map_x, map_y = cv2.initUndistortRectifyMap(
+        K_OPENCV, np.array(LENSES[lens]), None, K_OPENCV, (WIDTH, HEIGHT), cv2.CV_32FC1
+    )
+    centres = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), axis=-1)
+    assert np.allclose(ours.distort(centres) - 0.5, np.stack([map_x, map_y], axis=-1), atol=1e-4)
+    image = np.random.default_rng(0).random((HEIGHT, WIDTH, 3)).astype(np.float32)
+    expected = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    # remap rounds positions to 1/32 pixel
+    assert np.allclose(ours.undistort_image(image), expected, atol=1.1 / 32 * 2)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_undistort_inverts_distort_as_opencv_does(lens: str) -> None:
+    cv2 = pytest.importorskip("cv2")
+    ours = Distortion(WIDTH, HEIGHT, K, LENSES[lens])
+    pixels = np.random.default_rng(1).uniform((0, 0), (WIDTH, HEIGHT), (200, 2))
+    found = ours.undistort(pixels)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+    expected = cv2.undistortPoints(
+        pixels[:, None], K, np.array(LENSES[lens]), R=None, P=K, criteria=criteria
+    )[:, 0]
+    assert np.allclose(found, expected, atol=1e-3)
+    assert np.allclose(ours.distort(found), pixels, atol=1e-3)
+
+
+def test_pixels_that_no_ray_reaches_are_nan() -> None:
+    folding = Distortion(WIDTH, HEIGHT, K, (-3.0, 0.0, 0.0, 0.0))
+    assert np.isnan(folding.undistort(np.array([[0.5, 0.5]]))).all()
+    assert (folding.event_lookup()[0, 0] == -1).all()
+
+
+def test_event_lookup_follows_the_pictures_pixels() -> None:
+    """A bright sensor pixel lands, in the undistorted picture, where the lookup says."""
+    ours = Distortion(WIDTH, HEIGHT, K, LENSES["barrel"])
+    lookup = ours.event_lookup()
+    for x, y in ((5, 40), (32, 24), (60, 3), (20, 20)):
+        sensor = np.zeros((HEIGHT, WIDTH), dtype=np.float32)
+        sensor[y, x] = 1
+        to_x, to_y = lookup[y, x]
+        if to_x < 0:
+            assert ours.undistort_image(sensor).max() < 1e-6
+            continue
+        # a magnified pixel may miss the one pixel it was assigned to, never its neighbourhood
+        spot = ours.undistort_image(sensor)[
+            max(0, to_y - 1) : to_y + 2, max(0, to_x - 1) : to_x + 2
+        ]
+        assert spot.max() > 0.2

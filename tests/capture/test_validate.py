@@ -1,0 +1,631 @@
+"""The validator: one test per kind of fault; good captures have no findings."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from evsplat.capture import Finding, load_capture, validate_capture
+from evsplat.errors import DataError
+
+Factory = Callable[..., Path]
+
+
+def edit_json(path: Path, *keys: Any, value: Any) -> None:
+    """Set (or with ``...`` remove) a value of capture.json."""
+    document = json.loads((path / "capture.json").read_text())
+    inner = document
+    for key in keys[:-1]:
+        inner = inner[key]
+    if value is ...:
+        del inner[keys[-1]]
+    else:
+        inner[keys[-1]] = value
+    (path / "capture.json").write_text(json.dumps(document))
+
+
+def edit_body(path: Path, **changes: Any) -> None:
+    with np.load(path / "body.npz") as arrays:
+        body = {**arrays}
+    for key, value in changes.items():
+        if value is None:
+            del body[key]
+        else:
+            body[key] = value(body[key].copy()) if callable(value) else value
+    np.savez(path / "body.npz", **body)
+
+
+def the_only(path: Path, severity: str = "error", **options: Any) -> Finding:
+    findings = validate_capture(path, **options)
+    assert len(findings) == 1, findings
+    assert findings[0].severity == severity
+    assert findings[0].found and findings[0].expected and findings[0].remedy
+    return findings[0]
+
+
+def check(finding: Finding, file: Path, field: str, found: str, expected: str) -> None:
+    assert finding.file == file
+    assert finding.field == field
+    assert found in finding.found
+    assert expected in finding.expected
+    for part in (str(file), field, finding.found, finding.expected, finding.remedy):
+        assert part in str(finding)
+
+
+def refuses_to_load(path: Path) -> str:
+    with pytest.raises(DataError) as error:
+        load_capture(path)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tiny_capture_has_no_findings(tiny_capture: Factory, seed: int) -> None:
+    assert validate_capture(tiny_capture(seed=seed, frames=10 + seed)) == []
+
+
+def test_demo_capture_has_no_findings(demo_capture_path: Path) -> None:
+    assert validate_capture(demo_capture_path) == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "man_dance_hard_256",
+        "woman_dance_b_256",
+        "worker_punch_256",
+        "real_beam_256",
+        "real_beam_512",
+    ],
+)
+def test_shared_captures_are_valid(captures_root: Path, name: str) -> None:
+    findings = validate_capture(captures_root / name)
+    # the real footage says itself that its exposures overlap
+    assert [finding.field for finding in findings] == (
+        ["frames[1].exposure_us"] if name.startswith("real") else []
+    )
+    assert all(finding.severity == "warning" for finding in findings)
+
+
+# --- the faults that issue and README name ---------------------------------------------------
+
+
+def test_missing_image(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    (path / "images/0004.png").unlink()
+    finding = the_only(path)
+    check(finding, path / "images/0004.png", "frames[4].image", "no such file", "a picture")
+    assert "frame '0004'" in finding.found
+    assert str(path / "images/0004.png") in refuses_to_load(path)
+
+
+def test_body_without_pose_for_a_frame(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_body(
+        path, **{key: lambda a: np.delete(a, 5, 0) for key in ("times_us", "poses", "transl")}
+    )
+    finding = the_only(path)
+    check(
+        finding,
+        path / "body.npz",
+        "times_us",
+        "no pose for frame '0005' at 215000 us",
+        "15000..375000 us",
+    )
+    assert "frame '0005'" in refuses_to_load(path)
+
+
+def test_poses_that_end_early_name_the_frames_left(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_body(path, **{key: lambda a: a[:7] for key in ("times_us", "poses", "transl")})
+    finding = the_only(path)
+    check(finding, path / "body.npz", "times_us", "no pose for frame '0007'", "15000..255000 us")
+    assert "2 more frames: 0008, 0009" in finding.found
+
+
+def test_poses_at_another_rate_cover_the_frames(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    times = np.arange(0, 400_000, 33_333)
+    poses, transl = np.zeros((len(times), 3, 3)), np.zeros((len(times), 3))
+    edit_body(path, times_us=times, poses=poses, transl=transl)
+    assert validate_capture(path) == []
+
+
+def test_events_out_of_order(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    with h5py.File(path / "events.h5", "r+") as file:
+        t = file["events/t"][:]
+        late = np.flatnonzero(np.diff(t) > 0)[[20, 60]]
+        t[late], t[late + 1] = t[late + 1], t[late].copy()
+        file["events/t"][:] = t
+        first, total = int(late[0]) + 1, len(t)
+        by = int(t[late[0]] - t[late[0] + 1])
+    finding = the_only(path)
+    check(finding, path / "events.h5", f"events/t[{first}]", f"{by} us before", "ascending times")
+    assert f"2 of {total} events" in finding.found
+    load_capture(path)  # every event is scanned by the deep checks only
+
+
+def test_wrong_resolution(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    Image.new("RGB", (30, 24)).save(path / "images/0001.png")
+    finding = the_only(path)
+    check(
+        finding,
+        path / "images/0001.png",
+        "frames[1].image",
+        "30x24 pixels",
+        "32x24 pixels of camera 'main'",
+    )
+    assert "30x24" in refuses_to_load(path)
+
+
+@pytest.mark.parametrize("version", [2, 0, "1", 1.5, None, True])
+def test_unknown_version(tiny_capture: Factory, version: Any) -> None:
+    path = tiny_capture()
+    edit_json(path, "version", value=version)
+    finding = the_only(path)
+    check(finding, path / "capture.json", "version", repr(version), "1")
+    assert "version" in refuses_to_load(path)
+
+
+@pytest.mark.parametrize("keep", [0.2, 0.6, 0.98])
+def test_truncated_hdf5(tiny_capture: Factory, keep: float) -> None:
+    path = tiny_capture()
+    whole = (path / "events.h5").read_bytes()
+    (path / "events.h5").write_bytes(whole[: int(keep * len(whole))])
+    finding = the_only(path)
+    check(finding, path / "events.h5", "", "truncated", "a whole HDF5 file")
+    assert "events.h5" in refuses_to_load(path)
+
+
+def test_nan_pose(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+
+    def spoil(poses: np.ndarray) -> np.ndarray:
+        poses[3, 2, 1] = np.nan
+        poses[4, 0, 0] = np.inf
+        return poses
+
+    edit_body(path, poses=spoil)
+    finding = the_only(path)
+    check(
+        finding,
+        path / "body.npz",
+        "poses[3, 2, 1]",
+        "nan in pose 3 at 135000 us, joint 2 'Arm'",
+        "finite",
+    )
+    assert "2 such values" in finding.found
+    assert "joint 2 'Arm'" in refuses_to_load(path)
+
+
+# --- capture.json --------------------------------------------------------------------------
+
+
+def test_missing_folder_and_missing_or_broken_json(tmp_path: Path, tiny_capture: Factory) -> None:
+    check(the_only(tmp_path / "no"), tmp_path / "no", "", "no such folder", "a capture folder")
+    (tmp_path / "empty").mkdir()
+    finding = the_only(tmp_path / "empty")
+    check(finding, tmp_path / "empty/capture.json", "", "no such file", "capture's description")
+    path = tiny_capture()
+    (path / "capture.json").write_text('{"format": ')
+    check(the_only(path), path / "capture.json", "", "not valid JSON", "JSON object")
+
+
+def test_unknown_format(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_json(path, "format", value="colmap")
+    check(the_only(path), path / "capture.json", "format", "'colmap'", "'evsplat-capture'")
+
+
+@pytest.mark.parametrize(
+    ("keys", "field", "nearest"),
+    [
+        (("frame",), "frame", "frames"),
+        (("frames", 2, "exposure"), "frames[2].exposure", "exposure_us"),
+        (("cameras", "main", "k"), "cameras.main.k", "K"),
+        (("events", "contrast_thresholds"), "events.contrast_thresholds", "contrast_threshold"),
+    ],
+)
+def test_unknown_key_names_the_nearest(
+    tiny_capture: Factory, keys: tuple, field: str, nearest: str
+) -> None:
+    path = tiny_capture()
+    edit_json(path, *keys, value=1)
+    finding = the_only(path, "warning")
+    check(finding, path / "capture.json", field, "an unknown key", "a known key")
+    assert repr(nearest) in finding.remedy
+    load_capture(path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "field", "found", "expected"),
+    [
+        (("frames", 3, "exposure_us"), [5, 5], "frames[3].exposure_us", "empty", "start < end"),
+        (("frames", 3, "exposure_us"), [9, 5], "frames[3].exposure_us", "negative", "start < end"),
+        (("frames", 3, "exposure_us"), [0.5, 5], "frames[3].exposure_us", "0.5", "whole micro"),
+        (("frames", 3, "exposure_us"), [10, 20], "frames[3].exposure_us", "not after", "in order"),
+        (("frames", 3, "exposure_us"), "soon", "frames[3].exposure_us", "'soon'", "2 finite"),
+        (("frames", 3, "split"), "val", "frames[3].split", "'val'", "'train' or 'test'"),
+        (("frames", 3, "split"), ..., "frames", "9 of 10", "every frame or in none"),
+        (("frames", 3, "name"), "0001", "frames[3].name", "'0001', already", "of its own"),
+        (("frames", 3, "image"), ..., "frames[3].image", "nothing", "a value"),
+        (("frames", 3, "camera"), "left", "frames[3].camera", "'left'", "'main', 'side'"),
+        (("frames", 3), 7, "frames[3]", "7", "a JSON object"),
+        (("frames",), [], "frames", "no frame", "at least one frame"),
+        (("frames",), ..., "frames", "nothing", "a value"),
+        (("cameras", "main", "width"), 0, "cameras.main.width", "0", "at least 1"),
+        (("cameras", "side", "K"), [[1, 0], [0, 1]], "cameras.side.K", "[[1, 0]", "3x3 finite"),
+        (("cameras", "side", "K", 0, 0), -5.0, "cameras.side.K", "-5.0", "fx and fy above 0"),
+        (("cameras", "side", "K", 0, 1), 1.0, "cameras.side.K", "1.0", "[fx, 0, cx]"),
+        (
+            ("cameras", "side", "world_to_camera", 0),
+            [2, 0, 0, 0],
+            "cameras.side.world_to_camera",
+            "not orthonormal",
+            "a rotation",
+        ),
+        (
+            ("cameras", "side", "world_to_camera", 3),
+            [0, 0, 1, 1],
+            "cameras.side.world_to_camera",
+            "last row",
+            "[0, 0, 0, 1]",
+        ),
+        (
+            ("cameras", "side", "distortion"),
+            {"model": "fisheye", "coefficients": [0, 0, 0, 0]},
+            "cameras.side.distortion.model",
+            "'fisheye'",
+            "'opencv'",
+        ),
+        (
+            ("cameras", "side", "distortion"),
+            {"model": "opencv", "coefficients": [0.1, 0.2]},
+            "cameras.side.distortion.coefficients",
+            "[0.1, 0.2]",
+            "4, 5 or 8",
+        ),
+        (("novel_views", 0, "frame"), "77", "novel_views[0].frame", "'77'", "valid frame"),
+        (("novel_views", 0, "frame"), "0008", "novel_views[1].frame", "second view", "one view"),
+        (("body", "model"), "star", "body.model", "'star'", "'rig'"),
+        (("body", "file"), ..., "body.file", "nothing", "a value"),
+        (("body",), ..., "body", "nothing", "a value"),
+        (("events", "width"), 31, "events.width", "31x24", "32x24 pixels of camera 'main'"),
+        (
+            ("events", "contrast_threshold"),
+            [0.2, -0.2],
+            "events.contrast_threshold",
+            "-0.2",
+            "positive",
+        ),
+        (("events", "clock_offset_us"), 1.5, "events.clock_offset_us", "1.5", "whole number"),
+        (("events", "simulated"), "yes", "events.simulated", "'yes'", "true or false"),
+    ],
+)
+def test_fault_of_the_description(
+    tiny_capture: Factory, keys: tuple, value: Any, field: str, found: str, expected: str
+) -> None:
+    path = tiny_capture()
+    edit_json(path, *keys, value=value)
+    errors = [f for f in validate_capture(path) if f.severity == "error"]
+    matching = [finding for finding in errors if finding.field == field]
+    assert matching, errors
+    check(matching[0], path / "capture.json", field, found, expected)
+    message = refuses_to_load(path)
+    assert str(path / "capture.json") in message
+
+
+def test_mirrored_rotation(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    document = json.loads((path / "capture.json").read_text())
+    row = [-v for v in document["cameras"]["main"]["world_to_camera"][0]]
+    edit_json(path, "cameras", "main", "world_to_camera", 0, value=row)
+    first = validate_capture(path)[0]
+    assert first.field == "cameras.main.world_to_camera" and "mirrored" in first.found
+
+
+def test_no_train_frame_is_an_error_and_no_test_frame_a_warning(tiny_capture: Factory) -> None:
+    for split, severity in (("test", "error"), ("train", "warning")):
+        path = tiny_capture(split)
+        document = json.loads((path / "capture.json").read_text())
+        for frame in document["frames"]:
+            frame["split"] = split
+        (path / "capture.json").write_text(json.dumps(document))
+        finding = the_only(path, severity)
+        assert finding.field == "frames" and "among 10" in finding.found
+
+
+def test_overlapping_exposures_are_a_warning(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_json(path, "frames", 4, "exposure_us", value=[140_000, 190_000])
+    finding = the_only(path, "warning")
+    check(finding, path / "capture.json", "frames[4].exposure_us", "1 exposures", "do not overlap")
+    load_capture(path)
+
+
+def test_capture_without_events_is_a_warning(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_json(path, "events", value=...)
+    assert the_only(path, "warning").field == "events"
+    assert load_capture(path).events is None
+
+
+def test_first_error_is_raised_with_the_count_of_the_others(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    for name in ("0002", "0005", "0006"):
+        (path / f"images/{name}.png").unlink()
+    message = refuses_to_load(path)
+    assert "images/0002.png" in message and "2 more errors" in message
+
+
+# --- pictures ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["masks", "sharp"])
+def test_named_mask_or_truth_is_missing(tiny_capture: Factory, kind: str) -> None:
+    path = tiny_capture()
+    (path / kind / "0003.png").unlink()
+    field = f"frames[3].{kind.removesuffix('s')}"
+    check(the_only(path), path / kind / "0003.png", field, "no such file", "a picture")
+    refuses_to_load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [
+        ("masks/0003.png", "frames[3].mask"),
+        ("sharp/0003.png", "frames[3].sharp"),
+        ("novel/side/0008.png", "novel_views[1].image"),
+    ],
+)
+def test_wrong_resolution_of_the_other_pictures(
+    tiny_capture: Factory, name: str, field: str
+) -> None:
+    path = tiny_capture()
+    Image.new("L", (32, 25)).save(path / name)
+    check(the_only(path), path / name, field, "32x25 pixels", "32x24 pixels of camera")
+
+
+def test_damaged_pixels_are_found_by_the_deep_check(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    whole = (path / "images/0006.png").read_bytes()
+    (path / "images/0006.png").write_bytes(whole[: len(whole) // 2])
+    check(
+        the_only(path), path / "images/0006.png", "frames[6].image", "cannot be decoded", "readable"
+    )
+    (path / "images/0006.png").write_bytes(b"not a picture")
+    assert "images/0006.png" in refuses_to_load(path)
+
+
+def test_pairing_by_sort_order_is_noticed(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_json(path, "frames", 5, "mask", value="masks/0004.png")
+    findings = validate_capture(path)
+    assert [(f.severity, f.field) for f in findings] == [("warning", "frames[5].mask")] * 2
+    assert "frame '0004'" in findings[0].found and "by name" in findings[0].remedy
+    assert "frames[4].mask" in findings[1].found
+
+
+# --- body ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "field", "found", "expected"),
+    [
+        ({"poses": lambda a: a[:, :2]}, "poses", "10x2x3", "10x3x3"),
+        ({"poses": lambda a: a[:9]}, "poses", "9x3x3", "10x3x3"),
+        ({"transl": lambda a: a[:, :2]}, "transl", "10x2", "10x3"),
+        ({"transl": None}, "transl", "nothing", "10x3"),
+        ({"rest_joints": lambda a: a[:2]}, "rest_joints", "2x3", "3x3"),
+        ({"weights": lambda a: a[:-1]}, "weights", "15x3", "16x3"),
+        ({"weights": lambda a: a * 0.9}, "weights[0]", "a sum of 0.9", "sum to 1"),
+        ({"weights": lambda a: np.where(a == 1, 2, -0.5)}, "weights[0]", "-0.5", "at least 0"),
+        ({"parents": lambda a: a[::-1]}, "parents[0]", "1", "-1, the root"),
+        ({"parents": np.array([-1, 2, 0])}, "parents[1]", "2", "a joint before it"),
+        ({"parents": np.array([-1, -1, 0])}, "parents[1]", "-1", "a joint before it"),
+        ({"faces": lambda a: a + 1}, "faces[14]", "16", "0..15"),
+        ({"times_us": lambda a: a[::-1]}, "times_us[1]", "335000 after 375000", "ascending"),
+        ({"times_us": lambda a: a / 1e6}, "times_us", "float64", "whole numbers"),
+        ({"model": "smpl"}, "model", "'smpl'", "'rig'"),
+        ({"model": None}, "model", "nothing", "'rig'"),
+        ({"rest_vertices": None}, "rest_vertices", "nothing", "?x3"),
+    ],
+)
+def test_fault_of_the_body(
+    tiny_capture: Factory, changes: dict, field: str, found: str, expected: str
+) -> None:
+    path = tiny_capture()
+    edit_body(path, **changes)
+    matching = [finding for finding in validate_capture(path) if finding.field == field]
+    assert len(matching) == 1 and matching[0].severity == "error"
+    check(matching[0], path / "body.npz", field, found, expected)
+    assert str(path / "body.npz") in refuses_to_load(path)
+
+
+def test_infinite_translation_names_the_pose(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+
+    def spoil(transl: np.ndarray) -> np.ndarray:
+        transl[9, 2] = -np.inf
+        return transl
+
+    edit_body(path, transl=spoil)
+    check(
+        the_only(path), path / "body.npz", "transl[9, 2]", "-inf in pose 9 at 375000 us", "finite"
+    )
+
+
+def test_pickled_objects_are_refused_and_not_run(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_body(path, joint_names=np.array(["Hips", "Chest", None], dtype=object))
+    check(the_only(path), path / "body.npz", "", "pickled Python objects", "plain arrays")
+    assert "pickled" in refuses_to_load(path)
+
+
+def test_missing_and_damaged_body(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    whole = (path / "body.npz").read_bytes()
+    (path / "body.npz").write_bytes(whole[: len(whole) // 2])
+    check(the_only(path), path / "body.npz", "", "not a readable npz", "an npz")
+    (path / "body.npz").unlink()
+    check(the_only(path), path / "body.npz", "", "no such file", "the body")
+
+
+def test_faults_of_dense_poses_are_found_by_the_deep_check(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    times = np.arange(20)
+    np.savez(
+        path / "body_dense.npz",
+        times_us=times,
+        poses=np.zeros((20, 4, 3)),
+        transl=np.zeros((20, 3)),
+    )
+    check(the_only(path), path / "body_dense.npz", "poses", "20x4x3", "20x3x3")
+    assert validate_capture(path, deep=False) == []
+
+
+def test_parametric_bodies_need_their_shape(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_json(path, "body", "model", value="smpl")
+    edit_body(path, model="smpl", poses=np.zeros((10, 24, 3)), betas=np.zeros(10), gender="female")
+    assert validate_capture(path) == []
+    edit_body(path, betas=None, gender="other")
+    assert [f.field for f in validate_capture(path)] == ["betas", "gender"]
+
+
+# --- events --------------------------------------------------------------------------------
+
+
+def edit_events(path: Path, key: str, change: Callable[[np.ndarray], Any] | None) -> None:
+    with h5py.File(path / "events.h5", "r+") as file:
+        values = file[key][()]
+        del file[key]
+        if change is not None:
+            file[key] = change(values)
+
+
+def set_at(index: int, value: int) -> Callable[[np.ndarray], np.ndarray]:
+    def change(values: np.ndarray) -> np.ndarray:
+        values[index] = value
+        return values
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "field", "found", "expected", "quick"),
+    [
+        ("events/x", set_at(30, 32), "events/x[30]", "32 (1 of", "below 32", False),
+        ("events/y", set_at(40, 999), "events/y[40]", "999 (1 of", "below 24", False),
+        ("events/p", set_at(50, 2), "events/p[50]", "2 (1 of", "0 (darker) or 1", False),
+        ("ms_to_idx", set_at(100, 7), "ms_to_idx[100]", "7", "t >= 100000", False),
+        ("ms_to_idx", None, "ms_to_idx", "nothing", "a data set", True),
+        ("t_offset", None, "t_offset", "nothing", "a data set", True),
+        ("events/p", None, "events/p", "nothing", "a data set", True),
+        ("events/y", lambda a: a[:-1], "events", "events/y (", "equally long", True),
+        ("events/t", lambda a: a * 1e-6, "events/t", "float64", "int64", True),
+        ("t_offset", lambda a: a + 10**9, "events/t", "events from 1000", "over 0..390000", True),
+    ],
+)
+def test_fault_of_the_events(
+    tiny_capture: Factory, key: str, change: Any, field: str, found: str, expected: str, quick: bool
+) -> None:
+    path = tiny_capture()
+    edit_events(path, key, change)
+    check(the_only(path), path / "events.h5", field, found, expected)
+    if quick:
+        assert "events.h5" in refuses_to_load(path)
+
+
+def test_index_must_reach_the_last_event_and_hold_beyond_it(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    with h5py.File(path / "events.h5") as file:
+        total, last_ms = len(file["events/t"]), int(file["events/t"][-1]) // 1000
+    edit_events(path, "ms_to_idx", set_at(-1, 0))
+    finding = the_only(path)
+    check(finding, path / "events.h5", f"ms_to_idx[{last_ms + 1}]", "0", f"{total}, the first")
+    edit_events(path, "ms_to_idx", lambda index: index[:50])
+    finding = the_only(path)
+    check(finding, path / "events.h5", "ms_to_idx", "50 milli", f"at least {last_ms + 1}, one")
+
+
+def test_negative_polarity_is_not_brighter(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_events(path, "events/p", lambda p: 2 * p.astype(np.int8) - 1)
+    findings = {finding.severity: finding for finding in validate_capture(path)}
+    assert findings["warning"].field == "events/p" and findings["warning"].found == "int8"
+    assert "-1" in findings["error"].found
+
+
+def test_faults_beyond_the_first_piece_of_the_scan(
+    tiny_capture: Factory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The scan goes in pieces; order and index must hold across their borders."""
+    path = tiny_capture()
+    for piece in (1, 7, 64, 100):
+        monkeypatch.setattr("evsplat.capture.check_events._SCAN_EVENTS", piece)
+        assert validate_capture(path) == []
+    with h5py.File(path / "events.h5", "r+") as file:
+        file["events/t"][128] = file["events/t"][127] - 1
+    monkeypatch.setattr("evsplat.capture.check_events._SCAN_EVENTS", 64)
+    assert the_only(path).field == "events/t[128]"
+
+
+def test_damaged_chunk_is_found_by_the_deep_check(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    with h5py.File(path / "events.h5") as file:
+        chunk = file["events/t"].id.get_chunk_info(0)
+    raw = bytearray((path / "events.h5").read_bytes())
+    for at in range(chunk.byte_offset + 10, chunk.byte_offset + chunk.size - 10):
+        raw[at] ^= 0x5A
+    (path / "events.h5").write_bytes(raw)
+    fields = [finding for finding in validate_capture(path) if finding.severity == "error"]
+    assert any("cannot be read" in f.found or "HDF5 cannot read" in f.found for f in fields)
+
+
+def test_missing_event_file(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    (path / "events.h5").unlink()
+    check(the_only(path), path / "events.h5", "", "no such file", "the event recording")
+
+
+def test_events_that_cover_only_a_part_are_a_warning(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_json(path, "events", "clock_offset_us", value=120_000)
+    finding = the_only(path, "warning")
+    check(finding, path / "events.h5", "events/t", "events from 12", "over 0..390000 us")
+    assert "clock_offset_us" in finding.remedy
+
+
+# --- anything ------------------------------------------------------------------------------
+
+JUNK = [None, True, -1, 0.5, 1e300, 10**400, "", "x", "\0", [], {}, [None], [[1], [2, 3]], {"a": 1}]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_junk_anywhere_in_the_description_never_crashes(tiny_capture: Factory, seed: int) -> None:
+    path = tiny_capture()
+    original = json.loads((path / "capture.json").read_text())
+    places = list(_places(original))
+    rng = np.random.default_rng(seed)
+    for _ in range(25):
+        place = places[rng.integers(len(places))]
+        (path / "capture.json").write_text(json.dumps(original))
+        edit_json(path, *place, value=JUNK[rng.integers(len(JUNK))])
+        for finding in validate_capture(path, deep=False):
+            assert finding.found and finding.expected and finding.remedy
+
+
+def _places(node: Any, keys: tuple = ()) -> Any:
+    """The path of every value in a JSON document."""
+    children = node.items() if isinstance(node, dict) else enumerate(node)
+    for key, child in children:
+        yield (*keys, key)
+        if isinstance(child, (dict, list)):
+            yield from _places(child, (*keys, key))

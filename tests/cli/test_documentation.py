@@ -1,0 +1,68 @@
+"""What README and docs tell users to type works as written."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import evsplat
+from evsplat.cli import main
+from evsplat.events import EventStore
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+FORMAT = ROOT / "docs" / "capture-format.md"
+pytestmark = pytest.mark.skipif(not README.exists(), reason="not a source checkout")
+
+
+def _blocks(path: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def _commands() -> list[list[str]]:
+    lines = "\n".join(_blocks(README, "sh")).splitlines()
+    return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("evsplat ")]
+
+
+@pytest.mark.parametrize("arguments", _commands() if README.exists() else [], ids=" ".join)
+def test_readme_commands_have_only_known_options(arguments, capsys, tmp_path, monkeypatch):
+    # Paths do not exist here: the command must be understood and then miss its input.
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    stdout, stderr = capsys.readouterr()
+    assert "runs/mine" in stdout + stderr or "my_capture" in stdout + stderr
+    assert "Unrecognized" not in stderr
+
+
+def test_readme_python_uses_what_the_package_has():
+    used = set(re.findall(r"\bev\.(\w+)", "\n".join(_blocks(README, "python"))))
+    assert used and used <= set(evsplat.__all__)
+
+
+def test_event_file_written_as_documented_is_read_back(tmp_path, monkeypatch):
+    rng = np.random.default_rng(3)
+    count = 5000
+    t = rng.integers(0, 30_000, count)
+    x, y, p = (rng.integers(0, high, count) for high in (64, 48, 2))
+    monkeypatch.chdir(tmp_path)
+    code = next(block for block in _blocks(FORMAT, "python") if "events.h5" in block)
+    exec(code, {"t": t, "x": x, "y": y, "p": p})
+    store = EventStore(tmp_path / "events.h5", 64, 48, 0)
+    assert len(store) == count
+    inside = store.between(7_300, 11_900)
+    chosen = (t >= 7_300) & (t < 11_900)
+    assert len(inside) == chosen.sum()
+    assert np.array_equal(inside.t, np.sort(t[chosen]))
+    assert int(inside.p.sum()) == int((2 * p[chosen] - 1).sum())
+
+
+def test_documented_capture_json_names_every_key_of_the_format():
+    document = json.loads(_blocks(FORMAT, "json")[0])
+    assert document["format"] == "evsplat-capture"
+    assert document["version"] == 1
+    assert {"name", "cameras", "frames", "novel_views", "body", "events", "provenance"} <= set(
+        document
+    )

@@ -1,0 +1,154 @@
+"""Exit codes, messages and help of the command line."""
+
+import re
+import subprocess
+import sys
+from itertools import pairwise
+
+import pytest
+
+import evsplat
+from evsplat.cli import main
+from evsplat.cli.demo import demo_capture
+
+VERBS = ("demo", "doctor", "inspect", "train", "evaluate", "report", "render")
+
+
+def _outcome(capsys, *arguments):
+    """Exit code, stdout and stderr of a call."""
+    try:
+        code = main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    return code, *capsys.readouterr()
+
+
+@pytest.mark.parametrize("verb", ["inspect", "train"])
+def test_missing_capture_is_one_message_and_code_2(capsys, tmp_path, verb):
+    out = ["--out", str(tmp_path / "out")]
+    code, stdout, stderr = _outcome(capsys, verb, str(tmp_path / "nothing"), *out)
+    assert code == 2
+    assert str(tmp_path / "nothing") in stdout + stderr
+    assert "Traceback" not in stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "report", "render"])
+def test_folder_that_is_no_run_is_one_message_and_code_2(capsys, tmp_path, verb):
+    code, _, stderr = _outcome(capsys, verb, str(tmp_path))
+    assert code == 2
+    assert stderr.startswith(f"evsplat: {tmp_path}")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        (["--method", "papr"], ["papr", "Did you mean paper?"]),
+        (["--set", "event.wieght=0.2"], ["event.wieght", "Did you mean event.weight?"]),
+        (["--set", "optimisation.iterations=many"], ["optimisation.iterations", "'many'"]),
+        (["--set", "event.weight"], ["event.weight", "KEY=VALUE"]),
+        (["--config", "missing.yaml"], ["missing.yaml", "not found"]),
+        (["--device", "cuda"], ["--device cuda", "--device cpu"]),
+        (["--iterations", "0"], ["--iterations 0", "at least 1"]),
+        (["--max-minutes", "-1"], ["--max-minutes -1", "above 0"]),
+        (["--threads", "0"], ["--threads 0", "at least 1"]),
+        (["--resume"], ["no such run folder|not a run folder|config.yaml"]),
+    ],
+)
+def test_bad_training_options_say_what_is_wrong(capsys, tmp_path, options, parts):
+    run = str(tmp_path / "run")
+    code, _, stderr = _outcome(capsys, "train", str(demo_capture()), "--out", run, *options)
+    assert code == 2
+    for part in parts:
+        assert any(choice in stderr for choice in part.split("|")), stderr
+    assert "Traceback" not in stderr
+
+
+def test_misspelt_option_is_answered_with_the_nearest(capsys):
+    code, stdout, stderr = _outcome(capsys, "train", "capture", "--max-minuts", "3")
+    assert code == 2
+    assert "--max-minutes" in stdout + stderr
+
+
+def test_ctrl_c_is_code_130_and_says_how_to_go_on(capsys, monkeypatch, tmp_path):
+    import evsplat.training
+    from evsplat.training import Stopped
+
+    def interrupted(capture, **options):
+        raise Stopped(tmp_path / "my run")
+
+    monkeypatch.setattr(evsplat.training, "train", interrupted)
+    code, _, stderr = _outcome(capsys, "train", "my capture")
+    assert code == 130
+    assert f"evsplat train 'my capture' --out '{tmp_path}/my run' --resume" in stderr
+    assert "Traceback" not in stderr
+
+
+def test_ctrl_c_during_evaluation_says_that_the_training_is_safe(capsys, monkeypatch, tmp_path):
+    import evsplat.evaluation
+    import evsplat.training
+
+    def interrupted(run, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evsplat.training, "train", lambda capture, **options: tmp_path)
+    monkeypatch.setattr(evsplat.evaluation, "evaluate_run", interrupted)
+    code, _, stderr = _outcome(capsys, "train", "capture")
+    assert code == 130
+    assert f"evsplat evaluate {tmp_path}" in stderr
+
+
+@pytest.mark.parametrize("verb", ["", *VERBS])
+def test_help_fits_a_screen_of_80_by_45(capsys, monkeypatch, verb):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, stdout, _ = _outcome(capsys, *filter(None, [verb, "--help"]))
+    assert code == 0
+    usage, *lines = stdout.splitlines()
+    assert usage.startswith("usage: evsplat")
+    assert len(lines) <= 44
+    assert max(map(len, lines)) <= 80
+
+
+def test_every_option_of_train_and_render_is_explained(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    for verb in ("train", "render", "demo"):
+        _, stdout, _ = _outcome(capsys, verb, "--help")
+        options = [line.strip("│ ") for line in stdout.splitlines()]
+        found = 0
+        for line, below in pairwise(options):
+            if re.match("--[a-z]", line):
+                found += 1
+                # The explanation stands behind the option, or below a long one.
+                explanation = re.split("  +", line, maxsplit=1)[1:] or [below]
+                assert re.match(r"\w.{15}", explanation[0]), line
+        assert found > 3
+
+
+def test_no_argument_shows_the_help_and_version_the_version(capsys):
+    code, stdout, _ = _outcome(capsys)
+    assert code == 0
+    assert all(verb in stdout for verb in VERBS)
+    assert _outcome(capsys, "--version") == (0, f"evsplat {evsplat.__version__}\n", "")
+
+
+def test_help_as_a_process_loads_no_torch():
+    probe = (
+        "import sys, runpy; sys.argv = ['evsplat', '--help']\n"
+        "try: runpy.run_module('evsplat', run_name='__main__')\n"
+        "finally: print('torch' in sys.modules, 'numpy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "False False"
+
+
+@pytest.mark.parametrize("name", sorted(set(evsplat.__all__) - {"__version__"}))
+def test_the_verbs_are_functions_of_the_package(name):
+    assert callable(getattr(evsplat, name))
+    assert name in dir(evsplat)
+
+
+def test_unknown_attribute_of_the_package_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'trian'"):
+        _ = evsplat.trian

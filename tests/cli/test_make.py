@@ -1,0 +1,89 @@
+"""Set-up through the Makefile: what it runs, what it reuses, what it refuses in one sentence."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+pytestmark = [
+    pytest.mark.skipif(not (ROOT / "Makefile").exists(), reason="not a source checkout"),
+    pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed"),
+]
+
+
+def _plan(target, venv):
+    """Commands that make would run, without running them."""
+    done = subprocess.run(
+        ["make", "-n", target, f"VENV={venv}"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def _make_venv(target, **environment):
+    done = subprocess.run(
+        ["sh", str(ROOT / "tools" / "make_venv.sh"), str(target)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(("target", "command"), [("demo", "evsplat demo"), ("test", "-m pytest")])
+def test_first_call_sets_up_and_a_second_one_reuses(tmp_path, target, command):
+    first = _plan(target, tmp_path / "venv")
+    assert "make_venv.sh" in first
+    assert "--constraint constraints.txt" in first
+    assert command in first
+    (tmp_path / "venv").mkdir()
+    (tmp_path / "venv" / ".installed").touch()
+    second = _plan(target, tmp_path / "venv")
+    assert "pip install" not in second
+    assert command in second
+
+
+@pytest.mark.parametrize(
+    "name", ["pyproject.toml", "constraints.txt", "CMakeLists.txt", "native/module.cpp"]
+)
+def test_a_newer_input_sets_up_again(tmp_path, name):
+    stamp = tmp_path / ".installed"
+    stamp.touch()
+    before = (ROOT / name).stat().st_mtime - 10
+    os.utime(stamp, (before, before))
+    assert "pip install" in _plan("test", tmp_path)
+
+
+def test_wrong_python_and_missing_tools_are_one_sentence(tmp_path):
+    old = tmp_path / "python-too-old"
+    old.write_text("#!/bin/sh\nexit 1\n")
+    old.chmod(0o755)
+    code, message = _make_venv(tmp_path / "venv", PYTHON=str(old))
+    assert code != 0
+    assert "3.11" in message and message.count("\n") == 1
+
+    bare = tmp_path / "python-without-venv"
+    bare.write_text(
+        f'#!/bin/sh\ncase "$*" in *ensurepip*) exit 1;; esac\nexec {sys.executable} "$@"\n'
+    )
+    bare.chmod(0o755)
+    code, message = _make_venv(tmp_path / "venv", PYTHON=str(bare))
+    assert code != 0
+    assert "python3-venv" in message and message.count("\n") == 1
+
+    code, message = _make_venv(tmp_path / "venv", PYTHON=sys.executable, CXX="no-such-compiler")
+    assert code != 0
+    assert "no-such-compiler" in message and message.count("\n") == 1
+    assert not (tmp_path / "venv").exists()
+
+
+def test_a_folder_that_is_no_environment_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    code, message = _make_venv(tmp_path, PYTHON=sys.executable)
+    assert code != 0
+    assert "VENV=" in message
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]

@@ -1,0 +1,98 @@
+"""Colour networks: what they depend on, their sizes, gradients and the view jitter."""
+
+import math
+
+import pytest
+import torch
+
+from evsplat.deform import HumanColour, SceneColour, sh_basis, view_jitter
+
+
+def unit(*shape, seed=0, dtype=torch.float32):
+    points = torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(points, dim=-1).to(dtype)
+
+
+def test_human_colour_is_the_79_input_network():
+    torch.manual_seed(0)
+    network = HumanColour()
+    assert sum(p.numel() for p in network.parameters()) == 79 * 64 + 64 + 64 * 65 + 65 * 3
+    features, directions = torch.randn(20, 32), unit(2, 20, 3)
+    nonrigid, latent = torch.randn(2, 20, 16), torch.randn(2, 16)
+    colour = network(features, directions, nonrigid, latent)
+    mlp = network.mlp
+    weight = torch.cat((mlp.point_weight, mlp.both_weight, mlp.time_weight), 1)
+    for time in range(2):
+        hidden = torch.cat(
+            (features, sh_basis(directions[time]), nonrigid[time], latent[time].expand(20, -1)), -1
+        )
+        hidden = hidden @ weight.T + mlp.first_bias
+        for w, b in zip(mlp.weights, mlp.biases, strict=True):
+            hidden = torch.nn.functional.leaky_relu(hidden, 0.01) @ w.T + b
+        assert torch.allclose(colour[time], hidden.sigmoid(), atol=1e-6)
+
+
+def test_human_colour_gradcheck():
+    torch.manual_seed(1)
+    network = HumanColour(3, 2, 4, width=6).double()
+    d = torch.float64
+    leaves = [
+        torch.randn(4, 3, dtype=d),
+        unit(2, 4, 3, dtype=d),
+        torch.randn(2, 4, 2, dtype=d),
+        torch.randn(2, 4, dtype=d),
+    ]
+    leaves = [leaf.requires_grad_() for leaf in leaves]
+    assert torch.autograd.gradcheck(lambda *a: network(*a[:4]), (*leaves, *network.parameters()))
+
+
+def test_scene_colour_without_view_dependence_ignores_the_direction():
+    torch.manual_seed(2)
+    features = torch.randn(9, 32)
+    fixed, seeing = SceneColour(view_dependent=False), SceneColour()
+    one, other = unit(9, 3, seed=1), unit(9, 3, seed=2)
+    assert torch.equal(fixed(features, one), fixed(features, other))
+    assert (seeing(features, one) - seeing(features, other)).abs().max() > 1e-3
+    assert sum(p.numel() for p in seeing.parameters()) == 47 * 64 + 64 + 64 * 65 + 65 * 3
+
+
+def test_direction_dropout_acts_in_training_only_and_at_its_rate():
+    torch.manual_seed(3)
+    network = SceneColour(direction_dropout=0.3)
+    features, directions = torch.randn(1, 32).expand(4_000, -1), unit(1, 3).expand(4_000, -1)
+    network.eval()
+    still = network(features, directions)
+    assert (still == still[0]).all()
+    network.train()
+    dropped = (network(features, directions) - still[0]).abs().amax(-1) > 1e-6
+    assert abs(dropped.float().mean().item() - 0.3) < 0.03
+    blind = SceneColour(direction_dropout=1.0)
+    blind.load_state_dict(network.state_dict())
+    assert torch.allclose(network(features, directions)[dropped][0], blind(features, directions)[0])
+    with pytest.raises(ValueError, match="expected 0..1"):
+        SceneColour(direction_dropout=1.5)
+
+
+def test_scene_colour_gradcheck():
+    network = SceneColour(feature_dim=3, width=5).double()
+    leaves = [torch.randn(4, 3, dtype=torch.float64), unit(4, 3, dtype=torch.float64)]
+    leaves = [leaf.requires_grad_() for leaf in leaves]
+    parameters = [p for p in network.parameters() if p.numel()]
+    assert torch.autograd.gradcheck(lambda f, d, *_: network(f, d), (*leaves, *parameters))
+
+
+def test_view_jitter_is_a_rotation_with_the_released_codes_third_angle():
+    generator = torch.Generator().manual_seed(0)
+    literal = torch.stack([view_jitter(generator) for _ in range(400)])
+    symmetric = torch.stack([view_jitter(generator, symmetric=True) for _ in range(400)])
+    for rotations in (literal, symmetric):
+        assert torch.allclose(rotations @ rotations.mT, torch.eye(3).expand(400, 3, 3), atol=1e-6)
+        assert torch.allclose(torch.linalg.det(rotations), torch.ones(400), atol=1e-6)
+
+    def third(rotations):
+        return torch.atan2(rotations[:, 1, 0], rotations[:, 0, 0])  # of z @ y @ x
+
+    inside = literal[:, 2, 0].abs() < 0.999  # at 90 degrees about y the angles are not unique
+    assert (third(literal)[inside] > -1e-4).all()
+    assert (third(literal)[inside] < math.pi / 4 + 1e-4).all()
+    assert (third(symmetric) < 0).float().mean() > 0.3

@@ -1,0 +1,132 @@
+"""Encodings against literal loops, closed forms and finite differences."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+
+from evsplat.deform import HashGridEncoding, OneBlobEncoding, make_encoding
+
+
+def quartic_cdf(x, inverse_radius):
+    """tiny-cuda-nn's: a quartic kernel integrated up to x, clamped."""
+    u = x * inverse_radius
+    return min(max(15 / 16 * u * (1 - 2 / 3 * u**2 + 1 / 5 * u**4) + 0.5, 0.0), 1.0)
+
+
+def one_blob_loop(x, bins):
+    """tiny-cuda-nn's one-blob of one coordinate: wrapped kernel, bin by bin."""
+
+    def cdf(edge):
+        return sum(quartic_cdf(edge - x + shift, bins) for shift in (0, -1, 1))
+
+    return [cdf((k + 1) / bins) - cdf(k / bins) for k in range(bins)]
+
+
+@pytest.mark.parametrize("bins", [4, 16])
+def test_one_blob_equals_the_loop_over_bins(bins):
+    x = np.concatenate((np.random.default_rng(0).random(60), [0, 1, 0.5, 1 / bins, 0.999999]))
+    encoding = OneBlobEncoding(bins)
+    positions = torch.tensor(x).reshape(-1, 1).expand(-1, 3)
+    encoded = encoding(positions).reshape(-1, 3, bins)
+    expected = torch.tensor(np.array([one_blob_loop(float(value), bins) for value in x]))
+    assert encoding.dim == 3 * bins
+    for axis in range(3):
+        assert (encoded[:, axis] - expected).abs().max() < 1e-12
+
+
+def test_one_blob_integrates_the_quartic_kernel():
+    x, bins = 0.437, 16
+    encoded = OneBlobEncoding(bins)(torch.tensor([[x, 0.1, 0.9]], dtype=torch.float64))[0, :bins]
+    for k in range(bins):
+        area, _ = quad(
+            lambda v: bins * 15 / 16 * max(1 - ((v - x) * bins) ** 2, 0) ** 2,
+            k / bins,
+            (k + 1) / bins,
+        )
+        assert abs(encoded[k].item() - area) < 1e-8
+
+
+def test_one_blob_sums_to_one_per_axis_and_clamps():
+    positions = torch.rand(50, 3) * 1.4 - 0.2
+    encoded = OneBlobEncoding()(positions)
+    assert torch.allclose(encoded.view(50, 3, 16).sum(-1), torch.ones(50, 3), atol=1e-6)
+    assert torch.equal(encoded, OneBlobEncoding()(positions.clamp(0, 1)))
+
+
+def test_one_blob_gradient():
+    positions = torch.rand(6, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(OneBlobEncoding(), (positions,))
+
+
+def hash_grid_loop(grid, position):
+    """Instant-NGP, corner by corner."""
+    values = []
+    for level, cells in enumerate(grid.resolutions):
+        start, stop = grid.offsets[level : level + 2]
+        scaled = [min(max(float(p), 0.0), 1.0) * cells for p in position]
+        low = [min(math.floor(s), cells - 1) for s in scaled]
+        total = np.zeros(grid.features)
+        for corner in range(8):
+            bits = [(corner >> axis) & 1 for axis in range(3)]
+            x, y, z = (low[axis] + bits[axis] for axis in range(3))
+            share = math.prod(
+                scaled[axis] - low[axis] if bits[axis] else 1 - (scaled[axis] - low[axis])
+                for axis in range(3)
+            )
+            if (cells + 1) ** 3 == stop - start:
+                entry = x + (cells + 1) * (y + (cells + 1) * z)
+            else:
+                hashed = (x ^ (y * 2654435761) ^ (z * 805459861)) & 0xFFFFFFFF
+                entry = hashed % (stop - start)
+            total += share * grid.table[:, start + entry].detach().numpy()
+        values.extend(total)
+    return values
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_hash_grid_equals_the_loop_over_corners(seed):
+    torch.manual_seed(seed)
+    grid = HashGridEncoding(levels=6, features=2 + seed, log2_table=9, base=4, finest=200).double()
+    torch.nn.init.normal_(grid.table)
+    positions = torch.rand(40, 3, dtype=torch.float64) * 1.1 - 0.05
+    positions[0], positions[1] = 0.0, 1.0
+    encoded = grid(positions.view(4, 10, 3)).view(40, -1)
+    expected = torch.tensor(np.array([hash_grid_loop(grid, position) for position in positions]))
+    assert encoded.shape == (40, grid.dim)
+    assert (encoded - expected).abs().max() < 1e-12
+
+
+def test_default_hash_grid_has_the_configured_levels():
+    grid = make_encoding("hashgrid")
+    assert grid.dim == 32 and grid.resolutions[0] == 16 and grid.resolutions[-1] == 2048
+    assert all(abs(after / before - 1.3819) < 0.06 for before, after in pairwise(grid.resolutions))
+    sizes = np.diff(grid.offsets)
+    assert sizes[0] == 17**3 and sizes[-1] == 2**16 and grid.table.shape[1] == sizes.sum()
+    assert 0 < grid.table.abs().max() <= 1e-4
+
+
+def test_hash_grid_gradients_to_table_and_positions():
+    torch.manual_seed(0)
+    grid = HashGridEncoding(levels=3, features=2, log2_table=5, base=2, finest=9).double()
+    torch.nn.init.normal_(grid.table)
+    positions = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p, table: grid(p), (positions, grid.table))
+
+
+def test_gradients_of_one_input_do_not_need_the_other():
+    grid = HashGridEncoding(levels=2, log2_table=6, base=2, finest=4)
+    grid(torch.rand(4, 3)).sum().backward()
+    assert grid.table.grad.abs().sum() > 0
+    grid.table.requires_grad_(False)
+    positions = torch.rand(4, 3, requires_grad=True)
+    grid(positions).sum().backward()
+    assert positions.grad is not None
+
+
+def test_unknown_encoding_is_refused():
+    with pytest.raises(ValueError, match="encoding 'blob' is unknown"):
+        make_encoding("blob")

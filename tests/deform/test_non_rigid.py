@@ -1,0 +1,55 @@
+"""The non-rigid network: start, shapes, dependence and gradients."""
+
+import pytest
+import torch
+
+from evsplat.deform import HashGridEncoding, NonRigidNetwork, OneBlobEncoding, make_encoding
+
+
+@pytest.mark.parametrize("kind", ["oneblob", "hashgrid"])
+def test_start_changes_almost_nothing_unless_asked_for(kind):
+    torch.manual_seed(0)
+    positions, pose = torch.rand(500, 3) * 2 - 1, torch.randn(2, 144)
+    quiet = NonRigidNetwork(make_encoding(kind), 144)(positions, pose)
+    loud = NonRigidNetwork(make_encoding(kind), 144, last_layer_std=None)(positions, pose)
+    assert quiet.offset.shape == quiet.log_scale.shape == (2, 500, 3)
+    assert quiet.rotation.shape == (2, 500, 4) and quiet.feature.shape == (2, 500, 16)
+    assert quiet.offset.abs().max() < 0.005  # metres
+    assert loud.offset.abs().max() > 0.03  # the centimetres of method.md 1.5
+    assert (quiet.rotation[..., 0] == 1).all() and quiet.rotation[..., 1:].abs().max() < 0.02
+
+
+def test_output_equals_the_plain_network_on_encoding_and_pose():
+    torch.manual_seed(1)
+    encoding = OneBlobEncoding(8)
+    network = NonRigidNetwork(encoding, 10, width=16, depth=2, feature_dim=4, last_layer_std=None)
+    positions, pose = torch.rand(30, 3) * 2 - 1, torch.randn(3, 10)
+    out = network(positions, pose)
+    mlp = network.mlp
+    for time in range(3):
+        inputs = torch.cat((encoding((positions + 1) / 2), pose[time].expand(30, -1)), -1)
+        hidden = inputs @ torch.cat((mlp.point_weight, mlp.time_weight), 1).T + mlp.first_bias
+        for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
+            hidden = torch.nn.functional.leaky_relu(hidden, 0.01) @ weight.T + bias
+        parts = (out.offset, out.log_scale, out.rotation[..., 1:], out.feature)
+        assert torch.allclose(torch.cat([part[time] for part in parts], -1), hidden, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "encoding", [OneBlobEncoding(4), HashGridEncoding(2, 2, 5, 2, 4)], ids=["oneblob", "hashgrid"]
+)
+def test_gradcheck(encoding):
+    torch.manual_seed(2)
+    network = NonRigidNetwork(encoding, 3, width=5, depth=2, feature_dim=2, last_layer_std=None)
+    network = network.double()
+    for parameter in encoding.parameters():
+        torch.nn.init.normal_(parameter)
+    positions = (torch.rand(4, 3, dtype=torch.float64) * 2 - 1).requires_grad_()
+    pose = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
+    leaves = (positions, pose, *(p for p in network.parameters() if p.numel()))
+
+    def run(positions, pose, *_):
+        out = network(positions, pose)
+        return out.offset, out.log_scale, out.rotation, out.feature
+
+    assert torch.autograd.gradcheck(run, leaves)

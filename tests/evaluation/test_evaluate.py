@@ -1,0 +1,241 @@
+"""The evaluator on small captures, whole and with parts missing."""
+
+import json
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from evsplat.capture import load_capture
+from evsplat.evaluation import evaluate, evaluate_run
+from evsplat.evaluation.event_maps import chosen_pairs
+from evsplat.evaluation.lpips import WEIGHTS_VARIABLE
+from evsplat.evaluation.pictures import error_map, file_stem, signed_map
+from evsplat.evaluation.protocols import METRICS, PSNR_CEILING_DB, REGIONS
+from evsplat.methods.trivial import MedianBackground
+
+from .helpers import TruthWithNoise, drop, edit
+
+
+@pytest.fixture(autouse=True)
+def nobody_has_weights(monkeypatch, tmp_path):
+    """LPIPS's weights are absent; ST-LPIPS is left out to be quick."""
+    monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+
+
+def run(path, out, noise=0.1):
+    capture = load_capture(path)
+    metrics = evaluate(capture, TruthWithNoise(capture, noise), out_dir=out)
+    json.dumps(metrics, allow_nan=False)
+    return metrics
+
+
+def test_every_key_of_the_schema_is_there_and_means_are_means(tiny_capture, tmp_path):
+    metrics = run(tiny_capture(frames=20, width=48, height=40), tmp_path / "run")
+    assert list(metrics["protocols"]) == ["standard", "avatar-compat", "hugs-compat"]
+    rows = [*metrics["protocols"].values(), *metrics["trivial"].values(), metrics["blurry_input"]]
+    rows += [row for rows in metrics["compat_rows"].values() for row in rows.values()]
+    assert all(tuple(row) == REGIONS for row in rows)
+    assert all(tuple(row[region]) == METRICS for row in rows for region in REGIONS)
+    assert set(metrics["trivial"]) == {"median_background", "nearest_frame"}
+    assert len(metrics["per_frame"]) == 6
+    for protocol, regions in metrics["protocols"].items():
+        for region in REGIONS:
+            values = [f["protocols"][protocol][region]["psnr"] for f in metrics["per_frame"]]
+            assert regions[region]["psnr"] == pytest.approx(np.mean(values))
+    assert set(metrics["novel_views"]["side"]) == {"full", "person_crop", "per_view"}
+
+
+def test_missing_weights_are_null_with_the_reason(tiny_capture, tmp_path):
+    metrics = run(tiny_capture(), tmp_path / "run")
+    assert metrics["protocols"]["standard"]["full"]["lpips_vgg"] is None
+    assert metrics["weights"]["lpips_vgg"]["sha256"] is None
+    assert "vgg16-397923af.pth" in metrics["weights"]["lpips_vgg"]["reason"]
+    assert "perceptual" in metrics["weights"]["st_lpips"]["reason"]
+    assert "weights.lpips_vgg" in metrics["reasons"]["protocols.standard.full.lpips_vgg"]
+
+
+def test_every_null_has_a_reason(tiny_capture, tmp_path):
+    metrics = run(tiny_capture(), tmp_path / "run")
+    paths = {f"protocols.{name}": row for name, row in metrics["protocols"].items()}
+    paths |= {f"trivial.{name}": row for name, row in metrics["trivial"].items()}
+    paths |= {key: metrics[key] for key in ("blurry_input", "blurry_ground_truth")}
+    for path, row in paths.items():
+        for region in REGIONS:
+            for metric, value in row[region].items():
+                assert value is not None or metrics["reasons"][f"{path}.{region}.{metric}"]
+
+
+def test_the_truth_itself_reaches_the_ceiling_and_beats_all_rows(tiny_capture, tmp_path):
+    metrics = run(tiny_capture(), tmp_path / "run", noise=0.0)
+    ours = metrics["protocols"]["standard"]["full"]
+    assert ours["psnr"] == PSNR_CEILING_DB and ours["ssim"] == pytest.approx(1)
+    for row in (*metrics["trivial"].values(), metrics["blurry_input"]):
+        assert row["full"]["psnr"] < 60
+    assert metrics["novel_views"]["side"]["full"]["psnr"] == PSNR_CEILING_DB
+    # against the blurry picture the truth is as far off as the blurry picture is from the truth
+    assert metrics["blurry_ground_truth"]["full"]["psnr"] == pytest.approx(
+        metrics["blurry_input"]["full"]["psnr"]
+    )
+
+
+def test_pictures_are_written_for_all_test_frames_and_views(tiny_capture, tmp_path):
+    out = tmp_path / "run"
+    metrics = run(tiny_capture(), out)
+    named = [path for f in metrics["per_frame"] for path in f["pictures"].values()]
+    views = metrics["novel_views"]["side"]["per_view"]
+    named += [path for view in views for path in view["pictures"].values()]
+    named += [path for pair in metrics["events"]["pairs"] for path in pair["pictures"].values()]
+    assert {str(p.relative_to(out)) for p in (out / "pictures").iterdir()} == set(named)
+    assert all(Image.open(out / path).size == (32, 24) for path in named)
+
+
+def test_the_true_motion_explains_the_events_and_a_still_picture_does_not(tiny_capture, tmp_path):
+    path = tiny_capture(frames=20, width=48, height=40)
+    similarity = run(path, tmp_path / "a", noise=0.0)["events"]["mean_similarity"]
+    # not 1: events come in steps of the threshold, which are large beside this small motion
+    assert similarity["test"] > 0.85 and similarity["train"] > 0.85
+    capture = load_capture(path)
+    still = TruthWithNoise(capture)
+    still._picture = lambda camera, time: capture.sharp(capture.frames[0])
+    edit(path, lambda document: document.update(novel_views=[]))
+    pairs = evaluate(load_capture(path), still, out_dir=tmp_path / "b")["events"]["pairs"]
+    assert all(pair["similarity"] is None for pair in pairs)
+
+
+def test_event_pairs_hold_every_test_frame_and_some_of_training_only(tiny_capture):
+    capture = load_capture(tiny_capture(frames=30))
+    pairs = chosen_pairs(capture)
+    assert all(after.index == before.index + 1 for before, after in pairs)
+    test = {frame.name for pair in pairs for frame in pair if frame.split == "test"}
+    assert test == {frame.name for frame in capture.test_frames}
+    assert sum(all(frame.split == "train" for frame in pair) for pair in pairs) == 3
+
+
+def test_without_truth_the_figures_are_null_and_the_blurry_comparison_remains(
+    tiny_capture, tmp_path
+):
+    metrics = run(edit(tiny_capture(), drop("sharp")), tmp_path / "run")
+    assert metrics["protocols"]["standard"]["full"]["psnr"] is None
+    reason = metrics["reasons"]["protocols.standard.full.psnr"]
+    assert reason == "the frame has no sharp ground truth"
+    assert metrics["blurry_ground_truth"]["full"]["psnr"] > 10
+    assert "error" not in metrics["per_frame"][0]["pictures"]
+
+
+def test_without_masks_the_posed_body_gives_the_crop(tiny_capture, tmp_path):
+    with_mask = run(tiny_capture("a", width=96, height=80), tmp_path / "run_a")
+    path = edit(tiny_capture("b", width=96, height=80), drop("mask"))
+    without = run(path, tmp_path / "run_b")
+    crops = [m["protocols"]["standard"]["person_crop"]["psnr"] for m in (with_mask, without)]
+    # the boxes differ by a pixel at most: the mask covers pixels only in part
+    assert crops[1] == pytest.approx(crops[0], abs=0.3)
+    assert without["protocols"]["standard"]["person_mask"]["psnr"] is None
+
+
+def test_without_events_and_novel_views_both_say_so(tiny_capture, tmp_path):
+    def change(document):
+        document.pop("events")
+        document["novel_views"] = []
+
+    metrics = run(edit(tiny_capture(), change), tmp_path / "run")
+    assert metrics["events"] is None and "no events" in metrics["reasons"]["events"]
+    assert metrics["novel_views"] == {} and "novel" in metrics["reasons"]["novel_views"]
+
+
+def test_a_moving_camera_has_no_median_background(tiny_capture, tmp_path):
+    def change(document):
+        pose = document["cameras"]["main"]["world_to_camera"]
+        for frame in document["frames"]:
+            frame["world_to_camera"] = pose
+
+    metrics = run(edit(tiny_capture(), change), tmp_path / "run")
+    assert metrics["trivial"]["median_background"]["full"]["psnr"] is None
+    assert "camera moves" in metrics["reasons"]["trivial.median_background.full.psnr"]
+    assert metrics["trivial"]["nearest_frame"]["full"]["psnr"] > 10
+
+
+def test_a_grey_capture_is_measured_like_a_colour_one(tiny_capture, tmp_path):
+    path = tiny_capture()
+    for file in (*path.glob("images/*.png"), *path.glob("sharp/*.png")):
+        Image.open(file).convert("L").save(file)
+    metrics = run(path, tmp_path / "run", noise=0.0)
+    assert metrics["protocols"]["standard"]["full"]["psnr"] == PSNR_CEILING_DB
+
+
+def test_a_person_out_of_sight_in_one_frame_is_left_out_of_the_mean(tiny_capture, tmp_path):
+    path = tiny_capture()
+    empty = Image.fromarray(np.zeros((24, 32), dtype=np.uint8))
+    empty.save(path / "masks" / "0008.png")
+    metrics = run(path, tmp_path / "run")
+    values = [f["protocols"]["standard"]["person_mask"]["psnr"] for f in metrics["per_frame"]]
+    assert values[1] is None
+    assert metrics["protocols"]["standard"]["person_mask"]["psnr"] == pytest.approx(
+        (values[0] + values[2]) / 2
+    )
+    reason = metrics["reasons"]["protocols.standard.person_mask.psnr"]
+    assert reason == "missing in 1 of 3: the person mask is empty"
+
+
+def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
+    capture = load_capture(tiny_capture("under_score"))
+    out = tmp_path / "run"
+    trained = SimpleNamespace(
+        path=out,
+        capture=capture,
+        reconstruction=TruthWithNoise(capture, 0.05),
+        iteration=1200,
+        train_seconds=61.5,
+        device="cpu",
+        gaussians={"human": 10, "scene": 20},
+    )
+    module = ModuleType("evsplat.training.run")
+    module.load_run = lambda path: trained
+    monkeypatch.setitem(sys.modules, "evsplat.training.run", module)
+    metrics = evaluate_run(out)
+    assert json.loads((out / "metrics.json").read_text()) == metrics
+    facts = ["capture", "method", "iteration", "train_seconds", "device", "gaussians"]
+    assert list(metrics)[:6] == facts and metrics["iteration"] == 1200
+    psnr = f"{metrics['protocols']['standard']['full']['psnr']:.2f}"
+    for name in ("metrics.md", "metrics.tex"):
+        text = (out / name).read_text()
+        assert psnr in text and "median background" in text and "hugs-compat" in text
+    assert r"truth\_with\_noise" in (out / "metrics.tex").read_text()
+
+
+def test_error_maps_are_black_for_equal_pictures_and_rise_with_the_error():
+    truth = torch.full((1, 5, 3), 0.2)
+    picture = truth + torch.tensor([0, 0.05, 0.1, 0.2, 0.6])[None, :, None]
+    colours = error_map(picture, truth).astype(int)
+    assert colours[0, 0].sum() < 30
+    assert (np.diff(colours.sum(axis=-1)[0]) > 0).all()
+
+
+def test_signed_maps_are_red_for_brighter_blue_for_darker_and_white_for_none():
+    red, white, blue = signed_map(torch.tensor([[2.0, 0.0, -2.0]]), 3.0)[0].astype(int)
+    assert red[0] > red[2] + 50 and blue[2] > blue[0] + 50 and white.min() > 240
+
+
+def test_names_of_frames_cannot_leave_the_folder_or_collide():
+    assert file_stem("test", "0007") == "test_0007"
+    stems = {file_stem("test", name) for name in ("../a/b", "../a b", "../a-b")}
+    assert len(stems) == 3 and not any("/" in stem or " " in stem for stem in stems)
+
+
+def test_a_method_that_knows_one_camera_only_has_null_novel_views(tiny_capture, tmp_path):
+    capture = load_capture(tiny_capture())
+    metrics = evaluate(capture, MedianBackground(capture), out_dir=tmp_path / "run")
+    assert metrics["novel_views"]["side"]["full"]["psnr"] is None
+    assert "recording camera" in metrics["reasons"]["novel_views.side.full.psnr"]
+
+
+def test_a_capture_without_test_frames_has_null_figures(tiny_capture, tmp_path):
+    path = edit(tiny_capture(), lambda d: [f.update(split="train") for f in d["frames"]])
+    metrics = run(path, tmp_path / "run")
+    assert metrics["protocols"]["standard"]["full"]["psnr"] is None and not metrics["per_frame"]
+    assert metrics["reasons"]["protocols.standard.full.psnr"] == "no picture to measure"

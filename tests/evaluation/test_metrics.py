@@ -1,0 +1,130 @@
+"""PSNR and SSIM against scikit-image and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from evsplat.evaluation.metrics import (
+    GAUSSIAN_SSIM,
+    SCIKIT_DEFAULT_SSIM,
+    ZERO_PADDED_SSIM,
+    Ssim,
+    psnr,
+    psnr_channel_mean,
+    ssim,
+)
+
+
+def random_pair(seed: int, height: int = 37, width: int = 29) -> tuple[np.ndarray, np.ndarray]:
+    """A picture and a distorted one, of odd sizes, values in [0, 1]."""
+    rng = np.random.default_rng(seed)
+    first = np.clip(rng.random((height, width, 3)) ** rng.uniform(0.5, 3), 0, 1)
+    second = np.clip(first + rng.normal(0, rng.uniform(0.01, 0.3), first.shape), 0, 1)
+    return first, second
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_psnr_is_scikit_images(seed):
+    first, second = random_pair(seed)
+    ours = psnr(torch.from_numpy(second), torch.from_numpy(first), data_range=1.0)
+    assert float(ours) == pytest.approx(
+        peak_signal_noise_ratio(first, second, data_range=1.0), abs=1e-10
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gaussian_ssim_is_scikit_images(seed):
+    first, second = random_pair(seed)
+    theirs = structural_similarity(
+        first,
+        second,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
+    ours = ssim(torch.from_numpy(second), torch.from_numpy(first), GAUSSIAN_SSIM)
+    assert float(ours) == pytest.approx(theirs, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_uniform_ssim_is_scikit_images_default_with_range_two(seed):
+    first, second = random_pair(seed)
+    theirs = structural_similarity(first, second, data_range=2, channel_axis=-1)
+    ours = ssim(torch.from_numpy(second), torch.from_numpy(first), SCIKIT_DEFAULT_SSIM)
+    assert float(ours) == pytest.approx(theirs, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_zero_padded_ssim_is_the_valid_one_of_a_picture_with_a_black_frame(seed):
+    first, second = (torch.from_numpy(picture) for picture in random_pair(seed))
+    framed = [torch.nn.functional.pad(p, (0, 0, 5, 5, 5, 5)) for p in (first, second)]
+    expected = ssim(framed[0], framed[1], GAUSSIAN_SSIM)
+    assert float(ssim(first, second, ZERO_PADDED_SSIM)) == pytest.approx(float(expected), abs=1e-12)
+
+
+def test_equal_pictures_have_ssim_one_and_infinite_psnr():
+    picture = torch.from_numpy(random_pair(1)[0])
+    for settings in (GAUSSIAN_SSIM, SCIKIT_DEFAULT_SSIM, ZERO_PADDED_SSIM):
+        assert float(ssim(picture, picture, settings)) == pytest.approx(1.0, abs=1e-12)
+    assert math.isinf(float(psnr(picture, picture)))
+
+
+def test_psnr_of_a_mask_counts_its_pixels_only():
+    reference = torch.zeros(4, 4, 3, dtype=torch.float64)
+    picture = reference.clone()
+    picture[0, 0] = 0.1
+    picture[3, 3] = 0.7
+    mask = torch.zeros(4, 4, dtype=torch.bool)
+    mask[0, :2] = True
+    # mean squared error 0.01 / 2 over two pixels
+    assert float(psnr(picture, reference, mask=mask)) == pytest.approx(-10 * math.log10(0.005))
+
+
+def test_channel_mean_psnr_is_above_the_usual_one_unless_channels_are_alike():
+    reference = torch.zeros(3, 3, 3, dtype=torch.float64)
+    alike, unlike = reference + 0.1, reference + torch.tensor([0.1, 0.01, 0.2]).double()
+    assert float(psnr_channel_mean(alike, reference)) == pytest.approx(20.0)
+    by_hand = (20.0 + 40.0 - 20 * math.log10(0.2)) / 3
+    assert float(psnr_channel_mean(unlike, reference)) == pytest.approx(by_hand)
+    assert psnr_channel_mean(unlike, reference) > psnr(unlike, reference)
+
+
+def test_data_range_scales_with_the_values():
+    first, second = (torch.from_numpy(picture) for picture in random_pair(7))
+    scaled = Ssim(data_range=255.0)
+    assert float(ssim(first * 255, second * 255, scaled)) == pytest.approx(
+        float(ssim(first, second)), abs=1e-12
+    )
+    assert float(psnr(first * 255, second * 255, data_range=255)) == pytest.approx(
+        float(psnr(first, second))
+    )
+
+
+def test_ssim_has_a_gradient_that_improves_it():
+    first, second = (torch.from_numpy(picture) for picture in random_pair(3))
+    picture = second.clone().requires_grad_()
+    before = ssim(picture, first)
+    (gradient,) = torch.autograd.grad(before, picture)
+    assert ssim(second + 1e-3 * gradient / gradient.abs().max(), first) > before
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda a, b: psnr(a, b[:-1]),
+        lambda a, b: ssim(a, b[:, :-1]),
+        lambda a, b: ssim(a[:9], b[:9]),
+        lambda a, b: ssim(a, b, Ssim(size=8)),
+        lambda a, b: psnr(a, b, mask=torch.zeros(a.shape[:2], dtype=torch.bool)),
+    ],
+    ids=["psnr shapes", "ssim shapes", "smaller than the window", "even window", "empty mask"],
+)
+def test_what_is_not_defined_is_refused(call):
+    first, second = (torch.from_numpy(picture) for picture in random_pair(0))
+    with pytest.raises(ValueError):
+        call(first, second)

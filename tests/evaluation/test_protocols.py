@@ -1,0 +1,153 @@
+"""Regions, protocols, means over frames."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from evsplat.evaluation.protocols import (
+    AVATAR_COMPAT,
+    HUGS_COMPAT,
+    METRICS,
+    PROTOCOLS,
+    PSNR_CEILING_DB,
+    STANDARD,
+    Absent,
+    Truth,
+)
+from evsplat.evaluation.regions import Box, mask_box
+from evsplat.evaluation.tally import Tally, all_absent
+
+NO_NETWORKS = dict.fromkeys(METRICS[2:], Absent("no weights"))
+
+
+def scene(seed: int = 0):
+    """A true picture, a render that leaves [0, 1], and a person mask with its tight box."""
+    rng = np.random.default_rng(seed)
+    truth = np.round(rng.random((40, 60, 3)) * 255) / 255
+    render = truth + rng.normal(0, 0.15, truth.shape)
+    mask = np.zeros((40, 60), dtype=bool)
+    mask[10:34, 5:25] = rng.random((24, 20)) > 0.3
+    mask[10, 8] = mask[33, 9] = mask[20, 5] = mask[21, 24] = True
+    return truth, render, mask, Box(10, 34, 5, 25)
+
+
+def measure(protocol, truth, render, mask, box):
+    judge = Truth(
+        protocol,
+        torch.from_numpy(truth),
+        None if mask is None else torch.from_numpy(mask),
+        box,
+        NO_NETWORKS,
+    )
+    return judge.measure(torch.from_numpy(render))
+
+
+def test_standard_rounds_to_8_bits_and_enlarges_the_box_by_a_tenth_per_side():
+    truth, render, mask, box = scene()
+    saved = np.round(render.clip(0, 1) * 255) / 255
+    measured = measure(STANDARD, truth, render, mask, box)
+    crop = np.s_[10 - 2 : 34 + 2, 5 - 2 : 25 + 2]
+    settings = dict(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)
+    for region, part in (("full", np.s_[:, :]), ("person_crop", crop)):
+        assert measured[region]["psnr"] == pytest.approx(
+            peak_signal_noise_ratio(truth[part], saved[part], data_range=1)
+        )
+        assert measured[region]["ssim"] == pytest.approx(
+            structural_similarity(
+                truth[part], saved[part], data_range=1, channel_axis=-1, **settings
+            )
+        )
+    in_mask = -10 * math.log10(((saved - truth)[mask] ** 2).mean())
+    assert measured["person_mask"]["psnr"] == pytest.approx(in_mask)
+    assert all(isinstance(measured["person_mask"][m], Absent) for m in METRICS[1:])
+
+
+def test_avatar_compat_neither_clamps_nor_rounds_and_takes_range_two():
+    truth, render, mask, box = scene(1)
+    measured = measure(AVATAR_COMPAT, truth, render, mask, box)
+    assert measured["full"]["psnr"] == pytest.approx(
+        peak_signal_noise_ratio(truth, render, data_range=1)
+    )
+    assert measured["full"]["ssim"] == pytest.approx(
+        structural_similarity(truth, render, data_range=2, channel_axis=-1)
+    )
+
+
+def test_hugs_compat_averages_channels_leaves_the_last_row_out_and_blackens():
+    truth, render, mask, box = scene(2)
+    measured = measure(HUGS_COMPAT, truth, render, mask, box)
+
+    def channel_mean(a, b):
+        return np.mean([-10 * math.log10(((a - b)[..., c] ** 2).mean()) for c in range(3)])
+
+    crop = np.s_[10:33, 5:24]
+    black = mask[..., None]
+    assert measured["full"]["psnr"] == pytest.approx(channel_mean(truth, render))
+    assert measured["person_crop"]["psnr"] == pytest.approx(channel_mean(truth[crop], render[crop]))
+    assert measured["person_mask"]["psnr"] == pytest.approx(
+        channel_mean(truth * black, render * black)
+    )
+    assert 0 < measured["person_mask"]["ssim"] < 1
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS, ids=lambda p: p.name)
+def test_equal_pictures_reach_the_ceiling_and_missing_networks_give_their_reason(protocol):
+    truth, _, mask, box = scene()
+    measured = measure(protocol, truth, truth, mask, box)
+    assert measured["full"]["psnr"] == PSNR_CEILING_DB
+    assert measured["full"]["ssim"] == pytest.approx(1)
+    for name in METRICS[2:]:
+        reason = measured["full"][name].reason
+        expected = "no weights" if name in protocol.perceptual else "not part of protocol"
+        assert expected in reason
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS, ids=lambda p: p.name)
+def test_without_a_mask_the_mask_region_says_so(protocol):
+    truth, render, _, box = scene()
+    measured = measure(protocol, truth, render, None, box)
+    assert "no person mask" in measured["person_mask"]["psnr"].reason
+    assert isinstance(measured["person_crop"]["psnr"], float)
+
+
+def test_a_crop_smaller_than_the_window_has_psnr_only():
+    truth, render, mask, _ = scene()
+    measured = measure(STANDARD, truth, render, mask, Box(0, 5, 0, 5))
+    assert isinstance(measured["person_crop"]["psnr"], float)
+    assert "larger than the image" in measured["person_crop"]["ssim"].reason
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mask_box_is_tight(seed):
+    rng = np.random.default_rng(seed)
+    mask = torch.from_numpy(rng.random((13, 17)) > 0.97)
+    box = mask_box(mask)
+    rows, columns = np.nonzero(mask.numpy())
+    if len(rows) == 0:
+        assert box is None
+    else:
+        assert box == Box(rows.min(), rows.max() + 1, columns.min(), columns.max() + 1)
+
+
+def test_boxes_stay_inside_the_picture():
+    box = Box(1, 39, 2, 58).enlarged(0.1, 40, 60)
+    assert box == Box(0, 40, 0, 60)
+    assert Box(5, 35, 50, 58).at_least(1.0, 40, 60) == Box(5, 35, 30, 60)
+    assert Box(5, 15, 10, 40).at_least(1.0, 40, 60) == Box(5, 15, 10, 40)
+
+
+def test_means_skip_gaps_and_say_how_many():
+    tally = Tally()
+    truth, render, mask, box = scene()
+    first = measure(STANDARD, truth, render, mask, box)
+    second = measure(STANDARD, truth, 0.5 * (truth + render), mask, box)
+    for measured in (first, second, all_absent("no truth")):
+        tally.add(measured)
+    means, reasons = tally.means()
+    expected = (first["full"]["psnr"] + second["full"]["psnr"]) / 2
+    assert means["full"]["psnr"] == pytest.approx(expected)
+    assert reasons["full.psnr"] == "missing in 1 of 3: no truth"
+    assert means["full"]["lpips_vgg"] is None and reasons["full.lpips_vgg"] == "no weights"

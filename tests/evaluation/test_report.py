@@ -1,0 +1,212 @@
+"""The report page: complete, self-contained, safe with hostile names."""
+
+import base64
+import io
+import json
+import re
+import sys
+from html.parser import HTMLParser
+from types import ModuleType, SimpleNamespace
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from evsplat.capture import load_capture
+from evsplat.errors import DataError
+from evsplat.evaluation import evaluate
+from evsplat.evaluation.report import write_report
+from evsplat.evaluation.report.charts import Series, line_chart
+from evsplat.evaluation.report.page import page
+from evsplat.evaluation.report.source import Source
+from evsplat.files import write_json
+
+from .helpers import TruthWithNoise, drop, edit
+
+HOSTILE = '<img src="https://example.org/x" onerror=alert(1)>&'
+
+
+@pytest.fixture(autouse=True)
+def without_perceptual_metric(monkeypatch):
+    """ST-LPIPS is left out to be quick."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+
+
+class Page(HTMLParser):
+    """Elements with their attributes; checks that tags are balanced."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self._open: list[str] = []
+        self.feed(text)
+        assert not self._open, self._open
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in {"meta", "img", "input"}:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+    def count(self, tag: str) -> int:
+        return sum(name == tag for name, _ in self.elements)
+
+
+def evaluated(path, folder, *, training=True):
+    """An evaluated run of `TruthWithNoise`, as a source for the page."""
+    capture = load_capture(path)
+    reconstruction = TruthWithNoise(capture, 0.02)
+    metrics = evaluate(capture, reconstruction, out_dir=folder)
+    if training:
+        facts = {"iteration": 12345, "train_seconds": 3723.4, "device": "cpu"}
+        metrics |= facts | {"gaussians": {"human": 4321, "scene": 20}}
+        entries = [
+            {"iteration": i, "loss": 1 / i, "terms": {"l1": 0.5 / i}, "psnr": 20 + i, "human": i}
+            for i in range(1, 9)
+        ]
+        lines = [json.dumps(entry | {"scene": 5}) for entry in entries]
+        (folder / "log.jsonl").write_text("\n".join(lines) + '\n{"iteration": 9, "lo')
+        (folder / "config.yaml").write_text(f"event: {{weight: 0.2, note: '{HOSTILE}'}}\nseed: 3\n")
+        write_json(folder / "versions.json", {"torch": "2.13"})
+    write_json(folder / "metrics.json", metrics)
+    return Source.read(folder, capture, reconstruction)
+
+
+def test_page_is_one_file_without_any_request_and_hostile_names_stay_text(tiny_capture, tmp_path):
+    def change(document):
+        document["name"] = HOSTILE
+        document["provenance"]["text"] = HOSTILE
+
+    text = page(evaluated(edit(tiny_capture(), change), tmp_path))
+    parsed = Page(text)
+    for tag, attributes in parsed.elements:
+        assert tag not in {"script", "link", "iframe", "object", "embed"}
+        for name, value in attributes.items():
+            assert name != "onerror"
+            if name in {"src", "href", "poster", "srcset", "action"}:
+                assert value.startswith("data:")
+    assert not re.search(r"url\(|@import", text)
+    assert sum(HOSTILE in data for data in parsed.text) >= 3
+
+
+def test_page_shows_every_test_frame_pair_and_view(tiny_capture, tmp_path):
+    source = evaluated(tiny_capture(frames=20), tmp_path)
+    parsed = Page(page(source))
+    alts = [attributes["alt"] for tag, attributes in parsed.elements if tag == "img"]
+    for frame in source.capture.test_frames:
+        for title in ("blurry input", "our render", "sharp truth", "error"):
+            assert f"{title}, frame {frame.name}" in alts
+    for pair in source.metrics["events"]["pairs"]:
+        for kind in ("given", "rendered"):
+            assert f"{kind} events, frames {pair['frames'][0]} to {pair['frames'][1]}" in alts
+    assert sum(alt.startswith("render of side") for alt in alts) == 4
+    text = " ".join(parsed.text)
+    for shown in ("median background", "12\u202f345", "1 h 02 min", "4\u202f321", "2.13", "weight"):
+        assert shown in text
+    assert parsed.count("polyline") == 5
+
+
+def test_embedded_pictures_are_the_pictures(tiny_capture, tmp_path):
+    source = evaluated(tiny_capture(), tmp_path)
+    name = source.capture.test_frames[0].name
+    for tag, attributes in Page(page(source)).elements:
+        if tag == "img" and attributes["alt"] == f"sharp truth, frame {name}":
+            content = base64.b64decode(attributes["src"].split(",")[1])
+            picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
+            expected = np.asarray(Image.open(source.capture.path / "sharp" / f"{name}.png"))
+            assert np.array_equal(picture, expected)
+            break
+    else:
+        raise AssertionError("the truth is not on the page")
+
+
+def test_clip_plays_both_halves_in_slow_motion(tiny_capture, tmp_path):
+    source = evaluated(tiny_capture(), tmp_path)
+    (video,) = (a for tag, a in Page(page(source)).elements if tag == "video")
+    with av.open(io.BytesIO(base64.b64decode(video["src"].split(",")[1]))) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    # nine periods of 40 ms, five times slower, at 25 pictures per second
+    assert len(frames) == round(0.36 * 5 * 25)
+    scale = frames[0].shape[0] // 24
+    assert frames[0].shape == (24 * scale, 2 * 32 * scale + 4, 3)
+    left = frames[0][:, : 32 * scale][scale // 2 :: scale, scale // 2 :: scale]
+    blurry = (source.capture.image(source.capture.frames[0]) * 255).numpy()
+    assert np.abs(left - blurry).mean() < 8
+
+
+def test_page_of_a_method_without_training_or_truth_or_events(tiny_capture, tmp_path):
+    def change(document):
+        document.pop("events")
+        document["novel_views"] = []
+        drop("sharp", "mask")(document)
+
+    parsed = Page(page(evaluated(edit(tiny_capture(), change), tmp_path, training=False)))
+    text = " ".join(parsed.text)
+    assert "no sharp ground truth" in text and "no events" in text
+    assert "Novel views" not in text and "Curves" not in text
+    alts = [attributes["alt"] for tag, attributes in parsed.elements if tag == "img"]
+    assert any("our render" in alt for alt in alts) and not any("truth" in alt for alt in alts)
+
+
+def test_report_needs_an_evaluation(tiny_capture, tmp_path, monkeypatch):
+    capture = load_capture(tiny_capture())
+    run = SimpleNamespace(capture=capture, reconstruction=TruthWithNoise(capture))
+    module = ModuleType("evsplat.training.run")
+    module.load_run = lambda path: run
+    monkeypatch.setitem(sys.modules, "evsplat.training.run", module)
+    with pytest.raises(DataError, match="evsplat evaluate"):
+        write_report(tmp_path)
+    evaluated(capture.path, tmp_path)
+    path = write_report(tmp_path)
+    assert path == tmp_path / "report.html" and path.stat().st_size > 10_000
+
+
+def points(svg: str) -> list[list[tuple[float, float]]]:
+    return [
+        [tuple(map(float, pair.split(","))) for pair in line.split()]
+        for line in re.findall(r'points="([^"]*)"', svg)
+    ]
+
+
+def test_chart_places_values_linearly_and_skips_what_has_no_logarithm():
+    line = Series("a", [0, 1, 2], [1.0, 2.0, 4.0])
+    (linear,) = points(line_chart([line], x_title="x", y_title="y"))
+    (x0, y0), (x1, y1), (x2, y2) = linear
+    assert x1 - x0 == pytest.approx(x2 - x1, abs=0.11)
+    assert y1 - y2 == pytest.approx(2 * (y0 - y1), abs=0.31)
+    (log,) = points(line_chart([line], x_title="x", y_title="y", log=True))
+    assert log[0][1] - log[1][1] == pytest.approx(log[1][1] - log[2][1], abs=0.11)
+    gaps = Series("b", [0, 1, 2, 3], [1.0, 0.0, float("nan"), 2.0])
+    assert len(points(line_chart([gaps], x_title="x", y_title="y", log=True))[0]) == 2
+
+
+@pytest.mark.parametrize("values", [[3.0], [2.0, 2.0], [0.0, 0.0], [1e-9, 1e9], [-5.0, -5.0]])
+@pytest.mark.parametrize("log", [False, True])
+def test_chart_of_any_range_is_finite(values, log):
+    svg = line_chart([Series("<a>", range(len(values)), values)], x_title="x", y_title="y", log=log)
+    assert "nan" not in svg and "inf" not in svg and "<a>" not in svg
+
+
+def test_long_series_are_averaged():
+    noisy = Series("noisy", range(100_000), [i % 2 for i in range(100_000)])
+    scale = Series("scale", [0, 1], [0, 1])
+    line, (low, high) = points(line_chart([noisy, scale], x_title="x", y_title="y"))
+    assert len(line) <= 300
+    middle, height = (low[1] + high[1]) / 2, low[1] - high[1]
+    assert all(abs(y - middle) < 0.01 * height for _, y in line)
+
+
+def test_page_of_a_capture_without_test_frames(tiny_capture, tmp_path):
+    path = edit(tiny_capture(), lambda d: [f.update(split="train") for f in d["frames"]])
+    text = " ".join(Page(page(evaluated(path, tmp_path))).text)
+    assert "No frame has split" in text

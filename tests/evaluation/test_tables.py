@@ -1,0 +1,56 @@
+"""Markdown and LaTeX tables."""
+
+from evsplat.evaluation.protocols import METRICS, REGIONS
+from evsplat.evaluation.tables import Column, latex, markdown, tables_of
+
+
+def row(psnr: float, ssim: float, lpips: float | None = None) -> dict:
+    values = dict.fromkeys(METRICS, None) | {"psnr": psnr, "ssim": ssim, "lpips_vgg": lpips}
+    return {region: dict(values) for region in REGIONS}
+
+
+def metrics() -> dict:
+    return {
+        "capture": "c",
+        "method": "my_method",
+        "frames": {"train": 7, "test": 3},
+        "protocols": {"standard": row(30.004, 0.9, 0.1)},
+        "trivial": {"median_background": row(20, 0.95, 0.2), "nearest_frame": row(30.001, 0.8)},
+        "blurry_input": row(40, 0.99, 0.01),
+        "protocol_notes": {"standard": "how"},
+        "novel_views": {"side": row(18, 0.5)},
+        "weights": {"st_lpips": {"sha256": None, "reason": "fetch it"}},
+    }
+
+
+def test_best_is_by_what_is_printed_and_the_blurry_input_does_not_compete():
+    (table,) = tables_of(metrics())
+
+    def best(metric):
+        column = Column("full", metric)
+        return {name for name in table.rows if table.is_best(name, column)}
+
+    assert best("psnr") == {"my_method", "nearest_frame"}  # both are printed as 30.00
+    assert best("ssim") == {"median_background"}
+    assert best("lpips_vgg") == {"my_method"}
+
+
+def test_columns_without_any_figure_are_left_out():
+    (table,) = tables_of(metrics())
+    assert {column.metric for column in table.columns} == {"psnr", "ssim", "lpips_vgg"}
+
+
+def test_markdown_names_protocol_rows_novel_views_and_what_is_missing():
+    text = markdown(metrics())
+    assert "## Protocol `standard`" in text and "blurry input itself" in text
+    assert "| side | 18.00 | 0.5000 |" in text and "- fetch it" in text
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert len({line.count("|") for line in lines[:6]}) == 1
+    assert "| **30.00** |" in text and "| – |" in text
+
+
+def test_latex_is_escaped_and_every_row_has_all_cells():
+    text = latex(metrics())
+    assert r"my\_method" in text
+    body = text[text.index(r"\midrule") : text.index(r"\bottomrule")].splitlines()[1:]
+    assert len(body) == 4 and {line.count("&") for line in body} == {9}

@@ -1,0 +1,174 @@
+"""Which instants are drawn, from where, and what arrives on disk."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import av
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from evsplat.capture import Camera, Frame
+from evsplat.errors import ConfigError, DataError
+from evsplat.export import camera_at, render_run, rendered_instants, rendering
+from evsplat.methods.reconstruction import Rendering
+
+WIDTH, HEIGHT = 20, 14
+MIDS_US = (36_000, 116_000, 196_000, 276_000)
+
+
+def _pose(angle: float, x: float) -> torch.Tensor:
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix())
+    pose[:3, 3] = -pose[:3, :3] @ torch.tensor([x, 0.0, -3.0])
+    return pose
+
+
+def _camera(width: int = WIDTH, height: int = HEIGHT) -> Camera:
+    K = torch.tensor([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
+    return Camera(width, height, K, _pose(0.0, 0.0))
+
+
+class _Recording:
+    """The part of a capture that drawing needs: frame k is a flat grey of level 10 k."""
+
+    def __init__(self, *, moving: bool = False) -> None:
+        self.path = Path("recording")
+        self.cameras = {"main": _camera(), "side": _camera(10, 7)}
+        self.frames = tuple(
+            Frame(
+                f"f{k}",
+                k,
+                "main",
+                Path(f"{k}.png"),
+                (mid - 36_000, mid + 36_000),
+                "test" if k == 2 else "train",
+                world_to_camera=_pose(0.2 * k, float(k)) if moving else None,
+            )
+            for k, mid in enumerate(MIDS_US)
+        )
+        self.is_static_camera = not moving
+
+    def camera(self, frame: Frame) -> Camera:
+        camera = self.cameras[frame.camera]
+        if frame.world_to_camera is None:
+            return camera
+        return Camera(camera.width, camera.height, camera.K, frame.world_to_camera)
+
+    def image(self, frame: Frame) -> torch.Tensor:
+        return torch.full((HEIGHT, WIDTH, 3), 10 * frame.index / 255)
+
+
+class _Clock:
+    """A reconstruction whose grey level tells the time: one level per millisecond."""
+
+    name = "clock"
+
+    def render(self, camera, times_us, *, parts="all"):
+        levels = torch.tensor([time / 1000 / 255 for time in times_us])
+        rgb = levels[:, None, None, None].expand(-1, camera.height, camera.width, 3)
+        if parts == "human":
+            rgb = rgb * 0
+        return Rendering(rgb, rgb[..., 0], rgb[..., 0])
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A folder that `load_run` takes for a run of the clock on the recording."""
+    loaded = SimpleNamespace(capture=_Recording(), reconstruction=_Clock())
+    monkeypatch.setattr(rendering, "load_run", lambda path: loaded)
+    path = tmp_path / "run"
+    path.mkdir()
+    return path
+
+
+@pytest.mark.parametrize("rate_hz", [12.5, 30.0, 240.0, 1000.0])
+def test_sequence_spans_first_to_last_mid_exposure_at_the_rate(rate_hz):
+    instants = rendered_instants(_Recording(), "sequence", rate_hz=rate_hz)
+    times = np.array([instant.time_us for instant in instants])
+    assert times[0] == MIDS_US[0]
+    assert MIDS_US[-1] - 1e6 / rate_hz < times[-1] <= MIDS_US[-1]
+    np.testing.assert_allclose(np.diff(times), 1e6 / rate_hz, atol=1)
+    for instant in instants:
+        distances = [abs(mid - instant.time_us) for mid in MIDS_US]
+        assert distances[instant.frame.index] == min(distances)
+    assert len({instant.name for instant in instants}) == len(instants)
+
+
+def test_test_frames_are_drawn_at_mid_exposure_under_their_names():
+    instants = rendered_instants(_Recording(), "test")
+    assert [(i.name, i.time_us) for i in instants] == [("f2", MIDS_US[2])]
+
+
+def test_no_test_frame_is_told():
+    recording = _Recording()
+    recording.frames = tuple(f for f in recording.frames if f.split == "train")
+    with pytest.raises(DataError, match="split 'test'"):
+        rendered_instants(recording, "test")
+
+
+def test_moving_camera_passes_through_its_poses_and_turns_evenly_between():
+    recording = _Recording(moving=True)
+    for frame in recording.frames:
+        at = camera_at(recording, "main", frame.mid_us).world_to_camera
+        torch.testing.assert_close(at, frame.world_to_camera, atol=1e-6, rtol=0)
+    halfway = camera_at(recording, "main", (MIDS_US[1] + MIDS_US[2]) // 2)
+    torch.testing.assert_close(halfway.world_to_camera, _pose(0.3, 1.5), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        camera_at(recording, "main", MIDS_US[-1] + 10**6).world_to_camera, _pose(0.6, 3.0)
+    )
+    assert camera_at(recording, "side", 0) is recording.cameras["side"]
+
+
+def test_video_shows_the_asked_times_in_slow_motion_beside_the_blurry_frame(run):
+    path = render_run(run, fps=25, slow=4, beside=True)
+    assert path == run / "renders" / "sequence-beside.mp4"
+    expected = rendered_instants(_Recording(), "sequence", rate_hz=100)
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].average_rate == 25
+        pictures = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
+    assert len(pictures) == len(expected) == 25
+    for picture, instant in zip(pictures, expected, strict=True):
+        assert picture.shape == (HEIGHT, 2 * WIDTH)
+        # Grey is luma: limited range is undone, and the codec may be off by two levels.
+        assert abs(picture[:, 2:18].mean() - 10 * instant.frame.index) < 2.5
+        assert abs(picture[:, 22:38].mean() - min(instant.time_us / 1000, 255)) < 2.5
+
+
+def test_pictures_are_exact_and_a_second_call_replaces_them(run):
+    path = render_run(run, what="test")
+    assert path == run / "renders" / "test"
+    pixels = np.asarray(Image.open(path / "f2.png"))
+    assert pixels.shape == (HEIGHT, WIDTH, 3)
+    assert (pixels == 196).all()
+    assert render_run(run, what="test") == path
+    assert [p.name for p in path.iterdir()] == ["f2.png"]
+
+
+def test_out_chooses_video_or_pictures_and_parts_and_camera_are_obeyed(run, tmp_path):
+    folder = render_run(run, out=tmp_path / "png", fps=12.5, parts="human", camera="side")
+    pictures = [np.asarray(Image.open(path)) for path in sorted(folder.iterdir())]
+    assert len(pictures) == 4
+    assert all(p.shape == (7, 10, 3) and not p.any() for p in pictures)
+    video = render_run(run, what="test", out=tmp_path / "test.mp4")
+    with av.open(str(video)) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 1
+    with pytest.raises(DataError, match="not empty"):
+        render_run(run, out=folder)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fps": 0}, "--fps 0"),
+        ({"slow": -1}, "--slow -1"),
+        ({"slow": float("nan")}, "--slow nan"),
+        ({"camera": "top"}, "only main, side"),
+    ],
+)
+def test_impossible_options_name_themselves(run, options, message):
+    with pytest.raises(ConfigError, match=message):
+        render_run(run, **options)
+    assert not list(run.iterdir())
