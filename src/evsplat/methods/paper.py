@@ -210,7 +210,7 @@ def compose(
             "event": config.event.weight,
         },
         optimisation=config.optimisation,
-        densify={"human": config.densify_human} | _scene_limits(config),
+        densify={"human": config.densify_human, **_scene_limits(config)},
         body_frames=BodyFrames(track.body, track.bones(torch.tensor(times))),
         generator=generator,
     )

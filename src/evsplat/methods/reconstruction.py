@@ -27,8 +27,9 @@ class Rendering:
 class Reconstruction(Protocol):
     """A reconstructed person and scene."""
 
-    name: str
-    """Of the method, as in tables."""
+    @property
+    def name(self) -> str:
+        """Of the method, as in tables."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Draw the instants ``times_us`` (camera clock) as ``camera`` sees them.

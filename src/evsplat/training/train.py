@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -60,8 +61,8 @@ def train(
 ) -> Path:
     """Train ``method`` on a capture and return the run folder.
 
-    ``iterations`` scales every schedule. ``max_minutes`` stops gracefully; without ``iterations`` it
-    also shortens the schedule so that it is finished in time. ``resume`` goes on from the last
+    ``iterations`` scales every schedule. ``max_minutes`` stops gracefully; without ``iterations``
+    it also shortens the schedule so that it is finished in time. ``resume`` goes on from the last
     checkpoint in ``out``. ``config`` is a run's config.yaml; ``overrides`` are ``key=value``
     settings over it. Raises `Stopped` on Ctrl-C after saving.
     """
@@ -182,7 +183,7 @@ def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
     }
 
 
-def _show(bar: "tqdm[None]", trainer: Trainer, report: StepReport) -> None:
+def _show(bar: "tqdm[Any]", trainer: Trainer, report: StepReport) -> None:
     clock, counts = trainer.clock, trainer.counts()
     minutes, seconds = divmod(round(clock.seconds_left), 60)
     bar.update(100 * clock.fraction - bar.n)

@@ -1,0 +1,41 @@
+"""The clock: where a run stands in its schedule."""
+
+import pytest
+
+from evsplat.training.clock import Clock
+
+
+def test_steps_alone_go_through_the_schedule_exactly():
+    clock = Clock(iterations=7)
+    seen = []
+    while not clock.done:
+        seen.append(clock.fraction)
+        clock.advance(0.1)
+    assert seen == [i / 7 for i in range(7)]
+    assert clock.fraction == 1.0
+    assert clock.expected_iterations == 7
+
+
+def test_a_time_limit_shortens_the_schedule_to_fit():
+    clock = Clock(iterations=10_000, max_seconds=100.0, shrink=True)
+    while not clock.done and not clock.out_of_time:
+        # Steps become three times slower on the way, as they do when the set grows.
+        clock.advance(0.5 + clock.fraction)
+    assert clock.fraction == pytest.approx(1.0, abs=0.02)
+    assert 95.0 <= clock.seconds <= 102.0
+    assert clock.iteration < 250
+
+
+def test_a_generous_time_limit_changes_nothing():
+    clock = Clock(iterations=100, max_seconds=1e6, shrink=True)
+    while not clock.done and not clock.out_of_time:
+        clock.advance(0.01)
+    assert clock.iteration in (100, 101)
+
+
+def test_given_iterations_are_kept_and_cut_off_by_the_time_limit():
+    clock = Clock(iterations=100, max_seconds=1.25)
+    while not clock.done and not clock.out_of_time:
+        clock.advance(0.125)
+    assert clock.iteration == 10
+    assert clock.nominal == pytest.approx(1_500)

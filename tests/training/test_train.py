@@ -1,0 +1,221 @@
+"""A training run as a user meets it: reproducible, resumable, honest when it fails."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from evsplat.capture import load_capture
+from evsplat.errors import BackendError, ConfigError, DataError
+from evsplat.methods import PaperConfig, compose
+from evsplat.training import load_run, train
+from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
+from evsplat.training.clock import Clock
+from evsplat.training.run import RunFolder
+from evsplat.training.trainer import MAX_BAD_STEPS, Trainer
+
+SMALL = (
+    "human.count=120",
+    "scene.prefit_steps=3",
+    "skinning_prefit_steps=3",
+    "deform.width=16",
+    "deform.colour_width=16",
+    "isometry_samples=64",
+    "densify_human.max_count=150",
+    # Everything that the schedule switches on is on early, so that few steps meet all of it.
+    "deform.non_rigid_start=3000",
+    "event.start=1000",
+)
+
+# The same call in a process of its own that saves after every step.
+SCRIPT = """
+import sys, evsplat.training.train as module
+module.CHECKPOINT_SECONDS = 0.0
+module.train(sys.argv[1], out=sys.argv[2], iterations=int(sys.argv[3]), resume=sys.argv[4] == "1",
+             overrides=sys.argv[5:], threads=1)
+"""
+
+
+def start(capture: Path, out: Path, iterations: int, *, resume: bool = False) -> subprocess.Popen:
+    overrides = () if resume else SMALL
+    command = [sys.executable, "-c", SCRIPT, capture, out, iterations, int(resume), *overrides]
+    return subprocess.Popen(
+        [str(part) for part in command],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for_step(out: Path, step: int, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        found = latest_checkpoint(out / "checkpoints")
+        if found is not None and int(found.stem) >= step:
+            return
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.005)
+    raise AssertionError("no checkpoint in time")
+
+
+def final_tensors(out: Path) -> dict[str, torch.Tensor]:
+    path = latest_checkpoint(out / "checkpoints")
+    assert path is not None
+    return load_checkpoint(path)[0]
+
+
+def log_without_times(out: Path) -> list[dict]:
+    lines = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+
+
+def test_killed_and_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tiny_capture, tmp_path):
+    capture = tiny_capture(frames=10)
+    iterations = 40
+    whole = start(capture, tmp_path / "whole", iterations)
+    assert whole.wait(240) == 0, whole.stderr.read()
+    for kill_at in (3, 17):
+        broken = tmp_path / f"broken{kill_at}"
+        process = start(capture, broken, iterations)
+        wait_for_step(broken, kill_at, process)
+        process.kill()  # SIGKILL: nothing can be tidied up
+        process.wait()
+        resumed = start(capture, broken, iterations, resume=True)
+        assert resumed.wait(240) == 0, resumed.stderr.read()
+        expected, found = final_tensors(tmp_path / "whole"), final_tensors(broken)
+        assert expected.keys() == found.keys()
+        different = [name for name in expected if not torch.equal(expected[name], found[name])]
+        assert different == []
+        assert log_without_times(broken) == log_without_times(tmp_path / "whole")
+
+
+def test_ctrl_c_finishes_the_step_saves_and_says_how_to_resume(tiny_capture, tmp_path):
+    capture = tiny_capture(frames=10)
+    out = tmp_path / "run"
+    process = start(capture, out, 5_000)
+    wait_for_step(out, 2, process)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode != 0
+    assert f"--out {out} --resume" in errors
+    assert load_run(out).iteration >= 2
+
+
+def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(tiny_capture, tmp_path):
+    capture = tiny_capture(frames=10)
+    runs = {}
+    for name, seed in (("a", 5), ("b", 5), ("c", 6)):
+        out = train(capture, out=tmp_path / name, iterations=6, overrides=SMALL, seed=seed)
+        runs[name] = final_tensors(out)["model.gaussians.means"]
+    assert torch.equal(runs["a"], runs["b"])
+    assert not torch.equal(runs["a"], runs["c"])
+
+
+def test_training_lowers_the_picture_error(tiny_capture, tmp_path):
+    out = train(tiny_capture(frames=10), out=tmp_path / "run", iterations=120, overrides=SMALL)
+    lines = log_without_times(out)
+    first = sum(line["terms"]["l1"] for line in lines[:3]) / 3
+    last = sum(line["terms"]["l1"] for line in lines[-3:]) / 3
+    assert last < 0.7 * first
+
+
+@pytest.mark.parametrize("mode", ["fixed", "ste", "rendered"])
+def test_every_semantics_mode_trains_and_only_learning_modes_move_labels(
+    mode, tiny_capture, tmp_path
+):
+    capture = tiny_capture(frames=10)
+    out = train(
+        capture,
+        out=tmp_path / mode,
+        iterations=12,
+        overrides=(*SMALL, f"semantics={mode}", "optimisation.semantics_window=[0, 15000]"),
+    )
+    labels = final_tensors(out)["model.gaussians.semantic_logits"]
+    moved = bool((labels.abs() != 2.0).any())
+    assert moved == (mode != "fixed")
+
+
+def test_hash_grid_and_random_cube_are_selectable(tiny_capture, tmp_path):
+    out = train(
+        tiny_capture(frames=10),
+        out=tmp_path / "run",
+        iterations=6,
+        overrides=(
+            *SMALL,
+            "deform.encoding=hashgrid",
+            "scene.kind=random_cube",
+            "scene.cube_count=300",
+        ),
+    )
+    run = load_run(out)
+    assert run.gaussians["scene"] > 0
+    picture = run.reconstruction.render(run.capture.camera(run.capture.frames[0]), [10_000])
+    assert bool(picture.rgb.isfinite().all())
+
+
+def test_non_finite_steps_are_skipped_counted_and_finally_stop(tiny_capture, caplog):
+    capture = load_capture(tiny_capture(frames=10))
+    config = PaperConfig(skinning_prefit_steps=1)
+    composition = compose(config, capture, 0, fit=False)
+    trainer = Trainer(composition, capture, Clock(100))
+    assert trainer.step() is not None
+    before = composition.model.skinning.mlp.weights[0].detach().clone()
+    with torch.no_grad():
+        composition.model.gaussians.features[0] = float("nan")
+    for _ in range(MAX_BAD_STEPS - 1):
+        assert trainer.step() is None
+    assert trainer.skipped == MAX_BAD_STEPS - 1
+    assert torch.equal(composition.model.skinning.mlp.weights[0], before)
+    assert "l1" in caplog.text
+    with pytest.raises(DataError, match="steps in a row"):
+        trainer.step()
+
+
+def test_wrong_calls_are_refused_before_anything_is_written(tiny_capture, tmp_path):
+    capture = tiny_capture(frames=10)
+    out = tmp_path / "run"
+    calls = [
+        ({"method": "papr"}, ConfigError, "Did you mean paper"),
+        ({"iterations": 0}, ConfigError, "--iterations 0"),
+        ({"max_minutes": -1.0}, ConfigError, "--max-minutes -1"),
+        ({"device": "cuda"}, BackendError, "--device cuda"),
+        ({"device": "gpu"}, ConfigError, "expected auto, cpu or cuda"),
+        ({"overrides": ("event.wieght=1",)}, ConfigError, "Did you mean event.weight"),
+        ({"resume": True}, DataError, "not a run folder"),
+    ]
+    for arguments, kind, message in calls:
+        with pytest.raises(kind, match=message):
+            train(capture, out=out, **arguments)
+        assert not out.exists()
+    out.mkdir()
+    (out / "mine.txt").write_text("keep")
+    with pytest.raises(ConfigError, match="not empty"):
+        train(capture, out=out)
+
+
+def test_a_damaged_checkpoint_is_named(tiny_capture, tmp_path):
+    out = train(tiny_capture(frames=10), out=tmp_path / "run", iterations=2, overrides=SMALL)
+    path = latest_checkpoint(RunFolder(out).checkpoints)
+    assert path is not None
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(DataError, match="not a readable checkpoint"):
+        load_run(out)
+
+
+def test_a_run_folder_holds_what_it_was_made_with(tiny_capture, tmp_path):
+    out = train(tiny_capture(frames=10), out=tmp_path / "run", iterations=2, overrides=SMALL)
+    facts = json.loads((out / "versions.json").read_text())
+    assert facts["packages"]["torch"] == torch.__version__
+    assert facts["seed"] == 0 and facts["threads"] >= 1
+    again = train(
+        tiny_capture(frames=10), out=tmp_path / "again", iterations=2, config=out / "config.yaml"
+    )
+    assert torch.equal(
+        final_tensors(out)["model.gaussians.means"], final_tensors(again)["model.gaussians.means"]
+    )
