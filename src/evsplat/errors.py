@@ -2,7 +2,7 @@
 
 
 class EvsplatError(Exception):
-    """Anything that is the input's or the machine's fault; the command line prints it and exits 2."""
+    """The input's or the machine's fault; the command line prints it and exits with 2."""
 
 
 class DataError(EvsplatError):

@@ -33,7 +33,8 @@ class LearningRates:
     scales_log: float = 5e-3
     quaternions: float = 1e-3
     opacity_logits: float = 0.05
-    features: float = 1e-3
+    features: float = 5e-3
+    """Colour features; 3DGS-Avatar: 1e-3 over all 15,000 steps."""
     semantic_logits: float = 1e-2
     skinning: float = 1e-4
     non_rigid: float = 1e-3

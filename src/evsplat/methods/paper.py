@@ -1,7 +1,6 @@
 """Method `paper`: the faithful reading of the paper, every reading a named setting.
 
-The numbers A1 to A32 name the open points of the paper's text that a setting decides; docs/method.md
-lists them.
+The numbers A1 to A32 name the open points of the paper's text that a setting decides.
 """
 
 import logging
@@ -51,7 +50,7 @@ class HumanStartConfig:
     count: int | None = None
     """Number of surface samples. 3DGS-Avatar takes 50,000; null = as many as ``spacing_px`` asks
     for, since a person of 4,000 pixels needs no 50,000 Gaussians."""
-    spacing_px: float = 1.1
+    spacing_px: float = 1.5
     """Mean distance of neighbouring samples on the screen when ``count`` is null."""
     max_count: int = 20_000
     """Upper bound of the automatic count."""
@@ -144,7 +143,7 @@ class PaperConfig:
     skinning_prefit_steps: int = 400
     """Steps of fitting the skinning network alone before training proper."""
     optimisation: OptimisationConfig = field(default_factory=OptimisationConfig)
-    densify_human: DensifyConfig = field(default_factory=lambda: DensifyConfig(max_count=14_000))
+    densify_human: DensifyConfig = field(default_factory=lambda: DensifyConfig(max_count=12_000))
     densify_scene: DensifyConfig | None = None
     """Limits of the scene. Null: 3DGS's for a random cube; none for the median backdrop, which has
     a Gaussian for every 2x2 pixels already and would only grow where the person passes."""

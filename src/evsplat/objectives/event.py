@@ -30,8 +30,8 @@ def event_loss(
 ) -> Float[Tensor, ""]:
     """Distance of two maps of unit norm, in 0..2 at any resolution (eq. 9, A15-A16).
 
-    ``change`` is the rendered log-brightness change, ``events`` the signed event count; the contrast
-    threshold cancels. Sum of absolute differences divided by ``sqrt(N)``.
+    ``change`` is the rendered log-brightness change, ``events`` the signed event count; the
+    contrast threshold cancels. Sum of absolute differences divided by ``sqrt(N)``.
     """
     difference = normalised(change, floor) - normalised(events, floor)
     return difference.abs().sum() / difference.numel() ** 0.5

@@ -27,7 +27,7 @@ class Photometric(Stateless):
         dssim: bool,
         perceptual: PerceptualMetric | None,
     ) -> None:
-        """``boxes``: pixel box (x0, y0, x1, y1) of the posed body, of the training frames that show it."""
+        """``boxes``: posed body's pixel box (x0, y0, x1, y1) per training frame that shows it."""
         self.frames = {frame.mid_us: frame for frame in capture.train_frames}
         self.boxes, self.dssim, self.perceptual = boxes, dssim, perceptual
 
