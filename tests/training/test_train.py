@@ -35,7 +35,8 @@ SMALL = (
 
 # The same call in a process of its own that saves after every step.
 SCRIPT = """
-import sys, evsplat.training.train as module
+import importlib, sys
+module = importlib.import_module("evsplat.training.train")
 module.CHECKPOINT_SECONDS = 0.0
 module.train(sys.argv[1], out=sys.argv[2], iterations=int(sys.argv[3]), resume=sys.argv[4] == "1",
              overrides=sys.argv[5:], threads=1)
