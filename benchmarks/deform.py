@@ -89,8 +89,6 @@ def _cases(points: int, times: int) -> dict[str, tuple[Callable[[], None], float
         cases[f"non_rigid_{kind}"] = (non_rigid, products)
     products = 6 * rows * 128 * (3 + skinning.softmax.logits) + 3 * hidden
     cases["skinning"] = (lambda: _step(skinning(posed)), products)
-    low = SkinningNetwork(parents, precision="bfloat16")
-    cases["skinning_bfloat16"] = (lambda: _step(low(posed)), products)
     cases["human_colour"] = (
         lambda: _step(human(features, directions, carried, latent)),
         6 * (points * 32 * 64 + rows * (31 * 64 + 64 * 64 + 64 * 3)),

@@ -4,6 +4,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "mlp_kernels.h"
+
 namespace evsplat {
 
 constexpr int kTile = 16;              // pixels along the side of a tile
@@ -100,6 +102,7 @@ struct Kernels {
                              int channels, const GaussianGrads&);
     // Independent multiply-adds for `rounds`; returns the floating-point operations done.
     double (*multiply_add)(int64_t rounds, float* sink);
+    const MlpKernels* mlp;
 };
 
 namespace portable { extern const Kernels kernels; }

@@ -1,4 +1,4 @@
-// Python bindings of the native kernels; evsplat/render/native.py is their only caller.
+// Python bindings of the native kernels; evsplat/render/native.py and evsplat/deform/mlp.py call them.
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -10,6 +10,7 @@
 #include <optional>
 #include <stdexcept>
 
+#include "mlp.h"
 #include "rasterizer.h"
 
 namespace nb = nanobind;
@@ -154,6 +155,72 @@ class Render {
     std::unique_ptr<Record> record_;
 };
 
+// Later layers are passed as (weight, bias) pairs in one flat list, as are their gradients.
+class PyMlp {
+  public:
+    PyMlp(In point, std::optional<In> both, In bias, In point_weight, In both_weight, std::vector<In> layers,
+          float slope, bool keep, int threads)
+        : point_(point), bias_(bias), point_weight_(point_weight), both_weight_(both_weight), both_(both),
+          layers_(std::move(layers)) {
+        require(point.ndim() == 2 && bias.ndim() == 2 && bias.shape(0) > 0, "point or bias");
+        require(point_weight.ndim() == 2 && both_weight.ndim() == 2, "the first layer's weights");
+        require(!layers_.empty() && layers_.size() % 2 == 0, "layers");
+        MlpInputs in = {};
+        in.points = point.shape(0), in.times = bias.shape(0);
+        in.per_point = int(point.shape(1)), in.width = int(bias.shape(1)), in.slope = slope;
+        require(point_weight.shape(0) == bias.shape(1) && point_weight.shape(1) == point.shape(1), "point_weight");
+        if (both) {
+            require(both->ndim() == 3 && both->shape(0) == in.times && both->shape(1) == in.points, "both");
+            in.per_both = int(both->shape(2)), in.both = both->data();
+            require(both_weight.shape(0) == bias.shape(1) && both_weight.shape(1) == both->shape(2), "both_weight");
+        }
+        in.point = point.data(), in.bias = bias.data();
+        in.point_weight = point_weight.data(), in.both_weight = both_weight.data();
+        for (size_t l = 0; l < layers_.size(); l += 2) {
+            const In &w = layers_[l], &b = layers_[l + 1];
+            const bool last = l + 2 == layers_.size();
+            require(w.ndim() == 2 && w.shape(1) == bias.shape(1) && b.size() == w.shape(0), "a layer");
+            require(last || w.shape(0) == bias.shape(1), "a hidden layer");
+            in.weights.push_back(w.data()), in.biases.push_back(b.data());
+            in.out = int(w.shape(0));
+        }
+        in_ = in;
+        mlp_ = std::make_unique<Mlp>(in, keep, threads);
+    }
+
+    void forward(Out output) {
+        require(output.size() == in_.points * in_.times * in_.out, "output");
+        nb::gil_scoped_release release;
+        mlp_->forward(output.data());
+    }
+
+    void backward(In output_grad, std::optional<Out> point, std::optional<Out> both, Out bias, Out point_weight,
+                  Out both_weight, std::vector<Out> layers) {
+        require(output_grad.size() == in_.points * in_.times * in_.out, "output gradient");
+        require(!point || point->size() == point_.size(), "point gradient");
+        require(!both || (both_ && both->size() == both_->size()), "both gradient");
+        require(bias.size() == bias_.size() && point_weight.size() == point_weight_.size() &&
+                    both_weight.size() == both_weight_.size() && layers.size() == layers_.size(),
+                "the gradients of parameters");
+        MlpGrads grads = {};
+        grads.point = point ? point->data() : nullptr, grads.both = both ? both->data() : nullptr;
+        grads.bias = bias.data(), grads.point_weight = point_weight.data(), grads.both_weight = both_weight.data();
+        for (size_t l = 0; l < layers.size(); ++l) {
+            require(layers[l].size() == layers_[l].size(), "a layer's gradient");
+            (l % 2 ? grads.biases : grads.weights).push_back(layers[l].data());
+        }
+        nb::gil_scoped_release release;
+        mlp_->backward(output_grad.data(), grads);
+    }
+
+  private:
+    In point_, bias_, point_weight_, both_weight_;
+    std::optional<In> both_;
+    std::vector<In> layers_;
+    MlpInputs in_ = {};
+    std::unique_ptr<Mlp> mlp_;
+};
+
 double multiply_add(int64_t rounds) {
     float sink = 0.f;
     nb::gil_scoped_release release;
@@ -180,6 +247,13 @@ NB_MODULE(_native, m) {
         .def_prop_ro("bytes", &Render::bytes, "Memory kept for the backward pass.")
         .def_prop_ro("intersections", &Render::intersections, "Pairs of Gaussian and tile.")
         .def_prop_ro("patch_steps", &Render::patch_steps, "Pairs of Gaussian and patch.");
+    nb::class_<PyMlp>(m, "Mlp", "One evaluation of a network; keeps what its backward pass needs.")
+        .def(nb::init<In, std::optional<In>, In, In, In, std::vector<In>, float, bool, int>(), nb::arg("point"),
+             nb::arg("both").none(), nb::arg("bias"), nb::arg("point_weight"), nb::arg("both_weight"),
+             nb::arg("layers"), nb::arg("slope"), nb::arg("keep"), nb::arg("threads"))
+        .def("forward", &PyMlp::forward, nb::arg("output"))
+        .def("backward", &PyMlp::backward, nb::arg("output_grad"), nb::arg("point").none(), nb::arg("both").none(),
+             nb::arg("bias"), nb::arg("point_weight"), nb::arg("both_weight"), nb::arg("layers"));
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
     m.def("levels", &available_levels, "SIMD levels that run here, best first.");
     m.def("level", [] { return std::string(select_kernels().name); }, "SIMD level in use.");

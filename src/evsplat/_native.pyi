@@ -45,6 +45,33 @@ class Render:
     @property
     def patch_steps(self) -> int: ...
 
+class Mlp:
+    """One evaluation of a network; keeps what its backward pass needs."""
+
+    def __init__(
+        self,
+        point: Tensor,
+        both: Tensor | None,
+        bias: Tensor,
+        point_weight: Tensor,
+        both_weight: Tensor,
+        layers: list[Tensor],
+        slope: float,
+        keep: bool,
+        threads: int,
+    ) -> None: ...
+    def forward(self, output: Tensor) -> None: ...
+    def backward(
+        self,
+        output_grad: Tensor,
+        point: Tensor | None,
+        both: Tensor | None,
+        bias: Tensor,
+        point_weight: Tensor,
+        both_weight: Tensor,
+        layers: list[Tensor],
+    ) -> None: ...
+
 def lanes() -> int: ...
 def levels() -> list[str]: ...
 def level() -> str: ...

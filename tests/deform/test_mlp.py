@@ -1,10 +1,14 @@
-"""The chunked MLP against the plain one on concatenated inputs."""
+"""The split MLP against one on concatenated inputs, and the compiled one against float64."""
+
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
 from torch import nn
 
-from evsplat.deform import mlp as mlp_module
+from evsplat._native import levels as native_levels
 from evsplat.deform.mlp import PointMLP
 
 
@@ -38,33 +42,101 @@ def inputs(kind, dtype=torch.float64, points=13, times=3):
     return network, [tensor for tensor in (draw(points, 3), time, both)]
 
 
-KINDS = ["point", "point time", "point both", "point time both"]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("rows", [1, 8, 100_000])
-def test_values_and_gradients_equal_the_plain_network_whatever_the_chunks(kind, rows, monkeypatch):
-    monkeypatch.setattr(mlp_module, "_ROWS", rows)
-    network, arguments = inputs(kind)
+def both_ways(network, arguments):
+    """Output and gradients of the network, and those of the plain one."""
     leaves = [leaf for leaf in (*arguments, *network.parameters()) if leaf is not None]
+    leaves = [leaf for leaf in leaves if leaf.requires_grad and leaf.numel()]
     results = []
     for function in (network, lambda *a: plain(network, *a)):
         output = function(*arguments)
         upstream = torch.linspace(-1, 1, output.numel(), dtype=output.dtype).view_as(output)
         gradients = torch.autograd.grad(output, leaves, upstream, allow_unused=True)
-        results.append([output, *(g for g in gradients if g is not None and g.numel())])
+        results.append([output, *(g for g in gradients if g is not None)])
     assert len(results[0]) == len(results[1])
-    for chunked, expected in zip(*results, strict=True):
-        assert torch.allclose(chunked, expected, atol=1e-12)
+    return results
+
+
+KINDS = ["point", "point time", "point both", "point time both"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradcheck(kind, monkeypatch):
-    monkeypatch.setattr(mlp_module, "_ROWS", 12)
+def test_values_and_gradients_equal_the_network_on_concatenated_inputs(kind):
+    network, arguments = inputs(kind)
+    for split, expected in zip(*both_ways(network, arguments), strict=True):
+        assert torch.allclose(split, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradcheck(kind):
     network, arguments = inputs(kind, points=5, times=2)
     leaves = [leaf for leaf in (*arguments, *network.parameters()) if leaf is not None]
     leaves = [leaf for leaf in leaves if leaf.numel()]
     assert torch.autograd.gradcheck(lambda *_: network(*arguments), leaves)
+
+
+SIZES = [
+    ((48, 144, 0), 128, 3, 25),  # the non-rigid network
+    ((3, 0, 0), 128, 4, 35),  # the skinning network
+    ((32, 16, 31), 64, 2, 3),  # the person's colour
+    ((47, 0, 0), 64, 2, 3),  # the scene's colour
+    ((5, 2, 3), 7, 1, 2),  # no multiple of anything
+]
+
+
+@pytest.mark.parametrize(("inputs_of", "width", "depth", "out"), SIZES)
+@pytest.mark.parametrize("points", [1, 95, 96, 97, 1000])
+def test_native_values_and_gradients_equal_those_in_float64(inputs_of, width, depth, out, points):
+    torch.manual_seed(points)
+    network = PointMLP(*inputs_of, width=width, depth=depth, out=out)
+    times = 3 if inputs_of[1] or inputs_of[2] else 1
+    arguments = [
+        torch.randn(points, inputs_of[0]).requires_grad_(),
+        torch.randn(times, inputs_of[1]).requires_grad_() if inputs_of[1] else None,
+        torch.randn(times, points, inputs_of[2]).requires_grad_() if inputs_of[2] else None,
+    ]
+    native, _ = both_ways(network, arguments)
+    exact = PointMLP(*inputs_of, width=width, depth=depth, out=out).double()
+    exact.load_state_dict(network.state_dict())
+    doubles = [None if a is None else a.detach().double().requires_grad_() for a in arguments]
+    _, expected = both_ways(exact, doubles)
+    for value, truth in zip(native, expected, strict=True):
+        assert (value - truth).norm() < 3e-6 * truth.norm()
+
+
+def test_native_results_do_not_depend_on_the_number_of_threads():
+    torch.manual_seed(0)
+    network = PointMLP(48, 144, 0, width=128, depth=3, out=25)
+    arguments = [torch.randn(2_000, 48).requires_grad_(), torch.randn(2, 144), None]
+    threads = torch.get_num_threads()
+    try:
+        results = []
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            results.append(both_ways(network, arguments)[0])
+    finally:
+        torch.set_num_threads(threads)
+    # Products of plain torch (time's) may differ, so only what the native part gives is compared.
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("level", ["avx512", "avx2", "portable"])
+def test_every_simd_level_agrees(level):
+    if level not in native_levels():
+        pytest.skip(f"this processor has no {level}")
+    code = (
+        "import evsplat, torch; from evsplat.deform.mlp import PointMLP; torch.manual_seed(0);"
+        "n = PointMLP(9, 4, 5, width=23, depth=2, out=6); p = torch.randn(130, 9).requires_grad_();"
+        "o = n(p, torch.randn(2, 4), torch.randn(2, 130, 5)); o.square().sum().backward();"
+        "print(float(o.double().norm()), float(p.grad.double().norm()))"
+    )
+    printed = []
+    for isa in (level, native_levels()[0]):
+        environment = {**os.environ, "EVSPLAT_ISA": isa}
+        run = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+        )
+        printed.append([float(word) for word in run.stdout.split()])
+    assert printed[0] == pytest.approx(printed[1], rel=1e-5)
 
 
 def test_transposed_inputs_give_the_same():
@@ -92,30 +164,3 @@ def test_start_is_that_of_linear_layers_and_the_last_can_be_near_zero():
     assert abs(network.weights[0].abs().max().item() - 200**-0.5) < 1e-4
     assert abs(network.weights[-1].std().item() - 1e-4) < 1e-5
     assert (network.biases[-1] == 0).all()
-
-
-def test_bfloat16_stays_near_float32_in_values_and_gradients():
-    torch.manual_seed(0)
-    exact = PointMLP(48, 144, 0, width=128, depth=3, out=25)
-    fast = PointMLP(48, 144, 0, width=128, depth=3, out=25, precision="bfloat16")
-    fast.load_state_dict(exact.state_dict())
-    point, time = torch.rand(3_000, 48), torch.randn(2, 144)
-    upstream = torch.randn(2, 3_000, 25)
-    results = []
-    for network in (exact, fast):
-        leaf = point.clone().requires_grad_()
-        output = network(leaf, time)
-        output.backward(upstream)
-        gradients = [p.grad for p in network.parameters() if p.numel()]
-        results.append([output.detach(), leaf.grad, *gradients])
-        assert all(value.dtype == torch.float32 for value in results[-1])
-    for index, (reference, value) in enumerate(zip(*results, strict=True)):
-        # 8 bits round by up to 0.4 %; a gradient also errs where rounding moves an argument of the
-        # leaky ReLU across zero (upstream gradients are random here, which is the worst case).
-        limit = 0.01 if index == 0 else 0.12
-        assert (value - reference).norm() < limit * reference.norm()
-
-
-def test_unknown_precision_is_refused():
-    with pytest.raises(ValueError, match="precision is 'float16', expected float32 or bfloat16"):
-        PointMLP(3, 0, 0, width=4, depth=1, out=1, precision="float16")

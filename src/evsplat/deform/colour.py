@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.body.rotations import axis_angle_to_matrix
-from evsplat.deform.mlp import PointMLP, Precision
+from evsplat.deform.mlp import PointMLP
 from evsplat.deform.spherical_harmonics import sh_basis
 
 _DIRECTION_DIM = 15
@@ -22,7 +22,6 @@ class HumanColour(nn.Module):
         nonrigid_dim: int = 16,
         latent_dim: int = 16,
         width: int = 64,
-        precision: Precision = "float32",
     ) -> None:
         super().__init__()
         self.mlp = PointMLP(
@@ -32,7 +31,6 @@ class HumanColour(nn.Module):
             width,
             depth=2,
             out=3,
-            precision=precision,
         )
 
     def forward(
@@ -65,7 +63,6 @@ class SceneColour(nn.Module):
         view_dependent: bool = True,
         direction_dropout: float = 0.0,
         width: int = 64,
-        precision: Precision = "float32",
     ) -> None:
         super().__init__()
         if not 0 <= direction_dropout <= 1:
@@ -73,7 +70,7 @@ class SceneColour(nn.Module):
         self.view_dependent = view_dependent
         self.direction_dropout = direction_dropout
         inputs = feature_dim + (_DIRECTION_DIM if view_dependent else 0)
-        self.mlp = PointMLP(inputs, 0, 0, width, depth=2, out=3, precision=precision)
+        self.mlp = PointMLP(inputs, 0, 0, width, depth=2, out=3)
 
     def forward(
         self, features: Float[Tensor, "N 32"], directions: Float[Tensor, "N 3"]

@@ -151,8 +151,13 @@ class HumanSceneModel(nn.Module):
         *,
         noise: Noise | None = None,
         hard_semantics: bool = False,
+        share_skinning: bool = False,
     ) -> PosedGaussians:
         """All Gaussians in world space at ``times_us``, coloured for a camera at that centre.
+
+        ``share_skinning`` reads the skinning weights once, at the mean of a Gaussian's deformed
+        places, instead of at each (eq. 2): for the neighbouring times of a training step, whose
+        deformations differ by less than the weights notice, this halves the network's cost.
 
         ``hard_semantics`` puts the hard label into the semantic channel (evaluation); otherwise it
         is the soft attribute m.
@@ -163,7 +168,8 @@ class HumanSceneModel(nn.Module):
         canonical = gaussians.means[moving]
         non_rigid = self._non_rigid(canonical, rotations, noise)
         deformed, log_scales, quaternions, feature = non_rigid
-        weights = self.skinning(self.normalise(deformed))
+        skinned_at = deformed.mean(0, keepdim=True) if share_skinning else deformed
+        weights = self.skinning(self.normalise(skinned_at))
         world, transforms = skin(deformed, weights, bones)
 
         people = slice(0, gaussians.human_count)

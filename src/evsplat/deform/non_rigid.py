@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.deform.encodings import HashGridEncoding, OneBlobEncoding
-from evsplat.deform.mlp import PointMLP, Precision
+from evsplat.deform.mlp import PointMLP
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,6 @@ class NonRigidNetwork(nn.Module):
         depth: int = 3,
         feature_dim: int = 16,
         last_layer_std: float | None = 1e-3,
-        precision: Precision = "float32",
     ) -> None:
         """``last_layer_std`` None starts the last layer as any other, as the released code does.
 
@@ -57,7 +56,6 @@ class NonRigidNetwork(nn.Module):
             depth,
             9 + feature_dim,
             last_std=last_layer_std,
-            precision=precision,
         )
 
     def forward(self, positions: Float[Tensor, "N 3"], pose: Float[Tensor, "T P"]) -> NonRigid:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.body.tree import joint_depths
-from evsplat.deform.mlp import PointMLP, Precision
+from evsplat.deform.mlp import PointMLP
 
 
 class HierarchicalSoftmax(nn.Module):
@@ -98,11 +98,10 @@ class SkinningNetwork(nn.Module):
         parents: Sequence[int],
         width: int = 128,
         depth: int = 4,
-        precision: Precision = "float32",
     ) -> None:
         super().__init__()
         self.softmax = HierarchicalSoftmax([int(parent) for parent in parents])
-        self.mlp = PointMLP(3, 0, 0, width, depth, self.softmax.logits, precision=precision)
+        self.mlp = PointMLP(3, 0, 0, width, depth, self.softmax.logits)
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch J"]:
         """Weights at positions in [-1, 1]; each sums to one."""

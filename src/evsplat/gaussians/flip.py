@@ -31,7 +31,9 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
 
     Person to scene: placed where the body carries it at frame ``drawn``, the one rendered last.
     Scene to person: carried back by the nearest body vertex over all frames; beyond `REACH_M` of
-    all of them the row stays in the scene and its logit returns to the boundary.
+    all of them the row stays in the scene and its logit returns to the boundary. The two classes
+    have separate colour networks, to which the other's features mean nothing: a moved row takes
+    those of the nearest row of its new class.
     """
     wants_human = gaussians.semantic_logits.detach() > 0
     human = gaussians.human_mask()
@@ -46,6 +48,7 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
         nearest = _nearest(vertices, values["means"][leaving])[1]
         transforms = _blend(frames, nearest, torch.full_like(nearest, drawn))
         _carry(values, leaving, transforms)
+        _take_features(values, leaving, torch.nonzero(~human)[:, 0])
     if len(joining):
         distance, frame, vertex = _nearest_over_frames(frames, values["means"][joining])
         near = distance <= REACH_M
@@ -53,6 +56,7 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
         joining = joining[near]
         transforms = torch.linalg.inv(_blend(frames, vertex[near], frame[near]))
         _carry(values, joining, transforms)
+        _take_features(values, joining, torch.nonzero(human)[:, 0])
 
     moved = torch.zeros_like(human)
     moved[leaving] = True
@@ -68,6 +72,13 @@ def _carry(values: dict[str, Tensor], rows: Tensor, transforms: Float[Tensor, "M
     values["means"][rows] = (rotation @ values["means"][rows][..., None])[..., 0] + translation
     turn = matrix_to_quaternion(rotation)
     values["quaternions"][rows] = quaternion_multiply(turn, values["quaternions"][rows])
+
+
+def _take_features(values: dict[str, Tensor], rows: Tensor, others: Tensor) -> None:
+    """Copy the colour features of the nearest of ``others`` to ``rows``, in place."""
+    if len(others):
+        nearest = _nearest(values["means"][others], values["means"][rows])[1]
+        values["features"][rows] = values["features"][others[nearest]]
 
 
 def _blend(

@@ -136,7 +136,7 @@ class PaperConfig:
     event: EventConfig = field(default_factory=EventConfig)
     isometry_refresh: int = 100
     """Steps between neighbour searches."""
-    isometry_samples: int = 4_096
+    isometry_samples: int = 1_024
     """Gaussians whose isometry is looked at per step."""
     skinning_points: int = 1_024
     """Surface points per step of the skinning prior (1.6)."""

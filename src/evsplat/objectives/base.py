@@ -48,6 +48,10 @@ class Objective(Protocol):
         """Named scalar terms, unweighted; a term that does not apply is left out."""
         ...
 
+    def rows_changed(self) -> None:
+        """Called after Gaussians were added, removed or moved between the classes."""
+        ...
+
     def state(self) -> dict[str, Tensor]:
         """What a checkpoint must hold for a resume to repeat the same steps."""
         ...
@@ -59,6 +63,9 @@ class Objective(Protocol):
 
 class Stateless:
     """Base of objectives that remember nothing between steps."""
+
+    def rows_changed(self) -> None:
+        """Nothing refers to rows."""
 
     def state(self) -> dict[str, Tensor]:
         """Nothing."""

@@ -46,7 +46,7 @@ class Isometry:
         if count <= NEIGHBOURS:
             return {}
         canonical = gaussians.means[gaussians.human]
-        if self.age == 0 or len(self.neighbours) != count or self.age >= self.refresh:
+        if self.age == 0 or self.age >= self.refresh:
             self._search(canonical)
         self.age += 1
         chosen = torch.randint(count, (min(self.samples, count),), generator=step.generator)
@@ -69,6 +69,10 @@ class Isometry:
         after = (posed_6[:, :, :1] - posed_6[:, :, 1:]).norm(dim=-1)
         terms["isometry_covariances"] = (after - before).abs().mean()
         return terms
+
+    def rows_changed(self) -> None:
+        """Row numbers mean other Gaussians now: search again."""
+        self.age = 0
 
     def state(self) -> dict[str, Tensor]:
         """The neighbours and how many steps ago they were found."""

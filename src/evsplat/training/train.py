@@ -3,6 +3,7 @@
 import json
 import logging
 import signal
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -147,7 +148,7 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
     with (
         _interrupt_flag() as interrupted,
         folder.log.open("a", encoding="utf-8", buffering=1) as log,
-        tqdm(total=100.0, unit="%", bar_format="{percentage:3.0f}%|{bar:24}| {postfix}") as bar,
+        _progress_bar() as bar,
     ):
         while not clock.done and not clock.out_of_time:
             started = time.perf_counter()
@@ -183,15 +184,26 @@ def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
     }
 
 
+def _progress_bar() -> "tqdm[Any]":
+    """A bar that moves on a terminal, and a line now and then in a file."""
+    return tqdm(
+        total=100.0,
+        bar_format="{percentage:3.0f}%|{bar:24}| {postfix}",
+        mininterval=0.2 if sys.stderr.isatty() else 30.0,
+        miniters=0,
+    )
+
+
 def _show(bar: "tqdm[Any]", trainer: Trainer, report: StepReport) -> None:
     clock, counts = trainer.clock, trainer.counts()
     minutes, seconds = divmod(round(clock.seconds_left), 60)
-    bar.update(100 * clock.fraction - bar.n)
     bar.set_postfix_str(
         f"step {clock.iteration}/{clock.expected_iterations}  loss {report.loss:.4f}  "
         f"psnr {report.psnr:.2f}  person {counts['human']}  scene {counts['scene']}  "
-        f"left {minutes}:{seconds:02d}"
+        f"left {minutes}:{seconds:02d}",
+        refresh=False,
     )
+    bar.update(100 * clock.fraction - bar.n)
 
 
 @contextmanager

@@ -62,7 +62,7 @@ class Trainer:
 
         camera = self.capture.camera(frame).to(self.device)
         noise = self.model.draw_noise(len(times), generator)
-        posed = self.model.at(times, camera.center(), noise=noise)
+        posed = self.model.at(times, camera.center(), noise=noise, share_skinning=True)
         splats = posed.splats()
         shape = (len(times), splats.means.shape[1], 2)
         centers = torch.zeros(shape, device=self.device, requires_grad=True)
@@ -160,6 +160,8 @@ class Trainer:
         if self.model.semantics != "fixed":
             drawn = self.capture.train_frames.index(frame)
             flip_labels(gaussians, rows, self.composition.body_frames, drawn)
+        for objective in self.composition.objectives:
+            objective.rows_changed()
         self.statistics = self._fresh_statistics()
 
     def _fresh_statistics(self) -> ScreenStatistics:

@@ -1,0 +1,166 @@
+#include "mlp.h"
+
+#include <algorithm>
+#include <cstring>
+#include <stdexcept>
+
+#include "rasterizer.h"
+#include "thread_pool.h"
+
+namespace evsplat {
+namespace {
+
+constexpr size_t kBlocksPerGroup = 4;  // consecutive blocks share their sums
+constexpr size_t kMostGroups = 32;
+
+int panels_of(int columns, int lanes) { return (columns + lanes - 1) / lanes; }
+
+// Matrix (rows, columns), element (r, c) at from[r * row_step + c * column_step], to panels of columns.
+void to_panels(const float* from, int rows, int columns, int row_step, int column_step, int lanes, float* to) {
+    for (int p = 0; p < panels_of(columns, lanes); ++p)
+        for (int r = 0; r < rows; ++r)
+            for (int l = 0; l < lanes; ++l, ++to) {
+                const int c = p * lanes + l;
+                *to = c < columns ? from[size_t(r) * row_step + size_t(c) * column_step] : 0.f;
+            }
+}
+
+// Hands out consecutive pieces of one buffer.
+struct Pieces {
+    float* next;
+    float* take(size_t count) {
+        float* piece = next;
+        next += count;
+        return piece;
+    }
+};
+
+size_t weight_floats(int out, int in, int lanes) {
+    return size_t(panels_of(out, lanes)) * lanes * (in + 1) + size_t(panels_of(in, lanes)) * lanes * out;
+}
+
+MlpWeight pack_weight(const float* weight, const float* bias, int out, int in, int lanes, Pieces& pieces) {
+    float* forward = pieces.take(size_t(panels_of(out, lanes)) * lanes * in);
+    float* backward = pieces.take(size_t(panels_of(in, lanes)) * lanes * out);
+    float* padded = pieces.take(size_t(panels_of(out, lanes)) * lanes);
+    to_panels(weight, in, out, 1, in, lanes, forward);
+    to_panels(weight, out, in, in, 1, lanes, backward);
+    if (bias) to_panels(bias, 1, out, 0, 1, lanes, padded);
+    return {forward, backward, padded};
+}
+
+size_t sum_floats(int out, int in, int lanes) {
+    return size_t(panels_of(out, lanes)) * lanes * (size_t(panels_of(in, lanes)) * lanes + 1);
+}
+
+size_t floats_of_sums(const MlpShape& s) {
+    size_t floats = sum_floats(s.width, s.per_point, s.lanes) + sum_floats(s.width, s.per_both, s.lanes) +
+                    s.times * s.width_panels * s.lanes;
+    for (int l = 0; l < s.layers; ++l) floats += sum_floats(s.columns(l), s.width, s.lanes);
+    return floats;
+}
+
+MlpSums sums_in(const MlpShape& s, float* floats) {
+    Pieces pieces{floats};
+    MlpSums sums = {};
+    sums.point_weight = pieces.take(sum_floats(s.width, s.per_point, s.lanes));
+    sums.both_weight = pieces.take(sum_floats(s.width, s.per_both, s.lanes));
+    sums.bias = pieces.take(s.times * s.width_panels * s.lanes);
+    for (int l = 0; l < s.layers; ++l) {
+        const size_t rows = size_t(s.panels(l)) * s.lanes;
+        sums.weight[l] = pieces.take(rows * s.width_panels * s.lanes);
+        sums.layer_bias[l] = pieces.take(rows);
+    }
+    return sums;
+}
+
+// Sums (in panels, padded out rows, lanes) to a gradient (out, in).
+void from_panels(const float* from, int out, int in, int lanes, float* to) {
+    const int rows = panels_of(out, lanes) * lanes;
+    for (int o = 0; o < out; ++o)
+        for (int i = 0; i < in; ++i)
+            to[size_t(o) * in + i] = from[(size_t(i / lanes) * rows + o) * lanes + i % lanes];
+}
+
+}  // namespace
+
+Mlp::Mlp(const MlpInputs& inputs, bool keep, int threads)
+    : in_(inputs), keep_(keep), threads_(threads), kernels_(*select_kernels().mlp), shape_() {
+    if (in_.weights.size() > kMlpLayers) throw std::runtime_error("an MLP of more than 16 layers");
+    MlpShape& s = shape_;
+    s.points = in_.points, s.times = in_.times, s.blocks = (in_.points + kMlpRows - 1) / kMlpRows;
+    s.lanes = kernels_.lanes, s.layers = int(in_.weights.size());
+    s.per_point = in_.per_point, s.per_both = in_.both ? in_.per_both : 0;
+    s.width = in_.width, s.out = in_.out;
+    s.point_panels = panels_of(s.per_point, s.lanes), s.both_panels = panels_of(s.per_both, s.lanes);
+    s.width_panels = panels_of(s.width, s.lanes), s.out_panels = panels_of(s.out, s.lanes);
+    s.slope = in_.slope, s.keep = keep;
+}
+
+static MlpForward forward_job(const MlpInputs& in, const MlpShape& s, Buffer<float>& packed) {
+    size_t floats = weight_floats(s.width, s.per_point, s.lanes) + weight_floats(s.width, s.per_both, s.lanes) +
+                    s.times * s.width_panels * s.lanes;
+    for (int l = 0; l < s.layers; ++l) floats += weight_floats(s.columns(l), s.width, s.lanes);
+    packed.reset(floats);
+    Pieces pieces{packed.data()};
+    MlpForward job = {};
+    job.point = in.point, job.both = in.both;
+    job.point_weight = pack_weight(in.point_weight, nullptr, s.width, s.per_point, s.lanes, pieces);
+    job.both_weight = pack_weight(in.both_weight, nullptr, s.width, s.per_both, s.lanes, pieces);
+    for (int l = 0; l < s.layers; ++l)
+        job.layer[l] = pack_weight(in.weights[l], in.biases[l], s.columns(l), s.width, s.lanes, pieces);
+    float* bias = pieces.take(s.times * s.width_panels * s.lanes);
+    for (size_t t = 0; t < s.times; ++t)
+        to_panels(in.bias + t * s.width, 1, s.width, 0, 1, s.lanes, bias + t * s.width_panels * s.lanes);
+    job.bias = bias;
+    return job;
+}
+
+void Mlp::forward(float* output) {
+    MlpForward job = forward_job(in_, shape_, packed_);
+    if (keep_) activations_.reset(shape_.blocks * shape_.times * shape_.kept());
+    job.activations = activations_.data(), job.output = output;
+    parallel_for(threads_, shape_.blocks, [&](size_t block) {
+        Buffer<float> scratch(mlp_scratch(shape_));
+        kernels_.forward(shape_, job, block, scratch.data());
+    });
+}
+
+void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
+    const MlpShape& s = shape_;
+    if (!keep_) throw std::runtime_error("backward of an MLP that kept nothing");
+    MlpBackward job = {};
+    job.forward = forward_job(in_, s, packed_);
+    job.forward.activations = activations_.data();
+    job.output_grad = output_grad, job.point_grad = grads.point, job.both_grad = grads.both;
+
+    const size_t groups = std::max<size_t>(1, std::min(kMostGroups, s.blocks / kBlocksPerGroup));
+    const size_t floats = floats_of_sums(s);
+    Buffer<float> sums(groups * floats);
+    parallel_for(threads_, groups, [&](size_t group) {
+        Buffer<float> scratch(mlp_scratch(s));
+        float* mine = sums.data() + group * floats;
+        std::fill(mine, mine + floats, 0.f);
+        const MlpSums parts = sums_in(s, mine);
+        for (size_t block = s.blocks * group / groups; block < s.blocks * (group + 1) / groups; ++block)
+            kernels_.backward(s, job, block, parts, scratch.data());
+    });
+    // Pieces of the vector of sums, each over the groups in order.
+    constexpr size_t kPiece = 4096;
+    parallel_for(threads_, (floats + kPiece - 1) / kPiece, [&](size_t piece) {
+        const size_t begin = piece * kPiece, end = std::min(floats, begin + kPiece);
+        for (size_t group = 1; group < groups; ++group)
+            for (size_t i = begin; i < end; ++i) sums[i] += sums[group * floats + i];
+    });
+    const MlpSums total = sums_in(s, sums.data());
+    from_panels(total.point_weight, s.width, s.per_point, s.lanes, grads.point_weight);
+    if (in_.both) from_panels(total.both_weight, s.width, s.per_both, s.lanes, grads.both_weight);
+    for (size_t t = 0; t < s.times; ++t)
+        std::copy_n(total.bias + t * s.width_panels * s.lanes, s.width, grads.bias + t * s.width);
+    for (int l = 0; l < s.layers; ++l) {
+        from_panels(total.weight[l], s.columns(l), s.width, s.lanes, grads.weights[l]);
+        std::copy_n(total.layer_bias[l], s.columns(l), grads.biases[l]);
+    }
+}
+
+}  // namespace evsplat
