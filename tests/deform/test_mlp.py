@@ -133,7 +133,11 @@ def test_every_simd_level_agrees(level):
     for isa in (level, native_levels()[0]):
         environment = {**os.environ, "EVSPLAT_ISA": isa}
         run = subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+            [sys.executable, "-c", code],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
         )
         printed.append([float(word) for word in run.stdout.split()])
     assert printed[0] == pytest.approx(printed[1], rel=1e-5)

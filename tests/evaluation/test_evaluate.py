@@ -12,10 +12,10 @@ from PIL import Image
 from evsplat.capture import load_capture
 from evsplat.evaluation import evaluate, evaluate_run
 from evsplat.evaluation.event_maps import chosen_pairs
-from evsplat.evaluation.lpips import WEIGHTS_VARIABLE
 from evsplat.evaluation.pictures import error_map, file_stem, signed_map
 from evsplat.evaluation.protocols import METRICS, PSNR_CEILING_DB, REGIONS
 from evsplat.methods.trivial import MedianBackground
+from evsplat.similarity.lpips import WEIGHTS_VARIABLE
 
 from .helpers import TruthWithNoise, drop, edit
 

@@ -147,7 +147,7 @@ def _st_lpips() -> Check:
 
 
 def _lpips(network: Literal["alex", "vgg"]) -> Check:
-    from evsplat.evaluation.lpips import load_lpips
+    from evsplat.similarity.lpips import load_lpips
 
     name = f"LPIPS {network}"
     try:

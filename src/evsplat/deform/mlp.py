@@ -99,35 +99,40 @@ def plain_mlp(
 
 class _NativeMLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, keep: bool, *inputs: Tensor | None) -> Float[Tensor, "T N out"]:
-        plain = [None if tensor is None else tensor.detach().contiguous() for tensor in inputs]
-        point, both, bias, point_weight, both_weight, *layers = plain
-        assert point is not None and bias is not None
-        job = _native.Mlp(
-            point, both, bias, point_weight, both_weight, layers, SLOPE, keep,
-            torch.get_num_threads(),
-        )  # fmt: skip
-        output = torch.empty(len(bias), len(point), len(layers[-1]))
-        job.forward(output)
-        ctx.job = job
-        ctx.save_for_backward(*inputs)
+    def forward(
+        ctx: Any, keep: bool, point: Tensor, both: Tensor | None, *parameters: Tensor
+    ) -> Float[Tensor, "T N out"]:
+        points, (bias, point_weight, both_weight, *layers) = _plain(point), map(_plain, parameters)
+        moving = None if both is None else _plain(both)
+        threads = torch.get_num_threads()
+        ctx.job = _native.Mlp(
+            points, moving, bias, point_weight, both_weight, layers, SLOPE, keep, threads
+        )
+        output = torch.empty(len(bias), len(points), len(layers[-1]))
+        ctx.job.forward(output)
+        ctx.save_for_backward(point, both, *parameters)
         return output
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         # Reading saved_tensors also refuses inputs that were changed in place since.
-        inputs = ctx.saved_tensors
-        results = [None if tensor is None else torch.empty(tensor.shape) for tensor in inputs]
-        point, both, *parameters = results
-        needs = ctx.needs_input_grad[1:]
-        point = point if needs[0] else None
-        both = both if needs[1] else None
-        bias, point_weight, both_weight, *layers = parameters
-        ctx.job.backward(
-            gradients[0].contiguous(), point, both, bias, point_weight, both_weight, layers
+        inputs = [
+            None if tensor is None else torch.empty(tensor.shape) for tensor in ctx.saved_tensors
+        ]
+        point, both, bias, point_weight, both_weight, *layers = inputs
+        point, both = (
+            gradient if needed else None
+            for gradient, needed in zip((point, both), ctx.needs_input_grad[1:3], strict=True)
         )
-        return None, point, both, *parameters
+        upstream = gradients[0].contiguous()
+        ctx.job.backward(upstream, point, both, bias, point_weight, both_weight, layers)
+        return None, point, both, bias, point_weight, both_weight, *layers
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    """Contiguous and without gradient, as the module takes it."""
+    return tensor.detach().contiguous()
 
 
 def _uniform(shape: tuple[int, ...], fan_in: int) -> Tensor:

@@ -1,8 +1,6 @@
-"""Measuring a reconstruction: metrics, protocols, trivial rows, tables and the report page."""
+"""Measuring a reconstruction: protocols, trivial rows, tables and the report page."""
 
 from evsplat.evaluation.evaluator import evaluate, evaluate_run
-from evsplat.evaluation.lpips import load_lpips
-from evsplat.evaluation.metrics import Ssim, psnr, ssim
 from evsplat.evaluation.protocols import (
     AVATAR_COMPAT,
     HUGS_COMPAT,
@@ -10,7 +8,6 @@ from evsplat.evaluation.protocols import (
     STANDARD,
     Protocol,
 )
-from evsplat.evaluation.st_lpips import load_st_lpips
 
 __all__ = [
     "AVATAR_COMPAT",
@@ -18,11 +15,6 @@ __all__ = [
     "PROTOCOLS",
     "STANDARD",
     "Protocol",
-    "Ssim",
     "evaluate",
     "evaluate_run",
-    "load_lpips",
-    "load_st_lpips",
-    "psnr",
-    "ssim",
 ]

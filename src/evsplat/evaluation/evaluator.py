@@ -14,9 +14,7 @@ from tqdm import tqdm
 from evsplat.capture import Capture, Frame, NovelView
 from evsplat.errors import DataError
 from evsplat.evaluation.event_maps import evaluate_event_maps
-from evsplat.evaluation.lpips import MissingWeights, load_lpips
 from evsplat.evaluation.people import People
-from evsplat.evaluation.perceptual import PerceptualMetric
 from evsplat.evaluation.pictures import error_map, file_stem, save_png, to_bytes
 from evsplat.evaluation.protocols import (
     METRICS,
@@ -28,13 +26,15 @@ from evsplat.evaluation.protocols import (
     Protocol,
     Truth,
 )
-from evsplat.evaluation.st_lpips import load_st_lpips
 from evsplat.evaluation.tables import write_tables
 from evsplat.evaluation.tally import Tally, all_absent, without_reasons
 from evsplat.files import write_json
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
 from evsplat.render import choose_device
+from evsplat.similarity.lpips import MissingWeights, load_lpips
+from evsplat.similarity.perceptual import PerceptualMetric
+from evsplat.similarity.st_lpips import load_st_lpips
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from evsplat.evaluation.metrics import (
+from evsplat.evaluation.regions import CROP_MARGIN, Box
+from evsplat.similarity.perceptual import Features, PerceptualMetric
+from evsplat.similarity.psnr_ssim import (
     GAUSSIAN_SSIM,
     SCIKIT_DEFAULT_SSIM,
     ZERO_PADDED_SSIM,
@@ -18,8 +20,6 @@ from evsplat.evaluation.metrics import (
     psnr_channel_mean,
     ssim,
 )
-from evsplat.evaluation.perceptual import Features, PerceptualMetric
-from evsplat.evaluation.regions import CROP_MARGIN, Box
 
 REGIONS = ("full", "person_crop", "person_mask")
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "st_lpips")

@@ -2,9 +2,9 @@
 
 from typing import Literal
 
-from evsplat.evaluation.lpips import load_lpips
-from evsplat.evaluation.perceptual import PerceptualMetric
-from evsplat.evaluation.st_lpips import load_st_lpips
+from evsplat.similarity.lpips import load_lpips
+from evsplat.similarity.perceptual import PerceptualMetric
+from evsplat.similarity.st_lpips import load_st_lpips
 
 PerceptualName = Literal["none", "lpips_vgg", "st_lpips"]
 """``lpips_vgg``: what 3DGS-Avatar trains with; ``st_lpips``: the shift-tolerant AlexNet variant."""

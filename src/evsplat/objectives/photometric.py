@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.evaluation.metrics import GAUSSIAN_SSIM, ssim
-from evsplat.evaluation.perceptual import PerceptualMetric
 from evsplat.objectives.base import Stateless, Step
+from evsplat.similarity.perceptual import PerceptualMetric
+from evsplat.similarity.psnr_ssim import GAUSSIAN_SSIM, ssim
 
 
 class Photometric(Stateless):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from evsplat.errors import WeightsError
-from evsplat.evaluation.perceptual import Conv, Layer, MaxPool, Network, PerceptualMetric, Relu
+from evsplat.similarity.perceptual import Conv, Layer, MaxPool, Network, PerceptualMetric, Relu
 
 LpipsName = Literal["alex", "vgg"]
 

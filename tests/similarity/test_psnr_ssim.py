@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from evsplat.evaluation.metrics import (
+from evsplat.similarity.psnr_ssim import (
     GAUSSIAN_SSIM,
     SCIKIT_DEFAULT_SSIM,
     ZERO_PADDED_SSIM,

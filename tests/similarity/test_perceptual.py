@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional as F
 
 from evsplat.errors import WeightsError
-from evsplat.evaluation.lpips import (
+from evsplat.similarity.lpips import (
     HUB_FILES,
     NETWORKS,
     WEIGHTS_VARIABLE,
@@ -17,8 +17,8 @@ from evsplat.evaluation.lpips import (
     load_lpips,
     lpips_heads,
 )
-from evsplat.evaluation.st_lpips import NETWORK as ST_NETWORK
-from evsplat.evaluation.st_lpips import load_st_lpips
+from evsplat.similarity.st_lpips import NETWORK as ST_NETWORK
+from evsplat.similarity.st_lpips import load_st_lpips
 
 needs_st_lpips = pytest.mark.skipif(
     importlib.util.find_spec("stlpips_pytorch") is None,
@@ -205,7 +205,7 @@ def test_smallest_side_is_the_smallest_that_leaves_features(network):
 def plain_names(monkeypatch):
     """File names without a checksum, so that random weights may stand in for the trained ones."""
     names = {"alex": "alexnet.pth", "vgg": "vgg16.pth"}
-    monkeypatch.setattr("evsplat.evaluation.lpips.HUB_FILES", names)
+    monkeypatch.setattr("evsplat.similarity.lpips.HUB_FILES", names)
     return names
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 
 from evsplat.errors import WeightsError
-from evsplat.evaluation.lpips import MissingWeights, read_state, sha256_of
-from evsplat.evaluation.perceptual import Blur, Conv, MaxPool, Network, PerceptualMetric, Relu
+from evsplat.similarity.lpips import MissingWeights, read_state, sha256_of
+from evsplat.similarity.perceptual import Blur, Conv, MaxPool, Network, PerceptualMetric, Relu
 
 PACKAGE = "stlpips_pytorch"
 
