@@ -93,6 +93,8 @@ class EventConfig:
     """Absolute floor of both norms (A16)."""
     eps: float = 1e-5
     """Added to linear luminance before the logarithm (A11)."""
+    keep_chroma: bool = True
+    """Let the term's gradient change brightness only; without it people and floor get tinted."""
     across_gaps: bool = False
     """Also pair training frames with held-out frames between them (A13)."""
     weight_by_activity: bool = True
@@ -352,6 +354,7 @@ def _objectives(
                 start=config.event.start,
                 floor=config.event.floor,
                 eps=config.event.eps,
+                keep_chroma=config.event.keep_chroma,
                 across_gaps=config.event.across_gaps,
                 weight_by_activity=config.event.weight_by_activity,
                 min_active=config.event.min_active,

@@ -47,6 +47,7 @@ class EventChange(Stateless):
         start: float,
         floor: float,
         eps: float,
+        keep_chroma: bool,
         across_gaps: bool,
         weight_by_activity: bool,
         min_active: float,
@@ -55,6 +56,7 @@ class EventChange(Stateless):
         assert capture.events is not None
         self.capture, self.events = capture, capture.events
         self.start, self.floor, self.eps = start, floor, eps
+        self.keep_chroma = keep_chroma
         self.min_active = min_active
         self._maps: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
         self.partner: dict[str, Frame] = {}
@@ -96,7 +98,10 @@ class EventChange(Stateless):
         if weight == 0.0:
             return {}
         change = log_brightness_change(
-            step.rgb[step.index(before)], step.rgb[step.index(after)], eps=self.eps
+            step.rgb[step.index(before)],
+            step.rgb[step.index(after)],
+            eps=self.eps,
+            keep_chroma=self.keep_chroma,
         )
         events = self._map(before, after).to(change)
         return {"event": weight * event_loss(change, events, floor=self.floor)}

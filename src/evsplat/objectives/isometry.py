@@ -26,7 +26,8 @@ class Isometry:
 
     Four neighbours per Gaussian, found among the canonical centres; the search is repeated only
     every ``refresh`` steps and after densification, since centres move slowly. Each step looks at
-    ``samples`` random Gaussians, an unbiased estimate of the full mean.
+    ``samples`` random Gaussians, an unbiased estimate of the full mean, or at all if there are
+    fewer.
     """
 
     def __init__(self, *, refresh: int, samples: int) -> None:
@@ -49,7 +50,9 @@ class Isometry:
         if self.age == 0 or self.age >= self.refresh:
             self._search(canonical)
         self.age += 1
-        chosen = torch.randint(count, (min(self.samples, count),), generator=step.generator)
+        chosen = torch.arange(count)
+        if self.samples < count:
+            chosen = torch.randint(count, (self.samples,), generator=step.generator)
         near = self.neighbours[chosen].to(canonical.device)
         chosen = chosen.to(canonical.device)
 

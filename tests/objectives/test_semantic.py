@@ -1,0 +1,55 @@
+"""Semantic targets from the posed body, and the cross-entropy against them."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import distance_transform_edt
+
+from evsplat.objectives import RenderedSemantics, silhouette_bounds
+
+
+def disc(radius: float) -> np.ndarray:
+    y, x = np.mgrid[:40, :50]
+    return (x - 25) ** 2 + (y - 20) ** 2 <= radius**2
+
+
+def test_bounds_leave_a_band_of_the_given_width_undecided():
+    inside, outside = silhouette_bounds(disc(8), 5)
+    distance = distance_transform_edt(~disc(8))
+    undecided = ~(inside | outside).numpy()
+    assert not (inside & outside).any()
+    assert np.array_equal(undecided, (distance > 0) & (distance <= 5))
+
+
+def test_no_person_in_the_picture_makes_all_of_it_scene():
+    inside, outside = silhouette_bounds(np.zeros((4, 5), dtype=bool), 3)
+    assert not inside.any()
+    assert outside.all()
+
+
+@pytest.mark.parametrize("probability", [0.2, 0.5, 0.9])
+def test_cross_entropy_is_the_closed_form(probability):
+    bounds = silhouette_bounds(disc(8), 5)
+    soft = torch.tensor([0.1, 0.5, 0.9])
+    step = SimpleNamespace(
+        times_us=(10, 20),
+        semantic=torch.full((2, 40, 50), probability),
+        model=SimpleNamespace(gaussians=SimpleNamespace(semantics=lambda: soft)),
+    )
+    terms = RenderedSemantics({20: bounds}).loss(step)
+    inside, outside = (float(mask.float().mean()) for mask in bounds)
+    expected = -inside * math.log(probability) - outside * math.log(1 - probability)
+    assert float(terms["semantic"]) == pytest.approx(expected, rel=1e-5)
+    assert float(terms["binarise"]) == pytest.approx((0.09 + 0.25 + 0.09) / 3, rel=1e-5)
+
+
+def test_frames_without_bounds_say_nothing():
+    step = SimpleNamespace(
+        times_us=(10,),
+        semantic=torch.zeros(1, 4, 5),
+        model=SimpleNamespace(gaussians=SimpleNamespace(semantics=lambda: torch.tensor([0.5]))),
+    )
+    assert set(RenderedSemantics({}).loss(step)) == {"binarise"}
