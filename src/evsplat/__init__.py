@@ -26,9 +26,11 @@ if TYPE_CHECKING:
     from evsplat.training.train import train
 
 # OpenMP's default is to spin at every barrier. Where another process takes a core, the spinning
-# thread starves the one it waits for: two-thread matrix products were measured five times slower
-# with one busy neighbour. Read once, when torch is imported; set by the user, it stays.
+# thread starves the one it waits for (two-thread matrix products: five times slower with one busy
+# neighbour); sleeping at once costs a quarter of a training step on a quiet machine. A microsecond
+# of spinning is the middle. Read once, when torch is imported; what the user has set stays.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 __version__ = "0.1.0"
 

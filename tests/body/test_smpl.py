@@ -9,6 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from body_models.smpl.torch import SMPL
 from scipy import sparse
 
 from evsplat.body import axis_angle_to_matrix, load_body, skin
@@ -38,13 +39,8 @@ def smpl_like(seed=0, joints=24, directions=10, parents=SMPL_PARENTS):
     }
 
 
-@pytest.fixture
-def package():
-    return pytest.importorskip("body_models.smpl.torch", reason="needs evsplat[body-models]")
-
-
 @pytest.mark.parametrize("seed", range(3))
-def test_posed_vertices_equal_those_of_body_models(package, tmp_path, seed):
+def test_posed_vertices_equal_those_of_body_models(tmp_path, seed):
     file = tmp_path / "SMPL_NEUTRAL.npz"
     np.savez(file, **smpl_like(seed))
     rng = np.random.default_rng(seed)
@@ -55,7 +51,7 @@ def test_posed_vertices_equal_those_of_body_models(package, tmp_path, seed):
     bones = body.bone_transforms(rotations, torch.tensor(transl).float())
     moved, _ = skin(body.rest_vertices, body.weights, bones)
 
-    model = package.SMPL(model_path=file)
+    model = SMPL(model_path=file)
     expected = model.forward_vertices(
         torch.tensor(poses[:, 1:]).float(),
         pelvis_rotation=torch.tensor(poses[:, 0]).float(),
@@ -73,7 +69,7 @@ def test_posed_vertices_equal_those_of_body_models(package, tmp_path, seed):
     assert (still - pose["skinning_transforms"]).abs().max() < 1e-5
 
 
-def test_canonical_smpl_has_its_legs_45_degrees_apart(package, tmp_path):
+def test_canonical_smpl_has_its_legs_45_degrees_apart(tmp_path):
     np.savez(tmp_path / "SMPL_MALE.npz", **smpl_like())
     body = smpl_body("smpl", gender="male", path=tmp_path)
     turns = body.canonical_bone_transforms()[:, :3, :3]
@@ -83,7 +79,7 @@ def test_canonical_smpl_has_its_legs_45_degrees_apart(package, tmp_path):
     assert torch.allclose(turns[15], torch.eye(3), atol=1e-6)
 
 
-def test_smplx_with_pickled_joint_names_is_read(package, tmp_path):
+def test_smplx_with_pickled_joint_names_is_read(tmp_path):
     parents = (*SMPL_PARENTS[:22], 15, 15, 15, *np.repeat([20, 21], 15).tolist())
     names = {f"joint{j}": j for j in range(55) if j not in (1, 2)}
     names |= {"left_hip": 1, "right_hip": 2}
@@ -125,7 +121,7 @@ def chumpy_pickle(arrays, path):
             del sys.modules[name]
 
 
-def test_chumpy_and_sparse_pickles_give_the_same_body(package, tmp_path):
+def test_chumpy_and_sparse_pickles_give_the_same_body(tmp_path):
     arrays = smpl_like(5)
     chumpy_pickle(arrays, tmp_path / "SMPL_NEUTRAL.pkl")
     read = read_model_file(tmp_path / "SMPL_NEUTRAL.pkl")
@@ -174,7 +170,7 @@ def test_missing_folder_file_and_package_say_what_to_get_and_where(tmp_path, mon
         find_model_file("smpl", "x", tmp_path)
 
 
-def test_broken_files_are_one_sentence(package, tmp_path):
+def test_broken_files_are_one_sentence(tmp_path):
     file = tmp_path / "SMPL_NEUTRAL.npz"
     np.savez(file, **smpl_like())
     whole = file.read_bytes()

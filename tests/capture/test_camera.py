@@ -1,5 +1,6 @@
 """Projection and lens distortion, against OpenCV."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -34,7 +35,6 @@ def test_point_on_the_axis_meets_the_principal_point() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_projection_agrees_with_opencv(seed: int) -> None:
-    cv2 = pytest.importorskip("cv2")
     camera = random_camera(seed)
     in_camera = np.random.default_rng(seed).uniform((-2, -2, 1), (2, 2, 6), (4, 5, 3))
     pose = camera.world_to_camera.double().numpy()
@@ -49,7 +49,6 @@ def test_projection_agrees_with_opencv(seed: int) -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_distortion_agrees_with_opencv(lens: str) -> None:
-    cv2 = pytest.importorskip("cv2")
     ours = Distortion(WIDTH, HEIGHT, K, LENSES[lens])
     map_x, map_y = cv2.initUndistortRectifyMap(
         K_OPENCV, np.array(LENSES[lens]), None, K_OPENCV, (WIDTH, HEIGHT), cv2.CV_32FC1
@@ -64,7 +63,6 @@ def test_distortion_agrees_with_opencv(lens: str) -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_undistort_inverts_distort_as_opencv_does(lens: str) -> None:
-    cv2 = pytest.importorskip("cv2")
     ours = Distortion(WIDTH, HEIGHT, K, LENSES[lens])
     pixels = np.random.default_rng(1).uniform((0, 0), (WIDTH, HEIGHT), (200, 2))
     found = ours.undistort(pixels)

@@ -7,6 +7,7 @@ import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -172,7 +173,6 @@ def test_opening_a_long_recording_reads_no_events(tiny_capture: Factory) -> None
 
 @pytest.mark.parametrize("kind", ["grey8", "grey16", "rgb16", "rgba8"])
 def test_all_kinds_of_pictures_are_read(tiny_capture: Factory, kind: str) -> None:
-    cv2 = pytest.importorskip("cv2")
     path = tiny_capture()
     rng = np.random.default_rng(0)
     limit = 65_535 if "16" in kind else 255

@@ -15,7 +15,7 @@ from evsplat.deform.encodings import make_encoding
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
 from evsplat.deform.skinning_network import SkinningNetwork
-from evsplat.gaussians import GaussianSet, PosedGaussians, PosedHuman, StaticScene
+from evsplat.gaussians import ATTRIBUTES, GaussianSet, PosedGaussians, PosedHuman, StaticScene
 
 Semantics = Literal["fixed", "ste", "rendered"]
 
@@ -163,26 +163,33 @@ class HumanSceneModel(nn.Module):
         is the soft attribute m.
         """
         gaussians = self.gaussians
+        parts = {name: gaussians.of_parts(getattr(gaussians, name)) for name in ATTRIBUTES}
         rotations, bones = self.pose(times_us)
-        moving = self._moving_rows()
-        canonical = gaussians.means[moving]
-        non_rigid = self._non_rigid(canonical, rotations, noise)
-        deformed, log_scales, quaternions, feature = non_rigid
+        moving = self._moving(parts)
+        deformed, log_scales, quaternions, feature = self._non_rigid(moving, rotations, noise)
         skinned_at = deformed.mean(0, keepdim=True) if share_skinning else deformed
         weights = self.skinning(self.normalise(skinned_at))
         world, transforms = skin(deformed, weights, bones)
 
         people = slice(0, gaussians.human_count)
-        human_means, scene_means = world[:, people], gaussians.means[gaussians.scene]
+        human_means, scene_means = world[:, people], parts["means"][1]
         if self.semantics == "ste":
-            human_means, scene_means = self._straight_through(world, canonical, moving)
+            human_means, scene_means = self._straight_through(world, moving)
+        human_features, scene_features = parts["features"]
         rgb = self._human_rgb(
-            human_means, transforms[:, people], feature[:, people], camera_center, times_us, noise
+            human_features,
+            human_means,
+            transforms[:, people],
+            feature[:, people],
+            camera_center,
+            times_us,
+            noise,
         )
         hidden = noise is not None and noise.hide_scene_direction
         directions = nn.functional.normalize(scene_means.detach() - camera_center, dim=-1)
         soft = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
-        opacities = gaussians.opacities()
+        opacities = gaussians.of_parts(gaussians.opacities())
+        semantics = gaussians.of_parts(soft)
         times = len(times_us)
         return PosedGaussians(
             human=PosedHuman(
@@ -194,16 +201,14 @@ class HumanSceneModel(nn.Module):
             ),
             scene=StaticScene(
                 scene_means,
-                gaussians.quaternions[gaussians.scene],
-                gaussians.scales_log[gaussians.scene].exp(),
-                self.scene_colour(
-                    gaussians.features[gaussians.scene], directions * (0.0 if hidden else 1.0)
-                ),
+                parts["quaternions"][1],
+                parts["scales_log"][1].exp(),
+                self.scene_colour(scene_features, directions * (0.0 if hidden else 1.0)),
             ),
-            human_opacities=opacities[gaussians.human],
-            scene_opacities=opacities[gaussians.scene],
-            human_semantics=soft[gaussians.human],
-            scene_semantics=soft[gaussians.scene],
+            human_opacities=opacities[0],
+            scene_opacities=opacities[1],
+            human_semantics=semantics[0],
+            scene_semantics=semantics[1],
         )
 
     def draw_noise(self, times: int, generator: torch.Generator) -> Noise:
@@ -217,31 +222,28 @@ class HumanSceneModel(nn.Module):
         hide = float(torch.rand((), generator=generator)) < config.scene_direction_dropout
         return Noise(rotations, turn.to(self.box_low.device), hide)
 
-    def _moving_rows(self) -> Tensor | slice:
-        """Rows that the networks see: the person's, and with ``ste`` scene rows inside the box."""
+    def _moving(self, parts: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+        """What the networks see: the person, and with ``ste`` scene rows inside the box as well."""
         if self.semantics != "ste":
-            return self.gaussians.human
+            return {name: human for name, (human, _) in parts.items()}
         inside = self._scene_inside_box()
-        people = torch.arange(self.gaussians.human_count, device=inside.device)
-        return torch.cat([people, torch.nonzero(inside)[:, 0] + self.gaussians.human_count])
+        return {name: torch.cat([human, scene[inside]]) for name, (human, scene) in parts.items()}
 
     def _scene_inside_box(self) -> Bool[Tensor, " S"]:
         """Scene rows whose centre, read as canonical, lies in the body's box (literal eq. 6)."""
         scene = self.gaussians.means[self.gaussians.scene].detach()
         return ((scene > self.box_low) & (scene < self.box_high)).all(-1)
 
-    def _straight_through(
-        self, world: Tensor, canonical: Tensor, moving: Tensor | slice
-    ) -> tuple[Tensor, Tensor]:
+    def _straight_through(self, world: Tensor, moving: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Both placements of each row, chosen by the hard label, with the gradient of m (A2 ii).
 
         Forward: ``h * deformed + (1 - h) * canonical`` with the hard label h; backward: dm/dl. Rows
         outside the canonical box have no deformed placement and so no gradient.
         """
         count = self.gaussians.human_count
-        soft = self.gaussians.semantics()[moving]
+        soft = torch.sigmoid(moving["semantic_logits"])
         slope = (soft - soft.detach())[None, :, None]
-        step = slope * (world.detach() - canonical.detach())
+        step = slope * (world.detach() - moving["means"].detach())
         human = world[:, :count] + step[:, :count]
         scene = self.gaussians.means[self.gaussians.scene]
         if step.shape[1] > count:
@@ -251,15 +253,14 @@ class HumanSceneModel(nn.Module):
         return human, scene
 
     def _non_rigid(
-        self, canonical: Tensor, rotations: Tensor, noise: Noise | None
+        self, moving: dict[str, Tensor], rotations: Tensor, noise: Noise | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Deformed centres, log-scales, quaternions and colour feature (eq. 1), time leading.
 
         Before the network is switched on all but the feature have a leading axis of 1.
         """
-        rows = self._moving_rows()
-        log_scales = self.gaussians.scales_log[rows][None]
-        quaternions = self.gaussians.quaternions[rows][None]
+        canonical = moving["means"]
+        log_scales, quaternions = moving["scales_log"][None], moving["quaternions"][None]
         if not self.non_rigid_active:
             feature = canonical.new_zeros(
                 len(rotations), len(canonical), self.non_rigid.feature_dim
@@ -278,6 +279,7 @@ class HumanSceneModel(nn.Module):
 
     def _human_rgb(
         self,
+        features: Tensor,
         world: Tensor,
         transforms: Tensor,
         feature: Tensor,
@@ -293,7 +295,6 @@ class HumanSceneModel(nn.Module):
             canonical_view = canonical_view @ noise.view_turn.T
         canonical_view = nn.functional.normalize(canonical_view, dim=-1)
         latent = self._time_weights(times_us) @ self.latents
-        features = self.gaussians.features[self.gaussians.human]
         return self.human_colour(features, canonical_view, feature, latent)
 
     def _time_weights(self, times_us: Sequence[int]) -> Float[Tensor, "T F"]:

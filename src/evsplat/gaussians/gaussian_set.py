@@ -73,6 +73,14 @@ class GaussianSet(nn.Module):
         """Rows of one class by its name."""
         return self.human if part == "human" else self.scene
 
+    def of_parts(self, values: Float[Tensor, "N *rest"]) -> tuple[Tensor, Tensor]:
+        """Values per row, apart for person and scene.
+
+        One split: two slices would each fill a gradient of all rows with zeros.
+        """
+        human, scene = values.split([self.human_count, self.scene_count])
+        return human, scene
+
     def opacities(self) -> Float[Tensor, " N"]:
         """Opacity in (0, 1)."""
         return torch.sigmoid(self.opacity_logits)

@@ -93,8 +93,6 @@ class EventConfig:
     """Absolute floor of both norms (A16)."""
     eps: float = 1e-5
     """Added to linear luminance before the logarithm (A11)."""
-    keep_chroma: bool = True
-    """Let the term's gradient change brightness only; without it people and floor get tinted."""
     across_gaps: bool = False
     """Also pair training frames with held-out frames between them (A13)."""
     weight_by_activity: bool = True
@@ -107,9 +105,9 @@ class EventConfig:
 class LossConfig:
     """Weights of all other terms (A18)."""
 
-    l1: Weight = 1.0
-    dssim: Weight = 0.0
-    """1 - SSIM of the whole frame; the better variant uses 0.2."""
+    l1: Weight = 0.8
+    dssim: Weight = 0.2
+    """1 - SSIM of the whole frame, the better variant of A18; the base method has L1 alone."""
     perceptual: PerceptualName = "none"
     """``lpips_vgg`` is the paper's and needs its weights (see `evsplat doctor`); ``st_lpips`` runs
     with the extra `perceptual`."""
@@ -145,7 +143,7 @@ class PaperConfig:
     skinning_prefit_steps: int = 400
     """Steps of fitting the skinning network alone before training proper."""
     optimisation: OptimisationConfig = field(default_factory=OptimisationConfig)
-    densify_human: DensifyConfig = field(default_factory=lambda: DensifyConfig(max_count=12_000))
+    densify_human: DensifyConfig = field(default_factory=lambda: DensifyConfig(max_count=10_000))
     densify_scene: DensifyConfig | None = None
     """Limits of the scene. Null: 3DGS's for a random cube; none for the median backdrop, which has
     a Gaussian for every 2x2 pixels already and would only grow where the person passes."""
@@ -354,7 +352,6 @@ def _objectives(
                 start=config.event.start,
                 floor=config.event.floor,
                 eps=config.event.eps,
-                keep_chroma=config.event.keep_chroma,
                 across_gaps=config.event.across_gaps,
                 weight_by_activity=config.event.weight_by_activity,
                 min_active=config.event.min_active,

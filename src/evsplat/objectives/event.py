@@ -47,7 +47,6 @@ class EventChange(Stateless):
         start: float,
         floor: float,
         eps: float,
-        keep_chroma: bool,
         across_gaps: bool,
         weight_by_activity: bool,
         min_active: float,
@@ -56,7 +55,6 @@ class EventChange(Stateless):
         assert capture.events is not None
         self.capture, self.events = capture, capture.events
         self.start, self.floor, self.eps = start, floor, eps
-        self.keep_chroma = keep_chroma
         self.min_active = min_active
         self._maps: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
         self.partner: dict[str, Frame] = {}
@@ -98,10 +96,7 @@ class EventChange(Stateless):
         if weight == 0.0:
             return {}
         change = log_brightness_change(
-            step.rgb[step.index(before)],
-            step.rgb[step.index(after)],
-            eps=self.eps,
-            keep_chroma=self.keep_chroma,
+            step.rgb[step.index(before)], step.rgb[step.index(after)], eps=self.eps
         )
         events = self._map(before, after).to(change)
         return {"event": weight * event_loss(change, events, floor=self.floor)}

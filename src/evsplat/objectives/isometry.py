@@ -46,9 +46,9 @@ class Isometry:
         count = gaussians.human_count
         if count <= NEIGHBOURS:
             return {}
-        canonical = gaussians.means[gaussians.human]
+        canonical = gaussians.means  # the person's rows come first
         if self.age == 0 or self.age >= self.refresh:
-            self._search(canonical)
+            self._search(canonical[:count])
         self.age += 1
         chosen = torch.arange(count)
         if self.samples < count:
@@ -61,8 +61,8 @@ class Isometry:
         terms = {"isometry_centers": (after - before).abs().mean()}
 
         rows = torch.cat([chosen[:, None], near], dim=1)
-        rotation = quaternion_to_matrix(gaussians.quaternions[gaussians.human][rows])
-        scales = gaussians.scales_log[gaussians.human][rows].exp()
+        rotation = quaternion_to_matrix(gaussians.quaternions[rows])
+        scales = gaussians.scales_log[rows].exp()
         canonical_6 = covariance6(rotation * scales[..., None, :])
         posed_rotation = posed.transforms[:, rows][..., :3, :3] @ quaternion_to_matrix(
             posed.quaternions[:, rows]
