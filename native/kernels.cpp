@@ -705,7 +705,7 @@ double multiply_add(int64_t rounds, float* sink) {
 }  // namespace
 
 const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,         project, forward,
-                         backward,     project_backward, multiply_add, &mlp_kernels};
+                         backward,     project_backward, multiply_add, &mlp_kernels, ssim_plane};
 
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

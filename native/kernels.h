@@ -5,6 +5,7 @@
 #include <stdint.h>
 
 #include "mlp_kernels.h"
+#include "ssim.h"
 
 namespace evsplat {
 
@@ -103,12 +104,14 @@ struct Kernels {
     // Independent multiply-adds for `rounds`; returns the floating-point operations done.
     double (*multiply_add)(int64_t rounds, float* sink);
     const MlpKernels* mlp;
+    // Sum of the similarity over the window positions of a plane, and its gradient.
+    double (*ssim)(const SsimPlane&);
 };
 
-namespace portable { extern const Kernels kernels; }
+namespace portable { extern const Kernels kernels; double ssim_plane(const SsimPlane&); }
 #ifdef EVSPLAT_X86
-namespace avx2 { extern const Kernels kernels; }
-namespace avx512 { extern const Kernels kernels; }
+namespace avx2 { extern const Kernels kernels; double ssim_plane(const SsimPlane&); }
+namespace avx512 { extern const Kernels kernels; double ssim_plane(const SsimPlane&); }
 #endif
 
 }  // namespace evsplat

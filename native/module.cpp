@@ -12,6 +12,7 @@
 
 #include "mlp.h"
 #include "rasterizer.h"
+#include "ssim.h"
 
 namespace nb = nanobind;
 using namespace evsplat;
@@ -221,6 +222,21 @@ class PyMlp {
     std::unique_ptr<Mlp> mlp_;
 };
 
+// Sum over all planes and window positions; `grad` is that of the sum.
+double ssim(In image, In reference, In window, float c1, float c2, std::optional<Out> grad, int threads) {
+    require(image.ndim() == 3 && image.size() == reference.size() && window.size() == kSsimWindow, "the images");
+    const size_t planes = image.shape(0), height = image.shape(1), width = image.shape(2);
+    require(height >= kSsimWindow && width >= kSsimWindow && height < 1 << 20 && width < 1 << 20, "the images");
+    require(!grad || grad->size() == image.size(), "the gradient");
+    nb::gil_scoped_release release;
+    std::vector<double> sums(planes);
+    ssim_planes(planes, int(height), int(width), image.data(), reference.data(), window.data(), c1, c2, threads,
+                sums.data(), grad ? grad->data() : nullptr);
+    double total = 0.0;
+    for (double sum : sums) total += sum;
+    return total;
+}
+
 double multiply_add(int64_t rounds) {
     float sink = 0.f;
     nb::gil_scoped_release release;
@@ -254,6 +270,9 @@ NB_MODULE(_native, m) {
         .def("forward", &PyMlp::forward, nb::arg("output"))
         .def("backward", &PyMlp::backward, nb::arg("output_grad"), nb::arg("point").none(), nb::arg("both").none(),
              nb::arg("bias"), nb::arg("point_weight"), nb::arg("both_weight"), nb::arg("layers"));
+    m.def("ssim", &ssim, nb::arg("image"), nb::arg("reference"), nb::arg("window"), nb::arg("c1"), nb::arg("c2"),
+          nb::arg("grad").none(), nb::arg("threads"),
+          "Sum of the structural similarity over (planes, H, W); writes its gradient.");
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
     m.def("levels", &available_levels, "SIMD levels that run here, best first.");
     m.def("level", [] { return std::string(select_kernels().name); }, "SIMD level in use.");

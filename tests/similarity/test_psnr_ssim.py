@@ -15,6 +15,7 @@ from evsplat.similarity.psnr_ssim import (
     psnr,
     psnr_channel_mean,
     ssim,
+    ssim_map,
 )
 
 
@@ -128,3 +129,26 @@ def test_what_is_not_defined_is_refused(call):
     first, second = (torch.from_numpy(picture) for picture in random_pair(0))
     with pytest.raises(ValueError):
         call(first, second)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("shape", [(11, 11, 3), (12, 40, 3), (37, 19, 1), (64, 80, 3)])
+def test_compiled_ssim_and_its_gradient_equal_plain_torch_in_float64(seed, shape):
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.rand(shape, generator=generator)
+    reference = (image + 0.1 * torch.randn(shape, generator=generator)).clamp(0, 1)
+    fast, exact = image.clone().requires_grad_(), image.double().requires_grad_()
+    value = ssim(fast, reference)
+    expected = ssim_map(exact, reference.double(), GAUSSIAN_SSIM).mean()
+    assert float(value.detach()) == pytest.approx(float(expected.detach()), abs=2e-6)
+    (gradient,) = torch.autograd.grad(3 * value, fast)
+    (truth,) = torch.autograd.grad(3 * expected, exact)
+    assert (gradient - truth).norm() < 1e-4 * truth.norm()
+
+
+def test_compiled_ssim_reads_planar_and_interleaved_pictures_alike():
+    generator = torch.Generator().manual_seed(0)
+    planar = torch.rand(3, 30, 20, generator=generator).permute(1, 2, 0)
+    reference = torch.rand(30, 20, 3, generator=generator)
+    assert float(ssim(planar, reference)) == float(ssim(planar.contiguous(), reference))
+    assert float(ssim(planar, planar)) == pytest.approx(1.0, abs=1e-6)

@@ -2,12 +2,18 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
+
+try:
+    from evsplat import _native
+except ImportError:  # not built; rendering says so, and plain torch is exact as well
+    _native = None  # type: ignore[assignment]
 
 
 def psnr(
@@ -80,12 +86,7 @@ def ssim_map(
     if settings.padding == "valid" and min(image.shape[:2]) < size:
         raise ValueError(f"the {size}-pixel window is larger than the image")
 
-    if settings.window == "gaussian":
-        offsets = range(-(size // 2), size // 2 + 1)
-        bell = [math.exp(-0.5 * (offset / settings.sigma) ** 2) for offset in offsets]
-        kernel = [weight / sum(bell) for weight in bell]
-    else:
-        kernel = [1.0 / size] * size
+    kernel = _window(settings)
     pad = size // 2 if settings.padding == "zero" else 0
 
     def smooth(planes: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
@@ -121,7 +122,47 @@ def ssim(
 
     A ValueError where no window fits into the image.
     """
+    native = _native is not None and image.dtype == torch.float32 and image.device.type == "cpu"
+    if native and settings == GAUSSIAN_SSIM and not reference.requires_grad:
+        if min(image.shape[:2]) >= settings.size:
+            _check_same_shape(image, reference)
+            mean: Tensor = _NativeSsim.apply(image, reference)
+            return mean
     return ssim_map(image, reference, settings).mean()
+
+
+def _window(settings: Ssim) -> list[float]:
+    """Weights along one axis of the window; they sum to one."""
+    size = settings.size
+    if settings.window == "uniform":
+        return [1.0 / size] * size
+    offsets = range(-(size // 2), size // 2 + 1)
+    bell = [math.exp(-0.5 * (offset / settings.sigma) ** 2) for offset in offsets]
+    return [weight / sum(bell) for weight in bell]
+
+
+class _NativeSsim(torch.autograd.Function):
+    """`GAUSSIAN_SSIM` in the compiled module; the gradient is found on the way forward."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, reference: Tensor) -> Tensor:
+        x, y = (picture.detach().movedim(-1, 0).contiguous() for picture in (image, reference))
+        gradient = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        window = torch.tensor(_window(GAUSSIAN_SSIM))
+        c1, c2 = 0.01**2, 0.03**2
+        total = _native.ssim(x, y.float(), window, c1, c2, gradient, torch.get_num_threads())
+        planes, height, width = x.shape
+        size = GAUSSIAN_SSIM.size
+        positions = planes * (height - size + 1) * (width - size + 1)
+        if gradient is not None:
+            ctx.save_for_backward(gradient.div_(positions).movedim(0, -1))
+        return image.new_tensor(total / positions)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * upstream[0], None
 
 
 def _check_same_shape(image: Tensor, reference: Tensor) -> None:

@@ -1,0 +1,25 @@
+// Mean structural similarity of two planes and its gradient (Wang et al. 2004), valid windows only.
+#pragma once
+
+#include <stddef.h>
+
+namespace evsplat {
+
+constexpr int kSsimWindow = 11;
+
+struct SsimPlane {
+    int height, width;
+    const float *image, *reference;   // (height, width)
+    const float* window;              // kSsimWindow weights that sum to one
+    float c1, c2;
+    float* grad;                      // (height, width), written: gradient of the sum; may be null
+    float* scratch;                   // ssim_scratch floats
+};
+
+inline size_t ssim_scratch(int height, int width) { return size_t(8 * height + 8) * width; }
+
+// Sums over the window positions of each plane; `planes` of (height, width) follow each other.
+void ssim_planes(size_t planes, int height, int width, const float* image, const float* reference,
+                 const float* window, float c1, float c2, int threads, double* sums, float* grad);
+
+}  // namespace evsplat
