@@ -27,6 +27,7 @@ from evsplat.events import count_map
 from evsplat.files import atomic_path
 
 CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
+SHOWN_FINDINGS = 12
 # Longer windows cover the person so densely that single edges cannot be told apart.
 EVENT_WINDOW_US = 20_000
 _OUTLINE, _OUTLINE_ENDS = (60, 255, 120), (255, 225, 80)
@@ -151,7 +152,10 @@ def _findings_text(findings: tuple[Finding, ...]) -> str:
         return "findings   none"
     errors = sum(finding.severity == "error" for finding in findings)
     lines = [f"findings   errors: {errors}, warnings: {len(findings) - errors}"]
-    return "\n".join([*lines, *(f"{finding.severity}: {finding}" for finding in findings)])
+    lines += [f"{finding.severity}: {finding}" for finding in findings[:SHOWN_FINDINGS]]
+    if len(findings) > SHOWN_FINDINGS:
+        lines.append(f"... and {len(findings) - SHOWN_FINDINGS} more; correct these first.")
+    return "\n".join(lines)
 
 
 def _spread(frames: tuple[Frame, ...], count: int) -> tuple[Frame, ...]:

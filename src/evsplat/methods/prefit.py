@@ -18,10 +18,11 @@ def fit_skinning(
     model: HumanSceneModel, prior: SkinningPrior, steps: int, generator: torch.Generator
 ) -> None:
     """Start the skinning network at the body's weights instead of at random ones."""
-    adam = torch.optim.Adam(model.skinning.parameters(), lr=2e-3)
+    rate = 5e-3
+    adam = torch.optim.Adam(model.skinning.parameters(), lr=rate, fused=True)
     for step in range(steps):
         for group in adam.param_groups:
-            group["lr"] = 2e-3 * (1 - step / steps) + 1e-4
+            group["lr"] = rate * max(1 - step / steps, 0.02)
         adam.zero_grad()
         prior.of(model, generator).backward()
         adam.step()

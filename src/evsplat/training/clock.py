@@ -25,7 +25,7 @@ class Clock:
     iteration: int = 0
     fraction: float = 0.0
     seconds: float = 0.0
-    """Time spent in training, over all resumes."""
+    """Time spent in training, over all resumes, the fits before the first step among it."""
     step_seconds: float = 0.0
 
     @property

@@ -63,7 +63,8 @@ def train(
     """Train ``method`` on a capture and return the run folder.
 
     ``iterations`` scales every schedule. ``max_minutes`` stops gracefully; without ``iterations``
-    it also shortens the schedule so that it is finished in time. ``resume`` goes on from the last
+    it also shortens the schedule so that it is finished in time. The cheap fits before the first
+    step count as training. ``resume`` goes on from the last
     checkpoint in ``out``. ``config`` is a run's config.yaml; ``overrides`` are ``key=value``
     settings over it. Raises `Stopped` on Ctrl-C after saving.
     """
@@ -102,11 +103,13 @@ def train(
 
     checkpoint = latest_checkpoint(folder.checkpoints) if resume else None
     compose = TRAINABLE[method][1]
+    started = time.perf_counter()
     composition = compose(settings, capture, seed, device=device, fit=checkpoint is None)
     clock = Clock(
         iterations or settings.optimisation.iterations,
         None if max_minutes is None else 60 * max_minutes,
         shrink=max_minutes is not None and iterations is None,
+        seconds=time.perf_counter() - started,
     )
     trainer = Trainer(composition, capture, clock)
     if checkpoint is not None:
