@@ -1,0 +1,106 @@
+"""The paper's model put together: what moves, what stays, and where gradients reach."""
+
+import pytest
+import torch
+
+from evsplat.body import skin
+from evsplat.capture import load_capture
+from evsplat.config import override
+from evsplat.methods import PaperConfig, compose, method_config
+
+SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16")
+
+
+def model_of(path, *settings: str):
+    """Model, two frame times and a camera centre for a small capture."""
+    config = method_config("paper", override({}, (*SMALL, *settings)), where="test")
+    assert isinstance(config, PaperConfig)
+    capture = load_capture(path)
+    model = compose(config, capture, 0, fit=False).model
+    times = [frame.mid_us for frame in capture.train_frames[:2]]
+    return model, times, capture.camera(capture.train_frames[0]).center()
+
+
+def activate(model) -> None:
+    """Past the start of every part, with deformations that can be seen."""
+    model.nominal.fill_(10_000.0)
+    with torch.no_grad():
+        model.non_rigid.mlp.weights[-1].normal_(std=0.05)
+        model.gaussians.features.normal_()
+        model.latents.normal_()
+
+
+def test_before_the_non_rigid_network_the_person_is_blend_skinned(tiny_capture):
+    model, times, center = model_of(tiny_capture())
+    posed = model.at(times, center)
+    canonical = model.gaussians.means[model.gaussians.human]
+    _, bones = model.pose(times)
+    weights = model.skinning(model.normalise(canonical[None]))
+    expected, transforms = skin(canonical[None], weights, bones)
+    assert torch.allclose(posed.human.means, expected, atol=1e-6)
+    assert torch.allclose(posed.human.transforms, transforms, atol=1e-6)
+    assert torch.equal(posed.scene.means, model.gaussians.means[model.gaussians.scene])
+
+
+def test_times_do_not_see_each_other(tiny_capture):
+    model, times, center = model_of(tiny_capture())
+    activate(model)
+    together = model.at(times, center)
+    for index, time in enumerate(times):
+        alone = model.at([time], center)
+        for name in ("means", "quaternions", "scales", "rgb", "transforms"):
+            both, one = getattr(together.human, name)[index], getattr(alone.human, name)[0]
+            assert torch.allclose(both, one, atol=1e-5), name
+
+
+def test_shared_skinning_is_exact_for_one_time_and_near_for_neighbours(tiny_capture):
+    model, times, center = model_of(tiny_capture())
+    activate(model)
+    exact, shared = (
+        model.at(times[:1], center, share_skinning=s).human.means for s in (False, True)
+    )
+    assert torch.equal(exact, shared)
+    exact, shared = (model.at(times, center, share_skinning=s).human.means for s in (False, True))
+    offset = model.non_rigid(
+        model.normalise(model.gaussians.means[model.gaussians.human]),
+        model.pose_encoder(model.pose(times)[0]),
+    ).offset
+    apart = (offset[0] - offset[1]).norm(dim=-1).max()
+    assert 0 < float(difference) < float(apart.detach())
+
+
+@pytest.mark.parametrize(("semantics", "reached"), [("fixed", False), ("ste", True)])
+def test_placement_teaches_the_attribute_only_with_straight_through(
+    tiny_capture, semantics, reached
+):
+    model, times, center = model_of(tiny_capture(), f"semantics={semantics}")
+    posed = model.at(times, center)
+    target = torch.randn(posed.human.means.shape, generator=torch.Generator().manual_seed(0))
+    (posed.human.means * target).sum().backward()
+    gradient = model.gaussians.semantic_logits.grad
+    if not reached:
+        assert gradient is None or not gradient.any()
+        return
+    rows = model.gaussians.human
+    canonical = model.gaussians.means.detach()[rows]
+    soft = model.gaussians.semantics().detach()[rows]
+    # d/dl of m (deformed - canonical), summed over times: the closed form of A2 (ii).
+    apart = posed.human.means.detach() - canonical
+    expected = soft * (1 - soft) * (apart * target).sum((0, 2))
+    assert torch.allclose(gradient[rows], expected, rtol=1e-3, atol=1e-5)
+
+
+def test_every_network_and_attribute_gets_a_gradient(tiny_capture):
+    model, times, center = model_of(tiny_capture())
+    activate(model)
+    splats = model.at(times, center).splats()
+    fields = (splats.means, splats.quats, splats.scales, splats.opacities, splats.channels)
+    generator = torch.Generator().manual_seed(0)
+    sum((f * torch.randn(f.shape, generator=generator)).sum() for f in fields).backward()
+    silent = [
+        name
+        for name, value in model.named_parameters()
+        if value.numel() and (value.grad is None or not value.grad.any())
+    ]
+    # Residuals of the pose are learned only on demand.
+    assert [name for name in silent if not name.endswith("residuals")] == []

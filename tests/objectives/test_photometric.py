@@ -1,0 +1,38 @@
+"""The picture term against its closed forms."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from evsplat.objectives import Photometric
+from evsplat.similarity import ssim
+
+
+def make(seed: int, *, dssim: bool = True):
+    """Two frames at 10 and 20 us, a render at each and one between that no frame saw."""
+    generator = torch.Generator().manual_seed(seed)
+    frames = [SimpleNamespace(name=name, mid_us=mid) for name, mid in (("a", 10), ("b", 20))]
+    pictures = {name: torch.rand(20, 24, 3, generator=generator) for name in "ab"}
+    capture = SimpleNamespace(train_frames=frames, image=lambda frame: pictures[frame.name])
+    rgb = torch.rand(3, 20, 24, 3, generator=generator)
+    step = SimpleNamespace(capture=capture, times_us=(10, 15, 20), rgb=rgb)
+    return Photometric(capture, {}, dssim=dssim, perceptual=None), step, pictures
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_only_recorded_times_are_compared_and_values_are_means(seed):
+    objective, step, pictures = make(seed)
+    terms = objective.loss(step)
+    pairs = [(step.rgb[0], pictures["a"]), (step.rgb[2], pictures["b"])]
+    l1 = sum(float((ours - theirs).abs().mean()) for ours, theirs in pairs) / 2
+    similarity = sum(float(ssim(ours, theirs)) for ours, theirs in pairs) / 2
+    assert float(terms["l1"]) == pytest.approx(l1, rel=1e-6)
+    assert float(terms["dssim"]) == pytest.approx(1 - similarity, rel=1e-5)
+
+
+def test_terms_without_weight_are_not_computed_and_the_middle_of_the_exposure_is_asked_for():
+    objective, step, _ = make(0, dssim=False)
+    assert set(objective.loss(step)) == {"l1"}
+    assert objective.times(step.capture.train_frames[1], 0.0) == (20,)
+    assert objective.state() == {}
