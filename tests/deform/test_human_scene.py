@@ -56,17 +56,18 @@ def test_times_do_not_see_each_other(tiny_capture):
 def test_shared_skinning_is_exact_for_one_time_and_near_for_neighbours(tiny_capture):
     model, times, center = model_of(tiny_capture())
     activate(model)
-    exact, shared = (
-        model.at(times[:1], center, share_skinning=s).human.means for s in (False, True)
-    )
-    assert torch.equal(exact, shared)
-    exact, shared = (model.at(times, center, share_skinning=s).human.means for s in (False, True))
-    offset = model.non_rigid(
-        model.normalise(model.gaussians.means[model.gaussians.human]),
-        model.pose_encoder(model.pose(times)[0]),
-    ).offset
-    apart = (offset[0] - offset[1]).norm(dim=-1).max()
-    assert 0 < float(difference) < float(apart.detach())
+
+    def means(instants: list[int], share: bool) -> torch.Tensor:
+        return model.at(instants, center, share_skinning=share).human.means.detach()
+
+    assert torch.equal(means(times[:1], False), means(times[:1], True))
+    # The error is of first order in how much the deformations differ.
+    errors = []
+    for factor in (0.1, 0.1):
+        with torch.no_grad():
+            model.non_rigid.mlp.weights[-1].mul_(factor)
+        errors.append(float((means(times, False) - means(times, True)).norm(dim=-1).mean()))
+    assert 0 < errors[1] < 0.2 * errors[0]
 
 
 @pytest.mark.parametrize(("semantics", "reached"), [("fixed", False), ("ste", True)])
