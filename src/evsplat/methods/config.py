@@ -47,8 +47,8 @@ class LearningRates:
     """Factor that every rate reaches at the end, exponentially."""
     means_final: float = 0.1
     """The same for the centres."""
-    constant: float = 0.0
-    """Share of the training before the decay begins."""
+    constant: float = 0.3
+    """Share of the training before the decay begins; 3DGS-Avatar: none, over 15,000 steps."""
     latent_weight_decay: float = 0.05
     clip_networks: float = 0.1
     """Largest gradient norm of all networks together."""
