@@ -21,6 +21,11 @@ def covariance6(matrix: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 6"]:
     return covariance[..., row, column]
 
 
+def _rows(values: Tensor, rows: Tensor, axis: int) -> Tensor:
+    """``values`` at a matrix of rows; unlike indexing, its gradient adds in a fixed order."""
+    return values.index_select(axis, rows.flatten()).unflatten(axis, rows.shape)
+
+
 class Isometry:
     """L1 between pairwise distances in canonical space and posed (3DGS-Avatar, 1.9).
 
@@ -54,20 +59,20 @@ class Isometry:
         if self.samples < count:
             chosen = torch.randint(count, (self.samples,), generator=step.generator)
         near = self.neighbours[chosen].to(canonical.device)
-        chosen = chosen.to(canonical.device)
+        rows = torch.cat([chosen.to(canonical.device)[:, None], near], dim=1)
 
-        before = (canonical[chosen][:, None] - canonical[near]).norm(dim=-1)
-        after = (posed.means[:, chosen][:, :, None] - posed.means[:, near]).norm(dim=-1)
+        centers, after = _rows(canonical, rows, 0), _rows(posed.means, rows, 1)
+        before = (centers[:, :1] - centers[:, 1:]).norm(dim=-1)
+        after = (after[:, :, :1] - after[:, :, 1:]).norm(dim=-1)
         terms = {"isometry_centers": (after - before).abs().mean()}
 
-        rows = torch.cat([chosen[:, None], near], dim=1)
-        rotation = quaternion_to_matrix(gaussians.quaternions[rows])
-        scales = gaussians.scales_log[rows].exp()
+        rotation = quaternion_to_matrix(_rows(gaussians.quaternions, rows, 0))
+        scales = _rows(gaussians.scales_log, rows, 0).exp()
         canonical_6 = covariance6(rotation * scales[..., None, :])
-        posed_rotation = posed.transforms[:, rows][..., :3, :3] @ quaternion_to_matrix(
-            posed.quaternions[:, rows]
+        posed_rotation = _rows(posed.transforms, rows, 1)[..., :3, :3] @ quaternion_to_matrix(
+            _rows(posed.quaternions, rows, 1)
         )
-        posed_6 = covariance6(posed_rotation * posed.scales[:, rows][..., None, :])
+        posed_6 = covariance6(posed_rotation * _rows(posed.scales, rows, 1)[..., None, :])
         before = (canonical_6[:, :1] - canonical_6[:, 1:]).norm(dim=-1)
         after = (posed_6[:, :, :1] - posed_6[:, :, 1:]).norm(dim=-1)
         terms["isometry_covariances"] = (after - before).abs().mean()
