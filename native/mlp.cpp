@@ -1,10 +1,9 @@
 #include "mlp.h"
 
 #include <algorithm>
-#include <cstring>
 #include <stdexcept>
 
-#include "rasterizer.h"
+#include "levels.h"
 #include "thread_pool.h"
 
 namespace evsplat {
@@ -85,7 +84,7 @@ void from_panels(const float* from, int out, int in, int lanes, float* to) {
 }  // namespace
 
 Mlp::Mlp(const MlpInputs& inputs, bool keep, int threads)
-    : in_(inputs), keep_(keep), threads_(threads), kernels_(*select_kernels().mlp), shape_() {
+    : in_(inputs), threads_(threads), kernels_(*select_kernels().mlp), shape_() {
     if (in_.weights.size() > kMlpLayers) throw std::runtime_error("an MLP of more than 16 layers");
     MlpShape& s = shape_;
     s.points = in_.points, s.times = in_.times, s.blocks = (in_.points + kMlpRows - 1) / kMlpRows;
@@ -97,7 +96,8 @@ Mlp::Mlp(const MlpInputs& inputs, bool keep, int threads)
     s.slope = in_.slope, s.keep = keep;
 }
 
-static MlpForward forward_job(const MlpInputs& in, const MlpShape& s, Buffer<float>& packed) {
+// The weights as the kernels take them, for both directions.
+static MlpForward pack_weights(const MlpInputs& in, const MlpShape& s, Buffer<float>& packed) {
     size_t floats = weight_floats(s.width, s.per_point, s.lanes) + weight_floats(s.width, s.per_both, s.lanes) +
                     s.times * s.width_panels * s.lanes;
     for (int l = 0; l < s.layers; ++l) floats += weight_floats(s.columns(l), s.width, s.lanes);
@@ -117,22 +117,19 @@ static MlpForward forward_job(const MlpInputs& in, const MlpShape& s, Buffer<flo
 }
 
 void Mlp::forward(float* output) {
-    MlpForward job = forward_job(in_, shape_, packed_);
-    if (keep_) activations_.reset(shape_.blocks * shape_.times * shape_.kept());
-    job.activations = activations_.data(), job.output = output;
+    job_ = pack_weights(in_, shape_, packed_);
+    if (shape_.keep) activations_.reset(shape_.blocks * shape_.times * shape_.kept());
+    job_.activations = activations_.data(), job_.output = output;
     parallel_for(threads_, shape_.blocks, [&](size_t block) {
         Buffer<float> scratch(mlp_scratch(shape_));
-        kernels_.forward(shape_, job, block, scratch.data());
+        kernels_.forward(shape_, job_, block, scratch.data());
     });
 }
 
 void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
     const MlpShape& s = shape_;
-    if (!keep_) throw std::runtime_error("backward of an MLP that kept nothing");
-    MlpBackward job = {};
-    job.forward = forward_job(in_, s, packed_);
-    job.forward.activations = activations_.data();
-    job.output_grad = output_grad, job.point_grad = grads.point, job.both_grad = grads.both;
+    if (!s.keep) throw std::runtime_error("backward of an MLP that kept nothing");
+    const MlpBackward job = {job_, output_grad, grads.point, grads.both};
 
     const size_t groups = std::max<size_t>(1, std::min(kMostGroups, s.blocks / kBlocksPerGroup));
     const size_t floats = floats_of_sums(s);

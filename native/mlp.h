@@ -4,7 +4,6 @@
 // neighbouring columns of one row and every product is the same small kernel.
 #pragma once
 
-#include <optional>
 #include <vector>
 
 #include "buffer.h"
@@ -37,15 +36,14 @@ class Mlp {
     Mlp(const MlpInputs& inputs, bool keep, int threads);
     void forward(float* output);
     void backward(const float* output_grad, const MlpGrads& grads);
-    size_t bytes() const { return activations_.bytes(); }
 
   private:
     MlpInputs in_;
-    bool keep_;
     int threads_;
     const MlpKernels& kernels_;
     MlpShape shape_;
     Buffer<float> packed_, activations_;
+    MlpForward job_ = {};  // points into the buffers
 };
 
 }  // namespace evsplat

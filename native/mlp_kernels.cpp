@@ -233,8 +233,7 @@ void backward(const MlpShape& s, const MlpBackward& job, size_t block, const Mlp
 
 }  // namespace
 
-extern const MlpKernels mlp_kernels;
-const MlpKernels mlp_kernels = {W, kTileRows, forward, backward};
+const MlpKernels mlp_kernels = {W, forward, backward};
 
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

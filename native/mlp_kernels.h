@@ -53,7 +53,7 @@ struct MlpBackward {
 };
 
 struct MlpKernels {
-    int lanes, tile;        // lanes of a vector, rows of a register tile
+    int lanes;              // of a vector
     void (*forward)(const MlpShape&, const MlpForward&, size_t block, float* scratch);
     void (*backward)(const MlpShape&, const MlpBackward&, size_t block, const MlpSums&, float* scratch);
 };

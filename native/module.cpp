@@ -10,6 +10,7 @@
 #include <optional>
 #include <stdexcept>
 
+#include "levels.h"
 #include "mlp.h"
 #include "rasterizer.h"
 #include "ssim.h"

@@ -2,18 +2,12 @@
 #pragma once
 
 #include <memory>
-#include <string>
 #include <vector>
 
 #include "buffer.h"
 #include "kernels.h"
 
 namespace evsplat {
-
-// Kernels of the best level this CPU has, or of the one that EVSPLAT_ISA names. Throws
-// std::runtime_error where the named level is unknown or the CPU lacks it.
-const Kernels& select_kernels();
-std::vector<std::string> available_levels();
 
 // A field with a leading axis of times; `step` = 0 where one value serves all.
 struct Field {

@@ -1,7 +1,7 @@
 #include "ssim.h"
 
 #include "buffer.h"
-#include "rasterizer.h"
+#include "levels.h"
 #include "thread_pool.h"
 
 namespace evsplat {

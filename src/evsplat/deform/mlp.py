@@ -15,10 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-try:
-    from evsplat import _native
-except ImportError:  # not built; rendering says so, and plain torch is exact as well
-    _native = None  # type: ignore[assignment]
+from evsplat.compiled import native, runs_native
 
 SLOPE = 0.01
 """Of the leaky ReLU, as 3DGS-Avatar."""
@@ -68,7 +65,7 @@ class PointMLP(nn.Module):
             bias = bias.expand(len(both), -1)
         layers = [layer for pair in zip(self.weights, self.biases, strict=True) for layer in pair]
         inputs = (point, both, bias, self.point_weight, self.both_weight, *layers)
-        if _native is not None and point.dtype == torch.float32 and point.device.type == "cpu":
+        if runs_native(point):
             keep = torch.is_grad_enabled() and any(
                 tensor is not None and tensor.requires_grad for tensor in inputs
             )
@@ -105,7 +102,7 @@ class _NativeMLP(torch.autograd.Function):
         points, (bias, point_weight, both_weight, *layers) = _plain(point), map(_plain, parameters)
         moving = None if both is None else _plain(both)
         threads = torch.get_num_threads()
-        ctx.job = _native.Mlp(
+        ctx.job = native.Mlp(
             points, moving, bias, point_weight, both_weight, layers, SLOPE, keep, threads
         )
         output = torch.empty(len(bias), len(points), len(layers[-1]))

@@ -6,14 +6,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from evsplat.compiled import import_error, native, runs_native
 from evsplat.errors import BackendError
 from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
-
-_IMPORT_ERROR: ImportError | None = None
-try:
-    from evsplat import _native
-except ImportError as error:  # told when the backend is asked for
-    _IMPORT_ERROR = error
 
 
 def render(
@@ -24,13 +19,13 @@ def render(
     near: float,
 ) -> RenderOutput:
     """Draw with the native kernels; fields have their leading axis of times."""
-    if _IMPORT_ERROR is not None:
+    if native is None:
         raise BackendError(
-            f"The native render backend is not built ({_IMPORT_ERROR}); install evsplat with pip, "
+            f"The native render backend is not built ({import_error}); install evsplat with pip, "
             "or ask for backend='reference', which is slow."
         )
     means = splats.means
-    if means.device.type != "cpu" or means.dtype != torch.float32:
+    if not runs_native(means):
         raise BackendError(
             f"The native render backend needs float32 tensors on the CPU, not {means.dtype} on "
             f"{means.device}; convert them, or ask for backend='reference'."
@@ -56,7 +51,7 @@ class _Rasterize(torch.autograd.Function):
         times = max(f.shape[0] for f in fields[:-1] if f is not None)
         count, channels = means.shape[1], values.shape[2]
         try:
-            job = _native.Render(
+            job = native.Render(
                 width, height, _plain(K), _plain(pose), near, means, quats, scales, opacities,
                 values, linear, offset, background, times, torch.get_num_threads(),
             )  # fmt: skip

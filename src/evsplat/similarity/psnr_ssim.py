@@ -10,10 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-try:
-    from evsplat import _native
-except ImportError:  # not built; rendering says so, and plain torch is exact as well
-    _native = None  # type: ignore[assignment]
+from evsplat.compiled import native, runs_native
 
 
 def psnr(
@@ -64,6 +61,11 @@ class Ssim:
     sample_covariance: bool = False
     """Divide (co)variances by N - 1 instead of N, N the number of pixels of the window."""
 
+    @property
+    def stabilisers(self) -> tuple[float, float]:
+        """The constants C1 and C2 of Wang et al. 2004, with their K1 = 0.01 and K2 = 0.03."""
+        return (0.01 * self.data_range) ** 2, (0.03 * self.data_range) ** 2
+
 
 GAUSSIAN_SSIM = Ssim()
 """Gaussian 11/1.5, range 1: scikit-image's gaussian_weights, sigma=1.5, no sample covariance."""
@@ -107,7 +109,7 @@ def ssim_map(
     variance_x = unbias * (smooth(x * x) - mean_x**2)
     variance_y = unbias * (smooth(y * y) - mean_y**2)
     covariance = unbias * (smooth(x * y) - mean_x * mean_y)
-    c1, c2 = (0.01 * settings.data_range) ** 2, (0.03 * settings.data_range) ** 2
+    c1, c2 = settings.stabilisers
     luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
     structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
     return luminance * structure
@@ -122,12 +124,12 @@ def ssim(
 
     A ValueError where no window fits into the image.
     """
-    native = _native is not None and image.dtype == torch.float32 and image.device.type == "cpu"
-    if native and settings == GAUSSIAN_SSIM and not reference.requires_grad:
-        if min(image.shape[:2]) >= settings.size:
-            _check_same_shape(image, reference)
-            mean: Tensor = _NativeSsim.apply(image, reference)
-            return mean
+    fits = min(image.shape[:2]) >= settings.size
+    usual = settings == GAUSSIAN_SSIM and not reference.requires_grad
+    if runs_native(image) and usual and fits:
+        _check_same_shape(image, reference)
+        mean: Tensor = _NativeSsim.apply(image, reference)
+        return mean
     return ssim_map(image, reference, settings).mean()
 
 
@@ -149,8 +151,8 @@ class _NativeSsim(torch.autograd.Function):
         x, y = (picture.detach().movedim(-1, 0).contiguous() for picture in (image, reference))
         gradient = torch.empty_like(x) if ctx.needs_input_grad[0] else None
         window = torch.tensor(_window(GAUSSIAN_SSIM))
-        c1, c2 = 0.01**2, 0.03**2
-        total = _native.ssim(x, y.float(), window, c1, c2, gradient, torch.get_num_threads())
+        constants = GAUSSIAN_SSIM.stabilisers
+        total = native.ssim(x, y.float(), window, *constants, gradient, torch.get_num_threads())
         planes, height, width = x.shape
         size = GAUSSIAN_SSIM.size
         positions = planes * (height - size + 1) * (width - size + 1)
