@@ -280,20 +280,31 @@ struct Chunk {
     uint32_t count;
 };
 
+struct Found {
+    const Projected* projected;
+    const float* values;
+};
+
+INLINE Found find(const ForwardJob& job, uint32_t gaussian) {
+    const bool still = gaussian >= job.split;
+    const size_t i = gaussian - (still ? job.split : 0);
+    return {job.projected[still] + i, job.values[still] + i * job.value_stride};
+}
+
 // Copies entries [from, to) of a tile and asks for the memory of the chunk that comes next: behind it,
 // or, going back, before it.
-INLINE void fill_chunk(const ForwardJob& job, uint32_t from, uint32_t to, uint32_t next, uint32_t next_end,
-                       Chunk& chunk) {
+INLINE void fill_chunk(const ForwardJob& job, const Entry* entries, uint32_t from, uint32_t to, uint32_t next,
+                       uint32_t next_end, Chunk& chunk) {
     chunk.count = to - from;
     for (uint32_t j = 0; j < chunk.count; ++j) {
-        const uint32_t g = job.entries[from + j].gaussian;
-        chunk.projected[j] = job.projected[g];
-        chunk.values[j] = job.values + size_t(g) * job.value_stride;
+        const Found found = find(job, entries[from + j].gaussian);
+        chunk.projected[j] = *found.projected;
+        chunk.values[j] = found.values;
     }
     for (uint32_t i = next; i < next_end; ++i) {
-        const uint32_t g = job.entries[i].gaussian;
-        __builtin_prefetch(&job.projected[g]);
-        __builtin_prefetch(job.values + size_t(g) * job.value_stride);
+        const Found found = find(job, entries[i].gaussian);
+        __builtin_prefetch(found.projected);
+        __builtin_prefetch(found.values);
     }
 }
 
@@ -332,10 +343,10 @@ INLINE void transpose_masks(const Entry* entries, uint32_t count, uint32_t* word
 
 // C > 0: that many channels, kept in registers; C = 0: up to kMaxChannels, kept in memory.
 template <int C>
-void forward_tile(const ForwardJob& job, uint32_t index) {
+void forward_tile(const ForwardJob& job, const TileWork& work) {
     const View& view = job.view;
     const int channels = C ? C : job.channels;
-    const Tile tile = tile_of(view, index);
+    const Tile tile = tile_of(view, work.index);
     Pixels pixels;
     fill_pixels(tile, pixels);
     F live[kPatches], final[kPatches];  // transmittance, 0 once stopped; what it was when it stopped
@@ -348,19 +359,17 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
     }
     for (int k = 0; k < kPatches * channels; ++k) colour[k] = F{};
 
-    const uint32_t begin = job.tile_begin[index], end = job.tile_begin[index + 1];
-    uint32_t* patch_end = job.patch_end + size_t(index) * kPatches;
     uint64_t open = 0;
     for (int p = 0; p < kPatches; ++p) {
-        patch_end[p] = end - begin;
+        work.patch_end[p] = work.count;
         open |= uint64_t(bits(pixels.inside[p]) != 0) << p;
     }
     Chunk chunk;
-    for (uint32_t first = begin; first < end && open; first += kChunk) {
-        const uint32_t stop = least(first + kChunk, end);
-        fill_chunk(job, first, stop, stop, least(stop + kChunk, end), chunk);
+    for (uint32_t first = 0; first < work.count && open; first += kChunk) {
+        const uint32_t stop = least(first + kChunk, work.count);
+        fill_chunk(job, work.entries, first, stop, stop, least(stop + kChunk, work.count), chunk);
         uint32_t words[kPatches];
-        transpose_masks(job.entries + first, chunk.count, words);
+        transpose_masks(work.entries + first, chunk.count, words);
         for (uint64_t left = open; left; left &= left - 1) {
             const int p = __builtin_ctzll(left);
             uint32_t word = words[p];
@@ -378,7 +387,7 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
                 const I go = next > kMinTransmittance;
                 const F weight = select(go, t * alpha, F{});
                 t_final = select(go, next, t_final);
-                t_last = go ? I{} + int32_t(first - begin + j) : t_last;
+                t_last = go ? I{} + int32_t(first + j) : t_last;
                 t = select(go, next, F{});
                 const float* value = chunk.values[j];
                 if (C) {
@@ -391,13 +400,13 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
             live[p] = t, final[p] = t_final, last[p] = t_last;
             if (!bits(t > 0.f)) {
                 open &= ~(uint64_t(1) << p);
-                patch_end[p] = first - begin + chunk.count;
+                work.patch_end[p] = first + chunk.count;
             }
         }
     }
 
-    __builtin_memcpy(job.final_t + size_t(index) * kTilePixels, final, sizeof final);
-    __builtin_memcpy(job.last + size_t(index) * kTilePixels, last, sizeof last);
+    __builtin_memcpy(work.final_t, final, sizeof final);
+    __builtin_memcpy(work.last, last, sizeof last);
     if (job.background) {
         F value[kPatches];
         for (int k = 0; k < channels; ++k) {
@@ -406,9 +415,32 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
         }
     }
     const size_t plane = size_t(view.width) * view.height;
-    for (int k = 0; k < channels; ++k) store_plane(tile, colour + k, channels, job.image + k * plane, view.width);
     for (int p = 0; p < kPatches; ++p) final[p] = 1.f - final[p];
-    store_plane(tile, final, 1, job.alpha, view.width);
+    for (uint32_t i = 0; i < work.time_count; ++i) {
+        float* image = job.image + work.times[i] * job.image_t;
+        for (int k = 0; k < channels; ++k) store_plane(tile, colour + k, channels, image + k * plane, view.width);
+        store_plane(tile, final, 1, job.alpha + work.times[i] * job.alpha_t, view.width);
+    }
+}
+
+// Sum over the times of a tile: what shows the same picture gets the same gradient.
+INLINE void load_gradient(const Tile& t, const TileWork& work, F* patches, int step, const float* plane,
+                          ptrdiff_t st, ptrdiff_t sx, ptrdiff_t sy) {
+    load_plane(t, patches, step, plane + work.times[0] * st, sx, sy);
+    for (uint32_t i = 1; i < work.time_count; ++i) {
+        F more[kPatches];
+        load_plane(t, more, 1, plane + work.times[i] * st, sx, sy);
+        for (int p = 0; p < kPatches; ++p) patches[p * step] += more[p];
+    }
+}
+
+INLINE void store_slot(float* slot, F4 value, bool add) {
+    if (add) {
+        F4 before;
+        __builtin_memcpy(&before, slot, sizeof before);
+        value += before;
+    }
+    __builtin_memcpy(slot, &value, sizeof value);
 }
 
 // Back to front, with two running scalars per pixel: the transmittance T_i and the gradient-weighted
@@ -417,26 +449,27 @@ void forward_tile(const ForwardJob& job, uint32_t index) {
 // Unlike a front-to-back pass, which gets the light from behind as (total - sum so far), this loses no
 // digits behind nearly opaque Gaussians.
 template <int C>
-void backward_tile(const BackwardJob& back, uint32_t index) {
+void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
     const ForwardJob& job = back.forward;
     const View& view = job.view;
     const int channels = C ? C : job.channels;
     const int stride = slot_stride(channels);
-    const Tile tile = tile_of(view, index);
+    const Tile tile = tile_of(view, work.index);
     Pixels pixels;
     fill_pixels(tile, pixels);
     F transmittance[kPatches], behind[kPatches], value[kPatches];
     I last[kPatches];
     F grad[kPatches * (C ? C : kMaxChannels)];
-    __builtin_memcpy(transmittance, job.final_t + size_t(index) * kTilePixels, sizeof transmittance);
-    __builtin_memcpy(last, job.last + size_t(index) * kTilePixels, sizeof last);
+    __builtin_memcpy(transmittance, work.final_t, sizeof transmittance);
+    __builtin_memcpy(last, work.last, sizeof last);
 
-    if (back.alpha_grad) load_plane(tile, value, 1, back.alpha_grad, back.alpha_grad_x, back.alpha_grad_y);
+    if (back.alpha_grad)
+        load_gradient(tile, work, value, 1, back.alpha_grad, back.alpha_grad_t, back.alpha_grad_x, back.alpha_grad_y);
     for (int p = 0; p < kPatches; ++p) behind[p] = back.alpha_grad ? -value[p] : F{};
     for (int k = 0; k < channels; ++k) {
         if (back.image_grad) {
-            load_plane(tile, grad + k, channels, back.image_grad + k * back.image_grad_c, back.image_grad_x,
-                       back.image_grad_y);
+            load_gradient(tile, work, grad + k, channels, back.image_grad + k * back.image_grad_c, back.image_grad_t,
+                          back.image_grad_x, back.image_grad_y);
         } else {
             for (int p = 0; p < kPatches; ++p) grad[p * channels + k] = F{};
         }
@@ -456,27 +489,25 @@ void backward_tile(const BackwardJob& back, uint32_t index) {
             for (int k = 0; k < channels; ++k) {
                 F total = F{};
                 for (int p = 0; p < kPatches; ++p) total += grad[p * channels + k] * transmittance[p];
-                back.background_grad[size_t(index) * channels + k] = sum(total);
+                back.background_grad[size_t(work.index) * channels + k] += sum(total);
             }
         }
     }
 
-    const uint32_t begin = job.tile_begin[index], end = job.tile_begin[index + 1];
-    const uint32_t* patch_end = job.patch_end + size_t(index) * kPatches;
     Chunk chunk;
-    for (uint32_t stop = end; stop > begin;) {
-        const uint32_t first = begin + (stop - begin - 1) / kChunk * kChunk;
+    for (uint32_t stop = work.count; stop > 0;) {
+        const uint32_t first = (stop - 1) / kChunk * kChunk;
         uint64_t open = 0;
-        for (int p = 0; p < kPatches; ++p) open |= uint64_t(first - begin < patch_end[p]) << p;
-        fill_chunk(job, first, stop, first > begin ? first - kChunk : begin, first, chunk);
+        for (int p = 0; p < kPatches; ++p) open |= uint64_t(first < work.patch_end[p]) << p;
+        fill_chunk(job, work.entries, first, stop, first ? first - kChunk : 0, first, chunk);
         for (uint32_t j = 0; j < chunk.count; ++j)
-            __builtin_prefetch(back.slots + size_t(job.entries[first + j].slot) * stride, 1);
+            __builtin_prefetch(back.slots + size_t(work.entries[first + j].slot) * stride, 1);
         stop = first;
         for (uint32_t j = chunk.count; j-- > 0;) {
-            const Entry& entry = job.entries[first + j];
+            const Entry& entry = work.entries[first + j];
             const Projected g = chunk.projected[j];
             const float* colour = chunk.values[j];
-            const int32_t index_in_tile = int32_t(first - begin + j);
+            const int32_t index_in_tile = int32_t(first + j);
             F h0 = F{}, hu = F{}, hv = F{}, huu = F{}, huv = F{}, hvv = F{};
             F hc[C ? C : kMaxChannels];
             for (int k = 0; k < channels; ++k) hc[k] = F{};
@@ -502,40 +533,39 @@ void backward_tile(const BackwardJob& back, uint32_t index) {
             }
             float* slot = back.slots + size_t(entry.slot) * stride;
             const F zero = F{};
-            F4 out = sum4(h0, hu, hv, huu);
-            __builtin_memcpy(slot, &out, sizeof out);
-            out = sum4(huv, hvv, hc[0], channels > 1 ? hc[1] : zero);
-            __builtin_memcpy(slot + 4, &out, sizeof out);
-            for (int k = 2; k < channels; k += 4) {
-                out = sum4(hc[k], k + 1 < channels ? hc[k + 1] : zero, k + 2 < channels ? hc[k + 2] : zero,
-                           k + 3 < channels ? hc[k + 3] : zero);
-                __builtin_memcpy(slot + kMoments + k, &out, sizeof out);
-            }
+            const bool more = add && entry.gaussian >= job.split;
+            store_slot(slot, sum4(h0, hu, hv, huu), more);
+            store_slot(slot + 4, sum4(huv, hvv, hc[0], channels > 1 ? hc[1] : zero), more);
+            for (int k = 2; k < channels; k += 4)
+                store_slot(slot + kMoments + k,
+                           sum4(hc[k], k + 1 < channels ? hc[k + 1] : zero, k + 2 < channels ? hc[k + 2] : zero,
+                                k + 3 < channels ? hc[k + 3] : zero),
+                           more);
         }
     }
 }
 
-#define BY_CHANNELS(function, job, index)       \
-    switch (channels) {                         \
-        case 1: function<1>(job, index); break; \
-        case 2: function<2>(job, index); break; \
-        case 3: function<3>(job, index); break; \
-        case 4: function<4>(job, index); break; \
-        case 5: function<5>(job, index); break; \
-        case 6: function<6>(job, index); break; \
-        case 7: function<7>(job, index); break; \
-        case 8: function<8>(job, index); break; \
-        default: function<0>(job, index);       \
+#define BY_CHANNELS(function, ...)               \
+    switch (channels) {                          \
+        case 1: function<1>(__VA_ARGS__); break; \
+        case 2: function<2>(__VA_ARGS__); break; \
+        case 3: function<3>(__VA_ARGS__); break; \
+        case 4: function<4>(__VA_ARGS__); break; \
+        case 5: function<5>(__VA_ARGS__); break; \
+        case 6: function<6>(__VA_ARGS__); break; \
+        case 7: function<7>(__VA_ARGS__); break; \
+        case 8: function<8>(__VA_ARGS__); break; \
+        default: function<0>(__VA_ARGS__);       \
     }
 
-void forward(const ForwardJob& job, uint32_t tile) {
+void forward(const ForwardJob& job, const TileWork& work) {
     const int channels = job.channels;
-    BY_CHANNELS(forward_tile, job, tile)
+    BY_CHANNELS(forward_tile, job, work)
 }
 
-void backward(const BackwardJob& job, uint32_t tile) {
+void backward(const BackwardJob& job, const TileWork& work, bool add) {
     const int channels = job.forward.channels;
-    BY_CHANNELS(backward_tile, job, tile)
+    BY_CHANNELS(backward_tile, job, work, add)
 }
 
 // ------------------------------------------------------------------ back through the projection

@@ -56,29 +56,40 @@ struct Entry {
     uint64_t patches;
 };
 
+// Gaussians below `split` move: theirs is the first array, those of one time. The others stand still.
 struct ForwardJob {
     View view;
     int channels;
-    const Projected* projected;
-    const float* values;          // (N, value_stride), of which `channels` are drawn
+    uint32_t split;
+    const Projected* projected[2];
+    const float* values[2];       // (N, value_stride), of which `channels` are drawn
     size_t value_stride;
-    const Entry* entries;
-    const uint32_t* tile_begin;   // (tiles + 1)
     const float* background;      // null, or value of channel k at pixel (x, y): k*bc + x*bx + y*by
     ptrdiff_t background_c, background_x, background_y;
-    float *image, *alpha;         // planar (C, H, W) and (H, W)
-    // What the backward pass starts from, by tile and patch, not by row:
-    float* final_t;               // (tiles, 256) transmittance behind the last entry
-    int32_t* last;                // (tiles, 256) last entry of the tile before compositing stopped
-    uint32_t* patch_end;          // (tiles, patches) entries of the tile after which a patch is opaque
+    float *image, *alpha;         // planar (T, C, H, W) and (T, H, W)
+    size_t image_t, alpha_t;      // floats from one time to the next
+};
+
+// One tile with one list of entries, and the times whose picture it is.
+struct TileWork {
+    uint32_t index;
+    const Entry* entries;
+    uint32_t count;
+    const uint32_t* times;
+    uint32_t time_count;
+    // What the backward pass starts from, by patch, not by row:
+    float* final_t;               // (256) transmittance behind the last entry
+    int32_t* last;                // (256) last entry before compositing stopped
+    uint32_t* patch_end;          // (patches) entries after which a patch is opaque
 };
 
 struct BackwardJob {
     ForwardJob forward;
     const float *image_grad, *alpha_grad;  // any strides; may be null
-    ptrdiff_t image_grad_c, image_grad_x, image_grad_y, alpha_grad_x, alpha_grad_y;
+    ptrdiff_t image_grad_t, image_grad_c, image_grad_x, image_grad_y;
+    ptrdiff_t alpha_grad_t, alpha_grad_x, alpha_grad_y;
     float* slots;                 // (slots, slot_stride(C))
-    float* background_grad;       // null, or (tiles, C) partial sums, or (H, W, value_stride) added to
+    float* background_grad;       // null, or (tiles, C) or (H, W, value_stride), added to
     bool background_is_image;
 };
 
@@ -95,8 +106,9 @@ struct Kernels {
     // Projects [begin, end), appends its slots; first_slot[i] is relative to the list's start.
     void (*project)(const View&, const Gaussians&, uint32_t begin, uint32_t end, Projected*,
                     int32_t* radii, uint32_t* first_slot, SlotList&);
-    void (*forward)(const ForwardJob&, uint32_t tile);
-    void (*backward)(const BackwardJob&, uint32_t tile);
+    void (*forward)(const ForwardJob&, const TileWork&);
+    // Writes the entries' slots; with `add` those of Gaussians that stand still are added to.
+    void (*backward)(const BackwardJob&, const TileWork&, bool add);
     // Sums the slots of each Gaussian of [begin, end) and goes back through the projection.
     void (*project_backward)(const View&, const Gaussians&, uint32_t begin, uint32_t end,
                              const Projected*, const uint32_t* first_slot, const float* slots,

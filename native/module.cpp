@@ -21,8 +21,10 @@ using namespace evsplat;
 namespace {
 
 using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Fields = std::vector<std::optional<In>>;  // means, quats, scales, opacities, channels, linear, offset
 using Strided = nb::ndarray<const float, nb::device::cpu>;
 using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using OutFields = std::vector<std::optional<Out>>;
 using OutInt = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
 using Camera = nb::ndarray<const float, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
@@ -40,17 +42,22 @@ size_t step_of(const Array& a, size_t times, size_t count, size_t inner, const c
     return a.shape(0) == 1 ? 0 : count * inner;
 }
 
+constexpr size_t kInner[] = {3, 4, 3, 1, 0, 9, 2};  // floats per Gaussian of each field; 0: the channels
+constexpr const char* kFieldNames[] = {"means", "quats", "scales", "opacities", "channels", "linear", "offset"};
+constexpr size_t kFields = 7, kMeans = 0, kChannels = 4;
+
+template <class T>
+FieldOf<T>& field_of(LayerOf<T>& l, size_t i) {
+    FieldOf<T>* fields[] = {&l.means, &l.quats, &l.scales, &l.opacities, &l.values, &l.linear, &l.offset};
+    return *fields[i];
+}
+
 class Render {
   public:
-    Render(int width, int height, const Camera& k, const Pose& pose, float near_plane, In means, In quats, In scales,
-           In opacities, In values, std::optional<In> linear, std::optional<In> offset,
+    Render(int width, int height, const Camera& k, const Pose& pose, float near_plane, Fields moving, Fields still,
            std::optional<In> background, int times, int threads)
-        : means_(means), quats_(quats), scales_(scales), opacities_(opacities), values_(values), linear_(linear),
-          offset_(offset), background_(background), threads_(threads) {
+        : moving_(std::move(moving)), still_(std::move(still)), background_(background), threads_(threads) {
         require(width > 0 && height > 0 && width <= 1 << 16 && height <= 1 << 16 && times > 0, "the image");
-        require(means.ndim() == 3 && values.ndim() == 3 && means.shape(1) < (size_t(1) << 31), "means");
-        const size_t n = means.shape(1), c = values.shape(2), t = times;
-        require(c > 0 && c < 65536, "channels");
         View& v = scene_.view;
         for (int i = 0; i < 3; ++i) {
             for (int j = 0; j < 3; ++j) v.r[3 * i + j] = pose.data()[4 * i + j];
@@ -60,34 +67,33 @@ class Render {
         v.near_plane = near_plane;
         v.width = width, v.height = height;
         v.tiles_x = (width + kTile - 1) / kTile, v.tiles_y = (height + kTile - 1) / kTile;
-        scene_.times = times, scene_.channels = int(c), scene_.count = uint32_t(n);
-        scene_.means = {means.data(), step_of(means, t, n, 3, "means")};
-        scene_.quats = {quats.data(), step_of(quats, t, n, 4, "quats")};
-        scene_.scales = {scales.data(), step_of(scales, t, n, 3, "scales")};
-        scene_.opacities = {opacities.data(), step_of(opacities, t, n, 1, "opacities")};
-        scene_.values = {values.data(), step_of(values, t, n, c, "channels")};
-        if (linear) scene_.linear = {linear->data(), step_of(*linear, t, n, 9, "linear")};
-        if (offset) scene_.offset = {offset->data(), step_of(*offset, t, n, 2, "centers2d_offset")};
+        scene_.times = times;
+        require(moving_.size() == kFields && moving_[kChannels] && moving_[kChannels]->ndim() == 3, "channels");
+        const size_t c = moving_[kChannels]->shape(2);
+        require(c > 0 && c < 65536, "channels");
+        scene_.channels = int(c);
+        fill(scene_.moving, moving_, times);
+        if (!still_.empty()) fill(scene_.still, still_, 1);
+        require(size_t(scene_.moving.count) + scene_.still.count < size_t(1) << 31, "means");
         scene_.background_is_image = background && background->ndim() == 3;
         if (background) {
             require(background->size() == c * (scene_.background_is_image ? size_t(width) * height : 1), "background");
-            scene_.background = {background->data(), 0};
+            scene_.background = background->data();
         }
     }
 
-    void forward(Out image, Out alpha, OutInt radii) {
+    void forward(Out image, Out alpha, OutInt radii, OutInt still_radii) {
         const size_t pixels = size_t(scene_.view.width) * scene_.view.height * scene_.times;
         require(image.size() == pixels * scene_.channels, "image");
         require(alpha.size() == pixels, "alpha");
-        require(radii.size() == size_t(scene_.count) * scene_.times, "radii");
+        require(radii.size() == size_t(scene_.moving.count) * scene_.times, "radii");
+        require(still_radii.size() == scene_.still.count, "radii of what stands still");
         nb::gil_scoped_release release;
-        record_ = render_forward(scene_, threads_, image.data(), alpha.data(), radii.data());
+        record_ = render_forward(scene_, threads_, image.data(), alpha.data(), radii.data(), still_radii.data());
     }
 
-    void backward(std::optional<Strided> image_grad, std::optional<Strided> alpha_grad,
-                  std::optional<Out> means, std::optional<Out> quats, std::optional<Out> scales,
-                  std::optional<Out> opacities, std::optional<Out> values, std::optional<Out> linear,
-                  std::optional<Out> offset, std::optional<Out> view, std::optional<Out> background) {
+    void backward(std::optional<Strided> image_grad, std::optional<Strided> alpha_grad, OutFields moving,
+                  OutFields still, std::optional<Out> view, std::optional<Out> background) {
         if (!record_) throw std::runtime_error("evsplat._native: backward before forward");
         const size_t h = scene_.view.height, w = scene_.view.width, t = scene_.times, c = scene_.channels;
         OutputGrads out;
@@ -105,25 +111,14 @@ class Render {
             out.alpha_data = alpha_grad->data();
             for (int i = 0; i < 3; ++i) out.alpha[i] = alpha_grad->stride(i);
         }
-        const size_t n = scene_.count;
         InputGrads in;
-        const auto field = [&](std::optional<Out>& a, const Field& like, size_t inner, const char* what) {
-            if (!a) return GradField{};
-            require(step_of(*a, t, n, inner, what) == like.step, what);
-            return GradField{a->data(), like.step};
-        };
-        in.means = field(means, scene_.means, 3, "means gradient");
-        in.quats = field(quats, scene_.quats, 4, "quats gradient");
-        in.scales = field(scales, scene_.scales, 3, "scales gradient");
-        in.opacities = field(opacities, scene_.opacities, 1, "opacities gradient");
-        in.values = field(values, scene_.values, c, "channels gradient");
-        if (scene_.linear.data) in.linear = field(linear, scene_.linear, 9, "linear gradient");
-        if (scene_.offset.data) in.offset = field(offset, scene_.offset, 2, "centers2d_offset gradient");
+        fill_grads(in.moving, moving, scene_.moving, t);
+        fill_grads(in.still, still, scene_.still, 1);
         if (view) {
             require(view->size() == 12, "camera gradient");
             in.view = view->data();
         }
-        if (background && scene_.background.data) {
+        if (background && scene_.background) {
             require(background->size() == c * (scene_.background_is_image ? h * w : 1), "background gradient");
             in.background = background->data();
         }
@@ -132,26 +127,38 @@ class Render {
     }
 
     size_t bytes() const { return record_ ? record_->bytes() : 0; }
-
-    size_t intersections() const {
-        size_t total = 0;
-        if (record_)
-            for (const Drawn& d : record_->times) total += d.entries.size();
-        return total;
-    }
-
-    size_t patch_steps() const {
-        size_t total = 0;
-        if (record_)
-            for (const Drawn& d : record_->times)
-                for (size_t i = 0; i < d.entries.size(); ++i) total += __builtin_popcountll(d.entries[i].patches);
-        return total;
-    }
+    size_t intersections() const { return record_ ? record_->intersections() : 0; }
+    size_t patch_steps() const { return record_ ? record_->patch_steps() : 0; }
 
   private:
+    size_t inner(size_t field) const { return field == kChannels ? scene_.channels : kInner[field]; }
+
+    void fill(Layer& layer, const Fields& fields, size_t times) {
+        require(fields.size() == kFields && fields[kMeans] && fields[kMeans]->ndim() == 3, "means");
+        const size_t count = fields[kMeans]->shape(1);
+        require(count < size_t(1) << 31, "means");
+        layer.count = uint32_t(count);
+        for (size_t i = 0; i < kFields; ++i) {
+            require(fields[i] || i > kChannels, kFieldNames[i]);
+            if (!fields[i]) continue;
+            field_of<const float>(layer, i) = {fields[i]->data(),
+                                               step_of(*fields[i], times, count, inner(i), kFieldNames[i])};
+        }
+    }
+
+    void fill_grads(LayerGrads& grads, OutFields& fields, const Layer& layer, size_t times) {
+        require(fields.empty() || fields.size() == kFields, "the gradients");
+        for (size_t i = 0; i < fields.size(); ++i) {
+            const FieldOf<const float>& like = field_of<const float>(const_cast<Layer&>(layer), i);
+            if (!fields[i] || !like.data) continue;
+            require(step_of(*fields[i], times, layer.count, inner(i), kFieldNames[i]) == like.step, kFieldNames[i]);
+            field_of<float>(grads, i) = {fields[i]->data(), like.step};
+        }
+    }
+
     // The arrays keep the memory that scene_ points into alive.
-    In means_, quats_, scales_, opacities_, values_;
-    std::optional<In> linear_, offset_, background_;
+    Fields moving_, still_;
+    std::optional<In> background_;
     Scene scene_ = {};
     int threads_;
     std::unique_ptr<Record> record_;
@@ -250,17 +257,13 @@ NB_MODULE(_native, m) {
     m.doc() = "CPU kernels of evsplat.";
     nb::set_leak_warnings(false);  // images alive when the interpreter ends are no leak
     nb::class_<Render>(m, "Render", "One render of T times; keeps what its backward pass needs.")
-        .def(nb::init<int, int, const Camera&, const Pose&, float, In, In, In, In, In, std::optional<In>,
-                      std::optional<In>, std::optional<In>, int, int>(),
+        .def(nb::init<int, int, const Camera&, const Pose&, float, Fields, Fields, std::optional<In>, int, int>(),
              nb::arg("width"), nb::arg("height"), nb::arg("K"), nb::arg("world_to_camera"), nb::arg("near"),
-             nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"), nb::arg("channels"),
-             nb::arg("linear").none(), nb::arg("offset").none(), nb::arg("background").none(), nb::arg("times"),
-             nb::arg("threads"))
-        .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"))
-        .def("backward", &Render::backward, nb::arg("image_grad").none(),
-             nb::arg("alpha_grad").none(), nb::arg("means").none(), nb::arg("quats").none(), nb::arg("scales").none(),
-             nb::arg("opacities").none(), nb::arg("channels").none(), nb::arg("linear").none(),
-             nb::arg("offset").none(), nb::arg("view").none(), nb::arg("background").none())
+             nb::arg("moving"), nb::arg("still"), nb::arg("background").none(), nb::arg("times"), nb::arg("threads"))
+        .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"),
+             nb::arg("still_radii"))
+        .def("backward", &Render::backward, nb::arg("image_grad").none(), nb::arg("alpha_grad").none(),
+             nb::arg("moving"), nb::arg("still"), nb::arg("view").none(), nb::arg("background").none())
         .def_prop_ro("bytes", &Render::bytes, "Memory kept for the backward pass.")
         .def_prop_ro("intersections", &Render::intersections, "Pairs of Gaussian and tile.")
         .def_prop_ro("patch_steps", &Render::patch_steps, "Pairs of Gaussian and patch.");

@@ -45,6 +45,7 @@ struct TileSorter {
     std::vector<Keyed> items, spare;
     std::vector<Entry> moved;
 
+    // `projected` is that of Gaussian 0.
     void sort(Entry* entries, const Projected* projected, uint32_t n) {
         if (n < 2) return;
         if (items.size() < n) items.resize(n), spare.resize(n), moved.resize(n);
@@ -122,64 +123,46 @@ void run(int threads, size_t count, const std::function<void(size_t)>& task) {
     if (error) std::rethrow_exception(error);
 }
 
-Gaussians gaussians_at(const Scene& s, size_t t) {
-    const auto at = [t](const Field& f) { return f.data ? f.data + t * f.step : nullptr; };
-    return {at(s.means), at(s.quats), at(s.scales), at(s.opacities), at(s.linear), at(s.offset), s.count};
+// Moving and still entries of a tile, both in order, to one list in order: `merged` starts with the
+// moving ones and has room for all. Equal depths: the moving ones come first.
+void merge(Entry* merged, uint32_t moving, const Projected* projected, const Entry* still, uint32_t count,
+           const Projected* still_projected) {
+    Entry* end = merged + moving + count;
+    while (count) {
+        const Entry& back = still[count - 1];
+        if (moving && projected[merged[moving - 1].gaussian].depth > still_projected[back.gaussian].depth)
+            *--end = merged[--moving];
+        else
+            *--end = back, --count;
+    }
 }
 
-ForwardJob forward_job(const Scene& s, const Drawn& d, size_t t, int first_channel, int channels, float* image,
-                       float* alpha) {
-    const size_t pixels = size_t(s.view.width) * s.view.height;
-    ForwardJob job = {};
-    job.view = s.view;
-    job.channels = channels;
-    job.projected = d.projected.data();
-    job.values = s.values.data + t * s.values.step + first_channel;
-    job.value_stride = s.channels;
-    job.entries = d.entries.data();
-    job.tile_begin = d.tile_begin.data();
-    if (s.background.data) {
-        job.background = s.background.data + first_channel;
-        job.background_c = 1;
-        job.background_x = s.background_is_image ? s.channels : 0;
-        job.background_y = job.background_x * s.view.width;
-    }
-    if (image) {  // not for the backward pass
-        job.image = image + (t * s.channels + first_channel) * pixels;
-        job.alpha = alpha + t * pixels;
-    }
-    job.final_t = const_cast<float*>(d.final_t.data());
-    job.last = const_cast<int32_t*>(d.last.data());
-    job.patch_end = const_cast<uint32_t*>(d.patch_end.data());
-    return job;
+Gaussians gaussians_at(const Layer& l, size_t t) {
+    return {l.means.at(t), l.quats.at(t), l.scales.at(t), l.opacities.at(t), l.linear.at(t), l.offset.at(t), l.count};
 }
 
-// Projects all Gaussians of one time and sorts their intersections into tiles.
-void project_and_bin(const Kernels& kernels, const Scene& s, size_t t, int threads, Drawn& d, int32_t* radii) {
-    const Gaussians g = gaussians_at(s, t);
-    const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y;
-    const size_t blocks = (size_t(s.count) + kBlock - 1) / kBlock;
-    d.projected.reset(s.count);
-    d.first_slot.reset(size_t(s.count) + 1);
+// Projects a layer at one time and sorts its intersections into tiles. Gaussian 0 is called `first`.
+// In every tile that it touches, room is left for the entries that `still` has there.
+void project_and_bin(const Kernels& kernels, const View& view, const Gaussians& g, uint32_t first,
+                     const Binned* still, int threads, Binned& d, int32_t* radii) {
+    const size_t tiles = size_t(view.tiles_x) * view.tiles_y;
+    const size_t blocks = (size_t(g.count) + kBlock - 1) / kBlock;
+    d.projected.reset(g.count);
+    d.first_slot.reset(size_t(g.count) + 1);
     d.tile_begin.reset(tiles + 1);
-    d.patch_end.reset(tiles * kernels.patches);
-    d.final_t.reset(tiles * kTilePixels);
-    d.last.reset(tiles * kTilePixels);
 
     std::vector<BlockSlots> slots(blocks);
     run(threads, blocks, [&](size_t b) {
-        const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, s.count);
+        const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, g.count);
         BlockSlots list;  // on this thread's stack: its size changes with every slot
         list.start(3 * kBlock);
-        kernels.project(s.view, g, begin, end, d.projected.data(), radii, d.first_slot.data(), list);
+        kernels.project(view, g, begin, end, d.projected.data(), radii, d.first_slot.data(), list);
         slots[b].take(list);
     });
     std::vector<size_t> base(blocks + 1, 0);
     for (size_t b = 0; b < blocks; ++b) base[b + 1] = base[b] + slots[b].size;
-    if (base[blocks] > 0xffffffffull)
-        throw std::runtime_error("more than 2^32 tile intersections in one image");
-    d.first_slot[s.count] = uint32_t(base[blocks]);
-    d.entries.reset(base[blocks]);
+    d.slots = base[blocks];
+    d.first_slot[g.count] = uint32_t(d.slots);
 
     // Each part counts and then places its slots; within a tile, parts and slots keep the Gaussians'
     // order, whatever the number of parts.
@@ -196,122 +179,238 @@ void project_and_bin(const Kernels& kernels, const Scene& s, size_t t, int threa
             for (size_t i = 0; i < slots[b].size; ++i) ++count[list[i].tile];
         });
     });
-    uint32_t total = 0;
+    size_t total = 0;
     for (size_t tile = 0; tile < tiles; ++tile) {
-        d.tile_begin[tile] = total;
+        d.tile_begin[tile] = uint32_t(total);
         for (size_t part = 0; part < parts; ++part) {
             uint32_t& p = place[part * tiles + tile];
             const uint32_t count = p;
-            p = total;
+            p = uint32_t(total);
             total += count;
         }
+        if (still && total > d.tile_begin[tile]) total += still->in_tile(tile);
     }
-    d.tile_begin[tiles] = total;
+    if (total > 0xffffffffull || d.slot_base + d.slots > 0xffffffffull)
+        throw std::runtime_error("more than 2^32 tile intersections in one render");
+    d.tile_begin[tiles] = uint32_t(total);
+    d.entries.reset(total);
     run(threads, parts, [&](size_t part) {
         uint32_t* next = place.data() + part * tiles;
         for_part(part, [&](size_t b) {
             const Slot* list = slots[b].data;
+            const size_t slot = d.slot_base + base[b];
             for (size_t i = 0; i < slots[b].size; ++i)
-                d.entries[next[list[i].tile]++] = {list[i].gaussian, uint32_t(base[b] + i), list[i].patches};
-            const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, s.count);
+                d.entries[next[list[i].tile]++] = {first + list[i].gaussian, uint32_t(slot + i), list[i].patches};
+            const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, g.count);
             for (uint32_t i = begin; i < end; ++i) d.first_slot[i] += uint32_t(base[b]);
         });
     });
 }
 
+// Calls f(work) for each different picture of a tile: first the one without anything moving.
+template <class F>
+void for_pictures(const Record& r, uint32_t tile, F f) {
+    thread_local std::vector<uint32_t> bare;
+    bare.clear();
+    for (uint32_t t = 0; t < r.moving.size(); ++t)
+        if (!r.moving[t].in_tile(tile)) bare.push_back(t);
+    size_t picture = r.picture[tile];
+    const auto work = [&](const Binned& d, const uint32_t* times, size_t count) {
+        TileWork w = {};
+        w.index = tile;
+        w.entries = d.entries.data() + d.tile_begin[tile];
+        w.count = d.in_tile(tile);
+        w.times = times, w.time_count = uint32_t(count);
+        w.final_t = const_cast<float*>(r.final_t.data()) + picture * kTilePixels;
+        w.last = const_cast<int32_t*>(r.last.data()) + picture * kTilePixels;
+        w.patch_end = const_cast<uint32_t*>(r.patch_end.data()) + picture * r.kernels->patches;
+        ++picture;
+        f(w);
+    };
+    if (!bare.empty()) work(r.still, bare.data(), bare.size());
+    for (uint32_t t = 0; t < r.moving.size(); ++t)
+        if (r.moving[t].in_tile(tile)) work(r.moving[t], &t, 1);
+}
+
+template <class F>
+void for_entries(const Record& r, F f) {
+    for (uint32_t tile = 0; tile + 1 < r.picture.size(); ++tile)
+        for_pictures(r, tile, [&](const TileWork& w) {
+            for (uint32_t i = 0; i < w.count; ++i) f(w.entries[i]);
+        });
+}
+
+// Projected Gaussians and values of both layers; those of the moving one at `time`.
+ForwardJob forward_job(const Scene& s, const Record& r, size_t time, int first_channel, int channels) {
+    ForwardJob job = {};
+    job.view = s.view;
+    job.channels = channels;
+    job.split = s.moving.count;
+    job.projected[0] = r.moving[time].projected.data(), job.projected[1] = r.still.projected.data();
+    job.values[0] = s.moving.values.data ? s.moving.values.at(time) + first_channel : nullptr;
+    job.values[1] = s.still.values.data ? s.still.values.data + first_channel : nullptr;
+    job.value_stride = s.channels;
+    if (s.background) {
+        job.background = s.background + first_channel;
+        job.background_c = 1;
+        job.background_x = s.background_is_image ? s.channels : 0;
+        job.background_y = job.background_x * s.view.width;
+    }
+    return job;
+}
+
 constexpr size_t kTilesPerTask = 4;
+
+template <class F>
+void for_tiles(int threads, size_t tiles, F f) {
+    run(threads, (tiles + kTilesPerTask - 1) / kTilesPerTask, [&](size_t task) {
+        for (size_t i = task * kTilesPerTask; i < std::min(tiles, (task + 1) * kTilesPerTask); ++i) f(uint32_t(i));
+    });
+}
 
 }  // namespace
 
 size_t Record::bytes() const {
-    size_t total = 0;
-    for (const Drawn& d : times)
-        total += d.projected.bytes() + d.first_slot.bytes() + d.entries.bytes() + d.tile_begin.bytes() +
-                 d.patch_end.bytes() + d.final_t.bytes() + d.last.bytes();
+    const auto of = [](const Binned& d) {
+        return d.projected.bytes() + d.first_slot.bytes() + d.entries.bytes() + d.tile_begin.bytes();
+    };
+    size_t total = of(still) + picture.bytes() + final_t.bytes() + last.bytes() + patch_end.bytes();
+    for (const Binned& d : moving) total += of(d);
     return total;
 }
 
-std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image, float* alpha, int32_t* radii) {
+size_t Record::intersections() const {
+    size_t total = 0;
+    for_entries(*this, [&](const Entry&) { ++total; });
+    return total;
+}
+
+size_t Record::patch_steps() const {
+    size_t total = 0;
+    for_entries(*this, [&](const Entry& e) { total += __builtin_popcountll(e.patches); });
+    return total;
+}
+
+std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image, float* alpha, int32_t* radii,
+                                       int32_t* still_radii) {
     const Kernels& kernels = select_kernels();
+    const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y, pixels = size_t(s.view.width) * s.view.height;
     auto record = std::make_unique<Record>();
-    record->kernels = &kernels;
-    record->times.resize(s.times);
-    const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y;
+    Record& r = *record;
+    r.kernels = &kernels;
+    r.moving.resize(s.times);
+    project_and_bin(kernels, s.view, gaussians_at(s.still, 0), s.moving.count, nullptr, threads, r.still, still_radii);
+    size_t slots = r.still.slots;
     for (int t = 0; t < s.times; ++t) {
-        Drawn& d = record->times[t];
-        project_and_bin(kernels, s, t, threads, d, radii + size_t(t) * s.count);
-        run(threads, (tiles + kTilesPerTask - 1) / kTilesPerTask, [&](size_t task) {
-            thread_local TileSorter sorter;
-            for (size_t i = task * kTilesPerTask; i < std::min(tiles, (task + 1) * kTilesPerTask); ++i) {
-                const uint32_t tile = uint32_t(i), begin = d.tile_begin[tile];
-                sorter.sort(d.entries.data() + begin, d.projected.data(), d.tile_begin[tile + 1] - begin);
-                for (int c = 0; c < s.channels; c += kMaxChannels)
-                    kernels.forward(
-                        forward_job(s, d, t, c, std::min(kMaxChannels, s.channels - c), image, alpha), tile);
+        Binned& d = r.moving[t];
+        d.slot_base = slots;
+        project_and_bin(kernels, s.view, gaussians_at(s.moving, t), 0, &r.still, threads, d,
+                        radii + size_t(t) * s.moving.count);
+        slots += d.slots;
+    }
+    r.picture.reset(tiles + 1);
+    uint32_t pictures = 0;
+    for (size_t tile = 0; tile < tiles; ++tile) {
+        r.picture[tile] = pictures;
+        uint32_t touched = 0;
+        for (const Binned& d : r.moving) touched += d.in_tile(tile) > 0;
+        pictures += touched + (touched < r.moving.size());
+    }
+    r.picture[tiles] = pictures;
+    r.final_t.reset(size_t(pictures) * kTilePixels);
+    r.last.reset(size_t(pictures) * kTilePixels);
+    r.patch_end.reset(size_t(pictures) * kernels.patches);
+
+    for_tiles(threads, tiles, [&](uint32_t tile) {
+        thread_local TileSorter sorter;
+        const Projected* still_projected = r.still.projected.data() - s.moving.count;
+        Entry* still = r.still.entries.data() + r.still.tile_begin[tile];
+        const uint32_t still_count = r.still.in_tile(tile);
+        sorter.sort(still, still_projected, still_count);
+        for (Binned& d : r.moving)
+            if (const uint32_t all = d.in_tile(tile)) {
+                Entry* entries = d.entries.data() + d.tile_begin[tile];
+                sorter.sort(entries, d.projected.data(), all - still_count);
+                merge(entries, all - still_count, d.projected.data(), still, still_count, still_projected);
+            }
+        for_pictures(r, tile, [&](const TileWork& work) {
+            for (int c = 0; c < s.channels; c += kMaxChannels) {
+                ForwardJob job = forward_job(s, r, work.times[0], c, std::min(kMaxChannels, s.channels - c));
+                job.image = image + c * pixels, job.image_t = s.channels * pixels;
+                job.alpha = alpha, job.alpha_t = pixels;
+                kernels.forward(job, work);
             }
         });
-    }
+    });
     return record;
 }
 
-void render_backward(const Scene& s, const Record& record, int threads, const OutputGrads& out,
-                     const InputGrads& in) {
-    const Kernels& kernels = *record.kernels;
+void render_backward(const Scene& s, const Record& r, int threads, const OutputGrads& out, const InputGrads& in) {
+    const Kernels& kernels = *r.kernels;
     const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y;
-    const size_t blocks = (size_t(s.count) + kBlock - 1) / kBlock;
-    std::vector<double> view_total(12, 0.0), background_total(s.channels, 0.0);
-    Buffer<float> slots, view_parts(blocks * 12), background_parts(tiles * kMaxChannels);
-    for (int t = 0; t < s.times; ++t) {
-        const Drawn& d = record.times[t];
-        const size_t needed = d.entries.size() * slot_stride(std::min(s.channels, kMaxChannels));
-        if (slots.size() < needed) slots.reset(needed);
-        // Gradients of the channels' blocks add up, for the geometry too: the image is linear in the
-        // channels. The alpha gradient goes with the first block.
-        for (int c = 0; c < s.channels; c += kMaxChannels) {
-            BackwardJob job = {};
-            const int channels = std::min(kMaxChannels, s.channels - c);
-            job.forward = forward_job(s, d, t, c, channels, nullptr, nullptr);
-            if (out.image_data) {
-                job.image_grad = out.image_data + t * out.image[0] + c * out.image[3];
-                job.image_grad_y = out.image[1], job.image_grad_x = out.image[2], job.image_grad_c = out.image[3];
-            }
-            if (out.alpha_data && c == 0) {
-                job.alpha_grad = out.alpha_data + t * out.alpha[0];
-                job.alpha_grad_y = out.alpha[1], job.alpha_grad_x = out.alpha[2];
-            }
-            job.slots = slots.data();
-            job.background_is_image = s.background_is_image;
-            if (in.background) job.background_grad = s.background_is_image ? in.background + c : background_parts.data();
-            run(threads, (tiles + kTilesPerTask - 1) / kTilesPerTask, [&](size_t task) {
-                for (size_t i = task * kTilesPerTask; i < std::min(tiles, (task + 1) * kTilesPerTask); ++i)
-                    kernels.backward(job, uint32_t(i));
+    const auto blocks_of = [](const Layer& l) { return (size_t(l.count) + kBlock - 1) / kBlock; };
+    std::vector<double> view_total(12, 0.0);
+    const size_t slot_count = r.moving.back().slot_base + r.moving.back().slots;
+    Buffer<float> slots(slot_count * slot_stride(std::min(s.channels, kMaxChannels)));
+    Buffer<float> view_parts(std::max(blocks_of(s.moving), blocks_of(s.still)) * 12);
+    Buffer<float> background_parts(tiles * kMaxChannels);
+    // Gradients of the channels' blocks add up, for the geometry too: the image is linear in the
+    // channels. The alpha gradient goes with the first block.
+    for (int c = 0; c < s.channels; c += kMaxChannels) {
+        const int channels = std::min(kMaxChannels, s.channels - c);
+        std::fill_n(background_parts.data(), tiles * channels, 0.f);
+        for_tiles(threads, tiles, [&](uint32_t tile) {
+            bool add = false;
+            for_pictures(r, tile, [&](const TileWork& work) {
+                BackwardJob job = {};
+                job.forward = forward_job(s, r, work.times[0], c, channels);
+                if (out.image_data) {
+                    job.image_grad = out.image_data + c * out.image[3];
+                    job.image_grad_t = out.image[0], job.image_grad_y = out.image[1];
+                    job.image_grad_x = out.image[2], job.image_grad_c = out.image[3];
+                }
+                if (out.alpha_data && c == 0) {
+                    job.alpha_grad = out.alpha_data;
+                    job.alpha_grad_t = out.alpha[0], job.alpha_grad_y = out.alpha[1], job.alpha_grad_x = out.alpha[2];
+                }
+                job.slots = slots.data();
+                job.background_is_image = s.background_is_image;
+                if (in.background)
+                    job.background_grad = s.background_is_image ? in.background + c : background_parts.data();
+                kernels.backward(job, work, add);
+                add = true;
             });
-            if (in.background && !s.background_is_image)
-                for (size_t i = 0; i < tiles; ++i)
-                    for (int k = 0; k < channels; ++k) background_total[c + k] += background_parts[i * channels + k];
+        });
+        if (in.background && !s.background_is_image)
+            for (int k = 0; k < channels; ++k) {
+                double total = 0.0;
+                for (size_t i = 0; i < tiles; ++i) total += background_parts[i * channels + k];
+                in.background[c + k] = float(total);
+            }
 
-            const Gaussians g = gaussians_at(s, t);
-            const auto at = [t](const GradField& f) { return f.data ? f.data + t * f.step : nullptr; };
+        const auto to_fields = [&](const Layer& layer, const LayerGrads& to, const Binned& d, size_t t) {
             GaussianGrads grads = {};
-            grads.means = at(in.means), grads.quats = at(in.quats), grads.scales = at(in.scales);
-            grads.opacities = at(in.opacities), grads.linear = at(in.linear), grads.offset = at(in.offset);
-            grads.values = in.values.data ? at(in.values) + c : nullptr;
+            grads.means = to.means.at(t), grads.quats = to.quats.at(t), grads.scales = to.scales.at(t);
+            grads.opacities = to.opacities.at(t), grads.linear = to.linear.at(t), grads.offset = to.offset.at(t);
+            grads.values = to.values.data ? to.values.at(t) + c : nullptr;
             grads.value_stride = s.channels;
             grads.view = in.view ? view_parts.data() : nullptr;
-            run(threads, blocks, [&](size_t b) {
-                const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, s.count);
-                kernels.project_backward(s.view, g, begin, end, d.projected.data(), d.first_slot.data(),
-                                         slots.data(), channels, grads);
+            const Gaussians g = gaussians_at(layer, t);
+            const float* first = slots.data() + d.slot_base * slot_stride(channels);
+            run(threads, blocks_of(layer), [&](size_t b) {
+                const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, layer.count);
+                kernels.project_backward(s.view, g, begin, end, d.projected.data(), d.first_slot.data(), first,
+                                         channels, grads);
             });
             if (in.view)
-                for (size_t b = 0; b < blocks; ++b)
+                for (size_t b = 0; b < blocks_of(layer); ++b)
                     for (int k = 0; k < 12; ++k) view_total[k] += view_parts[b * 12 + k];
-        }
+        };
+        to_fields(s.still, in.still, r.still, 0);
+        for (int t = 0; t < s.times; ++t) to_fields(s.moving, in.moving, r.moving[t], t);
     }
     if (in.view)
         for (int k = 0; k < 12; ++k) in.view[k] = float(view_total[k]);
-    if (in.background && !s.background_is_image)
-        for (int k = 0; k < s.channels; ++k) in.background[k] = float(background_total[k]);
 }
 
 }  // namespace evsplat

@@ -1,4 +1,8 @@
 // One render of T times and its gradient: splits the work into pieces for the kernels.
+//
+// Gaussians come in two layers: those that move, with a place per time, and those that stand still.
+// The still ones are projected and sorted once; a tile that nothing moving touches is composited once
+// for all the times at which that is so.
 #pragma once
 
 #include <memory>
@@ -10,44 +14,63 @@
 namespace evsplat {
 
 // A field with a leading axis of times; `step` = 0 where one value serves all.
-struct Field {
-    const float* data = nullptr;
+template <class T>
+struct FieldOf {
+    T* data = nullptr;
     size_t step = 0;
+
+    T* at(size_t time) const { return data ? data + time * step : nullptr; }
 };
 
-struct GradField {
-    float* data = nullptr;
-    size_t step = 0;
+template <class T>
+struct LayerOf {
+    FieldOf<T> means, quats, scales, opacities, values, linear, offset;
 };
+
+struct Layer : LayerOf<const float> {
+    uint32_t count = 0;
+};
+
+using LayerGrads = LayerOf<float>;  // added to; may be null
 
 struct Scene {
     View view;
     int times, channels;
-    uint32_t count;
-    Field means, quats, scales, opacities, values, linear, offset;
-    Field background;  // step is per channel: (C,) or, with background_is_image, (H, W, C)
+    Layer moving, still;
+    const float* background;  // null, (C) or, with background_is_image, (H, W, C)
     bool background_is_image;
 };
 
-// What the backward pass of one time needs; grows with what is drawn.
-struct Drawn {
+// A layer at one time: its Gaussians on the screen and their intersections, by tile.
+struct Binned {
     Buffer<Projected> projected;
-    Buffer<uint32_t> first_slot;   // (N + 1)
-    Buffer<Entry> entries;
+    Buffer<uint32_t> first_slot;   // (N + 1), from 0
     Buffer<uint32_t> tile_begin;   // (tiles + 1)
-    Buffer<uint32_t> patch_end;
-    Buffer<float> final_t;
-    Buffer<int32_t> last;
+    Buffer<Entry> entries;         // in a tile that something moving touches: with the still ones
+    size_t slots = 0, slot_base = 0;
+
+    uint32_t in_tile(size_t tile) const { return tile_begin[tile + 1] - tile_begin[tile]; }
 };
 
+// What the backward pass needs; grows with what is drawn.
 struct Record {
     const Kernels* kernels;
-    std::vector<Drawn> times;
+    Binned still;
+    std::vector<Binned> moving;    // (T)
+    // Per picture of a tile (see TileWork); `picture` counts them, per tile.
+    Buffer<uint32_t> picture;      // (tiles + 1)
+    Buffer<float> final_t;
+    Buffer<int32_t> last;
+    Buffer<uint32_t> patch_end;
+
     size_t bytes() const;
+    size_t intersections() const;  // pairs of Gaussian and tile that are composited
+    size_t patch_steps() const;    // the same with patches
 };
 
-// image (T, C, H, W), alpha (T, H, W), radii (T, N) are written.
-std::unique_ptr<Record> render_forward(const Scene&, int threads, float* image, float* alpha, int32_t* radii);
+// image (T, C, H, W), alpha (T, H, W), radii (T, moving) and still_radii are written.
+std::unique_ptr<Record> render_forward(const Scene&, int threads, float* image, float* alpha, int32_t* radii,
+                                       int32_t* still_radii);
 
 struct OutputGrads {
     const float *image_data = nullptr, *alpha_data = nullptr;  // null: zero
@@ -56,9 +79,9 @@ struct OutputGrads {
 };
 
 struct InputGrads {
-    GradField means, quats, scales, opacities, values, linear, offset;  // added to; may be null
-    float* view = nullptr;        // (12)
-    float* background = nullptr;  // (C) or (H, W, C)
+    LayerGrads moving, still;
+    float* view = nullptr;        // (12), written
+    float* background = nullptr;  // (C), written, or (H, W, C), added to
 };
 
 void render_backward(const Scene&, const Record&, int threads, const OutputGrads&, const InputGrads&);

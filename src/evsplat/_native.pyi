@@ -2,6 +2,9 @@
 
 from torch import Tensor
 
+Fields = list[Tensor | None]
+"""Means, quats, scales, opacities, channels, linear, 2-D offset."""
+
 class Render:
     """One render of T times; keeps what its backward pass needs."""
 
@@ -12,29 +15,19 @@ class Render:
         K: Tensor,
         world_to_camera: Tensor,
         near: float,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        channels: Tensor,
-        linear: Tensor | None,
-        offset: Tensor | None,
+        moving: Fields,
+        still: Fields,
         background: Tensor | None,
         times: int,
         threads: int,
     ) -> None: ...
-    def forward(self, image: Tensor, alpha: Tensor, radii: Tensor) -> None: ...
+    def forward(self, image: Tensor, alpha: Tensor, radii: Tensor, still_radii: Tensor) -> None: ...
     def backward(
         self,
         image_grad: Tensor | None,
         alpha_grad: Tensor | None,
-        means: Tensor | None,
-        quats: Tensor | None,
-        scales: Tensor | None,
-        opacities: Tensor | None,
-        channels: Tensor | None,
-        linear: Tensor | None,
-        offset: Tensor | None,
+        moving: Fields,
+        still: Fields,
         view: Tensor | None,
         background: Tensor | None,
     ) -> None: ...

@@ -94,8 +94,12 @@ def test_placement_teaches_the_attribute_only_with_straight_through(
 def test_every_network_and_attribute_gets_a_gradient(tiny_capture):
     model, times, center = model_of(tiny_capture())
     activate(model)
-    splats = model.at(times, center).splats()
-    fields = (splats.means, splats.quats, splats.scales, splats.opacities, splats.channels)
+    posed = model.at(times, center)
+    fields = [
+        value
+        for splats in (posed.moving(), posed.static())
+        for value in (splats.means, splats.quats, splats.scales, splats.opacities, splats.channels)
+    ]
     generator = torch.Generator().manual_seed(0)
     sum((f * torch.randn(f.shape, generator=generator)).sum() for f in fields).backward()
     silent = [

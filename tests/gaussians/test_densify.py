@@ -164,7 +164,7 @@ def test_statistics_average_ndc_gradients_over_the_renders_that_drew_a_row():
     statistics = ScreenStatistics.zeros(2, torch.device("cpu"))
     gradient = torch.tensor([[[3e-6, 0.0], [1.0, 1.0]], [[0.0, 4e-6], [0.0, 0.0]]])
     radii = torch.tensor([[4, 0], [9, 0]])
-    statistics.add(gradient, radii, width=200, height=100)
+    statistics.add(slice(0, 2), gradient, radii, width=200, height=100)
     # Two renders share one mean loss, hence the factor 2 for each: 2 * 100 * 3e-6, 2 * 50 * 4e-6.
     assert statistics.mean_gradient().tolist() == pytest.approx([(6e-4 + 4e-4) / 2, 0.0])
     assert statistics.radius_px.tolist() == [9, 0]

@@ -65,24 +65,33 @@ def random_scene(
     return splats, PlainCamera(width, height, K, pose)
 
 
-def all_gradients(splats, camera, *, backend, dtype, background=None, seed=0):
+def all_gradients(splats, camera, *, backend, dtype, static=None, background=None, seed=0):
     """The render and the gradient of a fixed random projection of it, for every input."""
-    leaves = {
-        field.name: getattr(splats, field.name).to(dtype).clone().requires_grad_()
-        for field in fields(Splats)
-        if getattr(splats, field.name) is not None
-    }
-    inputs = Splats(**leaves)
-    times, count = splats.means.shape[:2]
-    leaves["offset"] = torch.zeros(times, count, 2, dtype=dtype, requires_grad=True)
+
+    def leaves_of(layer):
+        leaves = {
+            field.name: getattr(layer, field.name).to(dtype).clone().requires_grad_()
+            for field in fields(Splats)
+            if getattr(layer, field.name) is not None
+        }
+        shape = (*layer.means.shape[:2], 2)
+        leaves["centers2d_offset"] = torch.zeros(shape, dtype=dtype, requires_grad=True)
+        return leaves
+
+    leaves = leaves_of(splats)
+    inputs, still = Splats(**leaves), None
+    if static is not None:
+        of_static = leaves_of(static)
+        still = Splats(**of_static)
+        leaves |= {f"static {name}": leaf for name, leaf in of_static.items()}
     leaves["pose"] = camera.world_to_camera.to(dtype).clone().requires_grad_()
     if background is not None:
         leaves["background"] = background.to(dtype).clone().requires_grad_()
     out = render(
         inputs,
         replace(camera, world_to_camera=leaves["pose"]),
+        static=still,
         background=leaves.get("background"),
-        centers2d_offset=leaves["offset"],
         backend=backend,
     )
     generator = torch.Generator().manual_seed(seed)

@@ -105,13 +105,12 @@ def test_reference_gradients_equal_finite_differences():
     ]
 
     def function(*values):
-        *splats, offset, background, pose = values
+        *splats, background, pose = values
         camera = _Camera(6, 5, K, pose)
         out = render(
             Splats(*splats),
             camera,
             background=background,
-            centers2d_offset=offset,
             backend="reference",
         )
         return out.image, out.alpha

@@ -3,7 +3,7 @@
 from evsplat.gaussians.densify import DensifyConfig, Edit, ScreenStatistics, densify
 from evsplat.gaussians.flip import BodyFrames, flip_labels
 from evsplat.gaussians.gaussian_set import ATTRIBUTES, FEATURE_DIM, GaussianSet, Part
-from evsplat.gaussians.posed import Parts, PosedGaussians, PosedHuman, StaticScene
+from evsplat.gaussians.posed import PosedGaussians, PosedHuman, StaticScene
 from evsplat.gaussians.row_adam import RowAdam
 
 __all__ = [
@@ -14,7 +14,6 @@ __all__ = [
     "Edit",
     "GaussianSet",
     "Part",
-    "Parts",
     "PosedGaussians",
     "PosedHuman",
     "RowAdam",

@@ -59,19 +59,25 @@ class ScreenStatistics:
 
     def add(
         self,
-        centers_gradient: Float[Tensor, "T N 2"],
-        radii: Int[Tensor, "T N"],
+        rows: slice,
+        centers_gradient: Float[Tensor, "T M 2"],
+        radii: Int[Tensor, "T M"],
         width: int,
         height: int,
     ) -> None:
-        """Count T renders; gradients are of the loss with respect to centres in pixels."""
+        """Count T renders of the M Gaussians of ``rows``.
+
+        Gradients are of the loss with respect to centres in pixels; one time for Gaussians that
+        are the same in all renders.
+        """
         # The T renders share one mean loss; 3DGS's threshold is for the loss of a single view.
         scale = centers_gradient.new_tensor([width / 2, height / 2]) * len(centers_gradient)
         visible = radii > 0
         norms = (centers_gradient * scale).norm(dim=-1) * visible
-        self.gradient_sum += norms.sum(0)
-        self.seen += visible.sum(0)
-        torch.maximum(self.radius_px, radii.amax(0).float(), out=self.radius_px)
+        self.gradient_sum[rows] += norms.sum(0)
+        self.seen[rows] += visible.sum(0)
+        radius = self.radius_px[rows]
+        torch.maximum(radius, radii.amax(0).float(), out=radius)
 
     def mean_gradient(self) -> Float[Tensor, " N"]:
         """Mean gradient per render in which the Gaussian was drawn."""

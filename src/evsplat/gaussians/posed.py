@@ -1,15 +1,12 @@
 """The Gaussian set at given times: everything in world space, ready to be drawn."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.render import Splats
-
-Parts = Literal["all", "human", "scene"]
 
 
 @dataclass(frozen=True)
@@ -52,40 +49,26 @@ class PosedGaussians:
         """Number of times T."""
         return len(self.human.means)
 
-    def splats(self, parts: Parts = "all") -> Splats:
-        """What the rasteriser draws: channels are RGB and the semantic attribute, person first."""
-        person, scene, times = self.human, self.scene, self.times
-        human_channels = torch.cat(
-            [person.rgb, self.human_semantics[None, :, None].expand(times, -1, 1)], dim=-1
-        )
-        if parts == "human":
-            return Splats(
-                person.means,
-                person.quaternions,
-                person.scales,
-                self.human_opacities,
-                human_channels,
-                person.transforms[..., :3, :3],
-            )
-        scene_channels = torch.cat([scene.rgb, self.scene_semantics[:, None]], dim=-1)
-        if parts == "scene":
-            return Splats(
-                scene.means[None],
-                scene.quaternions,
-                scene.scales,
-                self.scene_opacities,
-                scene_channels[None],
-            )
-
-        def join(human: Tensor, static: Tensor) -> Tensor:
-            return torch.cat([human, static.expand(times, *static.shape)], dim=1)
-
-        identity = torch.eye(3, dtype=scene.means.dtype, device=scene.means.device)
+    def moving(self) -> Splats:
+        """What the rasteriser draws of the person; channels are RGB and the semantic attribute."""
+        person = self.human
+        semantics = self.human_semantics[None, :, None].expand(self.times, -1, 1)
         return Splats(
-            join(person.means, scene.means),
-            join(person.quaternions, scene.quaternions),
-            join(person.scales, scene.scales),
-            torch.cat([self.human_opacities, self.scene_opacities]),
-            join(human_channels, scene_channels),
-            join(person.transforms[..., :3, :3], identity.expand(len(scene.means), 3, 3)),
+            person.means,
+            person.quaternions,
+            person.scales,
+            self.human_opacities,
+            torch.cat([person.rgb, semantics], dim=-1),
+            person.transforms[..., :3, :3],
+        )
+
+    def static(self) -> Splats:
+        """The same of the scene, one for all times."""
+        scene = self.scene
+        return Splats(
+            scene.means[None],
+            scene.quaternions,
+            scene.scales,
+            self.scene_opacities,
+            torch.cat([scene.rgb, self.scene_semantics[:, None]], dim=-1)[None],
         )

@@ -16,8 +16,8 @@ def render(
     splats: Splats,
     camera: PinholeCamera,
     *,
+    static: Splats | None = None,
     background: Float[Tensor, "C"] | Float[Tensor, "H W C"] | None = None,
-    centers2d_offset: Float[Tensor, "T N 2"] | None = None,
     backend: BackendName = "auto",
     near: float = 0.01,
 ) -> RenderOutput:
@@ -25,18 +25,25 @@ def render(
 
     EWA projection with a low-pass of 0.3 px^2, alpha at most 0.999, contributions under 1/255
     left out, stop before the transmittance would reach 1e-4. Gaussians nearer than ``near`` metres
-    or with NaN in their geometry are not drawn. Gradients go to every field of ``splats``, to
-    ``background``, ``camera.world_to_camera`` and ``centers2d_offset`` (added to the projected
-    centres, pixels), not to ``camera.K``.
+    or with NaN in their geometry are not drawn. Gradients go to every field of ``splats`` and
+    ``static``, to ``background`` and ``camera.world_to_camera``, not to ``camera.K``.
+
+    ``static`` are more Gaussians of the same picture, the same at all times. The native backend
+    projects and sorts them once, and composites tiles that no other Gaussian touches once for all
+    times; the result is that of passing them in ``splats`` at each time.
     """
     if backend not in get_args(BackendName):
         raise BackendError(
             f"Unknown render backend {backend!r}; choose one of {', '.join(get_args(BackendName))}."
         )
-    fields = _with_times(splats)
-    _check(fields, camera, background, centers2d_offset)
-    if centers2d_offset is not None and centers2d_offset.ndim == 2:
-        centers2d_offset = centers2d_offset[None]
+    splats = splats.with_times()
+    times = _check_splats(splats, "")
+    if static is not None:
+        static = static.with_times()
+        if _check_splats(static, "static.") != 1:
+            raise BackendError("render: static Gaussians have no axis of times but 1.")
+        _check_alike(splats, static)
+    _check_camera(splats, camera, background)
 
     device = splats.means.device
     if backend == "auto" and device.type != "cpu":
@@ -44,78 +51,67 @@ def render(
             f"No render backend for device {device} in this version; move the tensors to the CPU, "
             "or ask for backend='reference', which is slow."
         )
-    if backend == "reference":
-        return reference.render(fields, camera, background, centers2d_offset, near)
-    return native.render(fields, camera, background, centers2d_offset, near)
+    draw = reference.render if backend == "reference" else native.render
+    return draw(splats, static, times, camera, background, near)
 
 
-def _with_times(splats: Splats) -> Splats:
-    """Add the leading axis of times where it was left out."""
-
-    def lead(value: Tensor | None, ndim: int) -> Tensor | None:
-        return value[None] if value is not None and value.ndim == ndim - 1 else value
-
-    return Splats(
-        means=lead(splats.means, 3),  # type: ignore[arg-type]
-        quats=lead(splats.quats, 3),  # type: ignore[arg-type]
-        scales=lead(splats.scales, 3),  # type: ignore[arg-type]
-        opacities=lead(splats.opacities, 2),  # type: ignore[arg-type]
-        channels=lead(splats.channels, 3),  # type: ignore[arg-type]
-        linear=lead(splats.linear, 4),
-    )
-
-
-def _check(
-    splats: Splats, camera: PinholeCamera, background: Tensor | None, offset: Tensor | None
-) -> None:
-    """Refuse shapes, devices and types that do not fit together, naming the field."""
+def _check_splats(splats: Splats, prefix: str) -> int:
+    """Refuse shapes, devices and types that do not fit together; returns the number of times."""
     means = splats.means
     if means.ndim != 3:
-        raise BackendError(f"render: means has shape {tuple(means.shape)}, expected (T, N, 3).")
+        raise BackendError(
+            f"render: {prefix}means has shape {tuple(means.shape)}, expected (T, N, 3)."
+        )
     count = means.shape[1]
-    inner: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
-        "means": (means, (count, 3)),
-        "quats": (splats.quats, (count, 4)),
-        "scales": (splats.scales, (count, 3)),
-        "opacities": (splats.opacities, (count,)),
-        "channels": (splats.channels, (count, max(1, splats.channels.shape[-1]))),
-        "linear": (splats.linear, (count, 3, 3)),
-        "centers2d_offset": (
-            offset[None] if offset is not None and offset.ndim == 2 else offset,
-            (count, 2),
-        ),
+    inner: dict[str, tuple[int, ...]] = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "opacities": (count,),
+        "channels": (count, max(1, splats.channels.shape[-1])),
+        "linear": (count, 3, 3),
+        "centers2d_offset": (count, 2),
     }
-    times = max(value.shape[0] for value, _ in inner.values() if value is not None)
-    for name, (value, shape) in inner.items():
-        if value is None:
-            continue
-        if tuple(value.shape[1:]) != shape or value.shape[0] not in (1, times):
+    values = {name: getattr(splats, name) for name in inner}
+    values = {name: value for name, value in values.items() if value is not None}
+    times = max(len(value) for value in values.values())
+    for name, value in values.items():
+        shape = inner[name]
+        if tuple(value.shape[1:]) != shape or len(value) not in (1, times):
             expected = ", ".join(str(size) for size in shape)
             raise BackendError(
-                f"render: {name} has shape {tuple(value.shape)}, expected (T, {expected}) "
+                f"render: {prefix}{name} has shape {tuple(value.shape)}, expected (T, {expected}) "
                 f"with T = 1 or {times}."
             )
+        _check_type(f"{prefix}{name}", value, means)
+    return times
+
+
+def _check_type(name: str, tensor: Tensor, means: Tensor) -> None:
+    if not tensor.is_floating_point() or tensor.dtype != means.dtype:
+        raise BackendError(f"render: {name} is {tensor.dtype}, but means is {means.dtype}.")
+    if tensor.device != means.device:
+        raise BackendError(f"render: {name} is on {tensor.device}, but means is on {means.device}.")
+
+
+def _check_alike(splats: Splats, static: Splats) -> None:
+    _check_type("static.means", static.means, splats.means)
+    channels, more = splats.channels.shape[-1], static.channels.shape[-1]
+    if channels != more:
+        raise BackendError(f"render: static has {more} channels, but splats has {channels}.")
+
+
+def _check_camera(splats: Splats, camera: PinholeCamera, background: Tensor | None) -> None:
     width, height, channels = camera.width, camera.height, splats.channels.shape[-1]
     if width < 1 or height < 1:
         raise BackendError(f"render: the camera's image is {width} x {height} pixels.")
-    if background is not None and tuple(background.shape) not in (
-        (channels,),
-        (height, width, channels),
-    ):
-        raise BackendError(
-            f"render: background has shape {tuple(background.shape)}, "
-            f"expected ({channels},) or ({height}, {width}, {channels})."
-        )
-    tensors = {name: value for name, (value, _) in inner.items()} | {"background": background}
-    for name, tensor in tensors.items():
-        if tensor is None:
-            continue
-        if not tensor.is_floating_point() or tensor.dtype != means.dtype:
-            raise BackendError(f"render: {name} is {tensor.dtype}, but means is {means.dtype}.")
-        if tensor.device != means.device:
+    if background is not None:
+        if tuple(background.shape) not in ((channels,), (height, width, channels)):
             raise BackendError(
-                f"render: {name} is on {tensor.device}, but means is on {means.device}."
+                f"render: background has shape {tuple(background.shape)}, "
+                f"expected ({channels},) or ({height}, {width}, {channels})."
             )
+        _check_type("background", background, splats.means)
     K = camera.K.detach()
     if tuple(K.shape) != (3, 3) or tuple(camera.world_to_camera.shape) != (4, 4):
         raise BackendError("render: the camera needs a (3, 3) K and a (4, 4) world_to_camera.")

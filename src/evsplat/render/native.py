@@ -1,5 +1,6 @@
 """The compiled CPU backend: float32, any number of times and channels, gradients in C++."""
 
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -13,9 +14,10 @@ from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
 def render(
     splats: Splats,
+    static: Splats | None,
+    times: int,
     camera: PinholeCamera,
     background: Tensor | None,
-    offset: Tensor | None,
     near: float,
 ) -> RenderOutput:
     """Draw with the native kernels; fields have their leading axis of times."""
@@ -30,64 +32,75 @@ def render(
             f"The native render backend needs float32 tensors on the CPU, not {means.dtype} on "
             f"{means.device}; convert them, or ask for backend='reference'."
         )
-    image, alpha, radii = _Rasterize.apply(
-        means, splats.quats, splats.scales, splats.opacities, splats.channels, splats.linear,
-        offset, background, camera.world_to_camera, camera.K, camera.width, camera.height, near,
+    image, alpha, radii, static_radii = _Rasterize.apply(
+        times, camera.width, camera.height, camera.K, near,
+        camera.world_to_camera, background, *_fields(splats), *_fields(static),
     )  # fmt: skip
-    return RenderOutput(image, alpha, radii)
+    return RenderOutput(image, alpha, radii, static_radii)
 
 
-def _plain(tensor: Tensor) -> Tensor:
+_FIELDS = len(fields(Splats))
+
+
+def _fields(splats: Splats | None) -> list[Tensor | None]:
+    """The fields in their order, as the module takes them."""
+    return [None if splats is None else getattr(splats, f.name) for f in fields(Splats)]
+
+
+def _plain(tensor: Tensor | None) -> Tensor | None:
     """Contiguous float32 without gradient, as the module takes it."""
-    return tensor.detach().to("cpu", torch.float32).contiguous()
+    return None if tensor is None else tensor.detach().to("cpu", torch.float32).contiguous()
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
-        *fields, pose, K, width, height, near = inputs
-        means, quats, scales, opacities, values = (_plain(f) for f in fields[:5])
-        linear, offset, background = (None if f is None else _plain(f) for f in fields[5:])
-        times = max(f.shape[0] for f in fields[:-1] if f is not None)
-        count, channels = means.shape[1], values.shape[2]
+    def forward(
+        ctx: Any, times: int, width: int, height: int, K: Tensor, near: float, *inputs: Any
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        pose, background, *layers = map(_plain, inputs)
+        moving, still = layers[:_FIELDS], layers[_FIELDS:]
+        means, channels = moving[0], moving[4]
+        assert means is not None and channels is not None
+        still_count = 0 if still[0] is None else still[0].shape[1]
         try:
             job = native.Render(
-                width, height, _plain(K), _plain(pose), near, means, quats, scales, opacities,
-                values, linear, offset, background, times, torch.get_num_threads(),
+                width, height, _plain(K), pose, near, moving, still if still_count else [],
+                background, times, torch.get_num_threads(),
             )  # fmt: skip
-            image = torch.empty(times, channels, height, width, dtype=torch.float32)
-            alpha = torch.empty(times, height, width, dtype=torch.float32)
-            radii = torch.empty(times, count, dtype=torch.int32)
-            job.forward(image, alpha, radii)
+            image = torch.empty(times, channels.shape[2], height, width)
+            alpha = torch.empty(times, height, width)
+            radii = torch.empty(times, means.shape[1], dtype=torch.int32)
+            still_radii = torch.empty(1, still_count, dtype=torch.int32)
+            job.forward(image, alpha, radii, still_radii)
         except (RuntimeError, ValueError) as error:
             raise BackendError(f"The native render backend failed: {error}.") from error
         # Planar in memory, which is what the kernels and convolutions like.
         image = image.permute(0, 2, 3, 1)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii)
+        ctx.mark_non_differentiable(radii, still_radii)
         ctx.job = job
-        ctx.save_for_backward(*fields, pose)
-        return image, alpha, radii
+        ctx.save_for_backward(*inputs)
+        return image, alpha, radii, still_radii
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, image_grad: Tensor | None, alpha_grad: Tensor | None, _: None) -> Any:
+    def backward(ctx: Any, *upstream: Tensor | None) -> Any:
         # Reading saved_tensors also refuses inputs that were changed in place since.
-        *fields, pose = ctx.saved_tensors
+        inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[5:]
+        image_grad, alpha_grad, *_ = upstream
         if image_grad is None and alpha_grad is None:
-            return (None,) * 13
-        needed = ctx.needs_input_grad
-        grads = [
-            torch.zeros(f.shape, dtype=torch.float32) if f is not None and need else None
-            for f, need in zip(fields, needed, strict=False)
+            return (None,) * (5 + len(inputs))
+        _, background, *layers = [
+            torch.zeros(tensor.shape) if tensor is not None and need else None
+            for tensor, need in zip(inputs, needed, strict=True)
         ]
-        view = torch.zeros(12, dtype=torch.float32) if needed[8] else None
-        *gaussians, background = grads
-        ctx.job.backward(image_grad, alpha_grad, *gaussians, view, background)
-        pose_grad = None
+        view = torch.zeros(12) if needed[0] else None
+        moving, still = layers[:_FIELDS], layers[_FIELDS:]
+        ctx.job.backward(image_grad, alpha_grad, moving, still, view, background)
+        pose = None
         if view is not None:
-            pose_grad = torch.zeros(4, 4, dtype=torch.float32)
-            pose_grad[:3, :3] = view[:9].view(3, 3)
-            pose_grad[:3, 3] = view[9:]
-            pose_grad = pose_grad.to(pose.dtype)
-        return *grads, pose_grad, None, None, None, None
+            pose = torch.zeros(4, 4)
+            pose[:3, :3] = view[:9].view(3, 3)
+            pose[:3, 3] = view[9:]
+            pose = pose.to(inputs[0].dtype)
+        return *(None,) * 5, pose, background, *layers

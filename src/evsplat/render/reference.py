@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
+from evsplat.render.splats import PinholeCamera, RenderOutput, Splats, join
 
 # The rules of gsplat 1.5.3 (cuda/csrc/ProjectionEWA3DGSFused.cu, RasterizeToPixels3DGSFwd.cu).
 EPS_2D = 0.3
@@ -23,24 +23,27 @@ _PAIRS_PER_CHUNK = 1 << 19
 
 def render(
     splats: Splats,
+    static: Splats | None,
+    times: int,
     camera: PinholeCamera,
     background: Tensor | None,
-    offset: Tensor | None,
     near: float,
 ) -> RenderOutput:
     """Draw tile by tile, all pairs of a tile's pixels and Gaussians at once."""
-    s = splats
-    fields = (s.means, s.quats, s.scales, s.opacities, s.channels, s.linear, offset)
-    times = max(f.shape[0] for f in fields if f is not None)
+    s = splats if static is None else join(splats, static, times)
+    fields = (
+        s.means, s.quats, s.scales, s.opacities, s.channels, s.linear, s.centers2d_offset
+    )  # fmt: skip
     drawn = [
         _draw([None if f is None else f[t if len(f) > 1 else 0] for f in fields], camera, near)
         for t in range(times)
     ]
-    images, alphas, all_radii = zip(*drawn, strict=True)
-    image, alpha, radii = torch.stack(images), torch.stack(alphas), torch.stack(all_radii)
+    images, alphas, radii = zip(*drawn, strict=True)
+    image, alpha, all_radii = torch.stack(images), torch.stack(alphas), torch.stack(radii)
     if background is not None:
         image = image + (1 - alpha)[..., None] * background
-    return RenderOutput(image, alpha, radii)
+    count = splats.means.shape[1]
+    return RenderOutput(image, alpha, all_radii[:, :count], all_radii[:1, count:])
 
 
 def _draw(

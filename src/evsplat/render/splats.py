@@ -1,8 +1,9 @@
 """What goes into rendering and what comes out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -43,6 +44,48 @@ class Splats:
     """What is composited, any number of channels."""
     linear: Float[Tensor, "T N 3 3"] | None = None
     """L in covariance = (L R S)(L R S)^T: a skinning matrix with its shear. None: identity."""
+    centers2d_offset: Float[Tensor, "T N 2"] | None = None
+    """Added to the projected centres, pixels: its gradient is theirs. None: zero."""
+
+    def with_times(self) -> "Splats":
+        """Every field with a leading axis of times, of size 1 where it was left out."""
+        per_gaussian = {"opacities": 0, "linear": 2}
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Splats(
+            **{
+                name: value[None]
+                if value is not None and value.ndim == 1 + per_gaussian.get(name, 1)
+                else value
+                for name, value in given.items()
+            }
+        )
+
+
+def join(first: Splats, second: Splats, times: int) -> Splats:
+    """Both sets in one, at each of ``times`` times; both have their axis of times."""
+
+    def both(a: Tensor, b: Tensor) -> Tensor:
+        times_of_both = 1 if len(a) == len(b) == 1 else times
+        wide = [value.expand(times_of_both, *value.shape[1:]) for value in (a, b)]
+        return torch.cat(wide, dim=1)
+
+    identity = torch.eye(3, dtype=first.means.dtype, device=first.means.device)
+    parts = []
+    for splats in (first, second):
+        count = splats.means.shape[1]
+        linear, offset = splats.linear, splats.centers2d_offset
+        parts.append(
+            (
+                splats.means,
+                splats.quats,
+                splats.scales,
+                splats.opacities,
+                splats.channels,
+                identity.expand(1, count, 3, 3) if linear is None else linear,
+                splats.means.new_zeros(1, count, 2) if offset is None else offset,
+            )
+        )
+    return Splats(*(both(a, b) for a, b in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -55,3 +98,5 @@ class RenderOutput:
     """Coverage in [0, 1)."""
     radii: Int[Tensor, "T N"]
     """Radius on the screen in pixels, rounded up; 0 = not drawn."""
+    static_radii: Int[Tensor, "1 S"]
+    """The same of the static Gaussians."""

@@ -16,9 +16,8 @@ from evsplat.config import load_yaml, to_dict
 from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
-from evsplat.gaussians import Parts
 from evsplat.methods import TRAINABLE, PaperConfig, method_config
-from evsplat.methods.reconstruction import Reconstruction, Rendering
+from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
 from evsplat.render import choose_device, render
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, load_model
 
@@ -107,7 +106,11 @@ class GaussianReconstruction:
         with torch.no_grad():
             camera = camera.to(self.model.box_low.device)
             posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
-            output = render(posed.splats(parts), camera)
+            if parts == "scene":
+                output = render(posed.static(), camera)
+            else:
+                static = posed.static() if parts == "all" else None
+                output = render(posed.moving(), camera, static=static)
         times = len(times_us)
 
         def all_times(values: torch.Tensor) -> torch.Tensor:

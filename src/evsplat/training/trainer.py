@@ -1,7 +1,7 @@
 """The training loop: draw a frame, render what the objectives need, compare, step, densify."""
 
 import logging
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from evsplat.gaussians.densify import reset_opacities
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import weight_at
 from evsplat.objectives import Step
-from evsplat.render import RenderOutput, render
+from evsplat.render import Splats, render
 from evsplat.training.checkpoint import below, flatten, load_model
 from evsplat.training.clock import Clock
 from evsplat.training.optimiser import Optimiser
@@ -63,10 +63,8 @@ class Trainer:
         camera = self.capture.camera(frame).to(self.device)
         noise = self.model.draw_noise(len(times), generator)
         posed = self.model.at(times, camera.center(), noise=noise, share_skinning=True)
-        splats = posed.splats()
-        shape = (len(times), splats.means.shape[1], 2)
-        centers = torch.zeros(shape, device=self.device, requires_grad=True)
-        output = render(splats, camera, centers2d_offset=centers)
+        moving, static = _with_centers(posed.moving()), _with_centers(posed.static())
+        output = render(moving, camera, static=static)
         rgb, semantic = output.image[..., :3], output.image[..., 3]
         step = Step(
             self.capture, self.model, frame, tuple(times), rgb, semantic, posed, nominal, generator
@@ -90,7 +88,15 @@ class Trainer:
             return None
         self.bad_steps = 0
         self.optimiser.step(nominal)
-        self._after_step(centers, output, frame, nominal)
+        height, width = output.alpha.shape[1:]
+        gaussians = self.model.gaussians
+        for rows, layer, radii in (
+            (gaussians.human, moving, output.radii),
+            (gaussians.scene, static, output.static_radii),
+        ):
+            assert layer.centers2d_offset is not None and layer.centers2d_offset.grad is not None
+            self.statistics.add(rows, layer.centers2d_offset.grad, radii, width, height)
+        self._edit(frame, nominal)
         drawn = rgb.detach()[step.index(frame.mid_us)]
         error = (drawn.clamp(0, 1) - self.capture.image(frame).to(drawn)).square().mean()
         return StepReport(float(loss.detach()), values, float(-10 * torch.log10(error)))
@@ -140,13 +146,8 @@ class Trainer:
             self.queue = order.tolist()
         return frames[self.queue.pop()]
 
-    def _after_step(
-        self, centers: Tensor, output: RenderOutput, frame: Frame, nominal: float
-    ) -> None:
-        """Collect statistics; edit the set where the schedule crosses a densification step."""
-        assert centers.grad is not None
-        height, width = output.alpha.shape[1:]
-        self.statistics.add(centers.grad, output.radii, width, height)
+    def _edit(self, frame: Frame, nominal: float) -> None:
+        """Edit the set where the schedule crosses a densification step."""
         gaussians, rows = self.model.gaussians, self.optimiser.rows
         limits = self.composition.densify
         previous, self.previous_nominal = self.previous_nominal, nominal
@@ -180,3 +181,9 @@ class Trainer:
                 f"{culprits[0]}; the last good checkpoint is kept. Lower the weight of that term "
                 "with --set, or check the poses with `evsplat inspect`."
             )
+
+
+def _with_centers(layer: Splats) -> Splats:
+    """Ready to tell the gradients of the projected centres."""
+    shape = (*layer.means.shape[:2], 2)
+    return replace(layer, centers2d_offset=layer.means.new_zeros(shape).requires_grad_())
