@@ -1,31 +1,42 @@
 """Where the time of a whole training step goes, method `paper`.
 
-python benchmarks/step.py [CAPTURE] [--human N] [--threads T] [--steps S]
+python benchmarks/step.py [--size PX] [--human N] [--scene N] [--renders T] [--steps S]
 
-Forward times are those of the named parts; "backward" is the whole of it, with the native kernels
-inside listed below. The limit is the time of the step's matrix products at the core's measured
-multiply-add peak: the share says how much of the step is arithmetic that cannot be avoided. The
-last line is JSON with a unit in each key.
+Each part's forward time is that of its calls, its backward time that of the gradient nodes that
+its forward pass made; the stages of `render` are timed inside the native module. "rest" is what no
+part explains: Python, the loop and what lies between the parts. The limit is the time of the
+networks' matrix products at the core's measured multiply-add peak. The last line is JSON with a
+unit in each key.
 """
 
 import argparse
 import dataclasses
 import json
+import resource
+import shutil
 import statistics
+import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import h5py
+import numpy as np
 import torch
-from torch.profiler import ProfilerActivity, profile
+from PIL import Image
+from torch import Tensor
 
 from evsplat import _native
-from evsplat.capture import load_capture
+from evsplat.capture import Frame, load_capture
 from evsplat.cli.demo import demo_capture
 from evsplat.deform import human_scene
+from evsplat.gaussians import ATTRIBUTES, GaussianSet
 from evsplat.methods import PaperConfig, compose
+from evsplat.objectives.base import Stateless, Step
+from evsplat.render import native as native_backend
 from evsplat.training import trainer as trainer_module
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
@@ -34,51 +45,231 @@ from evsplat.training.trainer import Trainer
 def main() -> None:
     """Print the table and one line of JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("capture", nargs="?", type=Path, default=None)
-    parser.add_argument("--human", type=int, default=10_000)
+    parser.add_argument("--size", type=int, default=512, help="image side, px")
+    parser.add_argument("--human", type=int, default=20_000)
+    parser.add_argument("--scene", type=int, default=30_000)
+    parser.add_argument("--renders", type=int, default=2, help="times per step")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--steps", type=int, default=20)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    trainer = _trainer(arguments.capture or demo_capture(), arguments.human)
+    trainer = build(arguments.size, arguments.human, arguments.scene, arguments.renders)
     for _ in range(5):
         trainer.step()
 
     steps = [_timed(trainer.step) for _ in range(arguments.steps)]
     median, best = 1e3 * statistics.median(steps), 1e3 * min(steps)
-    gflop = _products(trainer) / 1e9
+    gflop = _products(trainer, arguments.renders) / 1e9
     peak = _peak() * arguments.threads
-    parts = _parts(trainer, arguments.steps)
-    print(f"step {median:.1f} ms (best {best:.1f}), {arguments.threads} thread(s)")
-    for name, seconds in parts.most_common():
-        print(f"  {name:28s} {1e3 * seconds:7.2f} ms  {1e5 * seconds / median:5.1f} %")
     limit = 1e3 * gflop / peak
-    print(f"matrix products {gflop:.1f} GFLOP: {limit:.1f} ms at {peak:.0f} GFLOP/s")
-    results = {
-        "human": arguments.human,
-        "scene": trainer.counts()["scene"],
+    forward, backward, stages = measure(trainer, arguments.steps)
+    counts = trainer.counts()
+    print(
+        f"step {median:.1f} ms (best {best:.1f}): {arguments.size} px, {counts['human']} person "
+        f"and {counts['scene']} scene Gaussians, {arguments.renders} renders, "
+        f"{arguments.threads} thread(s)"
+    )
+    print(f"  {'part':22s} {'forward':>8s} {'backward':>8s} ms   share")
+    parts = sorted(forward | backward, key=lambda part: -(forward[part] + backward[part]))
+    for part in parts:
+        share = 100 * (forward[part] + backward[part]) / median
+        print(f"  {part:22s} {forward[part]:8.2f} {backward[part]:8.2f}    {share:5.1f} %")
+    rest = median - forward.total() - backward.total()
+    print(f"  {'rest':22s} {rest:17.2f}    {100 * rest / median:5.1f} %")
+    print("  inside render: " + ", ".join(f"{k} {v:.2f} ms" for k, v in stages.items()))
+    print(f"  matrix products {gflop:.1f} GFLOP: {limit:.1f} ms at {peak:.0f} GFLOP/s")
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    results: dict[str, float] = {
+        "image_px": arguments.size,
+        "human": counts["human"],
+        "scene": counts["scene"],
+        "renders": arguments.renders,
         "threads": arguments.threads,
         "step_median_ms": round(median, 2),
         "step_best_ms": round(best, 2),
         "products_gflop": round(gflop, 2),
         "products_limit_percent": round(100 * limit / median, 1),
+        "peak_rss_mb": round(peak_mb),
     }
-    for name, seconds in parts.items():
-        results[f"{name.replace(' ', '_')}_ms"] = round(1e3 * seconds, 3)
+    for label, times in (("forward", forward), ("backward", backward), ("render", stages)):
+        for part, value in times.items():
+            results[f"{label}_{part.replace(' ', '_')}_ms"] = round(value, 3)
     print(json.dumps(results))
 
 
-def _trainer(path: Path, human: int) -> Trainer:
-    """A training in the middle of its schedule, where everything is switched on."""
+def build(size: int, human: int, scene: int, renders: int) -> Trainer:
+    """A training on the demo capture in the middle of its schedule, with everything switched on."""
     config = PaperConfig()
     config = dataclasses.replace(
         config,
         human=dataclasses.replace(config.human, count=human),
         densify_human=dataclasses.replace(config.densify_human, max_count=human),
     )
-    capture = load_capture(path)
+    folder = tempfile.TemporaryDirectory()
+    _KEPT.append(folder)
+    capture = load_capture(resized_demo(size, Path(folder.name)))
     composition = compose(config, capture, 0, fit=False)
+    composition.objectives.append(MoreTimes(renders))
+    composition.weights["more_times"] = 1e-6
+    composition.model.gaussians = with_scene_count(composition.model.gaussians, scene)
     return Trainer(composition, capture, Clock(100_000, fraction=0.4))
+
+
+_KEPT: list[tempfile.TemporaryDirectory[str]] = []
+
+
+def resized_demo(size: int, folder: Path) -> Path:
+    """The demo capture with pictures and events stretched to ``size`` pixels."""
+    shutil.copytree(demo_capture(), folder, dirs_exist_ok=True)
+    metadata = json.loads((folder / "capture.json").read_text())
+    factor = size / metadata["cameras"]["main"]["width"]
+    metadata["cameras"] = {"main": metadata["cameras"]["main"]}
+    metadata["novel_views"] = []
+    for plane in (metadata["cameras"]["main"], metadata["events"]):
+        plane["width"] = plane["height"] = size
+    K = np.array(metadata["cameras"]["main"]["K"])
+    K[:2] *= factor
+    metadata["cameras"]["main"]["K"] = K.tolist()
+    for path in folder.glob("[ims]*/*.webp"):
+        Image.open(path).resize((size, size)).save(path, lossless=True)
+    with h5py.File(folder / "events.h5", "r+") as events:
+        for axis in ("x", "y"):
+            events["events"][axis][:] = (events["events"][axis][:] * factor).astype(np.uint16)
+    (folder / "capture.json").write_text(json.dumps(metadata))
+    return folder
+
+
+def with_scene_count(gaussians: GaussianSet, count: int) -> GaussianSet:
+    """As many scene Gaussians as asked: some of them, or some twice."""
+    generator = torch.Generator().manual_seed(0)
+    human, scene = gaussians.human, gaussians.scene_count
+    rows = (
+        gaussians.human_count
+        + torch.cat(
+            [torch.randperm(scene, generator=generator) for _ in range(-(-count // scene))]
+        )[:count]
+    )
+    values = {name: getattr(gaussians, name).detach() for name in ATTRIBUTES}
+    return GaussianSet(
+        {name: value[human] for name, value in values.items()},
+        {name: value[rows] for name, value in values.items()},
+    )
+
+
+class MoreTimes(Stateless):
+    """Asks for times around a frame until there are enough, with a small loss on each."""
+
+    def __init__(self, renders: int) -> None:
+        self.renders = renders
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """Beside the frame's own and its neighbour's."""
+        return [frame.mid_us + 1_000 * k for k in range(1, self.renders - 1)]
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """Mean square of all that was drawn."""
+        return {"more_times": step.rgb.square().mean()}
+
+
+def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], dict[str, float]]:
+    """Milliseconds per step: forward and backward by part, and the stages of render."""
+    watch = Stopwatch()
+    model = trainer.model
+    watch.calls(model, "pose", "body pose")
+    watch.calls(model.pose_encoder, "forward", "pose encoder")
+    watch.calls(model.non_rigid.encoding, "forward", "position encoding")
+    watch.calls(model.non_rigid, "forward", "non-rigid network")
+    watch.calls(model.skinning, "forward", "skinning network")
+    watch.calls(human_scene, "skin", "blend skinning")
+    watch.calls(model.human_colour, "forward", "human colour")
+    watch.calls(model.scene_colour, "forward", "scene colour")
+    watch.calls(model, "at", "posing, rest")
+    watch.calls(trainer_module, "render", "render")
+    for objective in trainer.composition.objectives:
+        watch.calls(objective, "loss", f"loss {type(objective).__name__}")
+    watch.calls(trainer.optimiser, "step", "optimiser")
+    watch.calls(trainer.optimiser, "finite", "finite check")
+    jobs: list[Any] = []
+
+    def keep(*inputs: Any) -> Any:
+        jobs.append(_native.Render(*inputs))
+        return jobs[-1]
+
+    native_backend.native = SimpleNamespace(Render=keep)
+    for _ in range(steps):
+        trainer.step()
+        watch.nodes.clear()
+    native_backend.native = _native
+    threads = torch.get_num_threads()
+    stages: dict[str, float] = defaultdict(float)
+    for job in jobs:
+        for stage, seconds in job.seconds.items():
+            stages[stage] += 1e3 * seconds / threads / steps
+
+    def per_step(seconds: Counter[str]) -> Counter[str]:
+        return Counter({part: 1e3 * value / steps for part, value in seconds.items()})
+
+    return per_step(watch.forward), per_step(watch.backward), dict(stages)
+
+
+class Stopwatch:
+    """Time of the parts' calls, without the calls of parts inside, and of their gradients."""
+
+    def __init__(self) -> None:
+        self.forward: Counter[str] = Counter()
+        self.backward: Counter[str] = Counter()
+        self.nodes: dict[Any, str] = {}
+        self._inner = [0.0]
+
+    def calls(self, owner: Any, name: str, part: str) -> None:
+        """Watch all calls of ``owner.name``."""
+        call = getattr(owner, name)
+
+        def outer(*args: Any, **kwargs: Any) -> Any:
+            self._inner.append(0.0)
+            start = time.perf_counter()
+            result = call(*args, **kwargs)
+            own = time.perf_counter() - start
+            self.forward[part] += own - self._inner.pop()
+            self._claim(result, part)
+            # What is spent on watching belongs to nobody.
+            self._inner[-1] += time.perf_counter() - start
+            return result
+
+        setattr(owner, name, outer)
+
+    def _claim(self, result: Any, part: str) -> None:
+        """Time the gradient of every operation that led to ``result`` and has no part yet."""
+        waiting = [tensor.grad_fn for tensor in _tensors(result)]
+        while waiting:
+            node = waiting.pop()
+            if node is None or node in self.nodes or node.name().endswith("AccumulateGrad"):
+                continue
+            self.nodes[node] = part
+            since = [0.0]
+
+            def before(_: Any, since: list[float] = since) -> None:
+                since[0] = time.perf_counter()
+
+            def after(_: Any, __: Any, since: list[float] = since) -> None:
+                self.backward[part] += time.perf_counter() - since[0]
+
+            node.register_prehook(before)
+            node.register_hook(after)
+            waiting += [next_node for next_node, _ in node.next_functions]
+
+
+def _tensors(value: Any) -> Iterable[Tensor]:
+    if isinstance(value, Tensor):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        for inner in vars(value).values():
+            yield from _tensors(inner)
+    elif isinstance(value, dict):
+        yield from _tensors(list(value.values()))
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            yield from _tensors(inner)
 
 
 def _timed(call: Callable[[], object]) -> float:
@@ -87,47 +278,8 @@ def _timed(call: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def _parts(trainer: Trainer, steps: int) -> Counter[str]:
-    """Seconds per step of each part, forward by wrapping and backward by the profiler."""
-    seconds: Counter[str] = Counter()
-
-    def watch(owner: Any, name: str, label: str) -> None:
-        inner = getattr(owner, name)
-
-        def outer(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
-            result = inner(*args, **kwargs)
-            seconds[label] += (time.perf_counter() - start) / steps
-            return result
-
-        setattr(owner, name, outer)
-
-    model = trainer.model
-    watch(model, "pose", "body pose")
-    watch(model.pose_encoder, "forward", "pose encoder")
-    watch(model.non_rigid, "forward", "non-rigid network")
-    watch(model.skinning, "forward", "skinning network")
-    watch(human_scene, "skin", "blend skinning")
-    watch(model.human_colour, "forward", "human colour")
-    watch(model.scene_colour, "forward", "scene colour")
-    watch(trainer_module, "render", "render")
-    for objective in trainer.composition.objectives:
-        watch(objective, "loss", f"objective {type(objective).__name__}")
-    watch(torch.Tensor, "backward", "backward")
-    watch(trainer.optimiser, "step", "optimiser")
-    for _ in range(steps):
-        trainer.step()
-    with profile(activities=[ProfilerActivity.CPU]) as profiler:
-        for _ in range(steps):
-            trainer.step()
-    for event in profiler.key_averages():
-        if event.key in ("_NativeMLPBackward", "_RasterizeBackward", "_NativeSsimBackward"):
-            seconds[f"of it {event.key.strip('_')}"] = event.cpu_time_total / 1e6 / steps
-    return seconds
-
-
-def _products(trainer: Trainer) -> float:
-    """Floating-point operations of the networks' matrix products, forward and backward, 2 times."""
+def _products(trainer: Trainer, renders: int) -> float:
+    """Floating-point operations of the networks' matrix products, forward and backward."""
     model, counts = trainer.model, trainer.counts()
     human, scene = counts["human"], counts["scene"]
 
@@ -136,9 +288,10 @@ def _products(trainer: Trainer) -> float:
 
     non_rigid, skinning = model.non_rigid.mlp, model.skinning.mlp
     colour, backdrop = model.human_colour.mlp, model.scene_colour.mlp
-    rows = human * (non_rigid.point_weight.numel() + 2 * later(non_rigid))
+    rows = human * (non_rigid.point_weight.numel() + renders * later(non_rigid))
     rows += human * (skinning.point_weight.numel() + later(skinning))
-    rows += human * (colour.point_weight.numel() + 2 * (colour.both_weight.numel() + later(colour)))
+    rows += human * colour.point_weight.numel()
+    rows += human * renders * (colour.both_weight.numel() + later(colour))
     rows += scene * (backdrop.point_weight.numel() + later(backdrop))
     return 6.0 * rows
 

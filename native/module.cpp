@@ -126,6 +126,13 @@ class Render {
         render_backward(scene_, *record_, threads_, out, in);
     }
 
+    nb::dict seconds() const {
+        constexpr const char* names[] = {"project", "sort", "composite", "composite_backward", "project_backward"};
+        nb::dict result;
+        for (int i = 0; record_ && i < kStages; ++i) result[names[i]] = 1e-9 * double(record_->nanoseconds[i]);
+        return result;
+    }
+
     size_t bytes() const { return record_ ? record_->bytes() : 0; }
     size_t intersections() const { return record_ ? record_->intersections() : 0; }
     size_t patch_steps() const { return record_ ? record_->patch_steps() : 0; }
@@ -264,6 +271,7 @@ NB_MODULE(_native, m) {
              nb::arg("still_radii"))
         .def("backward", &Render::backward, nb::arg("image_grad").none(), nb::arg("alpha_grad").none(),
              nb::arg("moving"), nb::arg("still"), nb::arg("view").none(), nb::arg("background").none())
+        .def_prop_ro("seconds", &Render::seconds, "Work so far by stage, summed over threads.")
         .def_prop_ro("bytes", &Render::bytes, "Memory kept for the backward pass.")
         .def_prop_ro("intersections", &Render::intersections, "Pairs of Gaussian and tile.")
         .def_prop_ro("patch_steps", &Render::patch_steps, "Pairs of Gaussian and patch.");

@@ -1,7 +1,7 @@
 #include "rasterizer.h"
 
 #include <algorithm>
-#include <atomic>
+#include <chrono>
 #include <cstring>
 #include <exception>
 #include <stdexcept>
@@ -137,14 +137,29 @@ void merge(Entry* merged, uint32_t moving, const Projected* projected, const Ent
     }
 }
 
+// Adds the time since its start or the last lap to a stage.
+class Lap {
+  public:
+    explicit Lap(const Record& r) : record_(r) {}
+    void end(Stage stage) {
+        const auto now = std::chrono::steady_clock::now();
+        record_.nanoseconds[stage] += std::chrono::nanoseconds(now - since_).count();
+        since_ = now;
+    }
+
+  private:
+    const Record& record_;
+    std::chrono::steady_clock::time_point since_ = std::chrono::steady_clock::now();
+};
+
 Gaussians gaussians_at(const Layer& l, size_t t) {
     return {l.means.at(t), l.quats.at(t), l.scales.at(t), l.opacities.at(t), l.linear.at(t), l.offset.at(t), l.count};
 }
 
 // Projects a layer at one time and sorts its intersections into tiles. Gaussian 0 is called `first`.
 // In every tile that it touches, room is left for the entries that `still` has there.
-void project_and_bin(const Kernels& kernels, const View& view, const Gaussians& g, uint32_t first,
-                     const Binned* still, int threads, Binned& d, int32_t* radii) {
+void project_and_bin(const Record& r, const View& view, const Gaussians& g, uint32_t first, const Binned* still,
+                     int threads, Binned& d, int32_t* radii) {
     const size_t tiles = size_t(view.tiles_x) * view.tiles_y;
     const size_t blocks = (size_t(g.count) + kBlock - 1) / kBlock;
     d.projected.reset(g.count);
@@ -154,10 +169,12 @@ void project_and_bin(const Kernels& kernels, const View& view, const Gaussians& 
     std::vector<BlockSlots> slots(blocks);
     run(threads, blocks, [&](size_t b) {
         const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, g.count);
+        Lap lap(r);
         BlockSlots list;  // on this thread's stack: its size changes with every slot
         list.start(3 * kBlock);
-        kernels.project(view, g, begin, end, d.projected.data(), radii, d.first_slot.data(), list);
+        r.kernels->project(view, g, begin, end, d.projected.data(), radii, d.first_slot.data(), list);
         slots[b].take(list);
+        lap.end(kProject);
     });
     std::vector<size_t> base(blocks + 1, 0);
     for (size_t b = 0; b < blocks; ++b) base[b + 1] = base[b] + slots[b].size;
@@ -195,6 +212,7 @@ void project_and_bin(const Kernels& kernels, const View& view, const Gaussians& 
     d.tile_begin[tiles] = uint32_t(total);
     d.entries.reset(total);
     run(threads, parts, [&](size_t part) {
+        Lap lap(r);
         uint32_t* next = place.data() + part * tiles;
         for_part(part, [&](size_t b) {
             const Slot* list = slots[b].data;
@@ -204,6 +222,7 @@ void project_and_bin(const Kernels& kernels, const View& view, const Gaussians& 
             const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, g.count);
             for (uint32_t i = begin; i < end; ++i) d.first_slot[i] += uint32_t(base[b]);
         });
+        lap.end(kSort);
     });
 }
 
@@ -261,11 +280,27 @@ ForwardJob forward_job(const Scene& s, const Record& r, size_t time, int first_c
 
 constexpr size_t kTilesPerTask = 4;
 
+// Calls f(first, end) for ranges of tiles.
 template <class F>
 void for_tiles(int threads, size_t tiles, F f) {
     run(threads, (tiles + kTilesPerTask - 1) / kTilesPerTask, [&](size_t task) {
-        for (size_t i = task * kTilesPerTask; i < std::min(tiles, (task + 1) * kTilesPerTask); ++i) f(uint32_t(i));
+        f(uint32_t(task * kTilesPerTask), uint32_t(std::min(tiles, (task + 1) * kTilesPerTask)));
     });
+}
+
+// Puts the entries of a tile into the order of compositing.
+void sort_tile(const Scene& s, Record& r, uint32_t tile) {
+    thread_local TileSorter sorter;
+    const Projected* still_projected = r.still.projected.data() - s.moving.count;
+    Entry* still = r.still.entries.data() + r.still.tile_begin[tile];
+    const uint32_t still_count = r.still.in_tile(tile);
+    sorter.sort(still, still_projected, still_count);
+    for (Binned& d : r.moving)
+        if (const uint32_t all = d.in_tile(tile)) {
+            Entry* entries = d.entries.data() + d.tile_begin[tile];
+            sorter.sort(entries, d.projected.data(), all - still_count);
+            merge(entries, all - still_count, d.projected.data(), still, still_count, still_projected);
+        }
 }
 
 }  // namespace
@@ -299,12 +334,12 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image
     Record& r = *record;
     r.kernels = &kernels;
     r.moving.resize(s.times);
-    project_and_bin(kernels, s.view, gaussians_at(s.still, 0), s.moving.count, nullptr, threads, r.still, still_radii);
+    project_and_bin(r, s.view, gaussians_at(s.still, 0), s.moving.count, nullptr, threads, r.still, still_radii);
     size_t slots = r.still.slots;
     for (int t = 0; t < s.times; ++t) {
         Binned& d = r.moving[t];
         d.slot_base = slots;
-        project_and_bin(kernels, s.view, gaussians_at(s.moving, t), 0, &r.still, threads, d,
+        project_and_bin(r, s.view, gaussians_at(s.moving, t), 0, &r.still, threads, d,
                         radii + size_t(t) * s.moving.count);
         slots += d.slots;
     }
@@ -321,18 +356,7 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image
     r.last.reset(size_t(pictures) * kTilePixels);
     r.patch_end.reset(size_t(pictures) * kernels.patches);
 
-    for_tiles(threads, tiles, [&](uint32_t tile) {
-        thread_local TileSorter sorter;
-        const Projected* still_projected = r.still.projected.data() - s.moving.count;
-        Entry* still = r.still.entries.data() + r.still.tile_begin[tile];
-        const uint32_t still_count = r.still.in_tile(tile);
-        sorter.sort(still, still_projected, still_count);
-        for (Binned& d : r.moving)
-            if (const uint32_t all = d.in_tile(tile)) {
-                Entry* entries = d.entries.data() + d.tile_begin[tile];
-                sorter.sort(entries, d.projected.data(), all - still_count);
-                merge(entries, all - still_count, d.projected.data(), still, still_count, still_projected);
-            }
+    const auto draw = [&](uint32_t tile) {
         for_pictures(r, tile, [&](const TileWork& work) {
             for (int c = 0; c < s.channels; c += kMaxChannels) {
                 ForwardJob job = forward_job(s, r, work.times[0], c, std::min(kMaxChannels, s.channels - c));
@@ -341,6 +365,13 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image
                 kernels.forward(job, work);
             }
         });
+    };
+    for_tiles(threads, tiles, [&](uint32_t first, uint32_t end) {
+        Lap lap(r);
+        for (uint32_t tile = first; tile < end; ++tile) sort_tile(s, r, tile);
+        lap.end(kSort);
+        for (uint32_t tile = first; tile < end; ++tile) draw(tile);
+        lap.end(kComposite);
     });
     return record;
 }
@@ -359,7 +390,7 @@ void render_backward(const Scene& s, const Record& r, int threads, const OutputG
     for (int c = 0; c < s.channels; c += kMaxChannels) {
         const int channels = std::min(kMaxChannels, s.channels - c);
         std::fill_n(background_parts.data(), tiles * channels, 0.f);
-        for_tiles(threads, tiles, [&](uint32_t tile) {
+        const auto draw_backward = [&](uint32_t tile) {
             bool add = false;
             for_pictures(r, tile, [&](const TileWork& work) {
                 BackwardJob job = {};
@@ -380,6 +411,11 @@ void render_backward(const Scene& s, const Record& r, int threads, const OutputG
                 kernels.backward(job, work, add);
                 add = true;
             });
+        };
+        for_tiles(threads, tiles, [&](uint32_t first, uint32_t end) {
+            Lap lap(r);
+            for (uint32_t tile = first; tile < end; ++tile) draw_backward(tile);
+            lap.end(kCompositeBackward);
         });
         if (in.background && !s.background_is_image)
             for (int k = 0; k < channels; ++k) {
@@ -399,8 +435,10 @@ void render_backward(const Scene& s, const Record& r, int threads, const OutputG
             const float* first = slots.data() + d.slot_base * slot_stride(channels);
             run(threads, blocks_of(layer), [&](size_t b) {
                 const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, layer.count);
+                Lap lap(r);
                 kernels.project_backward(s.view, g, begin, end, d.projected.data(), d.first_slot.data(), first,
                                          channels, grads);
+                lap.end(kProjectBackward);
             });
             if (in.view)
                 for (size_t b = 0; b < blocks_of(layer); ++b)

@@ -5,6 +5,7 @@
 // for all the times at which that is so.
 #pragma once
 
+#include <atomic>
 #include <memory>
 #include <vector>
 
@@ -52,6 +53,9 @@ struct Binned {
     uint32_t in_tile(size_t tile) const { return tile_begin[tile + 1] - tile_begin[tile]; }
 };
 
+// What a render's time goes into.
+enum Stage { kProject, kSort, kComposite, kCompositeBackward, kProjectBackward, kStages };
+
 // What the backward pass needs; grows with what is drawn.
 struct Record {
     const Kernels* kernels;
@@ -62,6 +66,7 @@ struct Record {
     Buffer<float> final_t;
     Buffer<int32_t> last;
     Buffer<uint32_t> patch_end;
+    mutable std::atomic<int64_t> nanoseconds[kStages] = {};  // of work, summed over threads
 
     size_t bytes() const;
     size_t intersections() const;  // pairs of Gaussian and tile that are composited
