@@ -735,7 +735,8 @@ double multiply_add(int64_t rounds, float* sink) {
 }  // namespace
 
 const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,         project, forward,
-                         backward,     project_backward, multiply_add, &mlp_kernels, ssim_plane};
+                         backward,     project_backward, multiply_add, &mlp_kernels,
+                         ssim_plane,   hash_forward, hash_backward};
 
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

@@ -4,6 +4,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "hash_grid.h"
 #include "mlp_kernels.h"
 #include "ssim.h"
 
@@ -118,12 +119,21 @@ struct Kernels {
     const MlpKernels* mlp;
     // Sum of the similarity over the window positions of a plane, and its gradient.
     double (*ssim)(const SsimPlane&);
+    void (*hash_forward)(const HashLevel&);
+    void (*hash_backward)(const HashLevel&);
 };
 
-namespace portable { extern const Kernels kernels; double ssim_plane(const SsimPlane&); }
+#define EVSPLAT_LEVEL_TABLE(level)               \
+    namespace level {                            \
+    extern const Kernels kernels;                \
+    double ssim_plane(const SsimPlane&);         \
+    void hash_forward(const HashLevel&);         \
+    void hash_backward(const HashLevel&);        \
+    }
+EVSPLAT_LEVEL_TABLE(portable)
 #ifdef EVSPLAT_X86
-namespace avx2 { extern const Kernels kernels; double ssim_plane(const SsimPlane&); }
-namespace avx512 { extern const Kernels kernels; double ssim_plane(const SsimPlane&); }
+EVSPLAT_LEVEL_TABLE(avx2)
+EVSPLAT_LEVEL_TABLE(avx512)
 #endif
 
 }  // namespace evsplat

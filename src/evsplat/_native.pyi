@@ -67,6 +67,26 @@ class Mlp:
         layers: list[Tensor],
     ) -> None: ...
 
+def hash_encode(
+    positions: Tensor,
+    table: Tensor,
+    cells: list[int],
+    begin: list[int],
+    mask: int,
+    encoded: Tensor,
+    threads: int,
+) -> None: ...
+def hash_encode_backward(
+    positions: Tensor,
+    table: Tensor,
+    cells: list[int],
+    begin: list[int],
+    mask: int,
+    encoded_grad: Tensor,
+    table_grad: Tensor | None,
+    position_grad: Tensor | None,
+    threads: int,
+) -> None: ...
 def ssim(
     image: Tensor,
     reference: Tensor,

@@ -1,6 +1,7 @@
 """Encodings against literal loops, closed forms and finite differences."""
 
 import math
+from copy import deepcopy
 from itertools import pairwise
 
 import numpy as np
@@ -82,7 +83,7 @@ def hash_grid_loop(grid, position):
             else:
                 hashed = (x ^ (y * 2654435761) ^ (z * 805459861)) & 0xFFFFFFFF
                 entry = hashed % (stop - start)
-            total += share * grid.table[:, start + entry].detach().numpy()
+            total += share * grid.table[start + entry].detach().numpy()
         values.extend(total)
     return values
 
@@ -105,7 +106,7 @@ def test_default_hash_grid_has_the_configured_levels():
     assert grid.dim == 32 and grid.resolutions[0] == 16 and grid.resolutions[-1] == 2048
     assert all(abs(after / before - 1.3819) < 0.06 for before, after in pairwise(grid.resolutions))
     sizes = np.diff(grid.offsets)
-    assert sizes[0] == 17**3 and sizes[-1] == 2**16 and grid.table.shape[1] == sizes.sum()
+    assert sizes[0] == 17**3 and sizes[-1] == 2**16 and len(grid.table) == sizes.sum()
     assert 0 < grid.table.abs().max() <= 1e-4
 
 
@@ -115,6 +116,51 @@ def test_hash_grid_gradients_to_table_and_positions():
     torch.nn.init.normal_(grid.table)
     positions = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda p, table: grid(p), (positions, grid.table))
+
+
+@pytest.mark.parametrize(("seed", "features", "points"), [(0, 2, 1000), (1, 2, 37), (2, 3, 16)])
+def test_native_values_and_gradients_equal_those_in_float64(seed, features, points):
+    torch.manual_seed(seed)
+    grid = HashGridEncoding(features=features, log2_table=12)
+    torch.nn.init.normal_(grid.table)
+    # Few bits, so that float32 finds the same cell on every level; the slope jumps between cells.
+    positions = (torch.randint(-200, 4300, (points, 3)) + 0.5) / 4096
+    upstream = torch.randn(points, grid.dim)
+    results = []
+    for precise in (False, True):
+        copy = deepcopy(grid).double() if precise else grid
+        here = positions.to(copy.table.dtype).requires_grad_()
+        encoded = copy(here)
+        gradients = torch.autograd.grad(encoded, (here, copy.table), upstream.to(encoded.dtype))
+        results.append((encoded, *gradients))
+    for name, (value, expected) in zip(
+        ("encoding", "positions", "table"), zip(*results, strict=True), strict=True
+    ):
+        error = ((value - expected).norm() / expected.norm()).item()
+        assert error < 1e-6, (name, error)
+
+
+def test_native_results_do_not_depend_on_the_number_of_threads():
+    torch.manual_seed(3)
+    grid = HashGridEncoding()
+    torch.nn.init.normal_(grid.table)
+    positions, upstream = torch.rand(5000, 3), torch.randn(5000, grid.dim)
+    before = torch.get_num_threads()
+    results = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        here = positions.clone().requires_grad_()
+        encoded = grid(here)
+        gradients = torch.autograd.grad(encoded, (here, grid.table), upstream)
+        results.append((encoded, *gradients))
+    torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_positions_that_are_no_number_stay_inside_the_table():
+    grid = HashGridEncoding()
+    encoded = grid(torch.tensor([[float("nan"), 0.5, 0.5], [0.5, 0.5, 0.5]]))
+    assert encoded[0].isnan().all() and encoded[1].isfinite().all()
 
 
 def test_gradients_of_one_input_do_not_need_the_other():

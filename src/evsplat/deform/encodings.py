@@ -1,4 +1,4 @@
-"""Position encodings: smooth one-blob and multi-resolution hash grid, in plain torch."""
+"""Position encodings: smooth one-blob and multi-resolution hash grid."""
 
 import math
 from typing import Any, Literal, Protocol
@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+from evsplat.compiled import native, runs_native
 
 _HASH_PRIMES = (1, 2_654_435_761, 805_459_861)
 """Instant-NGP (Mueller et al. 2022), eq. 4."""
@@ -86,13 +88,13 @@ class HashGridEncoding(nn.Module):
         self.table_mask = 2**log2_table - 1
         sizes = [min((cells + 1) ** 3, 2**log2_table) for cells in self.resolutions]
         self.offsets = tuple(sum(sizes[:level]) for level in range(levels + 1))
-        # One row per feature: gathers and sums then run along contiguous memory.
-        self.table = nn.Parameter(torch.empty(features, sum(sizes)).uniform_(-1e-4, 1e-4))
+        self.table = nn.Parameter(torch.empty(sum(sizes), features).uniform_(-1e-4, 1e-4))
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch D"]:
         """Encode positions in [0, 1]."""
         clamped = positions.clamp(0, 1).reshape(-1, 3)
-        encoded: Tensor = _HashGridLookup.apply(clamped, self.table, self)
+        lookup = _NativeLookup if runs_native(clamped) else _TorchLookup
+        encoded: Tensor = lookup.apply(clamped, self.table, self)
         return encoded.T.unflatten(0, positions.shape[:-1])
 
     def cell(
@@ -114,7 +116,38 @@ class HashGridEncoding(nn.Module):
         return entries.add_(self.offsets[level]), scaled.sub_(corner)
 
 
-class _HashGridLookup(torch.autograd.Function):
+class _NativeLookup(torch.autograd.Function):
+    """In the compiled module, one thread per level; sums into the table keep their order."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, positions: Tensor, table: Tensor, grid: HashGridEncoding
+    ) -> Float[Tensor, "D N"]:
+        layout = list(grid.resolutions), list(grid.offsets), grid.table_mask
+        encoded = torch.empty(grid.dim, len(positions))
+        positions = positions.contiguous()
+        native.hash_encode(
+            positions.detach(), table.detach(), *layout, encoded, torch.get_num_threads()
+        )
+        ctx.layout = layout
+        ctx.save_for_backward(positions, table)
+        return encoded
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        positions, table = (tensor.detach() for tensor in ctx.saved_tensors)
+        need_positions, need_table = ctx.needs_input_grad[:2]
+        table_gradient = torch.zeros_like(table) if need_table else None
+        position_gradient = torch.empty_like(positions) if need_positions else None
+        native.hash_encode_backward(
+            positions, table, *ctx.layout, upstream[0].contiguous(),
+            table_gradient, position_gradient, torch.get_num_threads(),
+        )  # fmt: skip
+        return position_gradient, table_gradient, None
+
+
+class _TorchLookup(torch.autograd.Function):
     """Per level: gather the eight corners and blend. Points are the last axis, for speed."""
 
     @staticmethod
@@ -124,25 +157,27 @@ class _HashGridLookup(torch.autograd.Function):
         transposed = positions.T.contiguous()
         encoded = positions.new_empty(grid.dim, len(positions))
         cells = [grid.cell(transposed, level) for level in range(len(grid.resolutions))]
+        # One row per feature: gathers and sums then run along contiguous memory.
+        features = table.T.contiguous()
         rows = iter(encoded)
         for entries, inside in cells:
             shares = _corner_shares(inside)
-            for feature in table:
+            for feature in features:
                 corners = feature.index_select(0, entries.view(-1)).view_as(shares)
                 torch.sum(corners.mul_(shares).flatten(0, 2), 0, out=next(rows))
         ctx.cells = cells
-        ctx.save_for_backward(table)
+        ctx.save_for_backward(features)
         ctx.resolutions = grid.resolutions
         return encoded
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        (table,) = ctx.saved_tensors
+        (features,) = ctx.saved_tensors
         need_positions, need_table = ctx.needs_input_grad[:2]
-        table_gradient = torch.zeros_like(table) if need_table else None
+        table_gradient = torch.zeros_like(features) if need_table else None
         position_gradient = torch.zeros_like(ctx.cells[0][1]) if need_positions else None
-        by_level = gradients[0].contiguous().split(len(table))
+        by_level = gradients[0].contiguous().split(len(features))
         for (entries, inside), cells, gradient in zip(
             ctx.cells, ctx.resolutions, by_level, strict=True
         ):
@@ -152,12 +187,15 @@ class _HashGridLookup(torch.autograd.Function):
                 for row, step in zip(table_gradient, gradient, strict=True):
                     row.scatter_add_(0, flat, (shares * step).view(-1))
             if position_gradient is not None:
-                pull = torch.zeros_like(entries, dtype=table.dtype)
-                for feature, step in zip(table, gradient, strict=True):
+                pull = torch.zeros_like(entries, dtype=features.dtype)
+                for feature, step in zip(features, gradient, strict=True):
                     pull.addcmul_(feature.index_select(0, flat).view_as(pull), step)
                 position_gradient += cells * _blend_slopes(pull, inside)
-        transposed = None if position_gradient is None else position_gradient.T
-        return transposed, table_gradient, None
+        return (
+            None if position_gradient is None else position_gradient.T,
+            None if table_gradient is None else table_gradient.T,
+            None,
+        )
 
 
 def _corner_shares(inside: Float[Tensor, "3 N"]) -> Float[Tensor, "2 2 2 N"]:
