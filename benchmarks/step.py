@@ -167,8 +167,8 @@ class MoreTimes(Stateless):
         return [frame.mid_us + 1_000 * k for k in range(1, self.renders - 1)]
 
     def loss(self, step: Step) -> dict[str, Tensor]:
-        """Mean square of all that was drawn."""
-        return {"more_times": step.rgb.square().mean()}
+        """Mean of all that was drawn."""
+        return {"more_times": torch.stack([picture.mean() for picture in step.rgb]).mean()}
 
 
 def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], dict[str, float]]:

@@ -117,8 +117,8 @@ struct Kernels {
     // Independent multiply-adds for `rounds`; returns the floating-point operations done.
     double (*multiply_add)(int64_t rounds, float* sink);
     const MlpKernels* mlp;
-    // Sum of the similarity over the window positions of a plane, and its gradient.
-    double (*ssim)(const SsimPlane&);
+    // Sum of the similarity over the window positions of a band, and its gradient.
+    double (*ssim)(const SsimBand&);
     void (*hash_forward)(const HashLevel&);
     void (*hash_backward)(const HashLevel&);
 };
@@ -126,7 +126,7 @@ struct Kernels {
 #define EVSPLAT_LEVEL_TABLE(level)               \
     namespace level {                            \
     extern const Kernels kernels;                \
-    double ssim_plane(const SsimPlane&);         \
+    double ssim_band(const SsimBand&);           \
     void hash_forward(const HashLevel&);         \
     void hash_backward(const HashLevel&);        \
     }

@@ -7,8 +7,9 @@ namespace evsplat {
 
 constexpr int kSsimWindow = 11;
 
-struct SsimPlane {
-    int height, width;
+// Rows [begin, end) of a plane: windows that start there, and the gradient there.
+struct SsimBand {
+    int height, width, begin, end;
     const float *image, *reference;   // (height, width)
     const float* window;              // kSsimWindow weights that sum to one
     float c1, c2;
@@ -16,7 +17,7 @@ struct SsimPlane {
     float* scratch;                   // ssim_scratch floats
 };
 
-inline size_t ssim_scratch(int height, int width) { return size_t(8 * height + 8) * width; }
+inline size_t ssim_scratch(int width) { return size_t(8 * kSsimWindow + 9) * (width + kSsimWindow); }
 
 // Sums over the window positions of each plane; `planes` of (height, width) follow each other.
 void ssim_planes(size_t planes, int height, int width, const float* image, const float* reference,

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
 from evsplat.capture.camera import Camera
-from evsplat.capture.images import ImageCache, read_image, to_grey, to_rgb, to_unit_range
+from evsplat.capture.images import (
+    ImageCache,
+    planar,
+    read_image,
+    to_grey,
+    to_rgb,
+    to_unit_range,
+)
 from evsplat.capture.metadata import Frame, Metadata, NovelView
 from evsplat.capture.points import read_points
 from evsplat.capture.validate import check_capture
@@ -187,9 +194,9 @@ class Capture:
                 "the camera in capture.json."
             )
         distortion = self._metadata.distortions.get(camera)
-        if distortion is None:
-            return pixels
-        return distortion.undistort_image(to_unit_range(pixels).numpy())
+        if distortion is not None:
+            pixels = distortion.undistort_image(to_unit_range(pixels).numpy())
+        return planar(pixels)
 
 
 def load_capture(path: Path | str) -> Capture:

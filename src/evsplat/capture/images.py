@@ -50,9 +50,16 @@ def image_size(path: Path) -> tuple[int, int]:
 def to_unit_range(pixels: np.ndarray) -> Float[Tensor, "..."]:
     """Float32 in [0, 1] of stored pixels; float pixels are taken to be in that range already."""
     if pixels.dtype == np.float32:
-        return torch.from_numpy(pixels.copy())
+        return torch.from_numpy(pixels.copy(order="K"))
     scale = float(np.iinfo(pixels.dtype).max)
     return torch.from_numpy(pixels.astype(np.float32) / np.float32(scale))
+
+
+def planar(pixels: np.ndarray) -> np.ndarray:
+    """The same (H, W) or (H, W, C) array, each channel in one piece of memory as in renders."""
+    if pixels.ndim == 2:
+        return pixels
+    return np.moveaxis(np.ascontiguousarray(np.moveaxis(pixels, -1, 0)), 0, -1)
 
 
 def to_rgb(image: Float[Tensor, "..."]) -> Float[Tensor, "H W 3"]:

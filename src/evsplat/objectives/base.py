@@ -22,9 +22,9 @@ class Step:
     frame: Frame
     """The drawn training frame."""
     times_us: tuple[int, ...]
-    """Sorted and distinct; the leading axis of everything below."""
-    rgb: Float[Tensor, "T H W 3"]
-    semantic: Float[Tensor, "T H W"]
+    """Sorted and distinct; the order of the pictures below."""
+    rgb: tuple[Float[Tensor, "H W 3"], ...]
+    semantic: tuple[Float[Tensor, "H W"], ...]
     """The soft attribute composited with the colour's weights, in [0, 1]."""
     posed: PosedGaussians
     nominal: float
@@ -33,7 +33,7 @@ class Step:
     """Randomness of the step; part of the checkpoint."""
 
     def index(self, time_us: int) -> int:
-        """Place of a time on the leading axis."""
+        """Place of a time among the pictures."""
         return self.times_us.index(time_us)
 
 

@@ -37,14 +37,16 @@ class Photometric(Stateless):
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``l1``, ``dssim`` and ``perceptual`` as configured, means over pictures and pixels."""
-        observed_at = [i for i, time in enumerate(step.times_us) if time in self.frames]
-        frames = [self.frames[step.times_us[i]] for i in observed_at]
-        rendered = step.rgb[observed_at]
-        observed = torch.stack([step.capture.image(frame) for frame in frames]).to(rendered)
-        terms = {"l1": (rendered - observed).abs().mean()}
+        frames, rendered, observed = [], [], []
+        for time, picture in zip(step.times_us, step.rgb, strict=True):
+            if time in self.frames:
+                frames.append(self.frames[time])
+                rendered.append(picture)
+                observed.append(step.capture.image(frames[-1]).to(picture))
+        pairs = list(zip(rendered, observed, strict=True))
+        terms = {"l1": torch.stack([(a - b).abs().mean() for a, b in pairs]).mean()}
         if self.dssim:
-            values = [ssim(a, b, GAUSSIAN_SSIM) for a, b in zip(rendered, observed, strict=True)]
-            terms["dssim"] = 1 - torch.stack(values).mean()
+            terms["dssim"] = 1 - torch.stack([ssim(a, b, GAUSSIAN_SSIM) for a, b in pairs]).mean()
         if self.perceptual is not None:
             values = []
             for a, b, frame in zip(rendered, observed, frames, strict=True):

@@ -43,11 +43,11 @@ class RenderedSemantics(Stateless):
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``semantic`` and the pressure ``binarise`` = mean m (1 - m) (A2)."""
         values: list[Float[Tensor, ""]] = []
-        for index, time in enumerate(step.times_us):
+        for time, drawn in zip(step.times_us, step.semantic, strict=True):
             if time not in self.bounds:
                 continue
-            inside, outside = (mask.to(step.semantic.device) for mask in self.bounds[time])
-            probability = step.semantic[index].clamp(1e-4, 1 - 1e-4)
+            inside, outside = (mask.to(drawn.device) for mask in self.bounds[time])
+            probability = drawn.clamp(1e-4, 1 - 1e-4)
             error = -torch.where(
                 inside, probability.log(), torch.where(outside, (1 - probability).log(), 0.0)
             )

@@ -65,7 +65,10 @@ class Trainer:
         posed = self.model.at(times, camera.center(), noise=noise, share_skinning=True)
         moving, static = _with_centers(posed.moving()), _with_centers(posed.static())
         output = render(moving, camera, static=static)
-        rgb, semantic = output.image[..., :3], output.image[..., 3]
+        # Pictures stay planar in memory, and their gradients come back in one piece.
+        planes = [picture.split([3, 1]) for picture in output.image.permute(0, 3, 1, 2).unbind(0)]
+        rgb = tuple(picture.permute(1, 2, 0) for picture, _ in planes)
+        semantic = tuple(picture[0] for _, picture in planes)
         step = Step(
             self.capture, self.model, frame, tuple(times), rgb, semantic, posed, nominal, generator
         )
@@ -97,7 +100,7 @@ class Trainer:
             assert layer.centers2d_offset is not None and layer.centers2d_offset.grad is not None
             self.statistics.add(rows, layer.centers2d_offset.grad, radii, width, height)
         self._edit(frame, nominal)
-        drawn = rgb.detach()[step.index(frame.mid_us)]
+        drawn = rgb[step.index(frame.mid_us)].detach()
         error = (drawn.clamp(0, 1) - self.capture.image(frame).to(drawn)).square().mean()
         return StepReport(float(loss.detach()), values, float(-10 * torch.log10(error)))
 
