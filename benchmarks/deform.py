@@ -3,10 +3,13 @@
 python benchmarks/deform.py [--points N] [--times T] [--repeats R]
 
 The limit is the time of the same multiply-adds in products of the widest layer's size, measured
-here (float32): the share says what a perfect implementation of the same arithmetic would save, and
-can pass 100 % with bfloat16. The last line is JSON with a unit in each key.
+here with torch: the share says what a perfect implementation of the same arithmetic would save.
+The last line is JSON with a unit in each key.
 """
 
+import evsplat  # noqa: F401 - before torch: it sets how OpenMP's threads wait
+
+# isort: split
 import argparse
 import json
 import time

@@ -15,13 +15,14 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import torch
 
 from evsplat import _native
 from evsplat.render import PinholeCamera, Splats, render
+from evsplat.render.splats import join
 
 # Floating-point operations per lane of a patch step, a multiply-add as two: constant, per channel.
 # Counted in native/kernels.cpp; comparisons, selections and integer operations are left out.
@@ -120,16 +121,66 @@ def native_job(scene: Scene) -> _native.Render:
     s, camera = scene.splats, scene.camera
     size = (camera.height, camera.width)
     channels = s.channels.shape[-1]
+    fields = [s.means, s.quats[None], s.scales[None], s.opacities[None], s.channels, None, None]
     job = _native.Render(
-        camera.width, camera.height, camera.K, camera.world_to_camera, 0.01,
-        s.means, s.quats[None], s.scales[None], s.opacities[None], s.channels, None, None, None,
+        camera.width, camera.height, camera.K, camera.world_to_camera, 0.01, fields, [], None,
         1, torch.get_num_threads(),
     )  # fmt: skip
     job.forward(
         torch.empty(1, channels, *size), torch.empty(1, *size),
-        torch.empty(1, s.means.shape[1], dtype=torch.int32),
+        torch.empty(1, s.means.shape[1], dtype=torch.int32), torch.empty(1, 0, dtype=torch.int32),
     )  # fmt: skip
     return job
+
+
+def with_gradient(splats: Splats) -> Splats:
+    """The same with every field a leaf."""
+    return Splats(
+        *(
+            None if value is None else value.clone().requires_grad_()
+            for value in vars(splats).values()
+        )
+    )
+
+
+def many_times(size_px: int, channels: int, repeats: int) -> dict[str, float]:
+    """Forward+backward of a person over a static scene: one time, five, five without sharing."""
+    static = make_scene(size_px, 30_000, channels)
+    person = make_scene(size_px, 20_000, channels, seed=1).splats
+    # A box of 15 % of the picture; it moves by a few pixels from time to time.
+    means = person.means[0] * torch.tensor([0.27, 0.55, 1.0])
+    means = torch.stack([means + 0.01 * t for t in range(5)])
+
+    def measured(name: str, moving: Splats, fixed: Splats | None) -> float:
+        moving = with_gradient(moving)
+        fixed = None if fixed is None else with_gradient(fixed)
+        grad = static.image_grad.expand(len(moving.means), -1, -1, -1)
+        layers = [layer for layer in (moving, fixed) if layer is not None]
+        leaves = [v for layer in layers for v in vars(layer).values() if v is not None]
+
+        def both() -> None:
+            out = render(moving, static.camera, static=fixed)
+            torch.autograd.grad(out.image, leaves, grad)
+
+        timing = timed(both, repeats)
+        print(f"  {name}: {timing}")
+        return timing.best
+
+    single = measured("person and scene, 1 time", replace(person, means=means[:1]), static.splats)
+    moving = replace(person, means=means)
+    shared = measured("person and scene, 5 times", moving, static.splats)
+    everything = join(moving.with_times(), static.splats.with_times(), 5)
+    apart = measured("the same without sharing", everything, None)
+    print(
+        f"  five times cost {shared / single:.2f} single renders, {apart / single:.2f} without "
+        "sharing"
+    )
+    return {
+        "person_and_scene_1_time_best_ms": round(single, 2),
+        "person_and_scene_5_times_best_ms": round(shared, 2),
+        "five_times_over_one": round(shared / single, 2),
+        "five_times_unshared_over_one": round(apart / single, 2),
+    }
 
 
 def peak_flops() -> float:
@@ -188,6 +239,7 @@ def main() -> None:
         f"  128x128 px, 1000 Gaussians, forward+backward, 2 threads: native {native}, "
         f"torch reference {reference}: {ratio:.0f} times as fast"
     )
+    result |= many_times(args.size, args.channels, args.repeats)
     peak_rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result |= {"kept_for_backward_mb": round(job.bytes / 1e6, 2)}
     result |= {"peak_rss_mb": round(peak_rss / 1e3)}

@@ -9,6 +9,9 @@ networks' matrix products at the core's measured multiply-add peak. The last lin
 unit in each key.
 """
 
+import evsplat  # noqa: F401 - before torch: it sets how OpenMP's threads wait
+
+# isort: split
 import argparse
 import dataclasses
 import json
