@@ -55,42 +55,45 @@ INLINE uint32_t load_points(const HashLevel& job, size_t first, float (&position
     return n;
 }
 
-template <int features>
-void forward_of(const HashLevel& job) {
-    const int count = features ? features : job.features;
+// Calls f(first, n, cells, shares of their corners) for every W points.
+template <class F>
+INLINE void for_cells(const HashLevel& job, F f) {
     for (size_t first = 0; first < job.points; first += W) {
         float position[3][W], share[8][W];
         const uint32_t n = load_points(job, first, position);
         Cells c;
         find_cells(job, position, c);
         corner_shares(c, share);
+        f(first, n, c, share);
+    }
+}
+
+template <int features>
+void forward_of(const HashLevel& job) {
+    const int count = features ? features : job.features;
+    for_cells(job, [&](size_t first, uint32_t n, const Cells& c, const float (&share)[8][W]) {
         for (int f = 0; f < count; ++f) {
             float total[W] = {};
             for (int k = 0; k < 8; ++k)
                 for (int l = 0; l < W; ++l) total[l] += share[k][l] * job.table[size_t(c.entry[k][l]) * count + f];
             for (uint32_t l = 0; l < n; ++l) job.encoded[f * job.points + first + l] = total[l];
         }
-    }
+    });
 }
 
 template <int features>
 void backward_of(const HashLevel& job) {
     const int count = features ? features : job.features;
-    for (size_t first = 0; first < job.points; first += W) {
-        float position[3][W], share[8][W];
-        const uint32_t n = load_points(job, first, position);
-        Cells c;
-        find_cells(job, position, c);
+    for_cells(job, [&](size_t first, uint32_t n, const Cells& c, const float (&share)[8][W]) {
         const float* grad = job.encoded_grad + first;
         if (job.table_grad) {
-            corner_shares(c, share);
             for (uint32_t l = 0; l < n; ++l)
                 for (int k = 0; k < 8; ++k) {
                     float* entry = job.table_grad + size_t(c.entry[k][l]) * count;
                     for (int f = 0; f < count; ++f) entry[f] += share[k][l] * grad[f * job.points + l];
                 }
         }
-        if (!job.position_grad) continue;
+        if (!job.position_grad) return;
         float pull[8][W] = {};
         for (int f = 0; f < count; ++f) {
             float g[W] = {};
@@ -111,7 +114,7 @@ void backward_of(const HashLevel& job) {
             out[job.points] = scale * along_y;
             out[2 * job.points] = scale * (z_low + x * (z_high - z_low));
         }
-    }
+    });
 }
 
 }  // namespace

@@ -1,0 +1,148 @@
+// Products of panel matrices. Included by the kernels of networks only, inside their namespace, behind
+// simd.h; nothing here may have external linkage.
+
+constexpr int kTileRows = W == 16 ? 8 : 4;  // with two panels: half of the registers hold sums
+constexpr int R = kMlpRows;
+constexpr size_t kPanel = size_t(R) * W;
+static_assert(R % kTileRows == 0, "a block is a whole number of tiles");
+
+template <int n>
+struct Count {
+    static constexpr int value = n;
+};
+
+// What a product is made of: `per` values along the summed axis in one element.
+struct Single {
+    typedef float Element;
+    static constexpr int per = 1;
+    static F load(const float* p) { F v; __builtin_memcpy(&v, p, sizeof v); return v; }
+    static F add(F sum, float a, F b) { return sum + splat(a) * b; }
+};
+
+// sums[p][i] += sum over k of a(i, k) * b(k, panel p). Element a(i, k) is at
+// a + (k / inner) * outer_step + (k % inner) * k_step + i * i_step.
+template <class Kind, int panels, int i_step, int k_step>
+INLINE void multiply(F (&sums)[2][kTileRows], const typename Kind::Element* a, size_t outer_step, int inner, int count,
+                     const typename Kind::Element* b, size_t b_step) {
+    for (int done = 0; done < count; done += inner, a += outer_step) {
+        const int n = count - done < inner ? count - done : inner;
+        for (int k = 0; k < n; ++k, b += W) {
+            const auto b0 = Kind::load(b), b1 = Kind::load(panels == 2 ? b + b_step : b);
+#pragma GCC unroll 8
+            for (int i = 0; i < kTileRows; ++i) {
+                const auto x = a[k * k_step + i * i_step];
+                sums[0][i] = Kind::add(sums[0][i], x, b0);
+                if (panels == 2) sums[1][i] = Kind::add(sums[1][i], x, b1);
+            }
+        }
+    }
+}
+
+// For every tile of a (rows, columns) result: start(p, row) -> F, then the product, then
+// end(p, row, F, F) for two rows. `x` (R, count) in panels times `w` (panels of the result, count, lanes).
+template <class Kind, class Start, class End>
+INLINE void rows_times(const typename Kind::Element* x, int count, const typename Kind::Element* w, int panels,
+                       Start start, End end) {
+    constexpr int inner = W / Kind::per;
+    const size_t step = size_t(count) * W;
+    const auto tile = [&](auto together, int p, int row) {
+        constexpr int n = decltype(together)::value;
+        F sums[2][kTileRows];
+        for (int q = 0; q < n; ++q)
+#pragma GCC unroll 8
+            for (int i = 0; i < kTileRows; ++i) sums[q][i] = start(p + q, row + i);
+        multiply<Kind, n, inner, 1>(sums, x + size_t(row) * inner, kPanel / Kind::per, inner, count, w + p * step, step);
+        for (int q = 0; q < n; ++q)
+#pragma GCC unroll 4
+            for (int i = 0; i < kTileRows; i += 2) end(p + q, row + i, sums[q][i], sums[q][i + 1]);
+    };
+    int p = 0;
+    for (; p + 2 <= panels; p += 2)
+        for (int row = 0; row < R; row += kTileRows) tile(Count<2>{}, p, row);
+    if (p < panels)
+        for (int row = 0; row < R; row += kTileRows) tile(Count<1>{}, p, row);
+}
+
+// An end of rows_times: the result to panels.
+INLINE auto to_panels(float* to) {
+    return [to](int p, int row, F a, F b) {
+        store(to + p * kPanel + row * W, a);
+        store(to + p * kPanel + row * W + W, b);
+    };
+}
+
+// sum (x panels, y columns, lanes) += y^T x over the rows of both; y has `y_panels`.
+template <class Kind>
+INLINE void add_outer(const typename Kind::Element* y, int y_panels, const typename Kind::Element* x, int x_panels,
+                      float* sum) {
+    constexpr int rows = R / Kind::per;
+    constexpr size_t panel = kPanel / Kind::per;
+    const int columns = y_panels * W;
+    const auto tile = [&](auto together, int p, int column) {
+        constexpr int n = decltype(together)::value;
+        F sums[2][kTileRows];
+        float* c = sum + (size_t(p) * columns + column) * W;
+        const size_t step = size_t(columns) * W;
+        for (int q = 0; q < n; ++q)
+#pragma GCC unroll 8
+            for (int i = 0; i < kTileRows; ++i) sums[q][i] = load(c + q * step + i * W);
+        multiply<Kind, n, 1, W>(sums, y + (column / W) * panel + column % W, 0, rows, rows, x + p * panel, panel);
+        for (int q = 0; q < n; ++q)
+#pragma GCC unroll 8
+            for (int i = 0; i < kTileRows; ++i) store(c + q * step + i * W, sums[q][i]);
+    };
+    int p = 0;
+    for (; p + 2 <= x_panels; p += 2)
+        for (int column = 0; column < columns; column += kTileRows) tile(Count<2>{}, p, column);
+    if (p < x_panels)
+        for (int column = 0; column < columns; column += kTileRows) tile(Count<1>{}, p, column);
+}
+
+INLINE void add_column_sums(const float* x, int panels, float* sum) {
+    for (int p = 0; p < panels; ++p) {
+        F total = load(sum + p * W);
+        for (int r = 0; r < R; ++r) total += load(x + p * kPanel + r * W);
+        store(sum + p * W, total);
+    }
+}
+
+INLINE F leaky(F v, F slope) { return select(v > 0.f, v, v * slope); }
+
+// Back through the leaky ReLU that gave `activation`, which has the sign of its input.
+INLINE F leaky_slope(F activation, F v, F slope) { return select(activation > 0.f, v, v * slope); }
+
+// Rows [first, first + R) of (rows, columns) to panels; rows and columns beyond the end are zero.
+void pack(const float* from, size_t first, size_t rows, int columns, int panels, float* to) {
+    const size_t have = rows - first < size_t(R) ? rows - first : R;
+    for (int p = 0; p < panels; ++p) {
+        const int n = columns - p * W < W ? columns - p * W : W;
+        float* panel = to + p * kPanel;
+        for (size_t r = 0; r < have; ++r) {
+            const float* source = from + (first + r) * columns + p * W;
+            float* target = panel + r * W;
+            if (n == W) {
+                store(target, load(source));
+            } else {
+                for (int l = 0; l < n; ++l) target[l] = source[l];
+                for (int l = n; l < W; ++l) target[l] = 0.f;
+            }
+        }
+        for (size_t r = have; r < size_t(R); ++r) store(panel + r * W, F{});
+    }
+}
+
+void unpack(const float* from, size_t first, size_t rows, int columns, float* to) {
+    const size_t have = rows - first < size_t(R) ? rows - first : R;
+    for (int p = 0; p * W < columns; ++p) {
+        const int n = columns - p * W < W ? columns - p * W : W;
+        for (size_t r = 0; r < have; ++r) {
+            const float* source = from + p * kPanel + r * W;
+            float* target = to + (first + r) * columns + p * W;
+            if (n == W) {
+                store(target, load(source));
+            } else {
+                for (int l = 0; l < n; ++l) target[l] = source[l];
+            }
+        }
+    }
+}
