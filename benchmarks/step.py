@@ -1,6 +1,6 @@
 """Where the time of a whole training step goes, method `paper`.
 
-python benchmarks/step.py [--size PX] [--human N] [--scene N] [--renders T] [--steps S]
+python benchmarks/step.py [--size PX] [--human N] [--scene N] [--renders T]
 
 Each part's forward time is that of its calls, its backward time that of the gradient nodes that
 its forward pass made; the stages of `render` are timed inside the native module. "rest" is what no
@@ -36,6 +36,7 @@ from evsplat import _native
 from evsplat.capture import Frame, load_capture
 from evsplat.cli.demo import demo_capture
 from evsplat.deform import human_scene
+from evsplat.deform.mlp import Precision
 from evsplat.gaussians import ATTRIBUTES, GaussianSet
 from evsplat.methods import PaperConfig, compose
 from evsplat.objectives.base import Stateless, Step
@@ -52,11 +53,14 @@ def main() -> None:
     parser.add_argument("--human", type=int, default=20_000)
     parser.add_argument("--scene", type=int, default=30_000)
     parser.add_argument("--renders", type=int, default=2, help="times per step")
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--steps", type=int, default=20)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    trainer = build(arguments.size, arguments.human, arguments.scene, arguments.renders)
+    trainer = build(
+        arguments.size, arguments.human, arguments.scene, arguments.renders, arguments.precision
+    )
     for _ in range(5):
         trainer.step()
 
@@ -82,12 +86,13 @@ def main() -> None:
     print("  inside render: " + ", ".join(f"{k} {v:.2f} ms" for k, v in stages.items()))
     print(f"  matrix products {gflop:.1f} GFLOP: {limit:.1f} ms at {peak:.0f} GFLOP/s")
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    results: dict[str, float] = {
+    results: dict[str, float | str] = {
         "image_px": arguments.size,
         "human": counts["human"],
         "scene": counts["scene"],
         "renders": arguments.renders,
         "threads": arguments.threads,
+        "precision": arguments.precision,
         "step_median_ms": round(median, 2),
         "step_best_ms": round(best, 2),
         "products_gflop": round(gflop, 2),
@@ -100,12 +105,13 @@ def main() -> None:
     print(json.dumps(results))
 
 
-def build(size: int, human: int, scene: int, renders: int) -> Trainer:
+def build(size: int, human: int, scene: int, renders: int, precision: Precision) -> Trainer:
     """A training on the demo capture in the middle of its schedule, with everything switched on."""
     config = PaperConfig()
     config = dataclasses.replace(
         config,
         human=dataclasses.replace(config.human, count=human),
+        deform=dataclasses.replace(config.deform, precision=precision),
         densify_human=dataclasses.replace(config.densify_human, max_count=human),
     )
     folder = tempfile.TemporaryDirectory()

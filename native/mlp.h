@@ -32,8 +32,8 @@ struct MlpGrads {
 // One evaluation. Sums are in an order that does not depend on the number of threads.
 class Mlp {
   public:
-    // `keep` stores what `backward` needs.
-    Mlp(const MlpInputs& inputs, bool keep, int threads);
+    // `keep` stores what `backward` needs; `bf16` multiplies the later layers in bfloat16.
+    Mlp(const MlpInputs& inputs, bool keep, bool bf16, int threads);
     void forward(float* output);
     void backward(const float* output_grad, const MlpGrads& grads);
 

@@ -86,31 +86,16 @@ void backward(const MlpShape& s, const MlpBackward& job, size_t block, const Mlp
             });
             y = to;
         }
-        add_column_sums(y, s.width_panels, sums.bias + t * s.width_panels * W);
-        if (f.both) {
-            pack(f.both + t * s.points * s.per_both, first, s.points, s.per_both, s.both_panels, both);
-            add_outer<Single>(y, s.width_panels, both, s.both_panels, sums.both_weight);
-            if (job.both_grad) {
-                rows_times<Single>(y, s.width, f.both_weight.backward, s.both_panels, zero, to_panels(both));
-                unpack(both, first, s.points, s.per_both, job.both_grad + t * s.points * s.per_both);
-            }
-        }
-        if (t == 0) {
-            for (size_t i = 0; i < matrix; i += W) store(over_times + i, load(y + i));
-        } else {
-            for (size_t i = 0; i < matrix; i += W) store(over_times + i, load(over_times + i) + load(y + i));
-        }
+        to_first_layer(s, job, first, t, y, both, sums);
+        for (size_t i = 0; i < matrix; i += W)
+            store(over_times + i, t ? load(over_times + i) + load(y + i) : load(y + i));
     }
-    add_outer<Single>(over_times, s.width_panels, point, s.point_panels, sums.point_weight);
-    if (job.point_grad) {
-        rows_times<Single>(over_times, s.width, f.point_weight.backward, s.point_panels, zero, to_panels(point));
-        unpack(point, first, s.points, s.per_point, job.point_grad);
-    }
+    to_points(s, job, first, over_times, point, sums);
 }
 
 }  // namespace
 
-const MlpKernels mlp_kernels = {W, forward, backward};
+const MlpKernels mlp_kernels = {W, 1, forward, backward};
 
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

@@ -146,3 +146,28 @@ void unpack(const float* from, size_t first, size_t rows, int columns, float* to
         }
     }
 }
+
+// The gradient `y` of the first layer at one time, to its bias and to what is given per point and time.
+INLINE void to_first_layer(const MlpShape& s, const MlpBackward& job, size_t first, size_t t, const float* y,
+                           float* both, const MlpSums& sums) {
+    const MlpForward& f = job.forward;
+    add_column_sums(y, s.width_panels, sums.bias + t * s.width_panels * W);
+    if (!f.both) return;
+    const size_t offset = t * s.points * s.per_both;
+    pack(f.both + offset, first, s.points, s.per_both, s.both_panels, both);
+    add_outer<Single>(y, s.width_panels, both, s.both_panels, sums.both_weight);
+    if (!job.both_grad) return;
+    const auto zero = [](int, int) { return F{}; };
+    rows_times<Single>(y, s.width, f.both_weight.backward, s.both_panels, zero, to_panels(both));
+    unpack(both, first, s.points, s.per_both, job.both_grad + offset);
+}
+
+// The sum `y` of that gradient over the times, to what is given per point; `point` holds that.
+INLINE void to_points(const MlpShape& s, const MlpBackward& job, size_t first, const float* y, float* point,
+                      const MlpSums& sums) {
+    add_outer<Single>(y, s.width_panels, point, s.point_panels, sums.point_weight);
+    if (!job.point_grad) return;
+    const auto zero = [](int, int) { return F{}; };
+    rows_times<Single>(y, s.width, job.forward.point_weight.backward, s.point_panels, zero, to_panels(point));
+    unpack(point, first, s.points, s.per_point, job.point_grad);
+}

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from evsplat._native import levels as native_levels
-from evsplat.deform.mlp import PointMLP
+from evsplat.deform.mlp import PointMLP, bfloat16_runs
 
 
 def plain(network, point, time=None, both=None):
@@ -104,9 +104,73 @@ def test_native_values_and_gradients_equal_those_in_float64(inputs_of, width, de
         assert (value - truth).norm() < 3e-6 * truth.norm()
 
 
-def test_native_results_do_not_depend_on_the_number_of_threads():
+def rounded(tensor):
+    return tensor.to(torch.bfloat16).to(tensor.dtype)
+
+
+class RoundedProduct(torch.autograd.Function):
+    """Of a hidden layer: all factors are rounded to bfloat16, forward and backward, and no sum."""
+
+    @staticmethod
+    def forward(ctx, hidden, weight, bias):
+        factors = rounded(hidden), rounded(weight)
+        ctx.save_for_backward(*factors)
+        return factors[0] @ factors[1].T + bias
+
+    @staticmethod
+    def backward(ctx, upstream):
+        hidden, weight = ctx.saved_tensors
+        flow = rounded(upstream)
+        over = flow.flatten(0, -2)
+        return flow @ weight, over.T @ hidden.flatten(0, -2), over.sum(0)
+
+
+@pytest.mark.parametrize(("inputs_of", "width", "depth", "out"), SIZES)
+@pytest.mark.parametrize("points", [1, 97, 1000])
+def test_bfloat16_rounds_factors_of_hidden_layers_and_nothing_else(
+    inputs_of, width, depth, out, points
+):
+    if not bfloat16_runs():
+        pytest.skip("this processor multiplies no bfloat16")
+    torch.manual_seed(points)
+    network = PointMLP(*inputs_of, width=width, depth=depth, out=out)
+    network.precision = "bfloat16"
+    times = 3 if inputs_of[1] or inputs_of[2] else 1
+    arguments = [
+        torch.randn(points, inputs_of[0]).requires_grad_(),
+        torch.randn(times, inputs_of[1]).requires_grad_() if inputs_of[1] else None,
+        torch.randn(times, points, inputs_of[2]).requires_grad_() if inputs_of[2] else None,
+    ]
+    values, _ = both_ways(network, arguments)
+    exact = PointMLP(*inputs_of, width=width, depth=depth, out=out).double()
+    exact.load_state_dict(network.state_dict())
+
+    def rounding(point, time, both):
+        hidden = exact.first_bias + point @ exact.point_weight.T
+        hidden = hidden[None] if time is None else hidden + (time @ exact.time_weight.T)[:, None]
+        hidden = hidden if both is None else hidden + both @ exact.both_weight.T
+        for weight, bias in zip(exact.weights, exact.biases, strict=True):
+            hidden = RoundedProduct.apply(nn.functional.leaky_relu(hidden, 0.01), weight, bias)
+        return hidden
+
+    doubles = [None if a is None else a.detach().double().requires_grad_() for a in arguments]
+    leaves = [leaf for leaf in (*doubles, *exact.parameters()) if leaf is not None and leaf.numel()]
+    output = rounding(*doubles)
+    upstream = torch.randn(
+        output.shape, generator=torch.Generator().manual_seed(output.numel()), dtype=torch.float32
+    )
+    expected = [output, *torch.autograd.grad(output, leaves, upstream.double())]
+    assert len(values) == len(expected)
+    for value, truth in zip(values, expected, strict=True):
+        # Sums near a tie of the rounding may fall on its other side, 2^-8 of a value away.
+        assert (value - truth).norm() < 2**-8 * truth.norm()
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_native_results_do_not_depend_on_the_number_of_threads(bfloat16):
     torch.manual_seed(0)
     network = PointMLP(48, 144, 0, width=128, depth=3, out=25)
+    network.precision = "bfloat16" if bfloat16 else "float32"
     arguments = [torch.randn(2_000, 48).requires_grad_(), torch.randn(2, 144), None]
     threads = torch.get_num_threads()
     try:

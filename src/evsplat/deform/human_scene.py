@@ -1,5 +1,6 @@
 """A person and a scene in one Gaussian set, posed at any time: the paper's model (eq. 1-7)."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -12,10 +13,13 @@ from evsplat.body import BodyTrack, bounding_box, skin
 from evsplat.body.rotations import axis_angle_to_matrix, quaternion_multiply
 from evsplat.deform.colour import HumanColour, SceneColour, view_jitter
 from evsplat.deform.encodings import make_encoding
+from evsplat.deform.mlp import PointMLP, Precision, bfloat16_runs
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
 from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.gaussians import ATTRIBUTES, GaussianSet, PosedGaussians, PosedHuman, StaticScene
+
+logger = logging.getLogger(__name__)
 
 Semantics = Literal["fixed", "ste", "rendered"]
 
@@ -40,6 +44,9 @@ class DeformConfig:
     """Hidden width of the colour networks (A10)."""
     latent_dim: int = 16
     """Size of the per-frame latent of the person's colour."""
+    precision: Precision = "float32"
+    """bfloat16: the hidden layers multiply with 8 bits and sum with 24, on CPUs that can
+    (AVX-512 BF16; elsewhere a warning says that it is float32). See docs/performance.md."""
     non_rigid_start: float = 3_000
     """Nominal iteration at which the non-rigid network is switched on (A9)."""
     pose_noise: float = 0.1
@@ -105,6 +112,11 @@ class HumanSceneModel(nn.Module):
         self.scene_colour = SceneColour(
             view_dependent=config.scene_view_dependent, width=config.colour_width
         )
+        if config.precision == "bfloat16" and not bfloat16_runs():
+            logger.warning("This machine multiplies no bfloat16: the networks run in float32.")
+        for module in self.modules():
+            if isinstance(module, PointMLP):
+                module.precision = config.precision
         frames = len(frame_times_us)
         # Zero, not random: what a frame has not learned must not show between frames.
         self.latents = nn.Parameter(torch.zeros(frames, config.latent_dim))

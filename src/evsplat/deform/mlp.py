@@ -8,7 +8,7 @@ back, while they are in the cache; everywhere else plain torch does the same.
 
 import math
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -16,6 +16,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from evsplat.compiled import native, runs_native
+
+Precision = Literal["float32", "bfloat16"]
 
 SLOPE = 0.01
 """Of the leaky ReLU, as 3DGS-Avatar."""
@@ -26,6 +28,9 @@ class PointMLP(nn.Module):
 
     Weights start as PyTorch's linear layers do, except that ``last_std`` (if given) draws those of
     the last layer from N(0, last_std^2) with zero bias, so that the output starts near zero.
+
+    With ``precision`` set to bfloat16, all layers but the first multiply in bfloat16 and sum in
+    float32, where `bfloat16_runs`; elsewhere they stay in float32.
     """
 
     def __init__(
@@ -39,6 +44,7 @@ class PointMLP(nn.Module):
         last_std: float | None = None,
     ) -> None:
         super().__init__()
+        self.precision: Precision = "float32"
         fan_in = per_point + per_time + per_both
         self.point_weight = nn.Parameter(_uniform((width, per_point), fan_in))
         self.time_weight = nn.Parameter(_uniform((width, per_time), fan_in))
@@ -69,9 +75,15 @@ class PointMLP(nn.Module):
             keep = torch.is_grad_enabled() and any(
                 tensor is not None and tensor.requires_grad for tensor in inputs
             )
-            output: Tensor = _NativeMLP.apply(keep, *inputs)
+            bf16 = self.precision == "bfloat16" and bfloat16_runs()
+            output: Tensor = _NativeMLP.apply(keep, bf16, *inputs)
             return output
         return plain_mlp(*inputs)
+
+
+def bfloat16_runs() -> bool:
+    """Whether this machine multiplies bfloat16 in the compiled module (AVX-512 BF16)."""
+    return native is not None and native.has_bf16()
 
 
 def plain_mlp(
@@ -97,13 +109,13 @@ def plain_mlp(
 class _NativeMLP(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, keep: bool, point: Tensor, both: Tensor | None, *parameters: Tensor
+        ctx: Any, keep: bool, bf16: bool, point: Tensor, both: Tensor | None, *parameters: Tensor
     ) -> Float[Tensor, "T N out"]:
         points, (bias, point_weight, both_weight, *layers) = _plain(point), map(_plain, parameters)
         moving = None if both is None else _plain(both)
         threads = torch.get_num_threads()
         ctx.job = native.Mlp(
-            points, moving, bias, point_weight, both_weight, layers, SLOPE, keep, threads
+            points, moving, bias, point_weight, both_weight, layers, SLOPE, keep, bf16, threads
         )
         output = torch.empty(len(bias), len(points), len(layers[-1]))
         ctx.job.forward(output)
@@ -120,11 +132,11 @@ class _NativeMLP(torch.autograd.Function):
         point, both, bias, point_weight, both_weight, *layers = inputs
         point, both = (
             gradient if needed else None
-            for gradient, needed in zip((point, both), ctx.needs_input_grad[1:3], strict=True)
+            for gradient, needed in zip((point, both), ctx.needs_input_grad[2:4], strict=True)
         )
         upstream = gradients[0].contiguous()
         ctx.job.backward(upstream, point, both, bias, point_weight, both_weight, layers)
-        return None, point, both, bias, point_weight, both_weight, *layers
+        return None, None, point, both, bias, point_weight, both_weight, *layers
 
 
 def _plain(tensor: Tensor) -> Tensor:
