@@ -143,33 +143,48 @@ def with_gradient(splats: Splats) -> Splats:
     )
 
 
-def many_times(size_px: int, channels: int, repeats: int) -> dict[str, float]:
-    """Forward+backward of a person over a static scene: one time, five, five without sharing."""
+@dataclass(frozen=True)
+class TwoLayers:
+    """A person that moves over a scene that does not."""
+
+    moving: Splats
+    static: Splats
+    camera: PinholeCamera
+    image_grad: torch.Tensor
+
+
+def person_over_scene(size_px: int, channels: int, times: int) -> TwoLayers:
+    """20,000 Gaussians in a box of 15 % of the picture, moving by pixels, over 30,000."""
     static = make_scene(size_px, 30_000, channels)
     person = make_scene(size_px, 20_000, channels, seed=1).splats
-    # A box of 15 % of the picture; it moves by a few pixels from time to time.
     means = person.means[0] * torch.tensor([0.27, 0.55, 1.0])
-    means = torch.stack([means + 0.01 * t for t in range(5)])
+    means = torch.stack([means + 0.01 * t for t in range(times)])
+    return TwoLayers(replace(person, means=means), static.splats, static.camera, static.image_grad)
+
+
+def many_times(size_px: int, channels: int, repeats: int) -> dict[str, float]:
+    """Forward+backward of a person over a static scene: one time, five, five without sharing."""
+    scene = person_over_scene(size_px, channels, 5)
 
     def measured(name: str, moving: Splats, fixed: Splats | None) -> float:
         moving = with_gradient(moving)
         fixed = None if fixed is None else with_gradient(fixed)
-        grad = static.image_grad.expand(len(moving.means), -1, -1, -1)
+        grad = scene.image_grad.expand(len(moving.means), -1, -1, -1)
         layers = [layer for layer in (moving, fixed) if layer is not None]
         leaves = [v for layer in layers for v in vars(layer).values() if v is not None]
 
         def both() -> None:
-            out = render(moving, static.camera, static=fixed)
+            out = render(moving, scene.camera, static=fixed)
             torch.autograd.grad(out.image, leaves, grad)
 
         timing = timed(both, repeats)
         print(f"  {name}: {timing}")
         return timing.best
 
-    single = measured("person and scene, 1 time", replace(person, means=means[:1]), static.splats)
-    moving = replace(person, means=means)
-    shared = measured("person and scene, 5 times", moving, static.splats)
-    everything = join(moving.with_times(), static.splats.with_times(), 5)
+    first = replace(scene.moving, means=scene.moving.means[:1])
+    single = measured("person and scene, 1 time", first, scene.static)
+    shared = measured("person and scene, 5 times", scene.moving, scene.static)
+    everything = join(scene.moving.with_times(), scene.static.with_times(), 5)
     apart = measured("the same without sharing", everything, None)
     print(
         f"  five times cost {shared / single:.2f} single renders, {apart / single:.2f} without "

@@ -106,21 +106,29 @@ def main() -> None:
 
 
 def build(size: int, human: int, scene: int, renders: int, precision: Precision) -> Trainer:
-    """A training on the demo capture in the middle of its schedule, with everything switched on."""
+    """A training on the demo capture, with pictures of that size."""
+    folder = tempfile.TemporaryDirectory()
+    _KEPT.append(folder)
+    return build_on(resized_demo(size, Path(folder.name)), human, scene, renders, precision)
+
+
+def build_on(
+    path: Path, human: int | None, scene: int | None, renders: int, precision: Precision
+) -> Trainer:
+    """A training in the middle of its schedule, with everything switched on."""
     config = PaperConfig()
     config = dataclasses.replace(
         config,
         human=dataclasses.replace(config.human, count=human),
         deform=dataclasses.replace(config.deform, precision=precision),
-        densify_human=dataclasses.replace(config.densify_human, max_count=human),
+        densify_human=dataclasses.replace(config.densify_human, max_count=human or 10_000),
     )
-    folder = tempfile.TemporaryDirectory()
-    _KEPT.append(folder)
-    capture = load_capture(resized_demo(size, Path(folder.name)))
+    capture = load_capture(path)
     composition = compose(config, capture, 0, fit=False)
     composition.objectives.append(MoreTimes(renders))
     composition.weights["more_times"] = 1e-6
-    composition.model.gaussians = with_scene_count(composition.model.gaussians, scene)
+    if scene is not None:
+        composition.model.gaussians = with_scene_count(composition.model.gaussians, scene)
     return Trainer(composition, capture, Clock(100_000, fraction=0.4))
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from evsplat.objectives import RenderedSemantics, silhouette_bounds
+from evsplat.objectives import PackedBounds, RenderedSemantics, silhouette_bounds
 
 
 def disc(radius: float) -> np.ndarray:
@@ -18,6 +18,8 @@ def disc(radius: float) -> np.ndarray:
 
 def test_bounds_leave_a_band_of_the_given_width_undecided():
     inside, outside = silhouette_bounds(disc(8), 5)
+    packed = PackedBounds.of(disc(8), 5).masks()
+    assert torch.equal(packed[0], inside) and torch.equal(packed[1], outside)
     distance = distance_transform_edt(~disc(8))
     undecided = ~(inside | outside).numpy()
     assert not (inside & outside).any()
@@ -39,7 +41,7 @@ def test_cross_entropy_is_the_closed_form(probability):
         semantic=torch.full((2, 40, 50), probability),
         model=SimpleNamespace(gaussians=SimpleNamespace(semantics=lambda: soft)),
     )
-    terms = RenderedSemantics({20: bounds}).loss(step)
+    terms = RenderedSemantics({20: PackedBounds.of(disc(8), 5)}).loss(step)
     inside, outside = (float(mask.float().mean()) for mask in bounds)
     expected = -inside * math.log(probability) - outside * math.log(1 - probability)
     assert float(terms["semantic"]) == pytest.approx(expected, rel=1e-5)

@@ -30,10 +30,10 @@ from evsplat.objectives import (
     EventChange,
     Isometry,
     Objective,
+    PackedBounds,
     Photometric,
     RenderedSemantics,
     SkinningPrior,
-    silhouette_bounds,
 )
 from evsplat.objectives.perceptual import PerceptualName, make_perceptual
 
@@ -329,7 +329,7 @@ def _objectives(
         vertices = track.vertices(frame.mid_us)
         mask = silhouette(vertices, track.body.faces, camera)
         band = max(1, round(config.semantic_band_px_at_256 * camera.height / 256))
-        bounds[frame.mid_us] = silhouette_bounds(mask.numpy(), band)
+        bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band)
         box = body_box(vertices, camera)
         if box is not None:
             boxes[frame.name] = box

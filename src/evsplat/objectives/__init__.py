@@ -4,13 +4,14 @@ from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event import EventChange, event_loss
 from evsplat.objectives.isometry import Isometry
 from evsplat.objectives.photometric import Photometric
-from evsplat.objectives.semantic import RenderedSemantics, silhouette_bounds
+from evsplat.objectives.semantic import PackedBounds, RenderedSemantics, silhouette_bounds
 from evsplat.objectives.skinning import SkinningPrior
 
 __all__ = [
     "EventChange",
     "Isometry",
     "Objective",
+    "PackedBounds",
     "Photometric",
     "RenderedSemantics",
     "SkinningPrior",

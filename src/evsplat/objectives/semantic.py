@@ -1,6 +1,7 @@
 """Teaches the semantic attribute where the person is, without any mask (A8)."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,14 +27,36 @@ def silhouette_bounds(
     return torch.from_numpy(silhouette.copy()), torch.from_numpy(outside)
 
 
+@dataclass(frozen=True)
+class PackedBounds:
+    """`silhouette_bounds` at one bit a mask and pixel: training keeps those of every frame."""
+
+    bits: np.ndarray
+    height: int
+    width: int
+
+    @classmethod
+    def of(cls, silhouette: Bool[np.ndarray, "H W"], band_px: int) -> "PackedBounds":
+        """Find and pack them."""
+        masks = torch.stack(silhouette_bounds(silhouette, band_px)).numpy()
+        return cls(np.packbits(masks), *silhouette.shape)
+
+    def masks(self) -> tuple[Bool[Tensor, "H W"], Bool[Tensor, "H W"]]:
+        """Inside and outside, as `silhouette_bounds` gave them."""
+        pixels = self.height * self.width
+        masks = torch.from_numpy(np.unpackbits(self.bits, count=2 * pixels).view(bool))
+        inside, outside = masks.view(2, self.height, self.width)
+        return inside, outside
+
+
 class RenderedSemantics(Stateless):
     """Cross-entropy of the rendered attribute against the posed body's bounds (A2 iii, A8)."""
 
     def __init__(
         self,
-        bounds: dict[int, tuple[Bool[Tensor, "H W"], Bool[Tensor, "H W"]]],
+        bounds: dict[int, PackedBounds],
     ) -> None:
-        """``bounds``: `silhouette_bounds` at the mid-exposure (microseconds) of training frames."""
+        """``bounds`` of the posed body, by mid-exposure (microseconds) of the training frames."""
         self.bounds = bounds
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
@@ -46,7 +69,7 @@ class RenderedSemantics(Stateless):
         for time, drawn in zip(step.times_us, step.semantic, strict=True):
             if time not in self.bounds:
                 continue
-            inside, outside = (mask.to(drawn.device) for mask in self.bounds[time])
+            inside, outside = (mask.to(drawn.device) for mask in self.bounds[time].masks())
             probability = drawn.clamp(1e-4, 1 - 1e-4)
             error = -torch.where(
                 inside, probability.log(), torch.where(outside, (1 - probability).log(), 0.0)
