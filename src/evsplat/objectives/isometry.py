@@ -61,18 +61,24 @@ class Isometry:
         near = self.neighbours[chosen].to(canonical.device)
         rows = torch.cat([chosen.to(canonical.device)[:, None], near], dim=1)
 
-        centers, after = _rows(canonical, rows, 0), _rows(posed.means, rows, 1)
+        # All that a row has is gathered in one piece: the gradient of a gather is as large as its
+        # source, whatever the number of rows.
+        parts = (gaussians.means, gaussians.quaternions, gaussians.scales_log)
+        gathered = _rows(torch.cat([part[:count] for part in parts], -1), rows, 0)
+        centers, quaternions, log_scales = gathered.split((3, 4, 3), -1)
+        linear = posed.transforms[..., :3, :3].flatten(-2)
+        world = torch.cat([posed.means, posed.quaternions, posed.scales, linear], -1)
+        gathered = _rows(world, rows, 1)
+        after, posed_quaternions, posed_scales, linear = gathered.split((3, 4, 3, 9), -1)
+
         before = (centers[:, :1] - centers[:, 1:]).norm(dim=-1)
         after = (after[:, :, :1] - after[:, :, 1:]).norm(dim=-1)
         terms = {"isometry_centers": (after - before).abs().mean()}
 
-        rotation = quaternion_to_matrix(_rows(gaussians.quaternions, rows, 0))
-        scales = _rows(gaussians.scales_log, rows, 0).exp()
-        canonical_6 = covariance6(rotation * scales[..., None, :])
-        posed_rotation = _rows(posed.transforms, rows, 1)[..., :3, :3] @ quaternion_to_matrix(
-            _rows(posed.quaternions, rows, 1)
-        )
-        posed_6 = covariance6(posed_rotation * _rows(posed.scales, rows, 1)[..., None, :])
+        rotation = quaternion_to_matrix(quaternions)
+        canonical_6 = covariance6(rotation * log_scales.exp()[..., None, :])
+        rotation = linear.unflatten(-1, (3, 3)) @ quaternion_to_matrix(posed_quaternions)
+        posed_6 = covariance6(rotation * posed_scales[..., None, :])
         before = (canonical_6[:, :1] - canonical_6[:, 1:]).norm(dim=-1)
         after = (posed_6[:, :, :1] - posed_6[:, :, 1:]).norm(dim=-1)
         terms["isometry_covariances"] = (after - before).abs().mean()
