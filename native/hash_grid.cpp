@@ -13,7 +13,7 @@ HashLevel level_of(const HashGrid& g, size_t level) {
     HashLevel l = {};
     l.points = g.points, l.features = g.features, l.cells = int(g.cells[level]);
     const int64_t vertices = (g.cells[level] + 1) * (g.cells[level] + 1) * (g.cells[level] + 1);
-    l.mask = g.begin[level + 1] - g.begin[level] == vertices ? 0 : g.mask;
+    l.dense = g.begin[level + 1] - g.begin[level] == vertices, l.mask = g.mask;
     l.positions = g.positions, l.table = g.table + g.begin[level] * g.features;
     return l;
 }

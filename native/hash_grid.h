@@ -10,7 +10,8 @@ namespace evsplat {
 struct HashLevel {
     size_t points;
     int features, cells;        // values per entry; cells per axis
-    uint32_t mask;              // of hashed entries; 0: the level is stored densely
+    bool dense;                 // an entry per vertex; else hashed
+    uint32_t mask;              // of hashed entries
     const float* positions;     // (N, 3) in [0, 1]
     const float* table;         // (entries, features)
     float* encoded;             // (features, N), written

@@ -18,7 +18,7 @@ struct Cells {
 INLINE void find_cells(const HashLevel& job, const float (&position)[3][W], Cells& c) {
     uint32_t at[3][2][W];
     const uint32_t side = uint32_t(job.cells) + 1;
-    const uint32_t stride[3] = {1u, job.mask ? 2654435761u : side, job.mask ? 805459861u : side * side};
+    const uint32_t stride[3] = {1u, job.dense ? side : 2654435761u, job.dense ? side * side : 805459861u};
     for (int axis = 0; axis < 3; ++axis)
         for (int l = 0; l < W; ++l) {
             const float scaled = position[axis][l] * float(job.cells);
@@ -31,10 +31,10 @@ INLINE void find_cells(const HashLevel& job, const float (&position)[3][W], Cell
         }
     for (int k = 0; k < 8; ++k) {
         const uint32_t *x = at[0][k >> 2], *y = at[1][k >> 1 & 1], *z = at[2][k & 1];
-        if (job.mask) {
-            for (int l = 0; l < W; ++l) c.entry[k][l] = (x[l] ^ y[l] ^ z[l]) & job.mask;
-        } else {
+        if (job.dense) {
             for (int l = 0; l < W; ++l) c.entry[k][l] = x[l] + y[l] + z[l];
+        } else {
+            for (int l = 0; l < W; ++l) c.entry[k][l] = (x[l] ^ y[l] ^ z[l]) & job.mask;
         }
     }
 }

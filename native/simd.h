@@ -1,7 +1,7 @@
 // Vectors of floats of one SIMD level, written with the compiler's vector types.
 //
-// Included by kernels.cpp and mlp_kernels.cpp only, inside the namespace of its level: nothing here may have external
-// linkage, or the linker could hand AVX-512 code to a machine without it.
+// Included by kernels.cpp and the kernels of networks only, inside the namespace of its level: nothing
+// here may have external linkage, or the linker could hand AVX-512 code to a machine without it.
 
 constexpr int W = EVSPLAT_LANES;                   // lanes = pixels of a patch
 constexpr int kPatchW = W == 4 ? 2 : 4;

@@ -37,19 +37,19 @@ class Photometric(Stateless):
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``l1``, ``dssim`` and ``perceptual`` as configured, means over pictures and pixels."""
-        frames, rendered, observed = [], [], []
-        for time, picture in zip(step.times_us, step.rgb, strict=True):
-            if time in self.frames:
-                frames.append(self.frames[time])
-                rendered.append(picture)
-                observed.append(step.capture.image(frames[-1]).to(picture))
-        pairs = list(zip(rendered, observed, strict=True))
+        frames = [self.frames.get(time) for time in step.times_us]
+        seen = [
+            (frame, rendered, step.capture.image(frame).to(rendered))
+            for frame, rendered in zip(frames, step.rgb, strict=True)
+            if frame is not None
+        ]
+        pairs = [(rendered, observed) for _, rendered, observed in seen]
         terms = {"l1": torch.stack([(a - b).abs().mean() for a, b in pairs]).mean()}
         if self.dssim:
             terms["dssim"] = 1 - torch.stack([ssim(a, b, GAUSSIAN_SSIM) for a, b in pairs]).mean()
         if self.perceptual is not None:
             values = []
-            for a, b, frame in zip(rendered, observed, frames, strict=True):
+            for frame, a, b in seen:
                 if frame.name not in self.boxes:
                     continue
                 x0, y0, x1, y1 = self.boxes[frame.name]
