@@ -84,9 +84,8 @@ SIZES = [
 ]
 
 
-@pytest.mark.parametrize(("inputs_of", "width", "depth", "out"), SIZES)
-@pytest.mark.parametrize("points", [1, 95, 96, 97, 1000])
-def test_native_values_and_gradients_equal_those_in_float64(inputs_of, width, depth, out, points):
+def sized(inputs_of, width, depth, out, points):
+    """A network of these sizes with random arguments, in float32 and the same in float64."""
     torch.manual_seed(points)
     network = PointMLP(*inputs_of, width=width, depth=depth, out=out)
     times = 3 if inputs_of[1] or inputs_of[2] else 1
@@ -95,10 +94,17 @@ def test_native_values_and_gradients_equal_those_in_float64(inputs_of, width, de
         torch.randn(times, inputs_of[1]).requires_grad_() if inputs_of[1] else None,
         torch.randn(times, points, inputs_of[2]).requires_grad_() if inputs_of[2] else None,
     ]
-    native, _ = both_ways(network, arguments)
     exact = PointMLP(*inputs_of, width=width, depth=depth, out=out).double()
     exact.load_state_dict(network.state_dict())
     doubles = [None if a is None else a.detach().double().requires_grad_() for a in arguments]
+    return network, arguments, exact, doubles
+
+
+@pytest.mark.parametrize(("inputs_of", "width", "depth", "out"), SIZES)
+@pytest.mark.parametrize("points", [1, 95, 96, 97, 1000])
+def test_native_values_and_gradients_equal_those_in_float64(inputs_of, width, depth, out, points):
+    network, arguments, exact, doubles = sized(inputs_of, width, depth, out, points)
+    native, _ = both_ways(network, arguments)
     _, expected = both_ways(exact, doubles)
     for value, truth in zip(native, expected, strict=True):
         assert (value - truth).norm() < 3e-6 * truth.norm()
@@ -132,18 +138,9 @@ def test_bfloat16_rounds_factors_of_hidden_layers_and_nothing_else(
 ):
     if not bfloat16_runs():
         pytest.skip("this processor multiplies no bfloat16")
-    torch.manual_seed(points)
-    network = PointMLP(*inputs_of, width=width, depth=depth, out=out)
+    network, arguments, exact, doubles = sized(inputs_of, width, depth, out, points)
     network.precision = "bfloat16"
-    times = 3 if inputs_of[1] or inputs_of[2] else 1
-    arguments = [
-        torch.randn(points, inputs_of[0]).requires_grad_(),
-        torch.randn(times, inputs_of[1]).requires_grad_() if inputs_of[1] else None,
-        torch.randn(times, points, inputs_of[2]).requires_grad_() if inputs_of[2] else None,
-    ]
     values, _ = both_ways(network, arguments)
-    exact = PointMLP(*inputs_of, width=width, depth=depth, out=out).double()
-    exact.load_state_dict(network.state_dict())
 
     def rounding(point, time, both):
         hidden = exact.first_bias + point @ exact.point_weight.T
@@ -153,7 +150,6 @@ def test_bfloat16_rounds_factors_of_hidden_layers_and_nothing_else(
             hidden = RoundedProduct.apply(nn.functional.leaky_relu(hidden, 0.01), weight, bias)
         return hidden
 
-    doubles = [None if a is None else a.detach().double().requires_grad_() for a in arguments]
     leaves = [leaf for leaf in (*doubles, *exact.parameters()) if leaf is not None and leaf.numel()]
     output = rounding(*doubles)
     upstream = torch.randn(
