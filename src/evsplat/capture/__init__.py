@@ -6,11 +6,13 @@ from evsplat.capture.capture import Capture, load_capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.validate import validate_capture
+from evsplat.capture.write import CaptureWriter
 
 __all__ = [
     "BodyFile",
     "Camera",
     "Capture",
+    "CaptureWriter",
     "Finding",
     "Frame",
     "NovelView",

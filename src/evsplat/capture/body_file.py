@@ -3,6 +3,7 @@
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Int64
@@ -33,6 +34,13 @@ class BodyFile:
     weights: Float[np.ndarray, "V J"] | None = None
     betas: Float[np.ndarray, "B"] | None = None
     gender: str | None = None
+
+    @property
+    def rig(self) -> dict[str, Any] | None:
+        """The arrays that make a rig, by name; None for other models."""
+        if self.model != "rig":
+            return None
+        return {name: getattr(self, name) for name in RIG_ARRAYS}
 
 
 RIG_ARRAYS = ("joint_names", "parents", "rest_joints", "rest_vertices", "faces", "weights")

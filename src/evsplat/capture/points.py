@@ -1,4 +1,4 @@
-"""Reading the optional initial scene points (PLY, ASCII or binary)."""
+"""The optional initial scene points: PLY, read as ASCII or binary, written as binary."""
 
 from pathlib import Path
 from typing import BinaryIO
@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from evsplat.errors import DataError
+from evsplat.files import atomic_path
 
 _TYPES = {
     **{name: "i1" for name in ("char", "int8")},
@@ -51,6 +52,27 @@ def read_points(
     colours = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
     scale = 255.0 if kinds["red"] == "u1" else 1.0
     return points, (colours / scale).astype(np.float32)
+
+
+def write_points(
+    path: Path,
+    points: Float32[np.ndarray, "N 3"],
+    colours: Float32[np.ndarray, "N 3"] | None = None,
+) -> None:
+    """Write positions (metres, world) and colours (sRGB in [0, 1]), whole or not at all."""
+    fields = [(axis, "<f4", "float") for axis in "xyz"]
+    if colours is not None:
+        fields += [(name, "u1", "uchar") for name in ("red", "green", "blue")]
+    rows = np.zeros(len(points), dtype=[(name, kind) for name, kind, _ in fields])
+    for column, axis in enumerate("xyz"):
+        rows[axis] = points[:, column]
+    if colours is not None:
+        for column, name in enumerate(("red", "green", "blue")):
+            rows[name] = (colours[:, column].clip(0, 1) * 255).round()
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [*(f"property {word} {name}" for name, _, word in fields), "end_header", ""]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes("\n".join(lines).encode("ascii") + rows.tobytes())
 
 
 def _read_header(file: BinaryIO) -> tuple[str, int, list[tuple[str, str]]]:

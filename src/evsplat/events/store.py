@@ -15,9 +15,7 @@ from jaxtyping import Float, Int64
 
 from evsplat.errors import DataError
 from evsplat.events.stream import EventStream
-from evsplat.files import atomic_path
 
-CHUNK_EVENTS = 65_536
 # HDF5 keeps decoded chunks per dataset; 4 MiB hold eight chunks of int64 times.
 _CHUNK_CACHE_BYTES = 4 << 20
 
@@ -162,40 +160,3 @@ class EventStore:
             y[keep].astype(np.uint16),
             stream.p[keep],
         )
-
-
-def milliseconds_to_index(t: Int64[np.ndarray, "N"]) -> np.ndarray:
-    """``ms_to_idx`` of sorted, non-negative times: entry m is the first index with t >= 1000 m."""
-    last_ms = int(t[-1]) // 1000 if len(t) else 0
-    edges = np.arange(last_ms + 2, dtype=np.int64) * 1000
-    return np.searchsorted(t, edges, side="left").astype(np.uint64)
-
-
-def write_events(path: Path | str, stream: EventStream, *, compression_level: int = 4) -> None:
-    """Write events as `EventStore` reads them, whole or not at all.
-
-    Times go to ``t_offset`` and ``t`` so that the first stored millisecond is not negative.
-    """
-    if len(stream) and (np.diff(stream.t) < 0).any():
-        raise DataError(f"{path}: events must be sorted by t before they are written.")
-    offset = min(0, int(stream.t[0])) if len(stream) else 0
-    t = stream.t.astype(np.int64) - offset
-    columns = {
-        "t": t,
-        "x": stream.x.astype(np.uint16),
-        "y": stream.y.astype(np.uint16),
-        "p": (stream.p > 0).astype(np.uint8),
-    }
-    packing: dict[str, Any] = {
-        "chunks": (min(CHUNK_EVENTS, len(stream)),),
-        "compression": "gzip",
-        "compression_opts": compression_level,
-        # bytes of equal weight together: neighbouring times share their high bytes
-        "shuffle": True,
-    }
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        for name, values in columns.items():
-            # HDF5 has no chunks of nothing
-            file.create_dataset(f"events/{name}", data=values, **(packing if len(t) else {}))
-        file["ms_to_idx"] = milliseconds_to_index(t)
-        file["t_offset"] = np.int64(offset)

@@ -1,0 +1,315 @@
+"""Writing a capture as a whole: everything an importer or a simulator needs to say."""
+
+import dataclasses
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evsplat.capture.body_file import RIG_ARRAYS
+from evsplat.capture.encode import write_image
+from evsplat.capture.images import image_size
+from evsplat.capture.parse import FORMAT, VERSION, default_split
+from evsplat.capture.points import write_points
+from evsplat.capture.validate import check_capture
+from evsplat.errors import DataError
+from evsplat.events import EventStream, write_events
+from evsplat.files import write_json
+
+_PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+_SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
+
+
+class CaptureWriter:
+    """Builds a capture folder that appears under its name only when it is whole and valid.
+
+    A context manager: pictures and events go to a hidden folder beside ``path`` as they come, so
+    that memory does not grow with the recording. When the block ends well, the quick checks of
+    `load_capture` run and the folder is renamed; on an error or Ctrl-C it is removed and ``path``
+    stays as it was.
+
+        with CaptureWriter("my_capture") as writer:
+            writer.add_camera("main", 640, 480, K, world_to_camera)
+            writer.add_frame("0000", "main", picture, exposure_us=(0, 30_000))
+            writer.set_body("default", times_us, poses, transl, betas=betas)
+
+    ``provenance`` is a dictionary that may be added to at any time (docs/capture-format.md).
+
+    Raises:
+        DataError: ``path`` exists (with ``overwrite`` only a capture is replaced), something does
+            not fit, or the capture is not valid in the end.
+    """
+
+    def __init__(
+        self, path: Path | str, name: str | None = None, *, overwrite: bool = False
+    ) -> None:
+        self.path = Path(path)
+        self.name = name or self.path.resolve().name
+        self.provenance: dict[str, Any] = {}
+        self._cameras: dict[str, dict[str, Any]] = {}
+        self._frames: list[dict[str, Any]] = []
+        self._novel_views: list[dict[str, Any]] = []
+        self._body: dict[str, str] | None = None
+        self._events: dict[str, Any] | None = None
+        self._folder: Path | None = None
+        self._overwrite = overwrite
+        self._check_target()
+
+    def __enter__(self) -> Self:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._folder = Path(tempfile.mkdtemp(dir=self.path.parent, prefix=f".{self.path.name}-"))
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            shutil.rmtree(self._root, ignore_errors=True)
+            self._folder = None
+
+    def add_camera(
+        self,
+        name: str,
+        width: int,
+        height: int,
+        K: ArrayLike,
+        world_to_camera: ArrayLike | None = None,
+        *,
+        distortion: Sequence[float] | None = None,
+    ) -> None:
+        """Declare a camera: size in pixels, K (3, 3), pose (4, 4; identity where it moves).
+
+        ``distortion`` holds OpenCV's k1, k2, p1, p2 (k3 (k4, k5, k6)) of the pictures as given.
+        """
+        _check_name("camera", name)
+        pose = np.eye(4) if world_to_camera is None else world_to_camera
+        lens = None
+        if distortion is not None and any(distortion):
+            lens = {"model": "opencv", "coefficients": [float(value) for value in distortion]}
+        self._cameras[name] = {
+            "width": int(width),
+            "height": int(height),
+            "K": _numbers(K),
+            "world_to_camera": _numbers(pose),
+            "distortion": lens,
+        }
+
+    def add_frame(
+        self,
+        name: str,
+        camera: str,
+        image: np.ndarray | Path | str,
+        exposure_us: tuple[int, int],
+        *,
+        split: Literal["train", "test"] | None = None,
+        sharp: np.ndarray | Path | str | None = None,
+        mask: np.ndarray | Path | str | None = None,
+        world_to_camera: ArrayLike | None = None,
+    ) -> None:
+        """Add the next frame; frames of a camera come in the order of time.
+
+        Pictures are arrays (H, W) or (H, W, 3), sRGB-coded: uint8, uint16 or floats in [0, 1]
+        (stored as 8 bit), or the path of a PNG, JPEG or WebP file that is copied as it is. ``mask``
+        is (H, W), the share of the person; booleans will do. Without ``split``, frames whose index
+        modulo 10 is 7, 8 or 9 are test.
+        """
+        _check_name("frame", name)
+        index = len(self._frames)
+        start, end = exposure_us
+        entry: dict[str, Any] = {"name": name, "camera": camera}
+        entry["image"] = self._store(f"images/{name}", camera, image)
+        entry["exposure_us"] = [int(start), int(end)]
+        entry["split"] = split or default_split(index)
+        if sharp is not None:
+            entry["sharp"] = self._store(f"sharp/{name}", camera, sharp)
+        if mask is not None:
+            entry["mask"] = self._store(f"masks/{name}", camera, mask)
+        if world_to_camera is not None:
+            entry["world_to_camera"] = _numbers(world_to_camera)
+        self._frames.append(entry)
+
+    def add_novel_view(
+        self, camera: str, frame: str, time_us: int, image: np.ndarray | Path | str
+    ) -> None:
+        """Add a sharp picture that another camera took at the time of a frame."""
+        stored = self._store(f"novel/{camera}/{frame}", camera, image)
+        self._novel_views.append(
+            {"camera": camera, "frame": frame, "time_us": int(time_us), "image": stored}
+        )
+
+    def set_body(
+        self,
+        model: str,
+        times_us: ArrayLike,
+        poses: ArrayLike,
+        transl: ArrayLike,
+        *,
+        rig: Mapping[str, Any] | None = None,
+        betas: ArrayLike | None = None,
+        gender: str | None = None,
+        dense: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Give the body and its key poses: times (P,), poses (P, J, 3), root shifts (P, 3).
+
+        A "rig" brings ``rig`` with the arrays of docs/capture-format.md, the other models
+        ``betas`` (and ``gender``, all but "default"). ``dense`` are times, poses and shifts of the
+        truth between key poses, for evaluation only.
+        """
+        arrays: dict[str, Any] = {"model": model, **_poses(times_us, poses, transl)}
+        if rig is not None:
+            arrays |= {key: np.asarray(rig[key]) for key in RIG_ARRAYS}
+        if betas is not None:
+            arrays["betas"] = np.asarray(betas, dtype=np.float64).ravel()
+        if gender is not None:
+            arrays["gender"] = gender
+        _save_arrays(self._root / "body.npz", arrays)
+        self._body = {"file": "body.npz", "model": model}
+        if dense is not None:
+            _save_arrays(self._root / "body_dense.npz", _poses(*dense))
+
+    def set_events(
+        self,
+        events: EventStream | Iterable[EventStream],
+        width: int,
+        height: int,
+        *,
+        contrast_threshold: tuple[float, float] | None,
+        simulated: bool,
+        clock_offset_us: int = 0,
+    ) -> int:
+        """Write the event recording, one stream or its consecutive pieces; gives their count.
+
+        ``width`` and ``height`` are those of the frames' camera. ``contrast_threshold`` is C+ and
+        C- in log intensity, None where unknown. ``clock_offset_us`` is added to the events' times
+        to get the camera's clock.
+        """
+        count = write_events(self._root / "events.h5", events)
+        self._events = {
+            "file": "events.h5",
+            "width": int(width),
+            "height": int(height),
+            "contrast_threshold": None
+            if contrast_threshold is None
+            else [float(value) for value in contrast_threshold],
+            "simulated": simulated,
+            "clock_offset_us": int(clock_offset_us),
+        }
+        return count
+
+    def set_points(self, points: ArrayLike, colours: ArrayLike | None = None) -> None:
+        """Give first scene points (N, 3) in metres and their sRGB colours (N, 3) in [0, 1]."""
+        write_points(
+            self._root / "points.ply",
+            np.asarray(points, dtype=np.float32),
+            None if colours is None else np.asarray(colours, dtype=np.float32),
+        )
+
+    @property
+    def _root(self) -> Path:
+        assert self._folder is not None, "CaptureWriter is used in a with statement"
+        return self._folder
+
+    def _check_target(self) -> None:
+        if not self.path.exists():
+            return
+        if not self._overwrite:
+            raise DataError(f"{self.path}: already exists; choose another name or remove it first.")
+        if not (self.path / "capture.json").is_file():
+            raise DataError(
+                f"{self.path}: exists and is not a capture, so it stays; choose another name."
+            )
+
+    def _store(self, stem: str, camera: str, image: np.ndarray | Path | str) -> str:
+        """Write or copy a picture of a camera; gives its path in the capture."""
+        if camera not in self._cameras:
+            raise DataError(
+                f"{self.path}: {stem} is of camera {camera!r}, expected one of "
+                f"{sorted(self._cameras)}; add the camera first."
+            )
+        expected = self._cameras[camera]["width"], self._cameras[camera]["height"]
+        if isinstance(image, np.ndarray):
+            source, suffix, size = f"{self.path}: {stem}", ".png", image.shape[1::-1]
+        else:
+            source, suffix, size = str(image), Path(image).suffix.lower(), image_size(Path(image))
+        if suffix not in _PICTURE_SUFFIXES:
+            raise DataError(f"{source}: expected a PNG, JPEG or WebP picture; save it as PNG.")
+        if size != expected:
+            raise DataError(
+                f"{source}: has {'x'.join(map(str, size))} pixels, expected "
+                f"{expected[0]}x{expected[1]} of camera {camera!r}."
+            )
+        target = self._root / (stem + suffix)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(image, np.ndarray):
+            write_image(target, image, source=source)
+        else:
+            shutil.copyfile(image, target)
+        return stem + suffix
+
+    def _finish(self) -> None:
+        if self._body is None:
+            raise DataError(f"{self.path}: the capture was given no body; call set_body.")
+        document = {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": self.name,
+            "cameras": self._cameras,
+            "frames": self._frames,
+            "novel_views": self._novel_views,
+            "body": self._body,
+            **({} if self._events is None else {"events": self._events}),
+            "provenance": self.provenance,
+        }
+        write_json(self._root / "capture.json", document)
+        for finding in check_capture(self._root, deep=False)[1]:
+            if finding.severity == "error":
+                place = self.path / finding.file.relative_to(self._root)
+                raise DataError(f"{dataclasses.replace(finding, file=place)}")
+        self._check_target()
+        umask = os.umask(0)
+        os.umask(umask)
+        self._root.chmod(0o777 & ~umask)
+        if self.path.exists():
+            replaced = self._root.with_name(f"{self._root.name}-replaced")
+            self.path.rename(replaced)
+            self._root.rename(self.path)
+            shutil.rmtree(replaced)
+        else:
+            self._root.rename(self.path)
+
+
+def _check_name(kind: str, name: str) -> None:
+    if not _SAFE_NAME.fullmatch(name):
+        raise DataError(
+            f"{name!r} is no name for a {kind}: it names files, so letters, digits, '_', '-' and "
+            "'.' only."
+        )
+
+
+def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
+def _numbers(matrix: ArrayLike) -> list[Any]:
+    return np.asarray(matrix, dtype=np.float64).tolist()
+
+
+def _poses(times_us: ArrayLike, poses: ArrayLike, transl: ArrayLike) -> dict[str, np.ndarray]:
+    return {
+        "times_us": np.asarray(times_us, dtype=np.int64),
+        "poses": np.asarray(poses, dtype=np.float32),
+        "transl": np.asarray(transl, dtype=np.float32),
+    }
