@@ -181,7 +181,7 @@ def test_an_existing_folder_is_only_replaced_when_asked_and_a_capture(tmp_path: 
     assert len(load_capture(tmp_path / "one").frames) == 12
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "dear.txt").write_text("…")
-    with pytest.raises(DataError, match="letters: exists and is no capture"):
+    with pytest.raises(DataError, match="letters: exists and is not a capture"):
         CaptureWriter(tmp_path / "letters", overwrite=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["letters", "one"]
 
