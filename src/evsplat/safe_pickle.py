@@ -1,0 +1,263 @@
+"""Reading pickles of other people without running code that they might hold.
+
+A pickle is a program: it may name any function and call it. Here the few names that arrays and
+plain containers need are answered by functions of our own, and every other name is refused.
+numpy's own are not called either, because a forged dtype can make them read arbitrary memory.
+"""
+
+import bz2
+import gzip
+import io
+import lzma
+import pickle
+import struct
+import zipfile
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from evsplat.errors import DataError
+
+StandIns = Callable[[str, str], type | None]
+"""Maps a module and a name in it to a class to build instead; it gets state by __setstate__."""
+
+_BROKEN = (
+    *(OSError, EOFError, ValueError, TypeError, KeyError, AttributeError, IndexError),
+    *(AssertionError, OverflowError, MemoryError, RecursionError, struct.error, zlib.error),
+    *(lzma.LZMAError, pickle.UnpicklingError, zipfile.BadZipFile),
+)
+_UNPACK: dict[bytes, Callable[[bytes], bytes]] = {
+    b"\x1f\x8b": gzip.decompress,
+    b"BZ": bz2.decompress,
+    b"\xfd7zXZ": lzma.decompress,
+    b"\x5d\x00": lzma.decompress,
+    b"\x78": zlib.decompress,
+}
+_PLAIN_KINDS = "biufcSU"
+
+
+def read_pickle(path: Path, *, what: str = "pickle", stand_ins: StandIns | None = None) -> Any:
+    """The arrays and plain containers in a pickle, also one that joblib wrote (packed or not).
+
+    ``what`` says in messages what the file should be.
+
+    Raises:
+        DataError: unreadable, or holding a type that is neither an array nor a plain container.
+    """
+
+    def read() -> Any:
+        data = path.read_bytes()
+        for magic, unpack in _UNPACK.items():
+            if data.startswith(magic):
+                data = unpack(data)
+                break
+        return _Unpickler(io.BytesIO(data), stand_ins).load()
+
+    return _guarded(path, what, read)
+
+
+def read_npy(path: Path, *, what: str = "npy file", stand_ins: StandIns | None = None) -> Any:
+    """The array of a .npy; what was wrapped in a 0-d object array comes bare. Errors as above."""
+
+    def read() -> Any:
+        with path.open("rb") as stream:
+            return _read_array(stream, stand_ins)
+
+    return _guarded(path, what, read)
+
+
+def read_npz(
+    path: Path,
+    *,
+    what: str = "npz archive",
+    keys: Collection[str] | None = None,
+    stand_ins: StandIns | None = None,
+) -> dict[str, Any]:
+    """The members of a .npz, all or those of ``keys``, each as `read_npy` gives it."""
+
+    def read() -> dict[str, Any]:
+        with zipfile.ZipFile(path) as archive:
+            found = {name.removesuffix(".npy"): name for name in archive.namelist()}
+            members = {}
+            for key, name in found.items():
+                if keys is None or key in keys:
+                    with archive.open(name) as stream:
+                        members[key] = _read_array(stream, stand_ins)
+            return members
+
+    return _guarded(path, what, read)
+
+
+def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
+    try:
+        return read()
+    except FileNotFoundError:
+        raise DataError(f"{path}: file not found.") from None
+    except _ForbiddenType as error:
+        raise DataError(
+            f"{path}: holds the pickled type {error}, which no {what} needs, so it was not loaded; "
+            "get the file again from its official source."
+        ) from None
+    except _BROKEN as error:
+        raise DataError(f"{path}: not a readable {what} ({error}).") from error
+
+
+class _ForbiddenType(Exception):
+    """A name in a pickle that is not on the list."""
+
+
+def _read_array(stream: IO[bytes], stand_ins: StandIns | None) -> Any:
+    """One array in npy format; an object array is a pickle after the header."""
+    version = np.lib.format.read_magic(stream)
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    if version not in readers:
+        raise ValueError(f"npy format {version}")
+    shape, fortran_order, dtype = readers[version](stream)
+    if dtype.hasobject:
+        value = _Unpickler(stream, stand_ins).load()
+        is_wrapped = isinstance(value, np.ndarray) and value.shape == ()
+        return value.item() if is_wrapped else value
+    count = int(np.prod(shape, dtype=np.int64))
+    data = stream.read(count * dtype.itemsize)
+    array = np.frombuffer(data, dtype, count).copy()
+    return array.reshape(shape, order="F" if fortran_order else "C")
+
+
+class _DType:
+    """A pickled dtype of plain numbers or text, made anew from its code and byte order."""
+
+    def __init__(self, code: str, align: Any = False, copy: Any = False) -> None:
+        self.dtype = np.dtype(str(code))
+        if self.dtype.kind not in _PLAIN_KINDS + "O":
+            raise _ForbiddenType(f"numpy.dtype {code!r}")
+
+    def __setstate__(self, state: tuple) -> None:
+        self.dtype = self.dtype.newbyteorder(state[1])
+
+
+class _JoblibArray:
+    """joblib's mark for an array whose bytes follow in the file."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.shape = tuple(state["shape"])
+        self.order: str = state["order"]
+        self.dtype: np.dtype = state["dtype"].dtype
+        self.aligned = state.get("numpy_array_alignment_bytes") is not None
+
+    def read(self, read: Callable[[int], bytes]) -> np.ndarray:
+        if self.aligned:
+            read(read(1)[0])
+        count = int(np.prod(self.shape, dtype=np.int64))
+        array = np.frombuffer(read(count * self.dtype.itemsize), self.dtype, count).copy()
+        return array.reshape(self.shape, order="F" if self.order == "F" else "C")
+
+
+def _new_array(kind: Any, shape: Any, code: Any) -> np.ndarray:
+    return np.empty(0)
+
+
+def _new_scalar(kind: _DType, data: bytes | str) -> Any:
+    return np.frombuffer(_bytes(data), kind.dtype, 1)[0]
+
+
+def _from_buffer(data: bytes, kind: _DType, shape: tuple[int, ...], order: str) -> np.ndarray:
+    flat = np.frombuffer(data, kind.dtype).copy()
+    return flat.reshape(shape, order="F" if order == "F" else "C")
+
+
+def _encode(text: str, encoding: str) -> bytes:
+    if encoding not in ("latin1", "latin-1"):
+        raise _ForbiddenType(f"_codecs.encode to {encoding!r}")
+    return text.encode("latin1")
+
+
+def _new_object(kind: type, base: Any, state: Any) -> Any:
+    return object.__new__(kind)
+
+
+def _bytes(data: bytes | str) -> bytes:
+    """Bytes of Python 2 come as text."""
+    return data.encode("latin1") if isinstance(data, str) else data
+
+
+_NO_CALL = object()
+_NAMES: dict[tuple[str, str], Any] = {
+    **{("numpy", name): _NO_CALL for name in ("ndarray", "memmap")},
+    ("numpy", "dtype"): _DType,
+    ("_codecs", "encode"): _encode,
+    ("collections", "OrderedDict"): OrderedDict,
+    ("joblib.numpy_pickle", "NumpyArrayWrapper"): _JoblibArray,
+}
+for _core in ("numpy.core", "numpy._core"):
+    _NAMES[f"{_core}.multiarray", "_reconstruct"] = _new_array
+    _NAMES[f"{_core}.multiarray", "scalar"] = _new_scalar
+    _NAMES[f"{_core}.numeric", "_frombuffer"] = _from_buffer
+for _builtins in ("builtins", "__builtin__"):
+    _NAMES[_builtins, "object"] = _NO_CALL
+    _NAMES |= {
+        (_builtins, kind.__name__): kind for kind in (set, frozenset, bytes, bytearray, complex)
+    }
+for _copyreg in ("copyreg", "copy_reg"):
+    _NAMES[_copyreg, "_reconstructor"] = _new_object
+
+
+class _Unpickler(pickle._Unpickler):
+    """Unpickles arrays, plain containers and the caller's stand-ins, nothing else.
+
+    The Python version of the class, because joblib's arrays lie between the opcodes.
+    """
+
+    dispatch = dict(pickle._Unpickler.dispatch)
+    stack: list[Any]
+    _file_read: Callable[[int], bytes]
+
+    def __init__(self, stream: IO[bytes], stand_ins: StandIns | None) -> None:
+        super().__init__(stream, encoding="latin1")
+        self._stream = stream
+        self._stand_ins = stand_ins
+        self._fillable: set[type] = {_DType}
+
+    def find_class(self, module: str, name: str) -> Any:
+        stand_in = self._stand_ins(module, name) if self._stand_ins else None
+        if stand_in is not None:
+            self._fillable.add(stand_in)
+            return stand_in
+        if (module, name) not in _NAMES:
+            raise _ForbiddenType(f"{module}.{name}")
+        return _NAMES[module, name]
+
+    def load_build(self) -> None:
+        """Give the object on top of the stack its state."""
+        state = self.stack.pop()
+        target = self.stack[-1]
+        if isinstance(target, np.ndarray):
+            _fill(target, state)
+        elif isinstance(target, _JoblibArray):
+            target.__setstate__(state)
+            if target.dtype.hasobject:
+                self.stack[-1] = _Unpickler(self._stream, self._stand_ins).load()
+            else:
+                self.stack[-1] = target.read(self._file_read)
+        elif type(target) in self._fillable:
+            target.__setstate__(state)
+        else:
+            raise _ForbiddenType(f"state of a {type(target).__name__}")
+
+    dispatch[pickle.BUILD[0]] = load_build  # type: ignore[assignment]
+
+
+def _fill(array: np.ndarray, state: tuple) -> None:
+    """Give an array its pickled shape and values; objects come as a list, numbers as bytes."""
+    _, shape, kind, fortran_order, values = state
+    values = values if kind.dtype.hasobject else _bytes(values)
+    if kind.dtype.hasobject and not isinstance(values, list):
+        raise ValueError("an object array without a list of objects")
+    state = (1, tuple(shape), kind.dtype, bool(fortran_order), values)
+    array.__setstate__(state)  # type: ignore[arg-type]
