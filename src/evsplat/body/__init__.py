@@ -2,6 +2,7 @@
 
 from evsplat.body.adapters import default_body, load_body, make_body
 from evsplat.body.body import Body, bounding_box, skin
+from evsplat.body.retarget import SkeletonMotion, retarget
 from evsplat.body.rotations import (
     axis_angle_to_matrix,
     matrix_to_quaternion,
@@ -15,6 +16,7 @@ from evsplat.body.track import BodyTrack, load_body_track
 __all__ = [
     "Body",
     "BodyTrack",
+    "SkeletonMotion",
     "SurfaceSamples",
     "axis_angle_to_matrix",
     "body_box",
@@ -26,6 +28,7 @@ __all__ = [
     "matrix_to_quaternion",
     "quaternion_multiply",
     "quaternion_to_matrix",
+    "retarget",
     "silhouette",
     "skin",
 ]

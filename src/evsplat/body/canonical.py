@@ -24,6 +24,11 @@ degrees the thighs are well apart and the feet about as wide as the hands of an 
 
 _THIGH_NAMES = ("upleg", "upperleg", "legupper", "thigh", "femur")
 _HIP_NAMES = ("hip", "hipjoint")
+_PREFIXED_NAMES = (
+    *(*_THIGH_NAMES, *_HIP_NAMES, "tibia", "foot", "toes"),
+    *("clavicle", "humerus", "radius", "wrist", "hand"),
+)
+"""Bones of Acclaim skeletons (CMU), whose names begin with an l or r that nothing sets apart."""
 _SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
 _WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+")
 
@@ -46,7 +51,7 @@ def find_legs(parents: Sequence[int], joint_names: Sequence[str]) -> Legs | None
     """
     if _is_smpl(parents, joint_names):
         return Legs(1, 2, smpl=True)
-    parsed = [_parse(name) for name in joint_names]
+    parsed = [side_and_core(name) for name in joint_names]
     for names in (_THIGH_NAMES, _HIP_NAMES):
         found: dict[str, int] = {}
         for joint, (side, core) in enumerate(parsed):
@@ -95,17 +100,17 @@ def _is_smpl(parents: Sequence[int], joint_names: Sequence[str]) -> bool:
     """SMPL, SMPL-H and SMPL-X share the joints 0..21 and their order."""
     if tuple(parents[:22]) != SMPL_PARENTS[:22]:
         return False
-    named = [_parse(name) for name in joint_names[1:3]]
+    named = [side_and_core(name) for name in joint_names[1:3]]
     nameless = len(parents) == len(SMPL_PARENTS) and all(side is None for side, _ in named)
     return nameless or named == [("left", "hip"), ("right", "hip")]
 
 
-def _parse(name: str) -> tuple[str | None, str]:
+def side_and_core(name: str) -> tuple[str | None, str]:
     """Side and lower-case rest of a name: 'mixamorig:LeftUpLeg' -> ('left', 'mixamorigupleg')."""
     words = [word.lower() for word in _WORD.findall(name)]
     sides = [_SIDES[word] for word in words if word in _SIDES]
     core = "".join(word for word in words if word not in _SIDES)
-    if not sides and core[:1] in _SIDES and core[1:] in _THIGH_NAMES + _HIP_NAMES:
+    if not sides and core[:1] in _SIDES and core[1:] in _PREFIXED_NAMES:
         return _SIDES[core[0]], core[1:]  # 'lfemur'
     return (sides[0] if len(set(sides)) == 1 else None), core
 
