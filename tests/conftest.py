@@ -29,6 +29,15 @@ def captures_root() -> Path:
 
 
 @pytest.fixture(scope="session")
+def recordings_root() -> Path:
+    """Folder of the shared event recordings; tests that need it are skipped where it is absent."""
+    for data in (os.environ.get("EVSPLAT_TEST_DATA"), REPOSITORY.parent / "shared" / "data"):
+        if data and (Path(data) / "events").is_dir():
+            return Path(data) / "events"
+    pytest.skip("needs the shared recordings: set EVSPLAT_TEST_DATA to the folder with events/")
+
+
+@pytest.fixture(scope="session")
 def demo_capture_path() -> Path:
     """The capture that ships with the package."""
     return REPOSITORY / "src" / "evsplat" / "data" / "demo_capture"

@@ -1,0 +1,63 @@
+"""Formats of event recordings, one module each, chosen by the first bytes of a file."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+from evsplat.errors import ConfigError, DataError
+from evsplat.events.formats.base import Damage, ReadOptions, Source, peek
+
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Format:
+    """How a format is recognised, and where its reader is."""
+
+    name: str
+    matches: Callable[[bytes], bool]
+    """Whether a file that begins with these bytes is of this format."""
+    reader: str
+    """``module:class``, imported at first use."""
+
+    def open(self, path: Path, options: ReadOptions, damage: Damage) -> Source:
+        """Read the header."""
+        module, name = self.reader.split(":")
+        source: Source = getattr(import_module(f"{__name__}.{module}"), name)(path, options, damage)
+        return source
+
+
+def _starts(*magics: bytes) -> Callable[[bytes], bool]:
+    return lambda head: head.startswith(magics)
+
+
+def _is_text(head: bytes) -> bool:
+    return bool(head) and not set(head) - set(range(32, 127)) - set(b"\t\r\n\xef\xbb\xbf")
+
+
+# Magics first; text is what is left.
+FORMATS = {
+    entry.name: entry
+    for entry in (
+        Format("aedat4", _starts(b"#!AER-DAT4.0"), "aedat4:Aedat4"),
+        Format("npz", _starts(b"PK\x03\x04", b"\x93NUMPY"), "npz:Npz"),
+        Format("csv", _is_text, "text:Text"),
+    )
+}
+
+
+def find_format(path: Path, name: str | None = None) -> Format:
+    """The format of a file by its content; ``name`` must agree where it is given."""
+    if name is not None and name not in FORMATS:
+        raise ConfigError(f"format is {name!r}, expected one of {', '.join(FORMATS)}.")
+    head = peek(path, _HEAD_BYTES)
+    found = next((entry for entry in FORMATS.values() if entry.matches(head)), None)
+    if found is None:
+        raise DataError(
+            f"{path}: not a recording that evsplat reads (begins with {head[:16]!r}); expected one "
+            f"of {', '.join(FORMATS)}."
+        )
+    if name is not None and found.name != name:
+        raise DataError(f"{path}: its content is {found.name}, not {name}.")
+    return found

@@ -1,0 +1,219 @@
+"""AEDAT 4 (iniVation DV): events and frames with their exposure; IMU and triggers are skipped.
+
+A text line, a FlatBuffers header with an XML description of the streams, then packets:
+int32 stream, int32 size, payload (compressed), up to the table of packets at the end.
+https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4.0.html
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import lz4.frame
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.events.formats.base import (
+    ByteReader,
+    Damage,
+    RawEvents,
+    ReadOptions,
+    RecordedFrame,
+    Source,
+)
+from evsplat.events.formats.flatbuffer import FlatbufferError, Table
+
+MAGIC = b"#!AER-DAT4.0\r\n"
+_MAX_HEADER_BYTES = 16 << 20
+# DV writes packets of a few hundred kilobytes; a picture of 20 megapixels in colour has 60 MB.
+_MAX_PACKET_BYTES = 256 << 20
+_EVENT = np.dtype(
+    {
+        "names": ["t", "x", "y", "p"],
+        "formats": ["<i8", "<i2", "<i2", "u1"],
+        "offsets": [0, 8, 10, 12],
+        "itemsize": 16,
+    }
+)
+# OpenCV's type numbers -> channels
+_PICTURE_CHANNELS = {0: 1, 16: 3, 24: 4}
+
+# stream -> type, width, height
+_Streams = dict[int, tuple[str, int | None, int | None]]
+
+
+class Aedat4(Source):
+    """An AEDAT4 file; its first event stream and its first frame stream are read."""
+
+    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        self._damage = damage
+        with ByteReader(path) as reader:
+            header = self._read_header(reader)
+            self._first_packet = reader.offset
+        compression = header.integer(0, "i")
+        table_position = header.integer(1, "q", default=-1)
+        self._end = table_position if table_position > 0 else None
+        self._decompress = _decompressor(path, compression)
+        streams = self._streams(bytes(header.vector(2, 1)))
+        self._events = self._choose(streams, "EVTS")
+        self._frames = self._choose(streams, "FRME")
+        if self._events is None:
+            raise DataError(f"{path}: holds no event stream (found {_names(streams)}).")
+        self.width, self.height = streams[self._events][1:]
+
+    def blocks(self) -> Iterator[RawEvents]:
+        """Packets of the event stream."""
+        for offset, data in self._packets(self._events, b"EVTS"):
+            try:
+                elements = Table.root(data, 4).vector(0, _EVENT.itemsize)
+            except FlatbufferError as error:
+                self._broken(offset, str(error))
+                continue
+            events = np.frombuffer(elements, dtype=_EVENT)
+            # bit 0 is the polarity, the rest of the byte is padding
+            yield RawEvents(events["t"], events["x"], events["y"], events["p"] & 1)
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Packets of the frame stream."""
+        if self._frames is None:
+            return
+        for offset, data in self._packets(self._frames, b"FRME"):
+            try:
+                frame = _frame(Table.root(data, 4))
+            except (FlatbufferError, ValueError) as error:
+                self._broken(offset, str(error))
+                continue
+            yield frame
+
+    def _read_header(self, reader: ByteReader) -> Table:
+        if reader.read(len(MAGIC)) != MAGIC:
+            raise DataError(f"{self.path}: not an AEDAT4 file (does not begin with #!AER-DAT4.0).")
+        size = int.from_bytes(reader.read(4), "little")
+        data = reader.read(size) if size <= _MAX_HEADER_BYTES else b""
+        try:
+            if len(data) < size or not size:
+                raise FlatbufferError(f"{size} bytes announced, {len(data)} there")
+            return Table.root(data)
+        except FlatbufferError as error:
+            raise DataError(f"{self.path}: its AEDAT4 header is damaged ({error}).") from None
+
+    def _streams(self, description: bytes) -> _Streams:
+        try:
+            if b"<!" in description:
+                raise ValueError("declarations are not expected")
+            tree = ElementTree.fromstring(description.rstrip(b"\0").decode("utf-8"))
+            streams = {}
+            for node in tree.iterfind(".//node[@name='outInfo']/node"):
+                values = {attr.get("key"): attr.text or "" for attr in node.iter("attr")}
+                size = [int(values[key]) if key in values else None for key in ("sizeX", "sizeY")]
+                kind = values.get("typeIdentifier", "")
+                streams[int(node.get("name", ""))] = (kind, size[0], size[1])
+            return streams
+        except (ElementTree.ParseError, ValueError) as error:
+            raise DataError(
+                f"{self.path}: the list of streams in its AEDAT4 header is damaged ({error})."
+            ) from None
+
+    def _choose(self, streams: _Streams, kind: str) -> int | None:
+        found = sorted(number for number, (name, _, _) in streams.items() if name == kind)
+        if len(found) > 1:
+            self.notes.append(f"{kind} streams {found}: only stream {found[0]} is read")
+        return found[0] if found else None
+
+    def _packets(self, stream: int | None, identifier: bytes) -> Iterator[tuple[int, bytes]]:
+        """Offset and decompressed, size-prefixed buffer of each packet of a stream."""
+        with ByteReader(self.path) as reader:
+            reader.skip_to(self._first_packet)
+            while self._end is None or reader.offset < self._end:
+                offset = reader.offset
+                head = reader.read(8)
+                if not head and self._end is None:
+                    return
+                number, size = struct.unpack("<ii", head) if len(head) == 8 else (-1, 0)
+                payload = reader.read(min(max(size, 0), _MAX_PACKET_BYTES))
+                if len(head) < 8 or size < 0 or len(payload) < size:
+                    self._damage.found(
+                        f"ends in the middle of a packet, or is damaged, at byte {offset}",
+                        repaired_by="keeps the packets before the cut",
+                    )
+                    return
+                if number != stream:
+                    continue
+                try:
+                    data = self._decompress(payload)
+                    if data[8:12] != identifier:
+                        raise ValueError(f"it is no {identifier.decode()} buffer")
+                except (RuntimeError, ValueError, EOFError) as error:
+                    self._broken(offset, str(error))
+                    continue
+                yield offset, data
+
+    def _broken(self, offset: int, reason: str) -> None:
+        self._damage.found(
+            f"the packet at byte {offset} is damaged ({reason})",
+            repaired_by="leaves out damaged packets",
+        )
+
+
+def _frame(table: Table) -> RecordedFrame:
+    start, end, timestamp = table.integer(3, "q"), table.integer(4, "q"), table.integer(0, "q")
+    if not start and not end:
+        # dv-processing writes the middle of the exposure and its length instead
+        exposure = table.integer(11, "q")
+        start, end = timestamp - exposure // 2, timestamp - exposure // 2 + exposure
+    kind, width, height = table.integer(5, "b"), table.integer(6, "h"), table.integer(7, "h")
+    pixels = np.frombuffer(table.vector(10, 1), dtype=np.uint8)
+    channels = _PICTURE_CHANNELS.get(kind)
+    if channels is None:
+        raise ValueError(f"pixel type {kind}, expected 8 bits with 1, 3 or 4 channels")
+    if width <= 0 or height <= 0 or pixels.size != width * height * channels or end < start:
+        raise ValueError(
+            f"a frame of {width}x{height}x{channels} with {pixels.size} bytes, exposed from "
+            f"{start} to {end}"
+        )
+    if channels == 1:
+        return RecordedFrame(pixels.reshape(height, width).copy(), (start, end))
+    image = pixels.reshape(height, width, channels)[..., 2::-1]
+    return RecordedFrame(np.ascontiguousarray(image), (start, end))
+
+
+def _names(streams: _Streams) -> str:
+    return ", ".join(sorted({kind for kind, _, _ in streams.values()})) or "none"
+
+
+def _decompressor(path: Path, compression: int) -> Callable[[bytes], bytes]:
+    if compression == 0:
+        return bytes
+    if compression in (1, 2):
+        return _lz4
+    if compression in (3, 4):
+        try:
+            import zstandard
+        except ImportError:
+            raise DataError(
+                f"{path}: its packets are packed with Zstandard; "
+                "pip install 'evsplat[recordings]' to read it."
+            ) from None
+        decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_PACKET_BYTES)
+
+        def zstd(payload: bytes) -> bytes:
+            try:
+                if zstandard.frame_content_size(payload) > _MAX_PACKET_BYTES:
+                    raise ValueError("it unpacks to more than a packet can hold")
+                return decompressor.decompress(payload, max_output_size=_MAX_PACKET_BYTES)
+            except zstandard.ZstdError as error:
+                raise ValueError(str(error)) from None
+
+        return zstd
+    raise DataError(f"{path}: unknown compression {compression} in its AEDAT4 header.")
+
+
+def _lz4(payload: bytes) -> bytes:
+    unpacker = lz4.frame.LZ4FrameDecompressor()
+    data = unpacker.decompress(payload, max_length=_MAX_PACKET_BYTES)
+    if not unpacker.eof:
+        raise ValueError("it ends early or unpacks to more than a packet can hold")
+    return data

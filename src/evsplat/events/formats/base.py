@@ -1,0 +1,154 @@
+"""What readers of recordings share: options, raw blocks, bytes with an offset, damage."""
+
+import gzip
+import os
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+import numpy as np
+
+from evsplat.errors import DataError
+
+BLOCK_EVENTS = 1 << 18
+"""Events that a reader hands over at a time, about; bounds the memory of a pass."""
+
+
+class RawEvents(NamedTuple):
+    """Events as a file says them, one array of length N per component; not yet checked."""
+
+    t: np.ndarray
+    """Microseconds, integer."""
+    x: np.ndarray
+    y: np.ndarray
+    """Column and row, integer, 0 at the left and the top."""
+    p: np.ndarray
+    """Polarity: positive is brighter."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """A picture that was recorded beside the events."""
+
+    image: np.ndarray
+    """(H, W) grey or (H, W, 3) RGB, uint8."""
+    exposure_us: tuple[int, int]
+    """Start and end of the exposure on the clock of the events."""
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What the caller says about a recording; None where the file is to tell."""
+
+    width: int | None = None
+    height: int | None = None
+    repair: bool = False
+    columns: tuple[str, ...] | Mapping[str, str] | None = None
+    time_unit: str | None = None
+
+
+class Source(ABC):
+    """An opened recording of one format: its header is read, its events are read on demand."""
+
+    width: int | None = None
+    height: int | None = None
+    has_polarity: bool = True
+    notes: list[str]
+
+    @abstractmethod
+    def blocks(self) -> Iterator[RawEvents]:
+        """Events from the first to the last, in order of the file."""
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Pictures recorded beside the events; none in most formats."""
+        return iter(())
+
+
+@dataclass
+class Damage:
+    """What is wrong with a recording: an error by default, a counted repair where asked for."""
+
+    path: Path
+    repair: bool
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def found(self, what: str, *, repaired_by: str, count: int = 1) -> None:
+        """Raise `DataError` that says ``what``, or count it under ``repaired_by``."""
+        if not self.repair:
+            raise DataError(f"{self.path}: {what}; repair=True (--repair) {repaired_by}.")
+        self.counts[repaired_by] = self.counts.get(repaired_by, 0) + count
+
+    def notes(self) -> list[str]:
+        """One line per kind of repair done so far."""
+        return [f"repaired: {what} ({count:,})" for what, count in self.counts.items()]
+
+
+class ByteReader:
+    """Sequential bytes of a file, gunzipped where it is a gzip file, with the offset in mind."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.offset = 0
+        try:
+            self._file = open(path, "rb")  # noqa: SIM115 - closed in __exit__
+        except FileNotFoundError:
+            raise DataError(f"{path}: file not found.") from None
+        except OSError as error:
+            raise DataError(f"{path}: cannot be opened ({error.strerror}).") from None
+        self.zipped = self._file.read(2) == b"\x1f\x8b"
+        self._file.seek(0)
+        self._stream = gzip.GzipFile(fileobj=self._file) if self.zipped else self._file
+
+    def __enter__(self) -> "ByteReader":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    @property
+    def progress(self) -> float:
+        """Share of the file read so far, 0 to 1."""
+        size = os.fstat(self._file.fileno()).st_size
+        return min(1.0, self._file.tell() / size) if size else 1.0
+
+    def read(self, count: int) -> bytes:
+        """``count`` bytes, fewer only at the end of the file."""
+        try:
+            data = self._stream.read(count)
+        except (OSError, EOFError, zlib.error) as error:
+            raise DataError(
+                f"{self.path}: cannot be read after byte {self.offset} ({error}); copy it again."
+            ) from None
+        self.offset += len(data)
+        return data
+
+    def skip_to(self, offset: int) -> None:
+        """Read on until ``offset`` or the end of the file."""
+        while self.offset < offset and self.read(min(offset - self.offset, 1 << 20)):
+            pass
+
+    def read_line(self, limit: int) -> bytes:
+        """Bytes up to and with the next newline, at most ``limit``."""
+        try:
+            line = self._stream.readline(limit)
+        except (OSError, EOFError, zlib.error) as error:
+            raise DataError(
+                f"{self.path}: cannot be read after byte {self.offset} ({error}); copy it again."
+            ) from None
+        self.offset += len(line)
+        return line
+
+
+def peek(path: Path, count: int) -> bytes:
+    """The first bytes, gunzipped where the file is a gzip file."""
+    with ByteReader(path) as reader:
+        return reader.read(count)

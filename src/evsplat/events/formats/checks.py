@@ -1,0 +1,198 @@
+"""Raw blocks become event streams: sorted, on the sensor, of known polarity, or a clear error."""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.events.formats.base import BLOCK_EVENTS, Damage, RawEvents
+from evsplat.events.stream import EventStream
+
+_MAX_GAP_AT_WRAP_US = 60_000_000
+_WRAP_PERIODS_US = (1 << 31, 1 << 32)
+_MAX_TIME_US = 1 << 60
+_SORTS = "sorts events that are out of order"
+
+
+def checked(
+    blocks: Iterable[RawEvents],
+    damage: Damage,
+    width: int | None,
+    height: int | None,
+    has_polarity: bool,
+) -> Iterator[EventStream]:
+    """Streams that follow each other in time, as `EventStream` promises.
+
+    With ``damage.repair``: times of a counter that wrapped go on rising, disorder within about one
+    block is sorted and events later than that, events beside the sensor and events without
+    polarity among others that have one are left out. Otherwise the first of these is a `DataError`.
+    """
+    settled = _Settled(blocks, damage, width, height, has_polarity)
+    return _sorted(settled, damage) if damage.repair else _ascending(settled, damage)
+
+
+class _Settled:
+    """Blocks with pixels, polarity and wrapped times settled; knows the index of each event."""
+
+    def __init__(
+        self,
+        blocks: Iterable[RawEvents],
+        damage: Damage,
+        width: int | None,
+        height: int | None,
+        has_polarity: bool,
+    ) -> None:
+        self._blocks = blocks
+        self._damage = damage
+        # x and y are kept in 16 bits
+        self._limits = (width or 1 << 16, height or 1 << 16)
+        self._has_polarity = has_polarity
+        self._seen_zero = self._seen_negative = self._zeros_as_darker = False
+        self._shift_us = 0
+        self._last_raw_us: int | None = None
+
+    def __iter__(self) -> Iterator[tuple[int, EventStream]]:
+        """Index of the first event in the file, and events whose order is as in the file."""
+        index = 0
+        for block in self._blocks:
+            if not len(block.t):
+                continue
+            t = self._unwrapped(block.t.astype(np.int64, copy=False), index)
+            p, keep = self._polarity(block.p, index)
+            keep = self._on_sensor(block.x, block.y, keep, index)
+            x, y = block.x, block.y
+            if keep is not None:
+                t, x, y, p = t[keep], x[keep], y[keep], p[keep]
+            yield (
+                index,
+                EventStream(t, x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False), p),
+            )
+            index += len(block.t)
+
+    def _unwrapped(self, t: np.ndarray, index: int) -> np.ndarray:
+        """Times that go on where a 31- or 32-bit counter began again (repair), or an error."""
+        low, high = int(t.min()), int(t.max())
+        if low < -_MAX_TIME_US or high > _MAX_TIME_US:
+            raise DataError(
+                f"{self._damage.path}: events {index} to {index + len(t) - 1} have times from "
+                f"{low} to {high} us; no recording is that long, check the file or time_unit."
+            )
+        before = t[0] if self._last_raw_us is None else self._last_raw_us
+        self._last_raw_us = int(t[-1])
+        falls = np.diff(t, prepend=before)
+        if falls.min() > -(_WRAP_PERIODS_US[0] - _MAX_GAP_AT_WRAP_US):
+            return t + self._shift_us if self._shift_us else t
+        shifts = np.zeros(len(t), dtype=np.int64)
+        for period in _WRAP_PERIODS_US:
+            wrapped = (falls <= 0) & (falls >= -period) & (falls < _MAX_GAP_AT_WRAP_US - period)
+            shifts[wrapped] = period
+        for at in np.flatnonzero(shifts):
+            self._damage.found(
+                f"the time falls from {t[at] - falls[at]} to {t[at]} us at event {index + at}: its "
+                f"{int(shifts[at]).bit_length() - 1}-bit counter began again",
+                repaired_by="adds up the periods of a counter that began again",
+            )
+        shifts = np.cumsum(shifts) + self._shift_us
+        self._shift_us = int(shifts[-1])
+        return t + shifts
+
+    def _polarity(self, p: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Polarity +1/-1 (all 0 where there is none), and which events to keep (None: all)."""
+        if not self._has_polarity:
+            return np.zeros(len(p), dtype=np.int8), None
+        if p.dtype == np.bool_ or p.dtype.kind == "u":
+            return _signs(p != 0), None
+        positive, negative = p > 0, p < 0
+        zeros = len(p) - int(positive.sum()) - int(negative.sum())
+        self._seen_negative |= bool(negative.any())
+        self._seen_zero |= bool(zeros)
+        if not (self._seen_negative and self._seen_zero):
+            self._zeros_as_darker = self._seen_zero
+            return _signs(positive), None
+        if self._zeros_as_darker:
+            raise DataError(
+                f"{self._damage.path}: polarity is 0 before event {index} and -1 after it; say "
+                "which events have none, or leave the polarity out."
+            )
+        self._damage.found(
+            f"{zeros or int(negative.sum())} of events {index} to {index + len(p) - 1} have "
+            f"polarity {0 if zeros else -1} although others have {-1 if zeros else 0}",
+            repaired_by="leaves out events of polarity 0 where others have -1",
+            count=zeros,
+        )
+        return _signs(positive), positive | negative
+
+    def _on_sensor(
+        self, x: np.ndarray, y: np.ndarray, keep: np.ndarray | None, index: int
+    ) -> np.ndarray | None:
+        width, height = self._limits
+        if x.min() >= 0 and y.min() >= 0 and x.max() < width and y.max() < height:
+            return keep
+        outside = (x < 0) | (y < 0) | (x >= width) | (y >= height)
+        at = int(np.argmax(outside))
+        count = int(outside.sum())
+        self._damage.found(
+            f"event {index + at} is at x={x[at]}, y={y[at]}, expected x < {width} and y < {height} "
+            f"({count} such events among {index} to {index + len(x) - 1})",
+            repaired_by="leaves out events beside the sensor",
+            count=count,
+        )
+        return ~outside if keep is None else keep & ~outside
+
+
+def _signs(positive: np.ndarray) -> np.ndarray:
+    return positive.view(np.int8) * np.int8(2) - np.int8(1)
+
+
+def _ascending(blocks: Iterable[tuple[int, EventStream]], damage: Damage) -> Iterator[EventStream]:
+    """The blocks as they are; an error where time goes back."""
+    last_us: int | None = None
+    for index, block in blocks:
+        falls = np.diff(block.t, prepend=block.t[0] if last_us is None else last_us) < 0
+        if falls.any():
+            at = int(np.argmax(falls))
+            damage.found(
+                f"event {index + at} is at {block.t[at]} us, after one at "
+                f"{block.t[at - 1] if at else last_us} us "
+                f"({int(falls.sum())} steps back among events {index} to {index + len(falls) - 1})",
+                repaired_by=_SORTS,
+            )
+        last_us = int(block.t[-1])
+        yield block
+
+
+def _sorted(blocks: Iterable[tuple[int, EventStream]], damage: Damage) -> Iterator[EventStream]:
+    """All but the latest `BLOCK_EVENTS` of what was read so far, sorted; then the rest."""
+    held: EventStream | None = None
+    last_us: int | None = None
+    for _, block in blocks:
+        if last_us is not None and len(block) and int(block.t.min()) < last_us:
+            on_time = block.t >= last_us
+            damage.found(
+                "events out of order by more than a block",
+                repaired_by="leaves out events too late to be sorted in",
+                count=len(block) - int(on_time.sum()),
+            )
+            block = _pick(block, on_time)
+        merged = block if held is None else _join(held, block)
+        falls = int((np.diff(merged.t) < 0).sum())
+        if falls:
+            damage.found("events out of order", repaired_by=_SORTS, count=falls)
+            merged = _pick(merged, np.argsort(merged.t, kind="stable"))
+        ready = max(0, len(merged) - BLOCK_EVENTS)
+        if ready:
+            last_us = int(merged.t[ready - 1])
+            yield _pick(merged, slice(0, ready))
+        held = _pick(merged, slice(ready, None))
+    if held is not None and len(held):
+        yield held
+
+
+def _pick(stream: EventStream, which: np.ndarray | slice) -> EventStream:
+    return EventStream(stream.t[which], stream.x[which], stream.y[which], stream.p[which])
+
+
+def _join(a: EventStream, b: EventStream) -> EventStream:
+    return EventStream(
+        *(np.concatenate([getattr(a, n), getattr(b, n)]) for n in ("t", "x", "y", "p"))
+    )

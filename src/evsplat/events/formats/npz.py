@@ -1,0 +1,141 @@
+""".npz and .npy files with one array per component, or one table of them; never unpickled."""
+
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.events.formats.base import (
+    BLOCK_EVENTS,
+    Damage,
+    RawEvents,
+    ReadOptions,
+    Source,
+)
+from evsplat.events.formats.columns import match_names
+from evsplat.events.formats.table import Table, table_order
+
+_READ_BYTES = 1 << 22
+# Deflate packs at most 1032 to 1.
+_MAX_RATIO = 1100
+_SIZE_KEYS = (("width", "height"), ("sensor_width", "sensor_height"))
+
+
+class Npz(Source):
+    """Arrays of a NumPy file; all of them are in memory while it is open."""
+
+    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
+        self._path = path
+        arrays = _load(path)
+        named = _components(path, arrays, options)
+        self._table = Table(path, named, options.time_unit)
+        self.has_polarity = self._table.has_polarity
+        self.notes = self._table.notes
+        for wide, high in _SIZE_KEYS:
+            if all(key in arrays and arrays[key].size == 1 for key in (wide, high)):
+                self.width, self.height = int(arrays[wide].item()), int(arrays[high].item())
+
+    def blocks(self) -> Iterator[RawEvents]:
+        """Slices of the arrays."""
+        for first in range(0, len(self._table), BLOCK_EVENTS):
+            yield self._table.events(slice(first, first + BLOCK_EVENTS), first)
+
+
+def _components(
+    path: Path, arrays: dict[str, np.ndarray], options: ReadOptions
+) -> dict[str, np.ndarray]:
+    """t, x, y and, where there is one, p."""
+    columns = options.columns
+    if isinstance(columns, Mapping):
+        missing = sorted(set(columns.values()) - set(arrays))
+        if missing:
+            raise DataError(f"{path}: has no key {missing[0]!r} (has {', '.join(arrays)}).")
+    wanted = columns if isinstance(columns, Mapping) else None
+    tables = [a for a in arrays.values() if a.ndim == 2 and a.shape[1] in (3, 4, 5)]
+    structured = [a for a in arrays.values() if a.dtype.names]
+    if structured:
+        arrays = {name: structured[0][name] for name in structured[0].dtype.names or ()}
+    found = {key: arrays[name] for key, name in match_names(arrays, wanted).items()}
+    pairs = next((arrays[key] for key in ("xy", "coords", "pixels") if key in arrays), None)
+    if pairs is not None and pairs.ndim == 2 and 2 in pairs.shape:
+        pairs = pairs if pairs.shape[1] == 2 else pairs.T
+        found |= {"x": pairs[:, 0], "y": pairs[:, 1]}
+    if {"t", "x", "y"} <= set(found):
+        return found
+    if len(tables) == 1 and not found:
+        order = columns if isinstance(columns, tuple) else table_order(path, tables[0], options)
+        if len(order) != tables[0].shape[1]:
+            raise DataError(
+                f"{path}: its table has {tables[0].shape[1]} columns, columns names {len(order)}."
+            )
+        return {name: tables[0][:, i] for i, name in enumerate(order) if name in "txyp"}
+    shapes = ", ".join(f"{key} {array.shape}" for key, array in arrays.items())
+    raise DataError(
+        f"{path}: no events found among its arrays ({shapes}); expected t, x, y, p (or xy, t, "
+        "p, or one table), or say which is which with columns."
+    )
+
+
+def _load(path: Path) -> dict[str, np.ndarray]:
+    with _as_data_error(path):
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                arrays = {}
+                for info in archive.infolist():
+                    if info.filename.endswith(".npy"):
+                        if info.file_size > _MAX_RATIO * info.compress_size:
+                            raise ValueError(f"{info.filename} has an impossible size")
+                        with archive.open(info) as member:
+                            arrays[info.filename[:-4]] = _read_array(member, info.file_size)
+                return arrays
+        with open(path, "rb") as file:
+            return {"events": _read_array(file, path.stat().st_size)}
+
+
+def _read_array(file: IO[bytes], size: int) -> np.ndarray:
+    """An array whose header agrees with the bytes that are there; allocates no more than those."""
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version[0]}.{version[1]} of the .npy format")
+    read_header = getattr(np.lib.format, f"read_array_header_{version[0]}_0")
+    shape, fortran, dtype = read_header(file)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects, which are not read from files of others")
+    expected = dtype.itemsize * int(np.prod([int(n) for n in shape], dtype=object))
+    data = bytearray()
+    while piece := file.read(_READ_BYTES):
+        data += piece
+        if len(data) > expected:
+            break
+    if len(data) != expected:
+        raise ValueError(f"an array of {expected} bytes is announced, {len(data)} are there")
+    array = np.frombuffer(data, dtype=dtype)
+    return array.reshape(shape, order="F" if fortran else "C")
+
+
+@contextmanager
+def _as_data_error(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (
+        OSError,
+        EOFError,
+        ValueError,
+        TypeError,
+        SyntaxError,
+        KeyError,
+        NotImplementedError,
+        RuntimeError,
+        MemoryError,
+        OverflowError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        reason = re.sub(r"\s+", " ", str(error))[:200]
+        raise DataError(f"{path}: not a readable NumPy file ({reason}).") from None

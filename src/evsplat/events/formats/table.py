@@ -1,0 +1,105 @@
+"""Events that come as a table of numbers (text, NumPy): units, polarity and order settled."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.events.formats.base import RawEvents, ReadOptions
+from evsplat.events.formats.columns import guess_time_unit, to_microseconds, to_whole
+
+_ORDERS = {4: ("txyp", "xytp", "xypt"), 3: ("txy", "xyt")}
+NO_POLARITY = "polarity is 0 throughout: the recording says that pixels changed, not how"
+
+
+class Table:
+    """Components of equal length, as `RawEvents` on demand."""
+
+    def __init__(
+        self, path: Path, components: Mapping[str, np.ndarray], time_unit: str | None
+    ) -> None:
+        self.notes: list[str] = []
+        self._columns = dict(components)
+        self._path = path
+        lengths = {name: column.shape for name, column in components.items()}
+        if len(set(lengths.values())) != 1 or any(len(s) != 1 for s in lengths.values()):
+            text = ", ".join(f"{name} {shape}" for name, shape in lengths.items())
+            raise DataError(f"{path}: its components differ in length or are not 1-D ({text}).")
+        for name, column in components.items():
+            if column.dtype.kind not in "iufb":
+                raise DataError(f"{path}: {name} is of type {column.dtype}, expected numbers.")
+        t = self._columns["t"]
+        self.unit = time_unit or guess_time_unit(t)
+        if time_unit is None and self.unit != "us":
+            self.notes.append(f"times are taken for {self.unit}: give time_unit if they are not")
+        if "p" not in components:
+            self.has_polarity = False
+            self.notes.append("no polarity: the recording says that pixels changed, not how")
+        else:
+            self.has_polarity = not len(t) or bool(np.any(components["p"]))
+            if not self.has_polarity:
+                self.notes.append(NO_POLARITY)
+
+    def __len__(self) -> int:
+        return len(self._columns["t"])
+
+    def events(self, part: slice, first: int = 0) -> RawEvents:
+        """Events of a slice; ``first`` is the index of its first event, for errors."""
+        where = str(self._path)
+        t = to_microseconds(self._columns["t"][part], self.unit, where, first)
+        x, y = (to_whole(self._columns[name][part], name, where, first) for name in "xy")
+        if "p" in self._columns:
+            p = to_polarity(self._columns["p"][part], where, first)
+        else:
+            p = np.zeros(len(t), dtype=np.int8)
+        return RawEvents(t, x, y, p)
+
+
+def to_polarity(values: np.ndarray, where: str, first: int) -> np.ndarray:
+    """Polarity as bool or int8 in -1, 0, 1."""
+    if values.dtype.kind == "b":
+        return values
+    values = to_whole(values, "p", where, first)
+    strange = (values > 1) | (values < -1) if values.dtype.kind == "i" else values > 1
+    if strange.any():
+        at = int(np.argmax(strange))
+        raise DataError(
+            f"{where}: polarity of event {first + at} is {values[at]}, expected 0 and 1, or -1 and "
+            "1; name the columns with columns."
+        )
+    return values.astype(np.int8)
+
+
+def table_order(path: Path, table: np.ndarray, options: ReadOptions) -> str:
+    """Which column is which, such as "txyp", when only one order can be meant.
+
+    Times ascend, pixels are whole numbers on the sensor (or below 65,536), polarity is -1, 0, 1.
+    """
+    if len(table) == 0:
+        return _ORDERS.get(table.shape[1], ("",))[0]
+    fits = [
+        order
+        for order in _ORDERS.get(table.shape[1], ())
+        if _fits({name: table[:, i] for i, name in enumerate(order)}, options)
+    ]
+    if len(fits) != 1:
+        found = f"could be {' or '.join(fits)}" if fits else "are of no known order"
+        raise DataError(
+            f"{path}: its {table.shape[1]} columns {found}; say which is which with columns."
+        )
+    return fits[0]
+
+
+def _fits(named: dict[str, np.ndarray], options: ReadOptions) -> bool:
+    limits = {"x": options.width or 1 << 16, "y": options.height or 1 << 16}
+    for name, limit in limits.items():
+        values = named[name]
+        if not ((values >= 0) & (values < limit) & (values == np.floor(values))).all():
+            return False
+    if "p" in named and not np.isin(named["p"], (-1, 0, 1)).all():
+        return False
+    t = named["t"]
+    falls = int((np.diff(t.astype(np.float64)) < 0).sum())
+    # a recording to be repaired may fall now and then
+    return falls <= (len(t) // 10 if options.repair else 0)

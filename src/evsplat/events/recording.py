@@ -1,0 +1,156 @@
+"""Recordings of any format, opened by what their first bytes say and read as event streams."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from evsplat.errors import ConfigError, DataError
+from evsplat.events.formats import find_format
+from evsplat.events.formats.base import Damage, ReadOptions, RecordedFrame, Source
+from evsplat.events.formats.checks import checked
+from evsplat.events.stream import EventStream
+
+TIME_UNITS = ("s", "ms", "us", "ns")
+
+
+class EventRecording:
+    """A recording on disk. Every pass (`chunks`, `read`, `frames`) reads the file anew."""
+
+    def __init__(self, path: Path, format: str, source: Source, damage: Damage) -> None:
+        self.path = path
+        self.format = format
+        self._source = source
+        self._damage = damage
+
+    @property
+    def width(self) -> int | None:
+        """Columns of the sensor; None where neither the file nor the caller says."""
+        return self._source.width
+
+    @property
+    def height(self) -> int | None:
+        """Rows of the sensor; None where neither the file nor the caller says."""
+        return self._source.height
+
+    @property
+    def has_polarity(self) -> bool:
+        """False where the recording says only that something changed; p is 0 then."""
+        return self._source.has_polarity
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know: assumptions made and, after a pass, what was repaired."""
+        return [*self._source.notes, *self._damage.notes()]
+
+    def chunks(self) -> Iterator[EventStream]:
+        """All events in order of time, a few hundred thousand at a time.
+
+        Memory does not grow with the recording, but for .npz and .npy files, which are one piece.
+        Raises `DataError` where the recording is damaged, unless it was opened with ``repair``.
+        """
+        self._damage.counts.clear()
+        return checked(
+            self._source.blocks(), self._damage, self.width, self.height, self.has_polarity
+        )
+
+    def read(self, start_us: int | None = None, end_us: int | None = None) -> EventStream:
+        """Events with ``start_us <= t < end_us`` in memory; None: from the first, to the last.
+
+        Reads the file up to ``end_us``.
+        """
+        parts = []
+        for chunk in self.chunks():
+            if start_us is not None or end_us is not None:
+                low = chunk.t[0] if start_us is None else start_us
+                high = chunk.t[-1] + 1 if end_us is None else end_us
+                part = chunk.between(int(low), int(high))
+            else:
+                part = chunk
+            if len(part):
+                parts.append(part)
+            if end_us is not None and chunk.t[-1] >= end_us:
+                break
+        columns = []
+        for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
+            empty = np.zeros(0, dtype=dtype)
+            columns.append(np.concatenate([empty, *(getattr(part, name) for part in parts)]))
+        return EventStream(*columns)
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Pictures recorded beside the events (AEDAT4 only), in order of the file."""
+        return self._source.frames()
+
+
+def open_recording(
+    path: Path | str,
+    *,
+    format: str | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    repair: bool = False,
+    columns: Sequence[str] | Mapping[str, str] | None = None,
+    time_unit: str | None = None,
+) -> EventRecording:
+    """Open an event recording of any format that evsplat reads (docs/event-formats.md).
+
+    Args:
+        path: The recording; its format is told from its content, whatever its name.
+        format: One of `evsplat.events.formats.FORMATS`; the content must agree.
+        width: Columns of the sensor, where the file does not say or says it wrongly.
+        height: Rows of the sensor, likewise.
+        repair: Read on where the file is cut, events are out of order, a time counter began again
+            or events lie beside the sensor; what was done is counted in ``notes``. Without it each
+            of these is a `DataError`.
+        columns: For text, the names of the columns in order, out of t, x, y, p and "-" for one to
+            pass over, or "mmhpsd". For .npz, HDF5: which key holds which, such as
+            ``{"t": "stamps"}``.
+        time_unit: "s", "ms", "us" or "ns", where the file does not say.
+
+    Raises:
+        DataError: The file is missing, of no known format, or its header is damaged.
+        ConfigError: An option is out of range.
+    """
+    path = Path(path)
+    if time_unit is not None and time_unit not in TIME_UNITS:
+        raise ConfigError(f"time_unit is {time_unit!r}, expected one of {', '.join(TIME_UNITS)}.")
+    for name, value in (("width", width), ("height", height)):
+        if value is not None and not 0 < value <= 1 << 16:
+            raise ConfigError(f"{name} is {value}, expected 1 to 65536 pixels.")
+    if not path.exists():
+        raise DataError(f"{path}: file not found.")
+    found = find_format(path, format)
+    if columns is not None and not isinstance(columns, Mapping):
+        columns = tuple(columns.split(",")) if isinstance(columns, str) else tuple(columns)
+    options = ReadOptions(width, height, repair, columns, time_unit)
+    damage = Damage(path, repair)
+    source = found.open(path, options, damage)
+    source.width = width or source.width
+    source.height = height or source.height
+    if (source.width is None) != (source.height is None):
+        raise DataError(f"{path}: only one of width and height is known; give both.")
+    if source.width is None:
+        source.notes.append("the size of the sensor is not in the file: give width and height")
+    return EventRecording(path, found.name, source, damage)
+
+
+def read_events(
+    path: Path | str,
+    *,
+    format: str | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    repair: bool = False,
+    columns: Sequence[str] | Mapping[str, str] | None = None,
+    time_unit: str | None = None,
+) -> EventStream:
+    """All events of a recording in memory; options and errors are those of `open_recording`."""
+    return open_recording(
+        path,
+        format=format,
+        width=width,
+        height=height,
+        repair=repair,
+        columns=columns,
+        time_unit=time_unit,
+    ).read()

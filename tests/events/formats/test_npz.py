@@ -1,0 +1,87 @@
+"""NumPy files in the key sets of the field."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evsplat.errors import DataError
+from evsplat.events import EventStream, open_recording, read_events
+
+from .helpers import WIDTH, random_stream, same
+
+
+def _variants(s: EventStream) -> dict[str, dict[str, np.ndarray]]:
+    t, x, y, p = s.t, s.x, s.y, s.p
+    table = np.stack([t, x, y, p], axis=1)
+    return {
+        "x/y/t/p": {"x": x, "y": y, "t": t, "p": p},
+        "bool": {"x": x, "y": y, "t": t, "p": p > 0},
+        "0/1": {"x": x, "y": y, "t": t, "p": (p > 0).astype(np.uint8)},
+        "0/1 signed": {"x": x, "y": y, "t": t, "p": (p > 0).astype(np.int64)},
+        "ts/pol": {"xs": x.astype(np.int32), "ys": y, "ts": t.astype(np.uint64), "pol": p},
+        "xy": {"xy": np.stack([x, y], axis=1), "t": t, "p": p},
+        "ExFMan": {"tE": t, "xE": x, "yE": y, "pE": p},
+        "t x y p": {"events": table},
+        "x y t p": {"arr_0": table[:, [1, 2, 0, 3]]},
+        "x y p t": {"arr_0": table[:, [1, 2, 3, 0]]},
+        "floats": {"events": table.astype(np.float64)},
+        "seconds": {"x": x, "y": y, "t": t * 1e-6, "p": p},
+        "nanoseconds": {"x": x, "y": y, "t": t * 1000 + 10**18, "p": p},
+    }
+
+
+@pytest.mark.parametrize("name", _variants(random_stream(0, 2)))
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_key_sets_and_polarities_give_the_same_events(tmp_path: Path, name: str, save) -> None:
+    stream = random_stream(3, 2_000, first_us=50)
+    save(tmp_path / "events.npz", **_variants(stream)[name])
+    read = read_events(tmp_path / "events.npz")
+    shift = 10**15 if name == "nanoseconds" else 0
+    assert same(EventStream(read.t - shift, read.x, read.y, read.p), stream)
+
+
+def test_structured_and_plain_npy(tmp_path: Path) -> None:
+    s = random_stream(4, 500)
+    fields = [("timestamp", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "?")]
+    table = np.array(list(zip(s.t, s.x, s.y, s.p > 0, strict=True)), dtype=fields)
+    np.save(tmp_path / "a.npy", table)
+    assert same(read_events(tmp_path / "a.npy"), s)
+    np.save(tmp_path / "b.npy", np.asfortranarray(np.stack([s.t, s.x, s.y, s.p], axis=1)))
+    assert same(read_events(tmp_path / "b.npy"), s)
+
+
+def test_all_zero_polarity_is_recognised_as_none(tmp_path: Path) -> None:
+    s = random_stream(5, 300)
+    np.savez(tmp_path / "e.npz", xy=np.stack([s.x, s.y], 1), t=s.t, p=np.zeros(300, dtype=np.int8))
+    recording = open_recording(tmp_path / "e.npz")
+    assert not recording.has_polarity and "polarity is 0 throughout" in recording.notes[0]
+    assert not recording.read().p.any()
+
+
+def test_ambiguous_table_asks_for_columns(tmp_path: Path) -> None:
+    table = np.array([[1, 1, 1, 1], [2, 2, 2, 0]])
+    np.save(tmp_path / "e.npy", table)
+    with pytest.raises(DataError, match="could be txyp or xytp.*columns"):
+        open_recording(tmp_path / "e.npy")
+    read = read_events(tmp_path / "e.npy", columns="t,x,y,p")
+    assert read.t.tolist() == [1, 2] and read.p.tolist() == [1, -1]
+
+
+def test_pickles_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "e.npy", np.array([{"t": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(DataError, match="Python objects"):
+        open_recording(tmp_path / "e.npy")
+
+
+def test_event_beside_the_sensor_is_an_error_or_left_out(tmp_path: Path) -> None:
+    s = random_stream(6, 300)
+    x = s.x.copy()
+    x[7] = WIDTH + 5
+    np.savez(tmp_path / "e.npz", t=s.t, x=x, y=s.y, p=s.p)
+    with pytest.raises(DataError, match=f"event 7 is at x={WIDTH + 5}.*1 such"):
+        read_events(tmp_path / "e.npz", width=WIDTH, height=240)
+    recording = open_recording(tmp_path / "e.npz", width=WIDTH, height=240, repair=True)
+    keep = np.arange(300) != 7
+    assert same(recording.read(), EventStream(s.t[keep], s.x[keep], s.y[keep], s.p[keep]))
+    assert recording.notes == ["repaired: leaves out events beside the sensor (1)"]

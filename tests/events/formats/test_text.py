@@ -1,0 +1,96 @@
+"""Text tables: headers, orders, units, MMHPSD's five columns."""
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evsplat.errors import DataError
+from evsplat.events import EventStream, open_recording, read_events
+
+from .helpers import HEIGHT, WIDTH, random_stream, same
+
+
+def _lines(*columns: np.ndarray, sep: str = " ", form: str = "d") -> str:
+    rows = zip(*columns, strict=True)
+    return "".join(
+        sep.join([format(row[0], form), *(str(int(v)) for v in row[1:])]) + "\n" for row in rows
+    )
+
+
+def test_headers_orders_and_units_give_the_same_events(tmp_path: Path) -> None:
+    s = random_stream(1, 3_000, first_us=17)
+    on = s.p > 0
+    texts = {
+        "t,x@320,y@240,on\n" + _lines(s.t, s.x, s.y, on, sep=","): (320, 240),
+        "# t x y p\n" + _lines(s.t, s.x, s.y, s.p): (None, None),
+        f"{WIDTH} {HEIGHT}\n" + _lines(s.t * 1e-6, s.x, s.y, on, form=".6f"): (WIDTH, HEIGHT),
+        _lines(s.t * 1e-6, s.x, s.y, on, form=".9f"): (None, None),
+        "x;y;polarity;timestamp\n" + _lines(s.x, s.y, on, s.t, sep=";"): (None, None),
+        _lines(s.x, s.y, s.t, s.p, sep="\t"): (None, None),
+    }
+    for number, (text, size) in enumerate(texts.items()):
+        path = tmp_path / f"{number}.txt"
+        path.write_text(text)
+        recording = open_recording(path)
+        assert (recording.width, recording.height) == size
+        assert same(recording.read(), s), text[:40]
+        packed = tmp_path / f"{number}.csv.gz"
+        packed.write_bytes(gzip.compress(text.encode()))
+        assert same(read_events(packed), s)
+
+
+def test_mmhpsd_rows_are_turned_by_180_degrees_and_carry_no_polarity(tmp_path: Path) -> None:
+    path = tmp_path / "event0000.csv"
+    path.write_text("0,0,10,3,0\n1279,799,20,3,0\n5,7,20,3,0\n")
+    recording = open_recording(path)
+    assert (recording.width, recording.height) == (800, 1280)
+    assert not recording.has_polarity
+    s = recording.read()
+    assert list(zip(s.t, s.x, s.y, s.p, strict=True)) == [
+        (10, 799, 1279, 0),
+        (20, 0, 0, 0),
+        (20, 792, 1274, 0),
+    ]
+
+
+def test_polarity_that_comes_late_is_still_a_polarity(tmp_path: Path) -> None:
+    rows = ["t x y p\n", *(f"{i} 1 2 0\n" for i in range(3000)), "3000 1 2 1\n"]
+    (tmp_path / "e.txt").write_text("".join(rows))
+    s = read_events(tmp_path / "e.txt")
+    assert np.array_equal(np.unique(s.p, return_counts=True), [[-1, 1], [3000, 1]])
+
+
+def test_named_columns_and_units(tmp_path: Path) -> None:
+    (tmp_path / "e.txt").write_text("3 9 1 7 12.5\n4 8 1 7 13\n")
+    s = read_events(tmp_path / "e.txt", columns="x,y,p,-,t", time_unit="ms")
+    assert same(
+        s,
+        EventStream(
+            np.array([12_500, 13_000]),
+            np.array([3, 4], dtype=np.uint16),
+            np.array([9, 8], dtype=np.uint16),
+            np.array([1, 1], dtype=np.int8),
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty|not a recording|holds no events"),
+        ("hello world\n", "holds no events"),
+        ("t,x,y,on\n1,2,3,1\n2,3,4\n", "event"),
+        ("1 2 3 1\n2 3 4 x\n", "event"),
+        ("5 9 8 1\n4 8 7 1\n", "4 columns are of no known order"),
+        ("t x y p\n5 2 3 1\n4 2 3 1\n", "event 1 is at 4 us, after one at 5 us"),
+        ("t x y p\n5 2.5 3 1\n", "expected a whole number"),
+        ("t x y p\n5 2 3 7\n", "polarity of event 0 is 7"),
+        ("t x y p\n1 2 3 1\nnan 2 3 1\n", "time of event 1 is nan, expected a number"),
+    ],
+)
+def test_bad_text_is_a_data_error(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "e.txt").write_text(text)
+    with pytest.raises(DataError, match=message):
+        read_events(tmp_path / "e.txt")
