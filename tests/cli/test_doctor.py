@@ -2,9 +2,11 @@
 
 import importlib
 import json
+from importlib.metadata import PackageNotFoundError
 
 import torch
 
+from evsplat import cuda_support
 from evsplat.cli import main
 
 doctor = importlib.import_module("evsplat.cli.doctor")
@@ -13,8 +15,10 @@ EXPECTED = {
     "python",
     "torch",
     "native rasteriser",
-    "CUDA",
+    "NVIDIA driver",
+    "torch with CUDA",
     "gsplat",
+    "CUDA compiler",
     "video (PyAV)",
     "demo capture",
     "SMPL bodies",
@@ -61,3 +65,46 @@ def test_missing_native_module_and_video_name_their_remedy(capsys, monkeypatch):
     assert "compiler" in found["native rasteriser"]["remedy"]
     assert found["video (PyAV)"]["status"] == "missing"
     assert "pip install av" in found["video (PyAV)"]["remedy"]
+
+
+def test_each_thing_that_cuda_lacks_is_one_sentence_with_its_remedy(monkeypatch):
+    def gone(*_):
+        raise OSError
+
+    def not_installed(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(cuda_support.ctypes, "CDLL", gone)
+    monkeypatch.setattr(cuda_support, "version", not_installed)
+    monkeypatch.setattr(cuda_support, "find_spec", lambda name: None)
+    monkeypatch.setattr(cuda_support, "_tools", lambda: {"nvcc": False, "ninja": False, "g++": 1})
+    monkeypatch.setattr(torch.version, "cuda", None)
+    needs = {need.name: need for need in cuda_support.needs()}
+    expected = {
+        "NVIDIA driver": ("libcuda", "driver"),
+        "torch with CUDA": ("without CUDA", "pytorch.org"),
+        "gsplat": ("not installed", "pip install 'evsplat[cuda]'"),
+        "CUDA compiler": ("nvcc and ninja not found", "pip install ninja"),
+    }
+    assert set(needs) == set(expected)
+    for name, (detail, remedy) in expected.items():
+        need = needs[name]
+        assert not need.there and detail in need.detail and remedy in need.remedy
+        assert need.detail.endswith(".") and ". " not in need.detail
+    assert cuda_support.what_is_missing().startswith("NVIDIA driver: no libcuda.so.1")
+
+
+def test_an_old_gpu_and_an_old_gsplat_are_told(monkeypatch):
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Quadro P1000")
+    monkeypatch.setattr(cuda_support, "version", lambda name: "1.4.0+pt24cu124")
+    for capability, there in (((6, 1), False), ((9, 0), True)):
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda c=capability: c)
+        need = cuda_support._torch()
+        assert need.there is there and f"{capability[0]}.{capability[1]}" in need.detail
+    assert not cuda_support._gsplat().there
+    monkeypatch.setattr(cuda_support, "version", lambda name: "1.5.3+pt26cu130")
+    assert cuda_support._gsplat().there
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "finds no usable GPU" in cuda_support._torch().detail

@@ -3,7 +3,7 @@ from dataclasses import dataclass, fields, replace
 import pytest
 import torch
 
-from evsplat.render import Splats, render
+from evsplat.render import RenderOutput, Splats, render
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,21 @@ def rotation(axis_angle):
 
 
 def random_scene(
-    seed, *, count=200, times=1, channels=3, width=61, height=45, linear=False, shared=False
+    seed,
+    *,
+    count=200,
+    times=1,
+    channels=3,
+    width=61,
+    height=45,
+    linear=False,
+    shared=False,
+    needle=20,
 ):
     """Float32 Gaussians all over the place, under a turned camera.
 
     A tenth lies behind the camera or right at it, a fifth outside or across the image border, a
-    tenth is 20 times longer than wide; opacities include 0.9999, 0.005 and 0.
+    tenth is ``needle`` times longer than wide; opacities include 0.9999, 0.005 and 0.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -48,7 +57,7 @@ def random_scene(
     ray = torch.cat([(pixel - K[:2, 2]) / K.diagonal()[:2], torch.ones(times, count, 1)], -1)
     means = (ray * depth[..., None] - pose[:3, 3]) @ pose[:3, :3]
     scales = torch.exp(2.5 * uniform(*lead, count, 3) - 4)
-    scales[..., count // 2 : count // 2 + count // 10, 0] *= 20
+    scales[..., count // 2 : count // 2 + count // 10, 0] *= needle
     opacities = uniform(*lead, count)
     opacities[..., ::7] = 0.9999
     opacities[..., 1::11] = 0.005
@@ -65,17 +74,24 @@ def random_scene(
     return splats, PlainCamera(width, height, K, pose)
 
 
-def all_gradients(splats, camera, *, backend, dtype, static=None, background=None, seed=0):
-    """The render and the gradient of a fixed random projection of it, for every input."""
+def all_gradients(
+    splats, camera, *, backend, dtype, static=None, background=None, seed=0, device="cpu"
+):
+    """The render and the gradient of a fixed random projection of it, for every input, on the CPU.
+
+    The tensors are rendered on ``device``.
+    """
 
     def leaves_of(layer):
         leaves = {
-            field.name: getattr(layer, field.name).to(dtype).clone().requires_grad_()
+            field.name: getattr(layer, field.name).to(device, dtype).clone().requires_grad_()
             for field in fields(Splats)
             if getattr(layer, field.name) is not None
         }
         shape = (*layer.means.shape[:2], 2)
-        leaves["centers2d_offset"] = torch.zeros(shape, dtype=dtype, requires_grad=True)
+        leaves["centers2d_offset"] = torch.zeros(
+            shape, dtype=dtype, device=device, requires_grad=True
+        )
         return leaves
 
     leaves = leaves_of(splats)
@@ -84,9 +100,9 @@ def all_gradients(splats, camera, *, backend, dtype, static=None, background=Non
         of_static = leaves_of(static)
         still = Splats(**of_static)
         leaves |= {f"static {name}": leaf for name, leaf in of_static.items()}
-    leaves["pose"] = camera.world_to_camera.to(dtype).clone().requires_grad_()
+    leaves["pose"] = camera.world_to_camera.to(device, dtype).clone().requires_grad_()
     if background is not None:
-        leaves["background"] = background.to(dtype).clone().requires_grad_()
+        leaves["background"] = background.to(device, dtype).clone().requires_grad_()
     out = render(
         inputs,
         replace(camera, world_to_camera=leaves["pose"]),
@@ -95,9 +111,12 @@ def all_gradients(splats, camera, *, backend, dtype, static=None, background=Non
         backend=backend,
     )
     generator = torch.Generator().manual_seed(seed)
-    loss = (out.image * torch.randn(out.image.shape, generator=generator)).sum()
-    loss = loss + (out.alpha * torch.randn(out.alpha.shape, generator=generator)).sum()
-    gradients = torch.autograd.grad(loss, list(leaves.values()))
+    loss = sum(
+        (value * torch.randn(value.shape, generator=generator).to(device)).sum()
+        for value in (out.image, out.alpha)
+    )
+    gradients = [value.cpu() for value in torch.autograd.grad(loss, list(leaves.values()))]
+    out = RenderOutput(*(getattr(out, field.name).cpu() for field in fields(RenderOutput)))
     return out, dict(zip(leaves, gradients, strict=True))
 
 

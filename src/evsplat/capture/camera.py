@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.devices import send
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -24,8 +26,8 @@ class Camera:
         return -rotation.T @ translation
 
     def to(self, device: torch.device | str) -> "Camera":
-        """The same camera with its matrices on ``device``."""
-        return replace(self, K=self.K.to(device), world_to_camera=self.world_to_camera.to(device))
+        """The same camera with its pose on ``device``; K stays where it is read, on the CPU."""
+        return replace(self, world_to_camera=send(self.world_to_camera, device))
 
     def project(
         self, points: Float[Tensor, "*batch 3"]

@@ -5,6 +5,7 @@ import os
 import platform
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -13,6 +14,7 @@ from typing import Literal
 import evsplat
 from evsplat.cli.demo import demo_capture
 from evsplat.cli.options import Flag
+from evsplat.cuda_support import Need, needs
 from evsplat.errors import DataError, WeightsError
 
 _MARKS = {"ok": "ok", "missing": "MISSING", "optional": "-"}
@@ -55,8 +57,7 @@ def run_checks() -> Iterator[Check]:
     checks: tuple[Callable[[], Check], ...] = (
         _torch,
         _native,
-        _cuda,
-        _gsplat,
+        *(partial(_for_cuda, need) for need in needs()),
         _video,
         _demo,
         _body_models,
@@ -87,27 +88,8 @@ def _native() -> Check:
     return Check(name, "ok", f"uses {native.level()} (this CPU runs {levels})")
 
 
-def _cuda() -> Check:
-    try:
-        torch = import_module("torch")
-    except ImportError:
-        return Check("CUDA", "optional", "unknown without torch.")
-    unused = "Not needed: this version trains on the CPU only."
-    if torch.version.cuda is None:
-        return Check("CUDA", "optional", "the installed torch is a build without CUDA.", unused)
-    if not torch.cuda.is_available():
-        detail = f"torch is built for CUDA {torch.version.cuda}, but finds no usable GPU or driver."
-        return Check("CUDA", "optional", detail, unused)
-    detail = f"{torch.cuda.get_device_name()} with CUDA {torch.version.cuda}."
-    return Check("CUDA", "optional", detail, unused)
-
-
-def _gsplat() -> Check:
-    found = _version("gsplat")
-    detail = "not installed." if found is None else f"{found} is installed but not connected."
-    return Check(
-        "gsplat", "optional", detail, "This version has no CUDA backend that could use it."
-    )
+def _for_cuda(need: Need) -> Check:
+    return Check(need.name, "ok" if need.there else "optional", need.detail, need.remedy)
 
 
 def _video() -> Check:

@@ -1,15 +1,22 @@
 """`render`: checks its input, picks the backend and hands over."""
 
+import logging
 from typing import Literal, get_args
 
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.cuda_support import needs, what_is_missing
 from evsplat.errors import BackendError, ConfigError
-from evsplat.render import native, reference
+from evsplat.render import cuda, native, reference
 from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
-BackendName = Literal["auto", "native", "reference"]
+logger = logging.getLogger(__name__)
+
+BackendName = Literal["auto", "native", "gsplat", "reference"]
+
+_BACKENDS = {"native": native.render, "gsplat": cuda.render, "reference": reference.render}
+_BACKEND_OF_DEVICE = {"cpu": "native", "cuda": "gsplat"}
 
 
 def render(
@@ -30,7 +37,10 @@ def render(
 
     ``static`` are more Gaussians of the same picture, the same at all times. The native backend
     projects and sorts them once, and composites tiles that no other Gaussian touches once for all
-    times; the result is that of passing them in ``splats`` at each time.
+    times; gsplat projects them once. The result is that of passing them in ``splats`` at each time.
+
+    ``auto`` takes ``native`` for tensors on the CPU and ``gsplat`` for those on a CUDA device. A
+    backend that cannot run is a `BackendError` with the reason, never another one's work.
     """
     if backend not in get_args(BackendName):
         raise BackendError(
@@ -45,14 +55,15 @@ def render(
         _check_alike(splats, static)
     _check_camera(splats, camera, background)
 
-    device = splats.means.device
-    if backend == "auto" and device.type != "cpu":
-        raise BackendError(
-            f"No render backend for device {device} in this version; move the tensors to the CPU, "
-            "or ask for backend='reference', which is slow."
-        )
-    draw = reference.render if backend == "reference" else native.render
-    return draw(splats, static, times, camera, background, near)
+    device, chosen = splats.means.device, str(backend)
+    if backend == "auto":
+        chosen = _BACKEND_OF_DEVICE.get(device.type, "")
+        if not chosen:
+            raise BackendError(
+                f"No render backend for device {device}; move the tensors to the CPU or a CUDA "
+                "device, or ask for backend='reference', which is slow."
+            )
+    return _BACKENDS[chosen](splats, static, times, camera, background, near)
 
 
 def _check_splats(splats: Splats, prefix: str) -> int:
@@ -123,11 +134,22 @@ def _check_camera(splats: Splats, camera: PinholeCamera, background: Tensor | No
 
 
 def choose_device(asked: str) -> str:
-    """The device for what was asked for; what cannot run is an error with the reason."""
+    """``cpu`` or ``cuda`` for what was asked for; what cannot run is an error with the reason.
+
+    ``auto`` is ``cuda`` where an NVIDIA GPU, its driver, PyTorch with CUDA, gsplat and the means to
+    build its kernels are all there, otherwise ``cpu``; which one it is, is logged.
+    """
     if asked not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"--device {asked}: expected auto, cpu or cuda.")
+    if asked == "cpu":
+        return asked
+    missing = what_is_missing()
     if asked == "cuda":
-        raise BackendError(
-            "--device cuda: this version rasterises on the CPU only; pass --device cpu or auto."
-        )
-    return "cpu"
+        if missing is not None:
+            raise BackendError(f"--device cuda: {missing} Or compute with --device cpu.")
+        return asked
+    device = "cuda" if missing is None else "cpu"
+    # Where there is no NVIDIA GPU at all, nobody misses the rest.
+    worth_telling = missing is not None and next(needs()).there
+    logger.info("device: %s", f"{device}. For CUDA: {missing}" if worth_telling else device)
+    return device

@@ -115,12 +115,13 @@ def project(
     factor = jacobian.view(-1, 2, 3) @ view[:3, :3]
     if linear is not None:
         factor = factor @ linear
-    factor = factor @ _rotation(quats) * scales[:, None, :]
+    factor = factor @ rotation_matrices(quats) * scales[:, None, :]
     low_pass = EPS_2D * torch.eye(2, dtype=means.dtype, device=means.device)
     return centers, factor @ factor.mT + low_pass, local[:, 2]
 
 
-def _rotation(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+def rotation_matrices(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
+    """Rotations of quaternions wxyz of any length but zero."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     return torch.stack(
         [
@@ -129,7 +130,7 @@ def _rotation(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
             2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
         ],
         -1,
-    ).view(-1, 3, 3)  # fmt: skip
+    ).unflatten(-1, (3, 3))  # fmt: skip
 
 
 @torch.no_grad()
