@@ -736,7 +736,7 @@ double multiply_add(int64_t rounds, float* sink) {
 
 const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,         project, forward,
                          backward,     project_backward, multiply_add, &mlp_kernels,
-                         ssim_band,    hash_forward, hash_backward};
+                         ssim_band,    hash_forward, hash_backward, sensor_step};
 
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

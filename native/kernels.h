@@ -6,6 +6,7 @@
 
 #include "hash_grid.h"
 #include "mlp_kernels.h"
+#include "sensor_kernels.h"
 #include "ssim.h"
 
 namespace evsplat {
@@ -121,6 +122,7 @@ struct Kernels {
     double (*ssim)(const SsimBand&);
     void (*hash_forward)(const HashLevel&);
     void (*hash_backward)(const HashLevel&);
+    void (*sensor_step)(const SensorPiece&);
 };
 
 #define EVSPLAT_LEVEL_TABLE(level)               \
@@ -129,6 +131,7 @@ struct Kernels {
     double ssim_band(const SsimBand&);           \
     void hash_forward(const HashLevel&);         \
     void hash_backward(const HashLevel&);        \
+    void sensor_step(const SensorPiece&);        \
     }
 EVSPLAT_LEVEL_TABLE(portable)
 #ifdef EVSPLAT_X86

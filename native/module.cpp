@@ -14,6 +14,7 @@
 #include "levels.h"
 #include "mlp.h"
 #include "rasterizer.h"
+#include "sensor_module.h"
 #include "ssim.h"
 
 namespace nb = nanobind;
@@ -326,6 +327,7 @@ NB_MODULE(_native, m) {
           nb::arg("begin"), nb::arg("mask"), nb::arg("encoded_grad"), nb::arg("table_grad").none(),
           nb::arg("position_grad").none(), nb::arg("threads"),
           "Adds to the table's gradient and writes that of the positions.");
+    bind_sensor(m);
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
     m.def("has_bf16", &has_bf16, "Whether networks can multiply bfloat16 here.");
     m.def("levels", &available_levels, "SIMD levels that run here, best first.");

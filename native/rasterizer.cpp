@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <chrono>
 #include <cstring>
-#include <exception>
 #include <stdexcept>
 
 #include "levels.h"
@@ -107,21 +106,6 @@ struct BlockSlots : SlotList {
         };
     }
 };
-
-// Runs tasks that may throw on threads that must not.
-void run(int threads, size_t count, const std::function<void(size_t)>& task) {
-    std::exception_ptr error;
-    std::atomic<bool> failed{false};
-    parallel_for(threads, count, [&](size_t i) {
-        if (failed.load(std::memory_order_relaxed)) return;
-        try {
-            task(i);
-        } catch (...) {
-            if (!failed.exchange(true)) error = std::current_exception();
-        }
-    });
-    if (error) std::rethrow_exception(error);
-}
 
 // Moving and still entries of a tile, both in order, to one list in order: `merged` starts with the
 // moving ones and has room for all. Equal depths: the moving ones come first.

@@ -2,6 +2,7 @@
 
 #include <atomic>
 #include <condition_variable>
+#include <exception>
 #include <mutex>
 #include <thread>
 #include <vector>
@@ -98,6 +99,20 @@ void parallel_for(int threads, size_t count, const std::function<void(size_t)>& 
     Pool& p = pool();
     std::lock_guard<std::mutex> lock(p.in_use());
     p.run(threads, count, task);
+}
+
+void run(int threads, size_t count, const std::function<void(size_t)>& task) {
+    std::exception_ptr error;
+    std::atomic<bool> failed{false};
+    parallel_for(threads, count, [&](size_t i) {
+        if (failed.load(std::memory_order_relaxed)) return;
+        try {
+            task(i);
+        } catch (...) {
+            if (!failed.exchange(true)) error = std::current_exception();
+        }
+    });
+    if (error) std::rethrow_exception(error);
 }
 
 }  // namespace evsplat

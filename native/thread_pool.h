@@ -9,4 +9,7 @@ namespace evsplat {
 // takes which i is left open, so tasks must not depend on it. One call runs at a time.
 void parallel_for(int threads, size_t count, const std::function<void(size_t)>& task);
 
+// The same for tasks that may throw; the first exception comes out of here.
+void run(int threads, size_t count, const std::function<void(size_t)>& task);
+
 }  // namespace evsplat

@@ -1,5 +1,6 @@
 """Types of the extension module; see native/module.cpp."""
 
+from numpy import ndarray
 from torch import Tensor
 
 Fields = list[Tensor | None]
@@ -67,6 +68,28 @@ class Mlp:
         both_weight: Tensor,
         layers: list[Tensor],
     ) -> None: ...
+
+class Sensor:
+    """An event camera: the state of its pixels, moved from picture to picture."""
+
+    def __init__(
+        self,
+        on: ndarray,
+        off: ndarray,
+        leak: ndarray | None,
+        phase: ndarray | None,
+        hot_hz: ndarray | None,
+        lin_log: bool,
+        eps: float,
+        cutoff_hz: float,
+        shot_hz: float,
+        refractory_us: float,
+        seed: int,
+    ) -> None: ...
+    def step(self, luma: ndarray, time_us: int, threads: int) -> bool: ...
+    @property
+    def count(self) -> int: ...
+    def take(self, t: ndarray, x: ndarray, y: ndarray, p: ndarray) -> None: ...
 
 def hash_encode(
     positions: Tensor,

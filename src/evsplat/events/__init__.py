@@ -1,19 +1,31 @@
-"""Event streams: recordings of any format, slices in memory, stores on disk, maps of counts."""
+"""Event streams: recordings of any format, slices, stores on disk, maps, a simulated sensor."""
 
 from evsplat.events.formats.base import RecordedFrame
 from evsplat.events.maps import count_map
 from evsplat.events.recording import EventRecording, open_recording, read_events
+from evsplat.events.simulator import (
+    PRESETS,
+    SensorSettings,
+    SensorSimulator,
+    sensor_settings,
+    simulate_events,
+)
 from evsplat.events.store import EventStore
 from evsplat.events.stream import EventStream
 from evsplat.events.write import write_events
 
 __all__ = [
+    "PRESETS",
     "EventRecording",
     "EventStore",
     "EventStream",
     "RecordedFrame",
+    "SensorSettings",
+    "SensorSimulator",
     "count_map",
     "open_recording",
     "read_events",
+    "sensor_settings",
+    "simulate_events",
     "write_events",
 ]
