@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from evsplat.events import EventStream, SensorSettings
+from evsplat.events import EventStream, SensorSettings, SensorSimulator
 
 
 def response(linear: np.ndarray, settings: SensorSettings) -> np.ndarray:
@@ -81,3 +81,27 @@ def moving_pattern(seed: int, count: int, height: int = 24, width: int = 37) -> 
         sum_of_waves = sum(np.sin(a * x + b * y + 0.5 * c * k + 9 * a) for a, b, c in waves)
         frames.append(((sum_of_waves / 10 + 0.5).clip(0, 1) ** 2.2).astype(np.float32))
     return frames
+
+
+def run(sensor: SensorSimulator, frames, times) -> EventStream:
+    """All events of pictures shown at these times."""
+    return joined([sensor.step(f, int(t)) for f, t in zip(frames, times, strict=True)])
+
+
+def constant(sensor: SensorSimulator, light: float, seconds: float, step_us: int) -> EventStream:
+    """All events under unchanging light."""
+    picture = np.full((sensor.height, sensor.width), light, dtype=np.float32)
+    times = range(0, int(seconds * 1e6) + 1, step_us)
+    return run(sensor, [picture] * len(times), times)
+
+
+def counts(stream: EventStream, sensor: SensorSimulator) -> np.ndarray:
+    """Events of each pixel (H, W)."""
+    pixel = stream.y.astype(int) * sensor.width + stream.x
+    flat = np.bincount(pixel, minlength=sensor.width * sensor.height)
+    return flat.reshape(sensor.height, sensor.width)
+
+
+def same(first: EventStream, second: EventStream) -> bool:
+    """Whether two streams are the same, event for event."""
+    return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in "txyp")
