@@ -1,21 +1,121 @@
-"""Event maps: what happened in a window, per pixel."""
+"""Event maps: what happened in a window, per pixel, as networks and losses take it.
+
+Every map is float32 on the CPU, polarity first ON then OFF. Where a map needs a window it is a pair
+of times in microseconds; left out, it reaches from the first to the last event.
+"""
+
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from evsplat.errors import DataError
 from evsplat.events.stream import EventStream
 
+VoxelScaling = Literal["none", "standard"]
+"""``standard``: entries that are not 0 get mean 0 and standard deviation 1, as E2VID wants it."""
+
 
 def count_map(stream: EventStream, height: int, width: int) -> Float[Tensor, "H W"]:
-    """Sum of polarities per pixel (the event map E of paper eq. 8), float32 on the CPU."""
+    """Sum of polarities per pixel (the event map E of paper eq. 8)."""
+    return _sums(_pixels(stream, height, width), stream.p, (height, width))
+
+
+def polarity_counts(stream: EventStream, height: int, width: int) -> Float[Tensor, "2 H W"]:
+    """Number of ON and of OFF events per pixel."""
+    place = _pixels(stream, height, width) + (stream.p < 0) * (height * width)
+    return _sums(place, None, (2, height, width))
+
+
+def voxel_grid(
+    stream: EventStream,
+    height: int,
+    width: int,
+    bins: int,
+    *,
+    window_us: tuple[int, int] | None = None,
+    scaling: VoxelScaling = "none",
+) -> Float[Tensor, "B H W"]:
+    """Polarities shared between the two nearest of ``bins`` instants, linearly in time.
+
+    The instants divide the window evenly and include both of its ends (Zhu et al., 2019, eq. 1-2;
+    the input of E2VID). The sum over bins is `count_map` of the window.
+    """
+    if bins < 1:
+        raise ValueError(f"a voxel grid needs at least one bin, not {bins}")
+    stream, start, end = _within(stream, window_us)
+    place = _pixels(stream, height, width)
+    if bins == 1 or end <= start:
+        grid = torch.zeros(bins, height, width)
+        grid[0] = _sums(place, stream.p, (height, width))
+        return _scaled(grid, scaling)
+    at = (stream.t - start) * ((bins - 1) / (end - start))
+    # the last instant belongs to the interval before it
+    below = np.minimum(at.astype(np.int64), bins - 2)
+    above = at - below
+    weights = np.concatenate([stream.p * (1 - above), stream.p * above])
+    first = below * (height * width) + place
+    place = np.concatenate([first, first + height * width])
+    return _scaled(_sums(place, weights, (bins, height, width)), scaling)
+
+
+def time_surface(
+    stream: EventStream, height: int, width: int, *, decay_us: float, time_us: int | None = None
+) -> Float[Tensor, "2 H W"]:
+    """``exp(-(time_us - t) / decay_us)`` of the last event of each polarity; 0 where none was.
+
+    Later events than ``time_us``, by default the last one, do not count (Lagorce et al., HOTS,
+    2017, with polarities apart).
+    """
+    if not decay_us > 0:
+        raise ValueError(f"the decay of a time surface must be above 0 us, not {decay_us:g}")
+    stream, _, now = _within(stream, None if time_us is None else (_EARLIEST, time_us))
+    last = np.full(2 * height * width, -np.inf)
+    # of several values for one place NumPy keeps the last
+    last[_pixels(stream, height, width) + (stream.p < 0) * (height * width)] = stream.t
+    surface = np.exp((last - now) / decay_us).reshape(2, height, width)
+    return torch.from_numpy(surface.astype(np.float32))
+
+
+_EARLIEST = np.iinfo(np.int64).min
+
+
+def _within(stream: EventStream, window_us: tuple[int, int] | None) -> tuple[EventStream, int, int]:
+    """The events of a window, both ends included, and the window."""
+    if window_us is None:
+        return (stream, int(stream.t[0]), int(stream.t[-1])) if len(stream) else (stream, 0, 0)
+    start, end = window_us
+    if end < start:
+        raise ValueError(f"a window from {start} to {end} us ends before it starts")
+    return stream.between(start, end + 1), start, end
+
+
+def _pixels(stream: EventStream, height: int, width: int) -> Int64[np.ndarray, "N"]:
+    """Place of each event in a flat map; a `DataError` where one lies outside."""
     if len(stream) and (stream.x.max() >= width or stream.y.max() >= height):
         raise DataError(
             f"events reach pixel x={stream.x.max()}, y={stream.y.max()}, outside of a map of "
             f"{width}x{height} pixels; give the size of the sensor that recorded them."
         )
-    pixel = stream.y.astype(np.int64) * width + stream.x
-    counts = np.bincount(pixel, weights=stream.p, minlength=height * width)
-    return torch.from_numpy(counts.reshape(height, width).astype(np.float32))
+    return stream.y.astype(np.int64) * width + stream.x
+
+
+def _sums(
+    place: Int64[np.ndarray, "N"], weights: np.ndarray | None, shape: tuple[int, ...]
+) -> Float[Tensor, "..."]:
+    sums = np.bincount(place, weights=weights, minlength=int(np.prod(shape)))
+    return torch.from_numpy(sums.reshape(shape).astype(np.float32))
+
+
+def _scaled(grid: Float[Tensor, "B H W"], scaling: VoxelScaling) -> Float[Tensor, "B H W"]:
+    if scaling == "none":
+        return grid
+    filled = grid != 0
+    if not bool(filled.any()):
+        return grid
+    values = grid[filled]
+    spread = values.std(correction=0)
+    grid[filled] = (values - values.mean()) / (spread if spread > 0 else 1.0)
+    return grid

@@ -100,8 +100,3 @@ def counts(stream: EventStream, sensor: SensorSimulator) -> np.ndarray:
     pixel = stream.y.astype(int) * sensor.width + stream.x
     flat = np.bincount(pixel, minlength=sensor.width * sensor.height)
     return flat.reshape(sensor.height, sensor.width)
-
-
-def same(first: EventStream, second: EventStream) -> bool:
-    """Whether two streams are the same, event for event."""
-    return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in "txyp")

@@ -20,7 +20,8 @@ from evsplat.events import (
 )
 from evsplat.imaging import luminance
 
-from .helpers import by_pixel, joined, moving_pattern, reference_events, run, same
+from ..formats.helpers import same
+from .helpers import by_pixel, joined, moving_pattern, reference_events, run
 
 CLEAN = SensorSettings()
 FILTERED = SensorSettings(cutoff_hz=80.0, contrast_mismatch=0.1)
