@@ -74,9 +74,9 @@ struct Pixel {
 };
 
 // The events of one pixel whose change goes from `before` to `after`, while `noise` noise events are to be
-// expected, `hot` of them because the pixel is a hot one; `hazard` were to be expected until the next.
+// expected and `hazard` were to be expected until the next.
 INLINE void send_events(const SensorPiece& piece, uint32_t index, float before, float after, double hazard,
-                        double noise, double hot) {
+                        double noise) {
     const PixelState& s = *piece.state;
     const Pixel pixel = {piece, index};
     const double duration = piece.duration_us, moved = double(after) - before;
@@ -94,7 +94,7 @@ INLINE void send_events(const SensorPiece& piece, uint32_t index, float before, 
             used += hazard;
             const double at = used / noise * duration;
             for (; k <= count && crossing(k) <= at; k += 1.0) pixel.send(crossing(k), brighter);
-            pixel.send(at, pixel.draw() < 0.5 + 0.5 * hot / noise);  // hot pixels only brighten
+            pixel.send(at, pixel.draw() < 0.5);
             hazard = -__builtin_log(pixel.draw());
         }
         s.hazard[index] = float(hazard - (noise - used));
@@ -160,10 +160,10 @@ INLINE void step_piece(const SensorPiece& piece) {
         }
         store(s.change + i, after);
         I busy = (after >= load(s.on + i)) | (after <= -load(s.off + i));
-        F noise = F{}, hot = F{}, hazard = F{};
+        F noise = F{}, hazard = F{};
         if (noisy) {
-            if (s.hot_hz) hot = load(s.hot_hz + i) * seconds;
-            noise = dark_noise * (1.f - (1.f - kBrightShare) * bounded) + hot;
+            noise = dark_noise * (1.f - (1.f - kBrightShare) * bounded);
+            if (s.hot_hz) noise += load(s.hot_hz + i) * seconds;
             hazard = load(s.hazard + i);
             busy |= hazard <= noise;
             F rest = load(s.hazard_rest + i);
@@ -173,7 +173,7 @@ INLINE void step_piece(const SensorPiece& piece) {
         uint64_t todo = bits(busy) & (lanes == uint32_t(W) ? ~uint64_t(0) : (uint64_t(1) << lanes) - 1);
         for (; todo; todo &= todo - 1) {
             const int l = __builtin_ctzll(todo);
-            send_events(piece, i + l, before[l], after[l], hazard[l], noise[l], hot[l]);
+            send_events(piece, i + l, before[l], after[l], hazard[l], noise[l]);
         }
     }
 }

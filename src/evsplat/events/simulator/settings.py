@@ -36,7 +36,7 @@ class SensorSettings:
     refractory_us: float = 0.0
     """After an event a pixel sends none for so long; what would have come is lost."""
     hot_pixel_fraction: float = 0.0
-    """Share of pixels that send ON events all the time."""
+    """Share of pixels that send events, ON and OFF alike, all the time."""
     hot_pixel_hz: float = 0.0
     """Events per second of each hot pixel."""
 
@@ -65,37 +65,37 @@ class SensorSettings:
 PRESETS: dict[str, SensorSettings] = {
     "clean": SensorSettings(),
     "davis346": SensorSettings(
-        contrast_on=0.2,
-        contrast_off=0.2,
-        contrast_mismatch=0.035,
+        contrast_on=0.36,
+        contrast_off=0.40,
+        contrast_mismatch=0.08,
         cutoff_hz=300.0,
-        leak_hz=0.1,
+        leak_hz=0.2,
         leak_spread=0.1,
         shot_hz=1.0,
-        refractory_us=500.0,
+        refractory_us=970.0,
     ),
     "dvxplorer": SensorSettings(
-        contrast_on=0.2,
-        contrast_off=0.2,
-        contrast_mismatch=0.035,
+        contrast_mismatch=0.15,
         cutoff_hz=300.0,
-        leak_hz=0.03,
+        leak_hz=0.01,
         leak_spread=0.1,
-        shot_hz=0.5,
+        shot_hz=0.03,
         refractory_us=200.0,
+        hot_pixel_fraction=1e-3,
+        hot_pixel_hz=110.0,
     ),
     "evk4": SensorSettings(
-        contrast_on=0.2,
-        contrast_off=0.2,
-        contrast_mismatch=0.035,
-        cutoff_hz=1000.0,
-        leak_hz=0.1,
-        leak_spread=0.1,
-        shot_hz=1.0,
-        refractory_us=100.0,
+        contrast_on=0.22,
+        contrast_off=0.22,
+        contrast_mismatch=0.14,
+        cutoff_hz=1_600.0,
+        shot_hz=0.002,
+        refractory_us=150.0,
+        hot_pixel_fraction=3e-6,
+        hot_pixel_hz=25.0,
     ),
 }
-"""Sensors by name."""
+"""Sensors by name; docs/simulator.md gives the source of each number."""
 
 
 def sensor_settings(preset: str = "clean", **changes: Any) -> SensorSettings:
