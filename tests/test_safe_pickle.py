@@ -202,3 +202,22 @@ def test_damaged_files_are_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "x.npz").write_bytes(b"PK\x03\x04")
     with pytest.raises(DataError, match="x.npz: not a readable npz archive"):
         read_npz(tmp_path / "x.npz")
+
+
+def test_damaged_numpy_files_are_one_sentence(tmp_path: Path) -> None:
+    """numpy's header reader and zipfile have errors of their own: cut tokens, unknown packing."""
+    np.save(tmp_path / "a.npy", np.array(TREE, dtype=object))
+    np.savez_compressed(tmp_path / "a.npz", a=TREE["text"], b=TREE["float"])
+    for name, read in (("a.npy", read_npy), ("a.npz", read_npz)):
+        file = tmp_path / name
+        whole = file.read_bytes()
+        for _ in range(400):
+            spoilt = bytearray(whole)
+            spoilt[RNG.integers(min(len(whole), 200))] = RNG.integers(256)
+            file.write_bytes(spoilt)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                try:
+                    read(file)
+                except DataError as error:
+                    assert str(error).startswith(f"{file}: ") and "\n" not in str(error)

@@ -11,6 +11,7 @@ import io
 import lzma
 import pickle
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections import OrderedDict
@@ -27,8 +28,9 @@ StandIns = Callable[[str, str], type | None]
 
 _BROKEN = (
     *(OSError, EOFError, ValueError, TypeError, KeyError, AttributeError, IndexError),
-    *(AssertionError, OverflowError, MemoryError, RecursionError, struct.error, zlib.error),
+    *(AssertionError, OverflowError, MemoryError, RuntimeError, struct.error, zlib.error),
     *(lzma.LZMAError, pickle.UnpicklingError, zipfile.BadZipFile),
+    *(SyntaxError, tokenize.TokenError),
 )
 _UNPACK: dict[bytes, Callable[[bytes], bytes]] = {
     b"\x1f\x8b": gzip.decompress,
@@ -98,12 +100,14 @@ def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
     except FileNotFoundError:
         raise DataError(f"{path}: file not found.") from None
     except _ForbiddenType as error:
+        name = " ".join(str(error).split())
         raise DataError(
-            f"{path}: holds the pickled type {error}, which no {what} needs, so it was not loaded; "
+            f"{path}: holds the pickled type {name}, which no {what} needs, so it was not loaded; "
             "get the file again from its official source."
         ) from None
     except _BROKEN as error:
-        raise DataError(f"{path}: not a readable {what} ({error}).") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise DataError(f"{path}: not a readable {what} ({reason}).") from error
 
 
 class _ForbiddenType(Exception):

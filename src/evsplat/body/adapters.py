@@ -118,6 +118,25 @@ def default_body(betas: Float[np.ndarray, "B"] | None = None, *, source: str = "
     return body
 
 
+def default_betas_for_stature(stature_m: float) -> Float[np.ndarray, "B"]:
+    """The smallest shape coefficients that make the default body this tall, crown to sole.
+
+    Raises:
+        DataError: outside 1.4 to 2.1 m, where adults of the body's kind end.
+    """
+    if not 1.4 <= stature_m <= 2.1:
+        raise DataError(f"stature is {stature_m} m, expected 1.4 to 2.1 m.")
+    data = _default_arrays()
+    betas = np.zeros(len(data["shapedirs"]))
+    for _ in range(10):  # which vertices are highest and lowest may change with the shape
+        height = data["v_template"][:, 2] + np.einsum("b,bv->v", betas, data["shapedirs"][..., 2])
+        top, bottom = int(height.argmax()), int(height.argmin())
+        growth = data["shapedirs"][:, top, 2].astype(np.float64) - data["shapedirs"][:, bottom, 2]
+        excess = stature_m - (height[top] - height[bottom])
+        betas = betas + excess * growth / (growth @ growth)
+    return betas
+
+
 def fit_betas(
     betas: Float[np.ndarray, "B"] | None, count: int, source: str
 ) -> Float[np.ndarray, "C"]:
