@@ -6,7 +6,9 @@
 
 #include "hash_grid.h"
 #include "mlp_kernels.h"
+#include "picture.h"
 #include "sensor_kernels.h"
+#include "skinning.h"
 #include "ssim.h"
 
 namespace evsplat {
@@ -118,8 +120,13 @@ struct Kernels {
     // Independent multiply-adds for `rounds`; returns the floating-point operations done.
     double (*multiply_add)(int64_t rounds, float* sink);
     const MlpKernels* mlp;
-    // Sum of the similarity over the window positions of a band, and its gradient.
-    double (*ssim)(const SsimBand&);
+    // Sums over a band, and the gradient of the similarity.
+    SsimSums (*ssim)(const SsimBand&);
+    void (*log_brightness)(const LogBrightness&, size_t begin, size_t end);
+    void (*add_sign)(const float*, const float*, float, float, size_t, float*);
+    // Points [begin, end).
+    void (*skin)(const Skinning&, size_t begin, size_t end, float* moved, float* blended);
+    void (*skin_backward)(const Skinning&, const SkinningGrads&, const float* blended, size_t begin, size_t end);
     void (*hash_forward)(const HashLevel&);
     void (*hash_backward)(const HashLevel&);
     void (*sensor_step)(const SensorPiece&);
@@ -128,7 +135,11 @@ struct Kernels {
 #define EVSPLAT_LEVEL_TABLE(level)               \
     namespace level {                            \
     extern const Kernels kernels;                \
-    double ssim_band(const SsimBand&);           \
+    SsimSums ssim_band(const SsimBand&);         \
+    void log_brightness(const LogBrightness&, size_t, size_t);                      \
+    void add_sign(const float*, const float*, float, float, size_t, float*);        \
+    void skin(const Skinning&, size_t, size_t, float*, float*);                                  \
+    void skin_backward(const Skinning&, const SkinningGrads&, const float*, size_t, size_t);     \
     void hash_forward(const HashLevel&);         \
     void hash_backward(const HashLevel&);        \
     void sensor_step(const SensorPiece&);        \

@@ -2,7 +2,9 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
@@ -11,10 +13,13 @@
 #include <stdexcept>
 
 #include "hash_grid.h"
+#include "isometry.h"
 #include "levels.h"
 #include "mlp.h"
+#include "picture.h"
 #include "rasterizer.h"
 #include "sensor_module.h"
+#include "skinning.h"
 #include "ssim.h"
 
 namespace nb = nanobind;
@@ -239,19 +244,37 @@ class PyMlp {
     std::unique_ptr<Mlp> mlp_;
 };
 
-// Sum over all planes and window positions; `grad` is that of the sum.
-double ssim(In image, In reference, In window, float c1, float c2, std::optional<Out> grad, int threads) {
+// Sums over all planes: of the similarity over window positions, whose gradient is `grad`, and of absolute
+// differences over pixels.
+std::pair<double, double> ssim(In image, In reference, In window, float c1, float c2, std::optional<Out> grad, int threads) {
     require(image.ndim() == 3 && image.size() == reference.size() && window.size() == kSsimWindow, "the images");
     const size_t planes = image.shape(0), height = image.shape(1), width = image.shape(2);
     require(height >= kSsimWindow && width >= kSsimWindow && height < 1 << 20 && width < 1 << 20, "the images");
     require(!grad || grad->size() == image.size(), "the gradient");
     nb::gil_scoped_release release;
-    std::vector<double> sums(planes);
-    ssim_planes(planes, int(height), int(width), image.data(), reference.data(), window.data(), c1, c2, threads,
-                sums.data(), grad ? grad->data() : nullptr);
-    double total = 0.0;
-    for (double sum : sums) total += sum;
-    return total;
+    const SsimSums sums = ssim_planes(planes, int(height), int(width), image.data(), reference.data(), window.data(),
+                                      c1, c2, threads, grad ? grad->data() : nullptr);
+    return {sums.similarity, sums.difference};
+}
+
+void picture_add_sign(In image, In reference, float by_difference, float scale, Out grad, int threads) {
+    require(image.size() == reference.size() && grad.size() == image.size(), "the pictures");
+    nb::gil_scoped_release release;
+    add_sign(image.data(), reference.data(), by_difference, scale, image.size(), threads, grad.data());
+}
+
+// Planes (3, pixels).
+void picture_log_brightness(In coded, const std::array<float, 3>& weight, float gamma, float darkest, float eps,
+                            Out value, std::optional<Out> slope, int threads) {
+    const size_t count = value.size();
+    require(coded.size() == 3 * count && (!slope || slope->size() == 3 * count), "the picture");
+    LogBrightness job = {{}, {}, gamma, darkest, eps, value.data(), {}};
+    for (int c = 0; c < 3; ++c) {
+        job.coded[c] = coded.data() + c * count, job.weight[c] = weight[c];
+        job.slope[c] = slope ? slope->data() + c * count : nullptr;
+    }
+    nb::gil_scoped_release release;
+    log_brightness(job, count, threads);
 }
 
 // Table (entries, features); level l has `cells[l]` cells per axis and entries from begin[l].
@@ -288,6 +311,69 @@ void hash_encode_backward(In positions, In table, std::vector<int64_t> cells, st
                        position_grad ? position_grad->data() : nullptr);
 }
 
+using InRows = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+
+Skinning skinning(const In& position, const In& weight, const In& bones) {
+    require(bones.ndim() == 4 && bones.shape(2) == 4 && bones.shape(3) == 4, "the bones");
+    const size_t times = bones.shape(0), joints = bones.shape(1);
+    require(position.ndim() == 3 && position.shape(2) == 3, "the points");
+    require(weight.ndim() == 3 && weight.shape(2) == joints && weight.shape(1) == position.shape(1), "the weights");
+    const size_t points = position.shape(1);
+    require(position.shape(0) == times || position.shape(0) == 1, "the points");
+    require(weight.shape(0) == times || weight.shape(0) == 1, "the weights");
+    return {times, points, joints, position.data(), weight.data(), position.shape(0) == 1 ? 0 : points * 3,
+            weight.shape(0) == 1 ? 0 : points * joints, bones.data()};
+}
+
+void blend_skin(In position, In weight, In bones, Out moved, Out blended, int threads) {
+    const Skinning job = skinning(position, weight, bones);
+    require(moved.size() == job.times * job.points * 3 && blended.size() == job.times * job.points * 16, "the result");
+    nb::gil_scoped_release release;
+    skin(job, threads, moved.data(), blended.data());
+}
+
+void blend_skin_backward(In position, In weight, In bones, In blended, std::optional<In> moved_grad,
+                         std::optional<In> blended_grad, std::optional<Out> position_grad,
+                         std::optional<Out> weight_grad, std::optional<Out> bones_grad, int threads) {
+    const Skinning job = skinning(position, weight, bones);
+    const size_t rows = job.times * job.points;
+    require(blended.size() == rows * 16 && (!moved_grad || moved_grad->size() == rows * 3) &&
+                (!blended_grad || blended_grad->size() == rows * 16),
+            "the result's gradient");
+    require((!position_grad || position_grad->size() == position.size()) &&
+                (!weight_grad || weight_grad->size() == weight.size()) &&
+                (!bones_grad || bones_grad->size() == bones.size()),
+            "the gradients");
+    const auto given = [](const std::optional<In>& array) { return array ? array->data() : nullptr; };
+    const auto asked = [](const std::optional<Out>& array) { return array ? array->data() : nullptr; };
+    const SkinningGrads grads = {given(moved_grad), given(blended_grad), asked(position_grad), asked(weight_grad),
+                                 asked(bones_grad), nullptr, 0, nullptr};
+    nb::gil_scoped_release release;
+    skin_backward(job, blended.data(), grads, threads);
+}
+
+// `arrays` and `grads`: means, quats, scales_log, posed means, posed quats, posed scales, transforms.
+std::pair<double, double> isometry_change(InRows rows, const std::vector<In>& arrays, const std::vector<Out>& grads) {
+    require(arrays.size() == 7 && grads.size() == 7, "the arrays");
+    require(rows.ndim() == 2 && rows.shape(1) == 1 + kNeighbours, "the rows");
+    require(arrays[3].ndim() == 3, "the posed means");
+    const size_t times = arrays[3].shape(0), points = arrays[3].shape(1);
+    const size_t width[7] = {3, 4, 3, 3, 4, 3, 16};
+    for (int i = 0; i < 7; ++i) {
+        require(grads[i].size() == arrays[i].size(), "a gradient");
+        require(i < 3 ? arrays[i].size() >= points * width[i] : arrays[i].size() == times * points * width[i], "an array");
+    }
+    for (size_t i = 0; i < rows.size(); ++i)
+        require(rows.data()[i] >= 0 && size_t(rows.data()[i]) < points, "the rows: outside of the points");
+    const IsometryInputs in = {rows.shape(0), times, points, rows.data(), arrays[0].data(), arrays[1].data(),
+                               arrays[2].data(), arrays[3].data(), arrays[4].data(), arrays[5].data(), arrays[6].data()};
+    const IsometryGrads out = {grads[0].data(), grads[1].data(), grads[2].data(), grads[3].data(), grads[4].data(),
+                               grads[5].data(), grads[6].data()};
+    nb::gil_scoped_release release;
+    const IsometryMeans means = isometry(in, out);
+    return {means.centers, means.covariances};
+}
+
 double multiply_add(int64_t rounds) {
     float sink = 0.f;
     nb::gil_scoped_release release;
@@ -320,7 +406,21 @@ NB_MODULE(_native, m) {
              nb::arg("bias"), nb::arg("point_weight"), nb::arg("both_weight"), nb::arg("layers"));
     m.def("ssim", &ssim, nb::arg("image"), nb::arg("reference"), nb::arg("window"), nb::arg("c1"), nb::arg("c2"),
           nb::arg("grad").none(), nb::arg("threads"),
-          "Sum of the structural similarity over (planes, H, W); writes its gradient.");
+          "Sums of the structural similarity, whose gradient it writes, and of absolute differences.");
+    m.def("add_sign", &picture_add_sign, nb::arg("image"), nb::arg("reference"), nb::arg("by_difference"),
+          nb::arg("scale"), nb::arg("grad"), nb::arg("threads"),
+          "grad = by_difference * sign(image - reference) + scale * grad.");
+    m.def("log_brightness", &picture_log_brightness, nb::arg("coded"), nb::arg("weight"), nb::arg("gamma"),
+          nb::arg("darkest"), nb::arg("eps"), nb::arg("value"), nb::arg("slope").none(), nb::arg("threads"),
+          "Logarithm of the luminance of (3, H, W) coded values, and its slope by each.");
+    m.def("skin", &blend_skin, nb::arg("position"), nb::arg("weight"), nb::arg("bones"), nb::arg("moved"),
+          nb::arg("blended"), nb::arg("threads"), "Linear blend skinning.");
+    m.def("skin_backward", &blend_skin_backward, nb::arg("position"), nb::arg("weight"), nb::arg("bones"),
+          nb::arg("blended"), nb::arg("moved_grad").none(), nb::arg("blended_grad").none(),
+          nb::arg("position_grad").none(), nb::arg("weight_grad").none(), nb::arg("bones_grad").none(),
+          nb::arg("threads"), "Writes the gradients of skin.");
+    m.def("isometry", &isometry_change, nb::arg("rows"), nb::arg("arrays"), nb::arg("grads"),
+          "Mean change of neighbours' distances and covariances; adds the gradients of each.");
     m.def("hash_encode", &hash_encode, nb::arg("positions"), nb::arg("table"), nb::arg("cells"), nb::arg("begin"),
           nb::arg("mask"), nb::arg("encoded"), nb::arg("threads"), "Hash grid encoding (levels * features, N).");
     m.def("hash_encode_backward", &hash_encode_backward, nb::arg("positions"), nb::arg("table"), nb::arg("cells"),

@@ -1,7 +1,6 @@
 #include "ssim.h"
 
 #include <algorithm>
-#include <numeric>
 #include <vector>
 
 #include "buffer.h"
@@ -10,11 +9,11 @@
 
 namespace evsplat {
 
-void ssim_planes(size_t planes, int height, int width, const float* image, const float* reference,
-                 const float* window, float c1, float c2, int threads, double* sums, float* grad) {
+SsimSums ssim_planes(size_t planes, int height, int width, const float* image, const float* reference,
+                 const float* window, float c1, float c2, int threads, float* grad) {
     constexpr int kBand = 64;  // fixes the order of sums
     const size_t plane = size_t(height) * width, bands = (height + kBand - 1) / kBand;
-    std::vector<double> parts(planes * bands);
+    std::vector<SsimSums> parts(planes * bands);
     const auto kernel = select_kernels().ssim;
     parallel_for(threads, parts.size(), [&](size_t i) {
         const size_t p = i / bands;
@@ -23,8 +22,9 @@ void ssim_planes(size_t planes, int height, int width, const float* image, const
         parts[i] = kernel({height, width, begin, std::min(height, begin + kBand), image + p * plane,
                            reference + p * plane, window, c1, c2, grad ? grad + p * plane : nullptr, scratch.data()});
     });
-    for (size_t p = 0; p < planes; ++p)
-        sums[p] = std::accumulate(parts.begin() + p * bands, parts.begin() + (p + 1) * bands, 0.0);
+    SsimSums total = {};
+    for (const SsimSums& part : parts) total.similarity += part.similarity, total.difference += part.difference;
+    return total;
 }
 
 }  // namespace evsplat

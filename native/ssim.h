@@ -17,10 +17,15 @@ struct SsimBand {
     float* scratch;                   // ssim_scratch floats
 };
 
+struct SsimSums {
+    double similarity;                // over the window positions
+    double difference;                // absolute, over the pixels
+};
+
 inline size_t ssim_scratch(int width) { return size_t(8 * kSsimWindow + 9) * (width + kSsimWindow); }
 
-// Sums over the window positions of each plane; `planes` of (height, width) follow each other.
-void ssim_planes(size_t planes, int height, int width, const float* image, const float* reference,
-                 const float* window, float c1, float c2, int threads, double* sums, float* grad);
+// Sums over all planes; `planes` of (height, width) follow each other.
+SsimSums ssim_planes(size_t planes, int height, int width, const float* image, const float* reference,
+                 const float* window, float c1, float c2, int threads, float* grad);
 
 }  // namespace evsplat

@@ -37,7 +37,7 @@ INLINE void blur_rows(const float* const (&from)[K], const float (&w)[K], int co
 
 }  // namespace
 
-double ssim_band(const SsimBand& job) {
+SsimSums ssim_band(const SsimBand& job) {
     const int h = job.height, w = job.width, rows = h - K + 1, columns = w - K + 1;
     float window[K];
     for (int k = 0; k < K; ++k) window[k] = job.window[k];
@@ -57,8 +57,15 @@ double ssim_band(const SsimBand& job) {
 
     const int first = job.begin > K - 1 ? job.begin - K + 1 : 0, last = job.end < rows ? job.end : rows;
     const int start = job.grad ? first : job.begin;
-    double total = 0.0;
+    SsimSums total = {};
     int filled = start;  // rows up to here are blurred
+    for (int q = job.begin; q < job.end; ++q) {
+        const float *x = job.image + size_t(q) * w, *y = job.reference + size_t(q) * w;
+        float sum = 0.f;
+#pragma GCC ivdep
+        for (int i = 0; i < w; ++i) sum += __builtin_fabsf(x[i] - y[i]);
+        total.difference += sum;
+    }
     for (int q = start; q < job.end; ++q) {
         for (; q < last && filled < q + K; ++filled) {
             const float *x = job.image + size_t(filled) * w, *y = job.reference + size_t(filled) * w;
@@ -89,7 +96,7 @@ double ssim_band(const SsimBand& job) {
                     2.f * my * a2 * inverse - 2.f * mx * s * b2 * inverse - 2.f * mx * d_square[i] - my * d_product[i];
                 sum += s;
             }
-            if (q >= job.begin) total += sum;
+            if (q >= job.begin) total.similarity += sum;
         }
         if (!job.grad) continue;
         for (int m = 0; m < 3; ++m) {

@@ -91,6 +91,27 @@ class Sensor:
     def count(self) -> int: ...
     def take(self, t: ndarray, x: ndarray, y: ndarray, p: ndarray) -> None: ...
 
+def skin(
+    position: Tensor,
+    weight: Tensor,
+    bones: Tensor,
+    moved: Tensor,
+    blended: Tensor,
+    threads: int,
+) -> None: ...
+def skin_backward(
+    position: Tensor,
+    weight: Tensor,
+    bones: Tensor,
+    blended: Tensor,
+    moved_grad: Tensor | None,
+    blended_grad: Tensor | None,
+    position_grad: Tensor | None,
+    weight_grad: Tensor | None,
+    bones_grad: Tensor | None,
+    threads: int,
+) -> None: ...
+def isometry(rows: Tensor, arrays: list[Tensor], grads: list[Tensor]) -> tuple[float, float]: ...
 def hash_encode(
     positions: Tensor,
     table: Tensor,
@@ -119,7 +140,25 @@ def ssim(
     c2: float,
     grad: Tensor | None,
     threads: int,
-) -> float: ...
+) -> tuple[float, float]: ...
+def add_sign(
+    image: Tensor,
+    reference: Tensor,
+    by_difference: float,
+    scale: float,
+    grad: Tensor,
+    threads: int,
+) -> None: ...
+def log_brightness(
+    coded: Tensor,
+    weight: tuple[float, float, float],
+    gamma: float,
+    darkest: float,
+    eps: float,
+    value: Tensor,
+    slope: Tensor | None,
+    threads: int,
+) -> None: ...
 def lanes() -> int: ...
 def has_bf16() -> bool: ...
 def levels() -> list[str]: ...

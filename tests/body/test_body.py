@@ -134,6 +134,27 @@ def test_skinning_gradients_reach_points_weights_and_bones():
     assert torch.autograd.gradcheck(skin, (points, weights, bones))
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("point_times", [1, 3])
+@pytest.mark.parametrize("weight_times", [1, 3])
+def test_compiled_skinning_and_its_gradients_equal_plain_torch_in_float64(
+    seed, point_times, weight_times
+):
+    generator = torch.Generator().manual_seed(seed)
+    shapes = ((point_times, 700, 3), (weight_times, 700, 17), (3, 17, 4, 4), (3, 700, 3))
+    *inputs, by_moved, by_blended = (
+        torch.randn(shape, generator=generator) for shape in (*shapes, (3, 700, 4, 4))
+    )
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [value.to(dtype).requires_grad_() for value in inputs]
+        moved, blended = skin(*leaves)
+        total = (moved * by_moved).sum() + (blended * by_blended).sum()
+        results.append((moved, blended, *torch.autograd.grad(total, leaves)))
+    for compiled, plain in zip(*results, strict=True):
+        assert (compiled - plain).norm() < 1e-6 * plain.norm()
+
+
 def test_bounding_box_encloses_the_canonical_body_with_its_margin():
     body = default_body()
     low, high = bounding_box(body, margin=0.25)

@@ -25,6 +25,25 @@ def test_value_and_gradient_are_those_of_the_definition(seed):
         assert torch.allclose(fused, plain, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("planar", [False, True])
+def test_compiled_value_and_gradient_equal_the_definition_in_float64(seed, planar):
+    generator = torch.Generator().manual_seed(seed)
+    rgb = 1.2 * torch.rand(61, 47, 3, generator=generator) - 0.1
+    rgb[0], rgb[1] = 0.0, torch.tensor([1e-3, 1.0, 0.5])
+    if planar:
+        rgb = rgb.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    upstream = torch.randn(61, 47, generator=generator)
+    leaf = rgb.clone().requires_grad_()
+    value = log_brightness(leaf, eps=1e-5)
+    (gradient,) = torch.autograd.grad(value, leaf, upstream)
+    leaf = rgb.double().requires_grad_()
+    expected = by_definition(leaf, 1e-5)
+    (expected_gradient,) = torch.autograd.grad(expected, leaf, upstream.double())
+    assert (value - expected).abs().max() < 2e-6
+    assert torch.allclose(gradient.double(), expected_gradient, rtol=2e-6, atol=1e-9)
+
+
 def test_gradcheck_of_the_change():
     before, after = (
         (0.1 + 0.9 * torch.rand(4, 5, 3, dtype=torch.float64)).requires_grad_() for _ in range(2)

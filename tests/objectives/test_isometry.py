@@ -8,6 +8,7 @@ import torch
 from evsplat.gaussians import GaussianSet
 from evsplat.gaussians.initialise import gaussians_at
 from evsplat.objectives import Isometry
+from evsplat.objectives.isometry import isometry_change
 
 
 def make_step(seed: int, count: int = 60, turn: float = 0.7, stretch: float = 1.0):
@@ -84,3 +85,21 @@ def test_state_repeats_the_same_loss():
     assert float(first.loss(make_step(3))["isometry_centers"]) == float(
         second.loss(make_step(3))["isometry_centers"]
     )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_change_and_its_gradients_equal_plain_torch_in_float64(seed):
+    generator = torch.Generator().manual_seed(seed)
+    shapes = ((90, 3), (90, 4), (90, 3), (2, 70, 3), (2, 70, 4), (2, 70, 3), (2, 70, 4, 4))
+    arrays = [torch.randn(shape, generator=generator) for shape in shapes]
+    arrays[2] -= 2.0
+    rows = torch.stack([torch.randperm(70, generator=generator)[:5] for _ in range(40)])
+    rows[0, 1] = rows[0, 0]  # a distance of zero has no direction, and no gradient
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [value.to(dtype).requires_grad_() for value in arrays]
+        terms = isometry_change(rows, tuple(leaves[:3]), tuple(leaves[3:]))
+        gradients = torch.autograd.grad(2 * terms[0] + 3 * terms[1], leaves)
+        results.append((*terms, *gradients))
+    for compiled, plain in zip(*results, strict=True):
+        assert (compiled - plain).norm() < 5e-6 * plain.norm()

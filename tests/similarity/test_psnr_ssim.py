@@ -12,6 +12,7 @@ from evsplat.similarity.psnr_ssim import (
     SCIKIT_DEFAULT_SSIM,
     ZERO_PADDED_SSIM,
     Ssim,
+    l1_and_ssim,
     psnr,
     psnr_channel_mean,
     ssim,
@@ -152,3 +153,18 @@ def test_compiled_ssim_reads_planar_and_interleaved_pictures_alike():
     reference = torch.rand(30, 20, 3, generator=generator)
     assert float(ssim(planar, reference)) == float(ssim(planar.contiguous(), reference))
     assert float(ssim(planar, planar)) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_difference_and_similarity_share_one_gradient(seed):
+    generator = torch.Generator().manual_seed(seed)
+    image, reference = (torch.rand(75, 31, 3, generator=generator) for _ in range(2))
+    image[:4] = reference[:4]  # equal pixels have no gradient of the absolute difference
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = image.to(dtype).requires_grad_()
+        l1, similarity = l1_and_ssim(leaf, reference.to(dtype))
+        (gradient,) = torch.autograd.grad(0.8 * l1 - 0.2 * similarity, leaf)
+        results.append((l1, similarity, gradient))
+    for compiled, plain in zip(*results, strict=True):
+        assert (compiled - plain).norm() < 2e-6 * plain.norm()

@@ -2,14 +2,17 @@
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from evsplat.body.canonical import leg_spread_rotations
 from evsplat.body.surface import SurfaceSamples, sample_mesh
 from evsplat.body.tree import Level, level_inverse, tree_levels
+from evsplat.compiled import native, runs_native
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +139,45 @@ def skin(
     Returns the moved points and the blended matrices, whose 3x3 part is not a rotation where
     bones disagree (the shear is kept; method.md 1.6).
     """
+    if all(map(runs_native, (points, weights, bones))):
+        matrices: Tensor
+        moved, matrices = _NativeSkin.apply(
+            points.expand(1, -1, -1) if points.dim() == 2 else points,
+            weights.expand(1, -1, -1) if weights.dim() == 2 else weights,
+            bones,
+        )
+        return moved, matrices
     blended = (weights @ bones.flatten(-2)).unflatten(-1, (4, 4))
     moved = (blended[..., :3, :3] * points[..., None, :]).sum(-1) + blended[..., :3, 3]
     return moved, blended
+
+
+class _NativeSkin(torch.autograd.Function):
+    """`skin` in the compiled module; points and weights have a leading axis of T or 1."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: Tensor, weights: Tensor, bones: Tensor
+    ) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N 4 4"]]:
+        given = [tensor.detach().contiguous() for tensor in (points, weights, bones)]
+        times, count = len(bones), points.shape[1]
+        moved, blended = bones.new_empty(times, count, 3), bones.new_empty(times, count, 4, 4)
+        native.skin(*given, moved, blended, torch.get_num_threads())
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*given, blended)
+        return moved, blended
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        *given, blended = ctx.saved_tensors
+        grads = [
+            torch.empty_like(tensor) if needed else None
+            for tensor, needed in zip(given, ctx.needs_input_grad, strict=True)
+        ]
+        above = [None if grad is None else grad.contiguous() for grad in upstream]
+        native.skin_backward(*given, blended, *above, *grads, torch.get_num_threads())
+        return tuple(grads)
 
 
 def bounding_box(body: Body, margin: float = 0.1) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

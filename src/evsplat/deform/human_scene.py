@@ -17,6 +17,7 @@ from evsplat.deform.mlp import PointMLP, Precision, bfloat16_runs
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
 from evsplat.deform.skinning_network import SkinningNetwork
+from evsplat.deform.skinning_turns import SkinningTurns
 from evsplat.gaussians import ATTRIBUTES, GaussianSet, PosedGaussians, PosedHuman, StaticScene
 
 logger = logging.getLogger(__name__)
@@ -40,6 +41,8 @@ class DeformConfig:
     point jump when the network is switched on."""
     skinning_depth: int = 4
     """Hidden layers of the skinning network."""
+    skinning_turns: int = 4
+    """A training step looks up the skinning weights of one row in so many, in turns; 1 = of all."""
     colour_width: int = 64
     """Hidden width of the colour networks (A10)."""
     latent_dim: int = 16
@@ -108,6 +111,7 @@ class HumanSceneModel(nn.Module):
             last_layer_std=config.non_rigid_last_std,
         )
         self.skinning = SkinningNetwork(parents, width=config.width, depth=config.skinning_depth)
+        self.skinning_turns = SkinningTurns(config.skinning_turns)
         self.human_colour = HumanColour(latent_dim=config.latent_dim, width=config.colour_width)
         self.scene_colour = SceneColour(
             view_dependent=config.scene_view_dependent, width=config.colour_width
@@ -179,8 +183,11 @@ class HumanSceneModel(nn.Module):
         rotations, bones = self.pose(times_us)
         moving = self._moving(parts)
         deformed, log_scales, quaternions, feature = self._non_rigid(moving, rotations, noise)
-        skinned_at = deformed.mean(0, keepdim=True) if share_skinning else deformed
-        weights = self.skinning(self.normalise(skinned_at))
+        if share_skinning:
+            shared = self.normalise(deformed.mean(0))
+            weights = self.skinning_turns.weights(self.skinning, shared)[None]
+        else:
+            weights = self.skinning(self.normalise(deformed))
         world, transforms = skin(deformed, weights, bones)
 
         people = slice(0, gaussians.human_count)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from evsplat.compiled import native, runs_native
 from evsplat.imaging.srgb import GAMMA, REC709, Transfer, decode, luminance
 
 DARKEST = 1.0 / 255.0
@@ -40,6 +41,16 @@ class _PowerLogBrightness(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rgb: Tensor, eps: float) -> Float[Tensor, "*shape"]:
+        if runs_native(rgb) and rgb.shape[-1] == len(REC709):
+            planes = rgb.detach().movedim(-1, 0).contiguous()
+            slopes = torch.empty_like(planes) if ctx.needs_input_grad[0] else None
+            value = torch.empty_like(planes[0])
+            native.log_brightness(
+                planes, REC709, GAMMA, DARKEST, eps, value, slopes, torch.get_num_threads()
+            )
+            if slopes is not None:
+                ctx.save_for_backward(slopes.movedim(0, -1))
+            return value
         coded = rgb.clamp_min(DARKEST)
         slope = coded ** (GAMMA - 1)
         light = luminance(slope * coded) + eps

@@ -1,14 +1,17 @@
 """As isometric as possible: neighbours keep their distances and covariances when posed."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Frame
+from evsplat.compiled import native, runs_native
 from evsplat.objectives.base import Step
 
 NEIGHBOURS = 4
@@ -19,6 +22,60 @@ def covariance6(matrix: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 6"]:
     covariance = matrix @ matrix.transpose(-1, -2)
     row, column = torch.triu_indices(3, 3, device=matrix.device)
     return covariance[..., row, column]
+
+
+def isometry_change(
+    rows: Int[Tensor, "S 5"],
+    canonical: tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"], Float[Tensor, "N 3"]],
+    posed: tuple[
+        Float[Tensor, "T H 3"],
+        Float[Tensor, "T H 4"],
+        Float[Tensor, "T H 3"],
+        Float[Tensor, "T H 4 4"],
+    ],
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Mean absolute change of neighbours' distances, and of their covariances' distances.
+
+    ``rows`` are a Gaussian and its neighbours, all below H. ``canonical`` holds centres,
+    quaternions and log-scales, ``posed`` centres, quaternions, scales and the transforms that carry
+    covariances on. The distance of two covariances is that of their upper triangles.
+    """
+    if all(map(runs_native, (*canonical, *posed))):
+        native_centers, native_covariances = _NativeIsometry.apply(rows, *canonical, *posed)
+        return native_centers, native_covariances
+    means, quaternions, log_scales = (_rows(part, rows, 0) for part in canonical)
+    after, posed_quaternions, posed_scales, transforms = (_rows(part, rows, 1) for part in posed)
+    before = (means[:, :1] - means[:, 1:]).norm(dim=-1)
+    after = (after[:, :, :1] - after[:, :, 1:]).norm(dim=-1)
+    centers = (after - before).abs().mean()
+
+    canonical_6 = covariance6(quaternion_to_matrix(quaternions) * log_scales.exp()[..., None, :])
+    rotation = transforms[..., :3, :3] @ quaternion_to_matrix(posed_quaternions)
+    posed_6 = covariance6(rotation * posed_scales[..., None, :])
+    before = (canonical_6[:, :1] - canonical_6[:, 1:]).norm(dim=-1)
+    after = (posed_6[:, :, :1] - posed_6[:, :, 1:]).norm(dim=-1)
+    return centers, (after - before).abs().mean()
+
+
+class _NativeIsometry(torch.autograd.Function):
+    """`isometry_change` in the compiled module; the gradients are found on the way forward."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, *arrays: Tensor) -> tuple[Tensor, Tensor]:
+        given = [array.detach().contiguous() for array in arrays]
+        grads = [torch.zeros_like(array) for array in given]
+        centers, covariances = native.isometry(rows.contiguous(), given, grads)
+        ctx.save_for_backward(*grads)
+        return arrays[0].new_tensor(centers), arrays[0].new_tensor(covariances)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        of_centers = (True, False, False, True, False, False, False)
+        return None, *(
+            grad * upstream[0 if centers else 1]
+            for grad, centers in zip(ctx.saved_tensors, of_centers, strict=True)
+        )
 
 
 def _rows(values: Tensor, rows: Tensor, axis: int) -> Tensor:
@@ -61,28 +118,10 @@ class Isometry:
         near = self.neighbours[chosen].to(canonical.device)
         rows = torch.cat([chosen.to(canonical.device)[:, None], near], dim=1)
 
-        # All that a row has is gathered in one piece: the gradient of a gather is as large as its
-        # source, whatever the number of rows.
-        parts = (gaussians.means, gaussians.quaternions, gaussians.scales_log)
-        gathered = _rows(torch.cat([part[:count] for part in parts], -1), rows, 0)
-        centers, quaternions, log_scales = gathered.split((3, 4, 3), -1)
-        linear = posed.transforms[..., :3, :3].flatten(-2)
-        world = torch.cat([posed.means, posed.quaternions, posed.scales, linear], -1)
-        gathered = _rows(world, rows, 1)
-        after, posed_quaternions, posed_scales, linear = gathered.split((3, 4, 3, 9), -1)
-
-        before = (centers[:, :1] - centers[:, 1:]).norm(dim=-1)
-        after = (after[:, :, :1] - after[:, :, 1:]).norm(dim=-1)
-        terms = {"isometry_centers": (after - before).abs().mean()}
-
-        rotation = quaternion_to_matrix(quaternions)
-        canonical_6 = covariance6(rotation * log_scales.exp()[..., None, :])
-        rotation = linear.unflatten(-1, (3, 3)) @ quaternion_to_matrix(posed_quaternions)
-        posed_6 = covariance6(rotation * posed_scales[..., None, :])
-        before = (canonical_6[:, :1] - canonical_6[:, 1:]).norm(dim=-1)
-        after = (posed_6[:, :, :1] - posed_6[:, :, 1:]).norm(dim=-1)
-        terms["isometry_covariances"] = (after - before).abs().mean()
-        return terms
+        at_rest = (gaussians.means, gaussians.quaternions, gaussians.scales_log)
+        moved = (posed.means, posed.quaternions, posed.scales, posed.transforms)
+        centers, covariances = isometry_change(rows, at_rest, moved)
+        return {"isometry_centers": centers, "isometry_covariances": covariances}
 
     def rows_changed(self) -> None:
         """Row numbers mean other Gaussians now: search again."""

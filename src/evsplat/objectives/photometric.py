@@ -8,7 +8,7 @@ from torch import Tensor
 from evsplat.capture import Capture, Frame
 from evsplat.objectives.base import Stateless, Step
 from evsplat.similarity.perceptual import PerceptualMetric
-from evsplat.similarity.psnr_ssim import GAUSSIAN_SSIM, ssim
+from evsplat.similarity.psnr_ssim import l1_and_ssim
 
 
 class Photometric(Stateless):
@@ -43,10 +43,12 @@ class Photometric(Stateless):
             for frame, rendered in zip(frames, step.rgb, strict=True)
             if frame is not None
         ]
-        pairs = [(rendered, observed) for _, rendered, observed in seen]
-        terms = {"l1": torch.stack([(a - b).abs().mean() for a, b in pairs]).mean()}
         if self.dssim:
-            terms["dssim"] = 1 - torch.stack([ssim(a, b, GAUSSIAN_SSIM) for a, b in pairs]).mean()
+            values = [torch.stack(l1_and_ssim(a, b)) for _, a, b in seen]
+            l1, similarity = torch.stack(values).mean(0).unbind()
+            terms = {"l1": l1, "dssim": 1 - similarity}
+        else:
+            terms = {"l1": torch.stack([(a - b).abs().mean() for _, a, b in seen]).mean()}
         if self.perceptual is not None:
             values = []
             for frame, a, b in seen:

@@ -69,12 +69,10 @@ class RenderedSemantics(Stateless):
         for time, drawn in zip(step.times_us, step.semantic, strict=True):
             if time not in self.bounds:
                 continue
-            inside, outside = (mask.to(drawn.device) for mask in self.bounds[time].masks())
-            probability = drawn.clamp(1e-4, 1 - 1e-4)
-            error = -torch.where(
-                inside, probability.log(), torch.where(outside, (1 - probability).log(), 0.0)
-            )
-            values.append(error.mean())
+            inside, outside = (mask.to(drawn) for mask in self.bounds[time].masks())
+            # The probability of what the pixel surely is: p inside, 1 - p outside, 1 between.
+            right = torch.addcmul(1 - inside, inside - outside, drawn.clamp(1e-4, 1 - 1e-4))
+            values.append(-right.log().mean())
         soft = step.model.gaussians.semantics()
         terms = {"binarise": (soft * (1 - soft)).mean()}
         if values:

@@ -1,6 +1,15 @@
 """Drawing posed Gaussians: one function, several backends that give the same numbers."""
 
 from evsplat.render.api import BackendName, choose_device, render
+from evsplat.render.pictures import split_channels
 from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
-__all__ = ["BackendName", "PinholeCamera", "RenderOutput", "Splats", "choose_device", "render"]
+__all__ = [
+    "BackendName",
+    "PinholeCamera",
+    "RenderOutput",
+    "Splats",
+    "choose_device",
+    "render",
+    "split_channels",
+]

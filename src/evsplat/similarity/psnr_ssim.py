@@ -124,13 +124,18 @@ def ssim(
 
     A ValueError where no window fits into the image.
     """
-    fits = min(image.shape[:2]) >= settings.size
-    usual = settings == GAUSSIAN_SSIM and not reference.requires_grad
-    if runs_native(image) and usual and fits:
-        _check_same_shape(image, reference)
-        mean: Tensor = _NativeSsim.apply(image, reference)
-        return mean
+    if settings == GAUSSIAN_SSIM and _runs_native(image, reference):
+        return _native_l1_ssim(image, reference)[1]
     return ssim_map(image, reference, settings).mean()
+
+
+def l1_and_ssim(
+    image: Float[Tensor, "H W C"], reference: Float[Tensor, "H W C"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Mean absolute difference, and `ssim` of `GAUSSIAN_SSIM`, for the cost of the latter."""
+    if _runs_native(image, reference):
+        return _native_l1_ssim(image, reference)
+    return (image - reference).abs().mean(), ssim_map(image, reference, GAUSSIAN_SSIM).mean()
 
 
 def _window(settings: Ssim) -> list[float]:
@@ -143,28 +148,46 @@ def _window(settings: Ssim) -> list[float]:
     return [weight / sum(bell) for weight in bell]
 
 
-class _NativeSsim(torch.autograd.Function):
+def _runs_native(image: Tensor, reference: Tensor) -> bool:
+    _check_same_shape(image, reference)
+    fits = min(image.shape[:2]) >= GAUSSIAN_SSIM.size
+    return fits and runs_native(image) and not reference.requires_grad
+
+
+def _native_l1_ssim(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+    l1, similarity = _NativeL1Ssim.apply(image, reference)
+    return l1, similarity
+
+
+class _NativeL1Ssim(torch.autograd.Function):
     """`GAUSSIAN_SSIM` in the compiled module; the gradient is found on the way forward."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, reference: Tensor) -> Tensor:
+    def forward(ctx: Any, image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
         x, y = (picture.detach().movedim(-1, 0).contiguous() for picture in (image, reference))
+        y = y.float()
         gradient = torch.empty_like(x) if ctx.needs_input_grad[0] else None
         window = torch.tensor(_window(GAUSSIAN_SSIM))
         constants = GAUSSIAN_SSIM.stabilisers
-        total = native.ssim(x, y.float(), window, *constants, gradient, torch.get_num_threads())
+        similarity, difference = native.ssim(
+            x, y, window, *constants, gradient, torch.get_num_threads()
+        )
         planes, height, width = x.shape
         size = GAUSSIAN_SSIM.size
-        positions = planes * (height - size + 1) * (width - size + 1)
+        ctx.positions = planes * (height - size + 1) * (width - size + 1)
         if gradient is not None:
-            ctx.save_for_backward(gradient.div_(positions).movedim(0, -1))
-        return image.new_tensor(total / positions)
+            ctx.save_for_backward(x, y, gradient)
+        l1, mean = difference / x.numel(), similarity / ctx.positions
+        return image.new_tensor(l1), image.new_tensor(mean)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * upstream[0], None
+        x, y, similarity_gradient = ctx.saved_tensors
+        gradient = similarity_gradient.clone()
+        by_difference, scale = float(upstream[0]) / x.numel(), float(upstream[1]) / ctx.positions
+        native.add_sign(x, y, by_difference, scale, gradient, torch.get_num_threads())
+        return gradient.movedim(0, -1), None
 
 
 def _check_same_shape(image: Tensor, reference: Tensor) -> None:

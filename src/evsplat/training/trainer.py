@@ -14,7 +14,7 @@ from evsplat.gaussians.densify import reset_opacities
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import weight_at
 from evsplat.objectives import Step
-from evsplat.render import Splats, render
+from evsplat.render import Splats, render, split_channels
 from evsplat.training.checkpoint import below, flatten, load_model
 from evsplat.training.clock import Clock
 from evsplat.training.optimiser import Optimiser
@@ -65,10 +65,8 @@ class Trainer:
         posed = self.model.at(times, camera.center(), noise=noise, share_skinning=True)
         moving, static = _with_centers(posed.moving()), _with_centers(posed.static())
         output = render(moving, camera, static=static)
-        # Pictures stay planar in memory, and their gradients come back in one piece.
-        planes = [picture.split([3, 1]) for picture in output.image.permute(0, 3, 1, 2).unbind(0)]
-        rgb = tuple(picture.permute(1, 2, 0) for picture, _ in planes)
-        semantic = tuple(picture[0] for _, picture in planes)
+        pictures = split_channels(output.image, (3, 1))
+        rgb, semantic = pictures[0], tuple(picture[..., 0] for picture in pictures[1])
         step = Step(
             self.capture, self.model, frame, tuple(times), rgb, semantic, posed, nominal, generator
         )
@@ -116,6 +114,7 @@ class Trainer:
         tensors |= flatten("statistics", vars(self.statistics))
         for number, objective in enumerate(self.composition.objectives):
             tensors |= flatten(f"objective{number}", objective.state())
+        tensors |= flatten("skinning_turns", self.model.skinning_turns.state())
         tensors["generator"] = self.composition.generator.get_state()
         state = {
             "clock": asdict(self.clock),
@@ -134,6 +133,7 @@ class Trainer:
         self.statistics = ScreenStatistics(**below("statistics", tensors))
         for number, objective in enumerate(self.composition.objectives):
             objective.load_state(below(f"objective{number}", tensors))
+        self.model.skinning_turns.load_state(below("skinning_turns", tensors))
         self.composition.generator.set_state(tensors["generator"])
         saved = state["clock"]
         for name in ("iteration", "fraction", "seconds", "step_seconds"):
@@ -164,6 +164,7 @@ class Trainer:
         if self.model.semantics != "fixed":
             drawn = self.capture.train_frames.index(frame)
             flip_labels(gaussians, rows, self.composition.body_frames, drawn)
+        self.model.skinning_turns.rows_changed()
         for objective in self.composition.objectives:
             objective.rows_changed()
         self.statistics = self._fresh_statistics()

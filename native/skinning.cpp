@@ -1,0 +1,52 @@
+#include "skinning.h"
+
+#include <algorithm>
+
+#include "buffer.h"
+#include "levels.h"
+#include "thread_pool.h"
+
+namespace evsplat {
+namespace {
+
+constexpr size_t kPoints = 512;  // of a block; fixes the order of sums over points
+constexpr size_t kLanes = 16;
+
+}  // namespace
+
+void skin(const Skinning& s, int threads, float* moved, float* blended) {
+    const auto kernel = select_kernels().skin;
+    parallel_for(threads, (s.points + kPoints - 1) / kPoints, [&](size_t block) {
+        kernel(s, block * kPoints, std::min(s.points, (block + 1) * kPoints), moved, blended);
+    });
+}
+
+void skin_backward(const Skinning& s, const float* blended, SkinningGrads g, int threads) {
+    const size_t blocks = (s.points + kPoints - 1) / kPoints, bones = s.times * s.joints * 16;
+    g.padded_joints = (s.joints + kLanes - 1) / kLanes * kLanes;
+    Buffer<float> columns(s.times * 16 * g.padded_joints);
+    for (size_t t = 0; t < s.times; ++t)
+        for (size_t i = 0; i < 16; ++i)
+            for (size_t j = 0; j < g.padded_joints; ++j)
+                columns[(t * 16 + i) * g.padded_joints + j] = j < s.joints ? s.bones[(t * s.joints + j) * 16 + i] : 0.f;
+    g.bones_columns = columns.data();
+    float* total = g.bones;
+    Buffer<float> sums(total ? blocks * bones : 0);
+    const auto kernel = select_kernels().skin_backward;
+    parallel_for(threads, blocks, [&](size_t block) {
+        SkinningGrads mine = g;
+        Buffer<float> scratch(g.padded_joints);
+        mine.scratch = scratch.data();
+        if (total) {
+            mine.bones = sums.data() + block * bones;
+            std::fill_n(mine.bones, bones, 0.f);
+        }
+        kernel(s, mine, blended, block * kPoints, std::min(s.points, (block + 1) * kPoints));
+    });
+    if (!total) return;
+    std::fill_n(total, bones, 0.f);
+    for (size_t block = 0; block < blocks; ++block)
+        for (size_t i = 0; i < bones; ++i) total[i] += sums[block * bones + i];
+}
+
+}  // namespace evsplat
