@@ -1,0 +1,75 @@
+"""Clock offset, contrast thresholds and noise of an event sensor, from what it recorded."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from evsplat.calibration.brightness import (
+    EventSource,
+    Exposure,
+    FramePair,
+    exposure,
+    pair,
+    pair_indices,
+)
+from evsplat.calibration.clock import ClockEstimate, estimate_clock
+from evsplat.calibration.noise import NoiseEstimate, estimate_noise
+from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
+
+if TYPE_CHECKING:
+    from evsplat.capture import Capture
+
+__all__ = [
+    "ClockEstimate",
+    "Exposure",
+    "FramePair",
+    "NoiseEstimate",
+    "SensorEstimate",
+    "ThresholdEstimate",
+    "estimate_clock",
+    "estimate_from_capture",
+    "estimate_from_pairs",
+    "estimate_noise",
+    "estimate_thresholds",
+    "exposure",
+    "pair",
+    "pair_indices",
+]
+
+MOST_PAIRS = 60
+
+
+@dataclass(frozen=True)
+class SensorEstimate:
+    """What frames tell about the events that were recorded with them."""
+
+    clock: ClockEstimate
+    thresholds: ThresholdEstimate | None
+    """Fitted at the estimated lag; None where there are too few events of either polarity."""
+
+
+def estimate_from_pairs(
+    pairs: Sequence[FramePair], events: EventSource, recorded_us: tuple[int, int]
+) -> SensorEstimate | None:
+    """Clock lag, then thresholds at that lag; None where frames and events do not correlate."""
+    clock = estimate_clock(pairs, events, recorded_us)
+    if clock is None:
+        return None
+    return SensorEstimate(clock, estimate_thresholds(pairs, events, recorded_us, clock.lag_us))
+
+
+def estimate_from_capture(capture: "Capture") -> SensorEstimate | None:
+    """Estimate from at most 60 pairs of consecutive frames; None where that is not possible.
+
+    The lag is what is left after the capture's own ``clock_offset_us``. A moving camera changes
+    nothing: both sides see what moves in the picture.
+    """
+    if capture.events is None or len(capture.events) == 0:
+        return None
+    frames = capture.frames
+    indices = pair_indices([frame.exposure_us for frame in frames], MOST_PAIRS)
+    pairs = [
+        pair(*(exposure(capture.image(frames[i]), frames[i].exposure_us) for i in both))
+        for both in indices
+    ]
+    return estimate_from_pairs(pairs, capture.events, capture.events.time_range_us)

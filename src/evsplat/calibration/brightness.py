@@ -1,0 +1,187 @@
+"""What frames and events both say about the change of brightness between two frames."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from evsplat.errors import DataError
+from evsplat.events import EventStream
+from evsplat.imaging.srgb import Transfer, decode, luminance
+
+DARKEST, BRIGHTEST = 0.02, 0.98
+"""Coded values outside of this range are mostly noise, or clipped."""
+SHORTEST_GAP_US = 20_000
+"""Frames that follow each other faster are skipped: little changes between them."""
+MOST_EVENTS = 10_000
+"""About a pair of frames; of more a part is taken."""
+
+
+class EventSource(Protocol):
+    """Events by time: an `EventStream` in memory or an `EventStore` on disk."""
+
+    def between(self, start_us: int, end_us: int) -> EventStream:
+        """Events with ``start_us <= t < end_us``."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """What a frame says of the brightness."""
+
+    log_luminance: Float[np.ndarray, "H W"]
+    """Natural logarithm of linear luminance."""
+    usable: Bool[np.ndarray, "H W"]
+    """Pixels that are neither too dark nor clipped."""
+    span_us: tuple[int, int]
+    """Start and end of the exposure."""
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """Two exposures and how the logarithm of luminance changed from one to the other."""
+
+    before_us: tuple[int, int]
+    after_us: tuple[int, int]
+    change: Float[np.ndarray, "H W"]
+    usable: Bool[np.ndarray, "H W"]
+
+    @property
+    def span_us(self) -> tuple[int, int]:
+        """When events can contribute to the change."""
+        return min(self.before_us[0], self.after_us[0]), max(self.before_us[1], self.after_us[1])
+
+    @property
+    def gap_us(self) -> float:
+        """From mid-exposure to mid-exposure."""
+        return (sum(self.after_us) - sum(self.before_us)) / 2
+
+
+def exposure(
+    image: Float[Tensor, "..."],
+    span_us: tuple[int, int],
+    *,
+    transfer: Transfer | Literal["linear"] = "power",
+) -> Exposure:
+    """Brightness of a picture (H, W) or (H, W, 3) with coded values in [0, 1].
+
+    ``transfer`` is the camera's curve; "linear" for sensors that store what they measure, as the
+    pictures in a DAVIS recording.
+    """
+    rgb = image if image.ndim == 3 else image[..., None].expand(-1, -1, 3)
+    linear = rgb if transfer == "linear" else decode(rgb, transfer)
+    usable = (rgb > DARKEST).all(-1) & (rgb < BRIGHTEST).all(-1)
+    # The clamp only keeps the logarithm finite: such pixels are not usable.
+    return Exposure(
+        torch.log(luminance(linear).clamp_min(1e-6)).cpu().numpy(), usable.cpu().numpy(), span_us
+    )
+
+
+def pair(before: Exposure, after: Exposure) -> FramePair:
+    """Two exposures as a pair."""
+    if before.log_luminance.shape != after.log_luminance.shape:
+        raise DataError(
+            f"frames of {before.log_luminance.shape[::-1]} and {after.log_luminance.shape[::-1]} "
+            "pixels cannot be compared; give frames of one size."
+        )
+    change = after.log_luminance - before.log_luminance
+    return FramePair(before.span_us, after.span_us, change, before.usable & after.usable)
+
+
+def pair_indices(spans_us: Sequence[tuple[int, int]], most: int) -> list[tuple[int, int]]:
+    """Which frames to pair: next to each other but `SHORTEST_GAP_US` apart, evenly spread."""
+    middle = np.array([(start + end) / 2 for start, end in spans_us])
+    after = np.searchsorted(middle, middle + SHORTEST_GAP_US)
+    found = [(i, max(int(j), i + 1)) for i, j in enumerate(after) if j < len(middle)]
+    chosen = np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int))
+    return [found[i] for i in chosen]
+
+
+class PairEvents:
+    """The events about a pair of exposures, and the change at the pixels where they are.
+
+    Of a busy recording only every n-th pixel is kept, so that no pair takes part with many more
+    than `MOST_EVENTS`: many thousand pixels say as much as a million.
+    """
+
+    def __init__(self, pair: FramePair, events: EventSource, lags_us: tuple[float, float]) -> None:
+        """Read what ``counts`` needs for lags in the given range."""
+        self.pair = pair
+        start, end = pair.span_us
+        near = events.between(start + math.floor(lags_us[0]), end + math.ceil(lags_us[1]) + 1)
+        height, width = pair.change.shape
+        if len(near) and (near.x.max() >= width or near.y.max() >= height):
+            raise DataError(
+                f"events reach pixel x={near.x.max()}, y={near.y.max()}, but the frames have "
+                f"{width}x{height} pixels; frames and events must share their pixels."
+            )
+        pixel = near.y.astype(np.int64) * width + near.x
+        share = max(1, len(near) // MOST_EVENTS)
+        # A stride that has no factor in common with the width meets all columns.
+        while math.gcd(share, width) > 1:
+            share += 1
+        kept = pixel % share == 0
+        self._t = near.t[kept]
+        self._brighter = near.p[kept] > 0
+        pixels, self._pixel = np.unique(pixel[kept], return_inverse=True)
+        self._steps = _level_steps(self._pixel, self._brighter)
+        self.change: Float[np.ndarray, K] = pair.change.reshape(-1)[pixels].astype(np.float64)
+        self.usable: Bool[np.ndarray, K] = pair.usable.reshape(-1)[pixels]
+
+    def counts(self, lag_us: float) -> tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]:
+        """Brighter and darker events per pixel between the two exposures, ``lag_us`` later.
+
+        The mean of log intensity over an exposure sees an event by the part of the exposure that
+        comes after it. So an event counts with a weight that rises from 0 to 1 over the first
+        exposure and falls again over the second; for short exposures this is the count between
+        mid-exposures.
+        """
+        within, weight = self._weights(lag_us)
+        pixel, brighter = self._pixel[within], self._brighter[within]
+        plus = np.bincount(pixel, weight * brighter, len(self.change))
+        return plus, np.bincount(pixel, weight, len(self.change)) - plus
+
+    def level_change(self, lag_us: float) -> tuple[Float[np.ndarray, "K"], Bool[np.ndarray, "K"]]:
+        """Change of the most likely level in thresholds (`_level_steps`); who has any event."""
+        within, weight = self._weights(lag_us)
+        pixel, count = self._pixel[within], len(self.change)
+        level = np.bincount(pixel, weight * self._steps[within], count)
+        return level, np.bincount(pixel, weight, count) > 0
+
+    def _weights(self, lag_us: float) -> tuple[slice, Float[np.ndarray, "N"]]:
+        pair, shift = self.pair, round(lag_us)
+        start, end = (time + shift for time in pair.span_us)
+        within = slice(*np.searchsorted(self._t, [start, end]))
+        t = self._t[within] - shift
+        return within, _elapsed(t, pair.before_us) - _elapsed(t, pair.after_us)
+
+
+def _level_steps(
+    pixel: Int64[np.ndarray, "N"], brighter: Bool[np.ndarray, "N"]
+) -> Float[np.ndarray, "N"]:
+    """By how many thresholds each event lifts the most likely level.
+
+    An event comes when a whole threshold has been passed. Until the next one the level lies up to
+    a threshold further in the same direction, half of it on average; a plain sum of polarities
+    would always be late. So an event with the polarity of its pixel's last one counts 1, and one
+    of the other polarity takes back the half threshold of the last and adds its own. What was
+    before the first is not known: it counts one and a half.
+    """
+    order = np.argsort(pixel, kind="stable")
+    sign = np.where(brighter[order], 1.0, -1.0)
+    last = np.zeros(len(sign))
+    last[1:] = np.where(np.diff(pixel[order]) == 0, sign[:-1], 0.0)
+    steps = np.empty(len(sign))
+    steps[order] = sign + 0.5 * (sign - last)
+    return steps
+
+
+def _elapsed(t: np.ndarray, span_us: tuple[int, int]) -> np.ndarray:
+    """Share of the exposure that lies before each time."""
+    start, end = span_us
+    return np.clip((t - start) / (end - start), 0.0, 1.0)

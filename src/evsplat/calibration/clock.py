@@ -1,0 +1,135 @@
+"""By how much the events' clock lags the frames', from how well both agree on what changed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from evsplat.calibration.brightness import EventSource, FramePair, PairEvents
+
+SEARCH_US = 100_000
+"""Lags up to here, either way, are tried."""
+LEAST_PIXELS = 300
+"""With fewer active pixels a correlation says nothing."""
+LEAST_CORRELATION = 0.3
+_GROUPS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class ClockEstimate:
+    """How well frames and events agree, by the shift between their clocks."""
+
+    lag_us: float
+    """Events are stamped this much later than the frames: subtract it from their times."""
+    spread_us: float
+    """Standard error of ``lag_us`` over the recording (jackknife over groups of frames)."""
+    correlation: float
+    """Of log luminance change and signed event count, over pixels with events, at ``lag_us``."""
+    lags_us: Float[np.ndarray, "L"]
+    correlations: Float[np.ndarray, "L"]
+    """At each of ``lags_us``; what a curve of it shows."""
+
+
+def estimate_clock(
+    pairs: Sequence[FramePair],
+    events: EventSource,
+    recorded_us: tuple[int, int],
+    *,
+    search_us: int = SEARCH_US,
+) -> ClockEstimate | None:
+    """The lag at which what events add up to correlates best with the change between frames.
+
+    The correlation is taken over the pixels with events, of all pairs together; a parabola through
+    its largest values gives the lag between the steps of the search. None where too little moves,
+    or frames and events have nothing to do with each other. ``recorded_us`` is when events were
+    recorded: pairs beyond it are left out.
+    """
+    if not pairs:
+        return None
+    step = max(500.0, float(np.median([pair.gap_us for pair in pairs])) / 4)
+    coarse = np.arange(-round(search_us / step), round(search_us / step) + 1) * step
+    sums = _moments(pairs, events, recorded_us, coarse)
+    best = _best(_correlation(sums.sum(0)))
+    if best is None:
+        return None
+    fine = coarse[best] + np.linspace(-1, 1, 13) * step
+    fine_sums = _moments(pairs, events, recorded_us, fine)
+    vertex = _vertex(fine, _correlation(fine_sums.sum(0)))
+    correlations = _correlation(fine_sums.sum(0))
+    if vertex is None or np.nanmax(correlations) < LEAST_CORRELATION:
+        return None
+    lags = np.concatenate([coarse, fine])
+    order = np.argsort(lags, kind="stable")
+    curve = np.concatenate([_correlation(sums.sum(0)), correlations])
+    return ClockEstimate(
+        lag_us=vertex,
+        spread_us=_jackknife(fine, fine_sums),
+        correlation=float(np.nanmax(correlations)),
+        lags_us=lags[order],
+        correlations=curve[order],
+    )
+
+
+def _moments(
+    pairs: Sequence[FramePair],
+    events: EventSource,
+    recorded_us: tuple[int, int],
+    lags_us: Float[np.ndarray, "L"],
+) -> Float[np.ndarray, "P L 6"]:
+    """Per pair and lag: count, sums of N, D, N^2, D^2 and ND over usable pixels with events."""
+    sums = np.zeros((len(pairs), len(lags_us), 6))
+    for row, pair in zip(sums, pairs, strict=True):
+        start, end = pair.span_us
+        near = PairEvents(pair, events, (lags_us[0], lags_us[-1]))
+        for values, lag in zip(row, lags_us, strict=True):
+            if start + lag < recorded_us[0] or end + lag > recorded_us[1]:
+                continue
+            level, active = near.level_change(lag)
+            active &= near.usable
+            n, d = level[active], near.change[active]
+            values[:] = len(n), n.sum(), d.sum(), n @ n, d @ d, n @ d
+    return sums
+
+
+def _correlation(sums: Float[np.ndarray, "L 6"]) -> Float[np.ndarray, "L"]:
+    """Pearson's correlation; NaN where there are too few pixels."""
+    count, n, d, nn, dd, nd = sums.T
+    with np.errstate(all="ignore"):
+        variances = (nn - n * n / count) * (dd - d * d / count)
+        found = (nd - n * d / count) / np.sqrt(variances)
+    # Lags that leave out most of the recording would win by chance.
+    few = (count < LEAST_PIXELS) | (count < 0.3 * count.max())
+    return np.where(few, np.nan, found)
+
+
+def _best(correlations: Float[np.ndarray, "L"]) -> int | None:
+    return None if np.isnan(correlations).all() else int(np.nanargmax(correlations))
+
+
+def _vertex(lags_us: Float[np.ndarray, "L"], correlations: Float[np.ndarray, "L"]) -> float | None:
+    """Where a parabola through the five values about the largest has its top."""
+    best = _best(correlations)
+    if best is None:
+        return None
+    first = min(max(best - 2, 0), len(lags_us) - 5)
+    near, values = lags_us[first : first + 5], correlations[first : first + 5]
+    if np.isnan(values).any():
+        return float(lags_us[best])
+    scale = near[1] - near[0]
+    a, b, _ = np.polyfit((near - lags_us[best]) / scale, values, 2)
+    if a >= 0:
+        return float(lags_us[best])
+    return float(lags_us[best] + np.clip(-b / (2 * a), -2, 2) * scale)
+
+
+def _jackknife(lags_us: Float[np.ndarray, "L"], sums: Float[np.ndarray, "P L 6"]) -> float:
+    """Standard error of the vertex when one group of neighbouring pairs at a time is left out."""
+    groups = [part for part in np.array_split(np.arange(len(sums)), _GROUPS) if len(part)]
+    total = sums.sum(0)
+    found = [_vertex(lags_us, _correlation(total - sums[part].sum(0))) for part in groups]
+    values = np.array([value for value in found if value is not None])
+    if len(values) < 2:
+        return float("nan")
+    count = len(values)
+    return float(np.sqrt((count - 1) / count * ((values - values.mean()) ** 2).sum()))
