@@ -8,7 +8,8 @@ The verbs of the command line are functions here, imported on first use:
     ev.write_report(run)
     ev.render_run(run, slow=8)
 
-The command ``evsplat render`` is `render_run` here, because ``evsplat.render`` is the rasteriser.
+``evsplat render`` is `render_run` here and ``evsplat restore`` is `restore_capture`, because
+``evsplat.render`` and ``evsplat.restore`` are the packages that do it.
 """
 
 import os
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from evsplat.evaluation import evaluate_run as evaluate
     from evsplat.evaluation.report import write_report
     from evsplat.export import render_run
+    from evsplat.restore import restore_capture
     from evsplat.training.run import load_run
     from evsplat.training.train import train
 
@@ -42,6 +44,7 @@ __all__ = [
     "load_capture",
     "load_run",
     "render_run",
+    "restore_capture",
     "train",
     "write_report",
 ]
@@ -53,6 +56,7 @@ _LAZY = {
     "load_capture": "evsplat.capture:load_capture",
     "load_run": "evsplat.training.run:load_run",
     "render_run": "evsplat.export:render_run",
+    "restore_capture": "evsplat.restore:restore_capture",
     "train": "evsplat.training:train",
     "write_report": "evsplat.evaluation.report:write_report",
 }

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,12 +26,36 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
+        temporary.chmod(0o666 & ~_umask())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def new_folder(path: Path | str) -> Iterator[Path]:
+    """Give an empty hidden folder beside ``path`` that takes its name when the block ends well.
+
+    On an exception it is removed with all that is in it. Something that is already there is a
+    `DataError`, at the start as at the end.
+    """
+    path = Path(path)
+
+    def check() -> None:
+        if path.exists():
+            raise DataError(f"{path}: already exists; choose another name or remove it first.")
+
+    check()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
+    try:
+        yield folder
+        check()
+        folder.chmod(0o777 & ~_umask())
+        folder.rename(path)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
@@ -54,3 +79,9 @@ def read_json(path: Path | str) -> Any:
         raise DataError(f"{path}: file not found.") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: not valid JSON ({error}).") from None
+
+
+def _umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask

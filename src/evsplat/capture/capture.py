@@ -79,6 +79,10 @@ class Capture:
             return camera
         return Camera(camera.width, camera.height, camera.K, frame.world_to_camera)
 
+    def is_distorted(self, camera: str) -> bool:
+        """Whether the lens of a camera distorts, which reading pictures and events undoes."""
+        return camera in self._metadata.distortions
+
     @property
     def is_static_camera(self) -> bool:
         """Whether all frames come from one camera that stands still."""

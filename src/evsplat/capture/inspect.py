@@ -184,12 +184,10 @@ def _events_sheet(capture: Capture) -> Image.Image:
     """Events in the middle of the exposure over the greyed picture."""
     assert capture.events is not None
     tiles = []
-    window = EVENT_WINDOW_US
     for frame in _spread(capture.frames, DETAIL_FRAMES):
-        window = min(EVENT_WINDOW_US, frame.exposure_us[1] - frame.exposure_us[0])
-        start = frame.mid_us - window // 2
+        start = frame.mid_us - EVENT_WINDOW_US // 2
         camera = capture.camera(frame)
-        stream = capture.events.between(start, start + window)
+        stream = capture.events.between(start, start + EVENT_WINDOW_US)
         counts = count_map(stream, camera.height, camera.width)
         grey = capture.image(frame).mean(-1, keepdim=True).expand(-1, -1, 3)
         strength = (counts.abs() / 3).clamp(0, 1).sqrt()[..., None]
@@ -199,7 +197,7 @@ def _events_sheet(capture: Capture) -> Image.Image:
         mixed = (0.25 + 0.6 * grey) * (1 - strength) + colour * strength
         picture = to_picture(mixed, fit(camera.width, camera.height, 380))
         tiles.append(Tile(picture, f"{_label(frame)}   {len(stream):,} events", frame.split))
-    subtitle = f"{window / 1000:g} ms about mid-exposure; red: brighter, blue: darker"
+    subtitle = f"{EVENT_WINDOW_US / 1000:g} ms about mid-exposure; red: brighter, blue: darker"
     return sheet(f"{capture.name}: events", subtitle, tiles, columns=4)
 
 

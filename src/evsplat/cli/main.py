@@ -14,11 +14,13 @@ from evsplat.cli.evaluate import evaluate
 from evsplat.cli.inspect import inspect
 from evsplat.cli.render import render
 from evsplat.cli.report import report
+from evsplat.cli.restore import restore
 from evsplat.cli.train import train
 from evsplat.errors import EvsplatError
 
 _VERBS: dict[str, Callable[..., Any]] = {
-    verb.__name__: verb for verb in (demo, doctor, inspect, train, evaluate, report, render)
+    verb.__name__: verb
+    for verb in (demo, doctor, inspect, restore, train, evaluate, report, render)
 }
 _DESCRIPTION = (
     "A sharp 3D Gaussian person in a scene, from a blurry video and events.\n\n"

@@ -1,0 +1,151 @@
+"""A capture made of another one: some pictures new, everything else as it was."""
+
+import dataclasses
+import os
+import shutil
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.capture.capture import Capture
+from evsplat.capture.encode import write_image
+from evsplat.capture.metadata import Frame
+from evsplat.capture.validate import check_capture
+from evsplat.errors import DataError
+from evsplat.events import EventStream, write_events
+from evsplat.files import new_folder, read_json, write_json
+
+_PICTURES = ("image", "sharp", "mask")
+_FOLDERS = {"image": "images", "sharp": "sharp", "mask": "masks"}
+_EVENT_PIECE_US = 1_000_000
+
+
+class Derivation:
+    """The capture in the making: its description and where its files go."""
+
+    def __init__(self, source: Capture, folder: Path, document: dict[str, Any]) -> None:
+        self.source = source
+        self.folder = folder
+        self.document = document
+        """capture.json, to be changed in place."""
+        self._entries = {entry["name"]: entry for entry in document["frames"]}
+        self._stems = {name: _stem(entry["image"]) for name, entry in self._entries.items()}
+
+    def entry(self, frame: Frame) -> dict[str, Any]:
+        """What capture.json says of a frame, to be changed in place."""
+        return self._entries[frame.name]
+
+    def set_picture(self, frame: Frame, key: str, picture: Float[Tensor, "..."]) -> None:
+        """Write an ``image``, ``sharp`` or ``mask`` in [0, 1] of a frame, seen without lens."""
+        entry = self.entry(frame)
+        entry[key] = f"{_FOLDERS[key]}/{self._stems[frame.name]}.png"
+        write_picture(self.folder / entry[key], picture)
+
+
+@contextmanager
+def derived_capture(
+    source: Capture, path: Path | str, *, without: Collection[str] = ()
+) -> Iterator[Derivation]:
+    """Give a capture in the making that becomes ``path`` when the block ends well and it is valid.
+
+    All files of ``source`` are in it but the frames' pictures of the kinds in ``without`` (out of
+    "image", "sharp" and "mask"). They are hard links where the file system can, since evsplat never
+    writes into a file that exists; else copies. Where the lens distorts, pictures and events are
+    written without distortion, because that is how they are read and new pictures are made.
+    """
+    path = Path(path)
+    document = read_json(source.path / "capture.json")
+    with new_folder(path) as folder:
+        making = Derivation(source, folder, document)
+        for entry in document["frames"]:
+            for key in without:
+                entry.pop(key, None)
+        _copy_files(making)
+        _undistort(making)
+        yield making
+        write_json(folder / "capture.json", document)
+        for finding in check_capture(folder, deep=False)[1]:
+            if finding.severity == "error":
+                place = path / finding.file.relative_to(folder)
+                raise DataError(f"{dataclasses.replace(finding, file=place)}")
+
+
+def write_picture(path: Path, picture: Float[Tensor, "..."]) -> None:
+    """Write a picture in [0, 1] as 8-bit PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # It may be a hard link, and what it is linked to must stay.
+    path.unlink(missing_ok=True)
+    write_image(path, np.ascontiguousarray(picture.detach().cpu().numpy()))
+
+
+def _stem(image: str) -> str:
+    """Path of a frame's picture without its suffix and the folder of all pictures."""
+    path = Path(image).with_suffix("")
+    return path.relative_to("images").as_posix() if path.parts[0] == "images" else path.as_posix()
+
+
+def _copy_files(making: Derivation) -> None:
+    root, document = making.source.path, making.document
+    names = {path.name for path in root.iterdir() if path.is_file() and path.name[0] != "."}
+    names -= {"capture.json"}
+    names |= {entry[key] for entry in document["frames"] for key in _PICTURES if entry.get(key)}
+    names |= {view["image"] for view in document.get("novel_views", [])}
+    names |= {document["body"]["file"]}
+    if document.get("events"):
+        names |= {document["events"]["file"]}
+    for name in sorted(names):
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise DataError(
+                f"{root / 'capture.json'}: names {name!r}, expected paths below the capture "
+                "folder; move the file there."
+            )
+        target = making.folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _link(root / name, target)
+
+
+def _link(source: Path, target: Path) -> None:
+    source = source.resolve()
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _undistort(making: Derivation) -> None:
+    """Replace what a distorting lens recorded by what is read of it."""
+    source, cameras = making.source, making.document["cameras"]
+    bent = {name for name, camera in cameras.items() if source.is_distorted(name)}
+    for name in bent:
+        cameras[name]["distortion"] = None
+    readers = {"image": source.image, "sharp": source.sharp, "mask": source.mask}
+    for frame in source.frames:
+        entry = making.entry(frame)
+        for key in set(_PICTURES) & set(entry) if frame.camera in bent else ():
+            picture = readers[key](frame)
+            assert picture is not None
+            (making.folder / entry[key]).unlink()
+            making.set_picture(frame, key, picture)
+    for view in source.novel_views:
+        entry = making.document["novel_views"][view.index]
+        if view.camera in bent:
+            (making.folder / entry["image"]).unlink()
+            entry["image"] = str(Path(entry["image"]).with_suffix(".png"))
+            write_picture(making.folder / entry["image"], source.novel_image(view))
+    if source.events is not None and source.frames[0].camera in bent:
+        events = making.document["events"]
+        write_events(making.folder / events["file"], _pieces(source))
+        events["clock_offset_us"] = 0
+
+
+def _pieces(source: Capture) -> Iterator[EventStream]:
+    """All events, undistorted and on the camera's clock."""
+    assert source.events is not None
+    start, end = source.events.time_range_us
+    for time in range(start, end, _EVENT_PIECE_US):
+        yield source.events.between(time, min(time + _EVENT_PIECE_US, end))

@@ -1,0 +1,82 @@
+"""Event double integral as a restorer (`evsplat.imaging.edi`)."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.calibration import estimate_from_capture
+from evsplat.capture import Capture, Frame
+from evsplat.errors import ConfigError, DataError
+from evsplat.imaging import Transfer, deblur
+
+
+class Edi:
+    """Sharp pictures at mid-exposure from each frame and the events of its exposure."""
+
+    name = "edi"
+
+    def __init__(
+        self,
+        capture: Capture,
+        *,
+        contrast_threshold: tuple[float, float] | None = None,
+        transfer: Transfer = "power",
+    ) -> None:
+        """``contrast_threshold``: C+ and C-; without them the capture's, or else estimated ones.
+
+        Raises:
+            DataError: The capture has no events, or no thresholds and none can be estimated.
+            ConfigError: A threshold is not above 0.
+        """
+        if capture.events is None:
+            raise DataError(
+                f"{capture.path}: has no events, which the event double integral (edi) needs; "
+                "record or simulate them first."
+            )
+        self._transfer: Transfer = transfer
+        if contrast_threshold is not None and min(contrast_threshold) <= 0:
+            raise ConfigError(
+                f"contrast threshold {contrast_threshold}: expected two numbers above 0, C+ and C-."
+            )
+        self._origin = "given"
+        if contrast_threshold is None and capture.contrast_threshold is not None:
+            contrast_threshold, self._origin = capture.contrast_threshold, "from the capture"
+        if contrast_threshold is None:
+            contrast_threshold, self._origin = _estimated(capture), "estimated from the capture"
+        self.contrast_threshold = contrast_threshold
+
+    def restore(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
+        """Each frame in order with its sharp picture at mid-exposure."""
+        assert capture.events is not None
+        for frame in capture.frames:
+            yield (
+                frame,
+                deblur(
+                    capture.image(frame),
+                    capture.events.between(*frame.exposure_us),
+                    frame.exposure_us,
+                    [frame.mid_us],
+                    self.contrast_threshold,
+                    transfer=self._transfer,
+                )[0],
+            )
+
+    def provenance(self) -> dict[str, Any]:
+        """The thresholds and where they come from."""
+        return {
+            "contrast_threshold": [round(value, 4) for value in self.contrast_threshold],
+            "contrast_threshold_origin": self._origin,
+            "transfer": self._transfer,
+        }
+
+
+def _estimated(capture: Capture) -> tuple[float, float]:
+    estimate = estimate_from_capture(capture)
+    if estimate is None or estimate.thresholds is None:
+        raise DataError(
+            f"{capture.path}: its contrast thresholds are unknown and cannot be estimated from its "
+            "frames and events; give them with --contrast-threshold C+ C-."
+        )
+    return estimate.thresholds.plus, estimate.thresholds.minus
