@@ -16,6 +16,7 @@
 #include "isometry.h"
 #include "levels.h"
 #include "mlp.h"
+#include "neighbours.h"
 #include "picture.h"
 #include "rasterizer.h"
 #include "sensor_module.h"
@@ -311,6 +312,7 @@ void hash_encode_backward(In positions, In table, std::vector<int64_t> cells, st
                        position_grad ? position_grad->data() : nullptr);
 }
 
+using OutIndex = nb::ndarray<int64_t, nb::c_contig, nb::device::cpu>;
 using InRows = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
 
 Skinning skinning(const In& position, const In& weight, const In& bones) {
@@ -347,7 +349,7 @@ void blend_skin_backward(In position, In weight, In bones, In blended, std::opti
     const auto given = [](const std::optional<In>& array) { return array ? array->data() : nullptr; };
     const auto asked = [](const std::optional<Out>& array) { return array ? array->data() : nullptr; };
     const SkinningGrads grads = {given(moved_grad), given(blended_grad), asked(position_grad), asked(weight_grad),
-                                 asked(bones_grad), nullptr, 0, nullptr};
+                                 asked(bones_grad), nullptr, 0};
     nb::gil_scoped_release release;
     skin_backward(job, blended.data(), grads, threads);
 }
@@ -372,6 +374,19 @@ std::pair<double, double> isometry_change(InRows rows, const std::vector<In>& ar
     nb::gil_scoped_release release;
     const IsometryMeans means = isometry(in, out);
     return {means.centers, means.covariances};
+}
+
+void nearest(In points, std::optional<In> queries, OutIndex index, Out square, int threads) {
+    require(points.ndim() == 2 && points.shape(1) == 3 && points.shape(0) < UINT32_MAX, "the points");
+    require(!queries || (queries->ndim() == 2 && queries->shape(1) == 3), "the queries");
+    const size_t count = points.shape(0), rows = queries ? queries->shape(0) : count;
+    require(index.ndim() == 2 && index.shape(0) == rows && square.size() == index.size(), "the result");
+    require(index.shape(1) >= 1 && index.shape(1) + (queries ? 0 : 1) <= count, "the result: too few points");
+    if (!rows) return;  // an empty array has no address, which would read as no queries
+    nb::gil_scoped_release release;
+    find_neighbours({points.data(), queries ? queries->data() : nullptr, count, rows, int(index.shape(1)), index.data(),
+                     square.data()},
+                    threads);
 }
 
 double multiply_add(int64_t rounds) {
@@ -428,6 +443,8 @@ NB_MODULE(_native, m) {
           nb::arg("position_grad").none(), nb::arg("threads"),
           "Adds to the table's gradient and writes that of the positions.");
     bind_sensor(m);
+    m.def("nearest", &nearest, nb::arg("points"), nb::arg("queries").none(), nb::arg("index"), nb::arg("square"),
+          nb::arg("threads"), "Nearest points of queries, or of the points themselves; squared distances.");
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
     m.def("has_bf16", &has_bf16, "Whether networks can multiply bfloat16 here.");
     m.def("levels", &available_levels, "SIMD levels that run here, best first.");

@@ -1,6 +1,6 @@
 // Vectors of floats of one SIMD level, written with the compiler's vector types.
 //
-// Included by kernels.cpp and the kernels of networks only, inside the namespace of its level: nothing
+// Included by kernels only, inside the namespace of its level: nothing
 // here may have external linkage, or the linker could hand AVX-512 code to a machine without it.
 
 constexpr int W = EVSPLAT_LANES;                   // lanes = pixels of a patch

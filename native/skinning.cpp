@@ -35,8 +35,6 @@ void skin_backward(const Skinning& s, const float* blended, SkinningGrads g, int
     const auto kernel = select_kernels().skin_backward;
     parallel_for(threads, blocks, [&](size_t block) {
         SkinningGrads mine = g;
-        Buffer<float> scratch(g.padded_joints);
-        mine.scratch = scratch.data();
         if (total) {
             mine.bones = sums.data() + block * bones;
             std::fill_n(mine.bones, bones, 0.f);

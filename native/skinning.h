@@ -20,7 +20,6 @@ struct SkinningGrads {
     float* bones;                           // (T, J, 16); a block adds to its own; may be null
     const float* bones_columns;
     size_t padded_joints;
-    float* scratch;                         // of that many floats
 };
 
 void skin(const Skinning&, int threads, float* moved, float* blended);

@@ -1,19 +1,35 @@
 // Blend skinning of a range of points, compiled once per SIMD level.
 
 #include "kernels.h"
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
 
 namespace evsplat {
 namespace EVSPLAT_LEVEL {
+namespace {
+
+#include "simd.h"
+
+constexpr int V = 16 / W;  // vectors of a matrix
+
+// to[v] += a b[v]
+INLINE void add_matrix(F (&to)[V], float a, const float* b) {
+#pragma GCC unroll 4
+    for (int v = 0; v < V; ++v) to[v] += a * load(b + v * W);
+}
+
+}  // namespace
 
 void skin(const Skinning& s, size_t begin, size_t end, float* moved, float* blended) {
     for (size_t t = 0; t < s.times; ++t) {
         const float* bones = s.bones + t * s.joints * 16;
         for (size_t n = begin; n < end; ++n) {
             const float* weight = s.weight + t * s.weight_step + n * s.joints;
-            float b[16] = {};
-            for (size_t j = 0; j < s.joints; ++j)
-#pragma GCC ivdep
-                for (int i = 0; i < 16; ++i) b[i] += weight[j] * bones[16 * j + i];
+            F sum[V] = {};
+            for (size_t j = 0; j < s.joints; ++j) add_matrix(sum, weight[j], bones + 16 * j);
+            float b[16];
+            __builtin_memcpy(b, sum, sizeof b);
             __builtin_memcpy(blended + (t * s.points + n) * 16, b, sizeof b);
             const float* p = s.position + t * s.position_step + n * 3;
             for (int r = 0; r < 3; ++r)
@@ -45,13 +61,16 @@ void skin_backward(const Skinning& s, const SkinningGrads& g, const float* blend
             }
             if (g.weight) {
                 const float* columns = g.bones_columns + t * 16 * g.padded_joints;
-                float* by_weight = g.scratch;
-                for (size_t j = 0; j < g.padded_joints; ++j) by_weight[j] = 0.f;
-                for (int i = 0; i < 16; ++i)
-#pragma GCC ivdep
-                    for (size_t j = 0; j < g.padded_joints; ++j) by_weight[j] += by_blended[i] * columns[i * g.padded_joints + j];
                 float* out = g.weight + t * s.weight_step + n * s.joints;
-                for (size_t j = 0; j < s.joints; ++j) out[j] = by_weight[j] + (t && !s.weight_step ? out[j] : 0.f);
+                for (size_t j = 0; j < s.joints; j += 16) {
+                    F sum[V] = {};
+#pragma GCC unroll 4
+                    for (int i = 0; i < 16; ++i) add_matrix(sum, by_blended[i], columns + i * g.padded_joints + j);
+                    float by_weight[16];
+                    __builtin_memcpy(by_weight, sum, sizeof by_weight);
+                    const size_t count = s.joints - j < 16 ? s.joints - j : 16;
+                    for (size_t l = 0; l < count; ++l) out[j + l] = by_weight[l] + (t && !s.weight_step ? out[j + l] : 0.f);
+                }
             }
             if (g.bones) {
                 const float* weight = s.weight + t * s.weight_step + n * s.joints;

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from evsplat.body import Body
+from evsplat.body import Body, skin
 from evsplat.body.rotations import matrix_to_quaternion, quaternion_multiply
 from evsplat.gaussians.densify import rebuild
 from evsplat.gaussians.gaussian_set import ATTRIBUTES, GaussianSet
 from evsplat.gaussians.row_adam import RowAdam
+from evsplat.neighbours import nearest
 
 REACH_M = 0.15
 """A scene Gaussian farther than this from the posed body in every frame cannot be the person's."""
@@ -45,8 +45,8 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
 
     if len(leaving):
         vertices = frames.body.canonical_vertices()
-        nearest = _nearest(vertices, values["means"][leaving])[1]
-        transforms = _blend(frames, nearest, torch.full_like(nearest, drawn))
+        vertex = _nearest(vertices, values["means"][leaving])[1]
+        transforms = _blend(frames, vertex, torch.full_like(vertex, drawn))
         _carry(values, leaving, transforms)
         _take_features(values, leaving, torch.nonzero(~human)[:, 0])
     if len(joining):
@@ -77,8 +77,8 @@ def _carry(values: dict[str, Tensor], rows: Tensor, transforms: Float[Tensor, "M
 def _take_features(values: dict[str, Tensor], rows: Tensor, others: Tensor) -> None:
     """Copy the colour features of the nearest of ``others`` to ``rows``, in place."""
     if len(others):
-        nearest = _nearest(values["means"][others], values["means"][rows])[1]
-        values["features"][rows] = values["features"][others[nearest]]
+        source = _nearest(values["means"][others], values["means"][rows])[1]
+        values["features"][rows] = values["features"][others[source]]
 
 
 def _blend(
@@ -91,9 +91,8 @@ def _blend(
 def _nearest(
     vertices: Float[Tensor, "V 3"], points: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, " M"], Int[Tensor, " M"]]:
-    distance, index = cKDTree(vertices.cpu().numpy()).query(points.cpu().numpy())
-    device = points.device
-    return torch.from_numpy(distance).float().to(device), torch.from_numpy(index).to(device)
+    distance, index = nearest(vertices, 1, points)
+    return distance[:, 0], index[:, 0]
 
 
 def _nearest_over_frames(
@@ -105,9 +104,8 @@ def _nearest_over_frames(
     best_frame = torch.zeros(len(points), dtype=torch.long, device=points.device)
     best_vertex = torch.zeros_like(best_frame)
     for number in range(len(frames.bones)):
-        transforms = torch.einsum("vj,jab->vab", frames.body.weights, frames.bones[number])
-        posed = (transforms[:, :3, :3] @ canonical[..., None])[..., 0] + transforms[:, :3, 3]
-        distance, vertex = _nearest(posed, points)
+        posed, _ = skin(canonical, frames.body.weights, frames.bones[number : number + 1])
+        distance, vertex = _nearest(posed[0], points)
         better = distance < best
         best = torch.where(better, distance, best)
         best_frame[better] = number

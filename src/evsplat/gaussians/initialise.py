@@ -2,14 +2,13 @@
 
 import math
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from evsplat.capture import Camera
 from evsplat.gaussians.gaussian_set import FEATURE_DIM
+from evsplat.neighbours import nearest
 
 COLOUR_LOGITS = slice(0, 3)
 """Feature entries that carry the start colour of a scene Gaussian, as logits of sRGB."""
@@ -22,12 +21,9 @@ def logit(probability: float) -> float:
 
 def nearest_spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
     """Root mean squared distance to the three nearest neighbours, metres, at least 0.3 mm."""
-    positions = points.detach().cpu().double().numpy()
-    if len(positions) < 4:
-        return torch.full((len(positions),), 0.05)
-    distances, _ = cKDTree(positions).query(positions, k=4)
-    spacing = np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
-    return torch.from_numpy(spacing).float().clamp_min(3e-4)
+    if len(points) < 4:
+        return torch.full((len(points),), 0.05)
+    return nearest(points, 3)[0].square().mean(-1).sqrt().float().clamp_min(3e-4)
 
 
 def gaussians_at(

@@ -5,13 +5,13 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Frame
 from evsplat.compiled import native, runs_native
+from evsplat.neighbours import nearest
 from evsplat.objectives.base import Step
 
 NEIGHBOURS = 4
@@ -136,7 +136,5 @@ class Isometry:
         self.neighbours, self.age = state["neighbours"], int(state["age"])
 
     def _search(self, canonical: Float[Tensor, "H 3"]) -> None:
-        positions = canonical.detach().cpu().numpy()
-        _, index = cKDTree(positions).query(positions, k=NEIGHBOURS + 1)
-        self.neighbours = torch.from_numpy(index[:, 1:]).long()
+        self.neighbours = nearest(canonical, NEIGHBOURS)[1].cpu()
         self.age = 0
