@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -34,3 +35,11 @@ def test_pieces_of_a_recording_give_the_file_of_the_whole(tmp_path: Path, first_
             read, window = (s.between(start, start + 7_777) for s in (store, whole))
             for column in "txyp":
                 assert np.array_equal(getattr(read, column), getattr(window, column))
+
+
+def test_attributes_stay_with_the_file(tmp_path: Path) -> None:
+    empty = EventStream(*(np.zeros(0, dtype=d) for d in (np.int64, np.uint16, np.uint16, np.int8)))
+    told = {"width": 20, "simulated": True, "contrast": 0.2, "source": "clip.mp4"}
+    write_events(tmp_path / "events.h5", empty, attributes=told)
+    with h5py.File(tmp_path / "events.h5") as file:
+        assert dict(file.attrs) == told

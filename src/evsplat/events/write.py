@@ -1,6 +1,6 @@
 """Writing event recordings in the layout that `EventStore` reads, whole or piece by piece."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,18 @@ _COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 
 
 def write_events(
-    path: Path | str, events: EventStream | Iterable[EventStream], *, compression_level: int = 4
+    path: Path | str,
+    events: EventStream | Iterable[EventStream],
+    *,
+    compression_level: int = 4,
+    attributes: Mapping[str, str | int | float] | None = None,
 ) -> int:
     """Write events as `EventStore` reads them, whole or not at all; gives their count.
 
     ``events`` is one stream or its consecutive pieces, which are written as they come: memory does
     not grow with the length of the recording. ``t_offset`` is the first event's millisecond, so
-    that the index of milliseconds does not start in 1970.
+    that the index of milliseconds does not start in 1970. ``attributes`` tell where the events come
+    from and are kept as the file's; readers use ``width`` and ``height``.
 
     Raises:
         DataError: times that go back, within a piece or from one to the next.
@@ -33,6 +38,7 @@ def write_events(
         for piece in pieces:
             writer.append(piece)
         writer.finish()
+        file.attrs.update(attributes or {})
         return writer.count
 
 

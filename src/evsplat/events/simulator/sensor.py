@@ -89,6 +89,8 @@ class SensorSimulator:
         or where the picture has another size or is not finite; the sensor then stays as it was.
         """
         time_us = int(time_us)
+        if isinstance(linear_luma, Tensor):
+            linear_luma = linear_luma.detach().cpu().numpy()
         luma = np.ascontiguousarray(linear_luma, dtype=np.float32)
         if luma.shape != (self.height, self.width):
             raise DataError(
