@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from evsplat import neighbours
 from evsplat.neighbours import nearest
 
 
@@ -20,12 +21,14 @@ def clouds(seed: int):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("other", [False, True])
-def test_distances_are_the_smallest_of_all(seed, dtype, other):
+@pytest.mark.parametrize("find", [nearest, neighbours._by_all_distances])
+def test_distances_are_the_smallest_of_all(seed, dtype, other, find, monkeypatch):
+    monkeypatch.setattr(neighbours, "_ROWS_AT_ONCE", 700)
     for points in clouds(seed):
         k = 4
         points = points.to(dtype)
         queries = points[::3] + 0.1 if other else None
-        distance, index = nearest(points, k, queries)
+        distance, index = find(points, k, queries)
         every = torch.cdist((points if queries is None else queries).double(), points.double())
         if queries is None:
             every.fill_diagonal_(torch.inf)

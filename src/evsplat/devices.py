@@ -1,4 +1,8 @@
-"""Moving tensors to a device without waiting for it."""
+"""Tensors on a device: sending them without waiting, and keeping recorded data there."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
 from torch import Tensor
@@ -16,3 +20,63 @@ def send(tensor: Tensor, device: torch.device | str) -> Tensor:
     if device.type == "cuda" and not tensor.requires_grad:
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
+
+
+def default_cache_bytes(device: torch.device) -> int:
+    """A quarter of what is free on the device now."""
+    return torch.cuda.mem_get_info(device)[0] // 4 if device.type == "cuda" else 0
+
+
+class DeviceCache:
+    """Recorded data on a device: the most recently used stay there, up to a bound in bytes.
+
+    What is not there is made by one background thread, in pinned memory, and copied on a stream of
+    its own: asked for a step ahead with `prefetch`, it is there when `get` wants it. On the CPU
+    nothing is kept or copied, since whoever makes the data has a cache of its own.
+    """
+
+    def __init__(self, device: torch.device | str, limit_bytes: int) -> None:
+        """The latest value always stays, however small the limit."""
+        self.device, self.limit_bytes = torch.device(device), limit_bytes
+        self.bytes = 0
+        self._kept: OrderedDict[Hashable, Tensor] = OrderedDict()
+        self._coming: dict[Hashable, Future[tuple[Tensor, torch.cuda.Event | None]]] = {}
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="device-cache")
+        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
+
+    def prefetch(self, key: Hashable, make: Callable[[], Tensor]) -> None:
+        """Start to bring ``make()`` to the device, unless it is there or on its way."""
+        if self.device.type != "cpu" and key not in self._kept and key not in self._coming:
+            self._coming[key] = self._worker.submit(self._load, make)
+
+    def get(self, key: Hashable, make: Callable[[], Tensor]) -> Tensor:
+        """``make()`` on the device; not to be written to."""
+        if self.device.type == "cpu":
+            return make()
+        self.prefetch(key, make)
+        if key in self._coming:
+            tensor, copied = self._coming.pop(key).result()
+            if copied is not None:
+                torch.cuda.current_stream(self.device).wait_event(copied)
+            self._keep(key, tensor)
+        self._kept.move_to_end(key)
+        tensor = self._kept[key]
+        if self._stream is not None:
+            # Else its memory could be used again on the copying stream while this one reads.
+            tensor.record_stream(torch.cuda.current_stream(self.device))
+        return tensor
+
+    def _keep(self, key: Hashable, tensor: Tensor) -> None:
+        self._kept[key] = tensor
+        self.bytes += tensor.nbytes
+        while self.bytes > self.limit_bytes and len(self._kept) > 1:
+            self.bytes -= self._kept.popitem(last=False)[1].nbytes
+
+    def _load(self, make: Callable[[], Tensor]) -> tuple[Tensor, torch.cuda.Event | None]:
+        if self._stream is None:
+            return send(make(), self.device), None
+        with torch.cuda.stream(self._stream):
+            tensor = send(make(), self.device)
+            copied = torch.cuda.Event()
+            copied.record(self._stream)
+        return tensor, copied

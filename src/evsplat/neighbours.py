@@ -7,25 +7,30 @@ from torch import Tensor
 
 from evsplat.compiled import native, runs_native
 
+_ROWS_AT_ONCE = 2_048
+"""Distances of so many points to all others are held at a time: 160 MB at 20,000 points."""
+
 
 def nearest(
     points: Float[Tensor, "N 3"], k: int, queries: Float[Tensor, "M 3"] | None = None
 ) -> tuple[Float[Tensor, "M k"], Int[Tensor, "M k"]]:
     """Distances to the k nearest of ``points``, and their rows, nearest first.
 
-    Without ``queries`` those of the points themselves, none of which is its own neighbour. Found on
-    the CPU whatever the device; the result lies where the points do. A ValueError where there are
-    too few points.
+    Without ``queries`` those of the points themselves, none of which is its own neighbour. On the
+    CPU a k-d tree finds them, elsewhere all distances, without the host waiting; the result lies
+    where the points do. A ValueError where there are too few points.
     """
     if len(points) < k + (queries is None):
         raise ValueError(f"{len(points)} points have no {k} neighbours each")
-    places = points.detach().cpu().contiguous()
-    asked = places if queries is None else queries.detach().cpu().contiguous()
+    if points.device.type != "cpu":
+        return _by_all_distances(points.detach(), k, None if queries is None else queries.detach())
+    places = points.detach().contiguous()
+    asked = places if queries is None else queries.detach().contiguous()
     if runs_native(places) and runs_native(asked):
         index, square = torch.empty(len(asked), k, dtype=torch.long), torch.empty(len(asked), k)
         others = None if queries is None else asked
         native.nearest(places, others, index, square, torch.get_num_threads())
-        return square.sqrt().to(points.device), index.to(points.device)
+        return square.sqrt(), index
     found = cKDTree(places.numpy()).query(asked.numpy(), k=range(1, k + 1 + (queries is None)))
     distance, index = (torch.from_numpy(values) for values in found)
     if queries is None:
@@ -33,4 +38,22 @@ def nearest(
         itself = index == torch.arange(len(index))[:, None]
         order = itself.int().argsort(dim=1, stable=True)[:, :k]
         distance, index = distance.gather(1, order), index.gather(1, order)
-    return distance.to(points), index.to(points.device)
+    return distance.to(points), index
+
+
+def _by_all_distances(
+    points: Float[Tensor, "N 3"], k: int, queries: Float[Tensor, "M 3"] | None
+) -> tuple[Float[Tensor, "M k"], Int[Tensor, "M k"]]:
+    asked = points if queries is None else queries
+    distances, rows = [], []
+    for start in range(0, max(1, len(asked)), _ROWS_AT_ONCE):
+        some = asked[start : start + _ROWS_AT_ONCE]
+        # Differences, not products of matrices, whose rounding exceeds what neighbours differ by.
+        all_of = torch.cdist(some, points, compute_mode="donot_use_mm_for_euclid_dist")
+        if queries is None:
+            own = torch.arange(start, start + len(some), device=points.device)
+            all_of.scatter_(1, own[:, None], torch.inf)
+        found = all_of.topk(k, largest=False)
+        distances.append(found.values)
+        rows.append(found.indices)
+    return torch.cat(distances), torch.cat(rows)

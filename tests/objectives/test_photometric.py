@@ -16,7 +16,7 @@ def make(seed: int, *, dssim: bool = True):
     pictures = {name: torch.rand(20, 24, 3, generator=generator) for name in "ab"}
     capture = SimpleNamespace(train_frames=frames, image=lambda frame: pictures[frame.name])
     rgb = torch.rand(3, 20, 24, 3, generator=generator)
-    step = SimpleNamespace(capture=capture, times_us=(10, 15, 20), rgb=rgb)
+    step = SimpleNamespace(capture=capture, times_us=(10, 15, 20), rgb=rgb, observed=capture.image)
     return Photometric(capture, {}, dssim=dssim, perceptual=None), step, pictures
 
 

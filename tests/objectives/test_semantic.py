@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
 
+from evsplat.devices import DeviceCache
 from evsplat.objectives import PackedBounds, RenderedSemantics, silhouette_bounds
 
 
@@ -38,6 +39,7 @@ def test_cross_entropy_is_the_closed_form(probability):
     soft = torch.tensor([0.1, 0.5, 0.9])
     step = SimpleNamespace(
         times_us=(10, 20),
+        data=DeviceCache("cpu", 0),
         semantic=torch.full((2, 40, 50), probability),
         model=SimpleNamespace(gaussians=SimpleNamespace(semantics=lambda: soft)),
     )

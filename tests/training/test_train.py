@@ -15,10 +15,11 @@ from evsplat.capture import load_capture
 from evsplat.errors import BackendError, ConfigError, DataError
 from evsplat.methods import PaperConfig, compose
 from evsplat.training import load_run, train
+from evsplat.training.bad_steps import MAX_BAD_STEPS
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.clock import Clock
 from evsplat.training.run import RunFolder
-from evsplat.training.trainer import MAX_BAD_STEPS, Trainer
+from evsplat.training.trainer import Trainer
 
 SMALL = (
     "human.count=120",
@@ -163,7 +164,7 @@ def test_non_finite_steps_are_skipped_counted_and_finally_stop(tiny_capture, cap
         composition.model.gaussians.features[0] = float("nan")
     for _ in range(MAX_BAD_STEPS - 1):
         assert trainer.step() is None
-    assert trainer.skipped == MAX_BAD_STEPS - 1
+    assert trainer.bad.skipped == MAX_BAD_STEPS - 1
     assert torch.equal(composition.model.skinning.mlp.weights[0], before)
     assert "l1" in caplog.text
     with pytest.raises(DataError, match="steps in a row"):

@@ -14,6 +14,14 @@ from evsplat.body.surface import SurfaceSamples, sample_mesh
 from evsplat.body.tree import Level, level_inverse, tree_levels
 from evsplat.compiled import native, runs_native
 
+_DERIVED = (
+    "_level_inverse",
+    "_bone_vectors",
+    "_canonical_bones",
+    "_inverse_canonical_bones",
+    "_canonical_vertices",
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Body:
@@ -31,7 +39,11 @@ class Body:
     def to(self, device: torch.device | str) -> "Body":
         """The same body with its arrays on ``device``."""
         tensors = (f.name for f in fields(self) if f.name != "joint_names")
-        return replace(self, **{name: getattr(self, name).to(device) for name in tensors})
+        moved = replace(self, **{name: getattr(self, name).to(device) for name in tensors})
+        # What follows from them moves along: to derive it anew would read the tree back.
+        derived = {name: getattr(self, name).to(device) for name in _DERIVED}
+        vars(moved).update(derived, _levels=tuple(level.to(device) for level in self._levels))
+        return moved
 
     def joint_transforms(
         self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
@@ -75,10 +87,7 @@ class Body:
     @cached_property
     def _levels(self) -> tuple[Level, ...]:
         device = self.rest_joints.device
-        return tuple(
-            Level(level.joints.to(device), level.parents.to(device), level.parent_slots.to(device))
-            for level in tree_levels(self.parents.tolist())
-        )
+        return tuple(level.to(device) for level in tree_levels(self.parents.tolist()))
 
     @cached_property
     def _level_inverse(self) -> Int[Tensor, "J"]:
@@ -192,5 +201,6 @@ def _rigid(
     rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     top = torch.cat((rotation, translation[..., None]), -1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    # Made on the device: a host array would have to be waited for.
+    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3].expand(*top.shape[:-2], 1, 4)
     return torch.cat((top, bottom), -2)

@@ -14,6 +14,7 @@ from torch import Tensor
 from evsplat.body.adapters import load_body
 from evsplat.body.body import Body, skin
 from evsplat.body.rotations import axis_angle_to_matrix
+from evsplat.devices import send
 from evsplat.errors import DataError
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ class BodyTrack:
     ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
         """Rotations local to the parent (root: in the world) and root translation, float32."""
         device = self._seconds.device
-        times = torch.as_tensor(times_us, dtype=torch.int64, device=device)
+        times = send(torch.as_tensor(times_us, dtype=torch.int64), device)
         seconds = (times - int(self.times_us[0])).double() * 1e-6
         seconds = seconds.clamp(self._seconds[0], self._seconds[-1])
         index = torch.searchsorted(self._seconds, seconds, right=True) - 1

@@ -23,6 +23,7 @@ def train(
         tuple[str, ...], option("[KEY=VALUE ...]", default="none", name="set")
     ] = (),
     threads: Threads = None,
+    device_memory_gb: Annotated[float | None, option("GB", default="a quarter of the free")] = None,
     seed: Annotated[int | None, option("S", default="the method's")] = None,
     evaluate: Flag = True,
 ) -> None:
@@ -41,6 +42,7 @@ def train(
         config: A config.yaml of an earlier run to start from.
         overrides: Configuration values to change, such as event.weight=0.2.
         threads: CPU threads.
+        device_memory_gb: GPU memory for recorded pictures and event maps.
         seed: Seed of every random number.
         evaluate: Skip the evaluation and the report at the end.
     """
@@ -60,6 +62,7 @@ def train(
             overrides=overrides,
             threads=threads,
             seed=seed,
+            device_memory_gb=device_memory_gb,
         )
     except Stopped as stop:
         command = shlex.join(["evsplat", "train", str(capture), "--out", str(stop.run), "--resume"])

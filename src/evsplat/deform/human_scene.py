@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,6 +18,7 @@ from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
 from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.deform.skinning_turns import SkinningTurns
+from evsplat.devices import send
 from evsplat.gaussians import ATTRIBUTES, GaussianSet, PosedGaussians, PosedHuman, StaticScene
 
 logger = logging.getLogger(__name__)
@@ -135,6 +136,14 @@ class HumanSceneModel(nn.Module):
         self.register_buffer("frame_times", torch.tensor(frame_times_us, dtype=torch.float64))
         self.register_buffer("nominal", torch.zeros((), dtype=torch.float64))
 
+    def _apply(self, fn: Any, recurse: bool = True) -> "HumanSceneModel":
+        """Move to another device, the body track as well; progress stays where it is read."""
+        nominal = self.nominal
+        super()._apply(fn, recurse)
+        self.nominal = nominal
+        self.track = self.track.to(self.box_low.device)
+        return self
+
     @property
     def non_rigid_active(self) -> bool:
         """Whether training has reached the start of the non-rigid network."""
@@ -236,10 +245,10 @@ class HumanSceneModel(nn.Module):
         rotations = None
         if float(torch.rand((), generator=generator)) < config.pose_noise_probability:
             rotations = config.pose_noise * torch.randn(1, joints, 3, 3, generator=generator)
-            rotations = rotations.expand(times, -1, -1, -1).to(self.box_low.device)
+            rotations = send(rotations, self.box_low.device).expand(times, -1, -1, -1)
         turn = view_jitter(generator, symmetric=True) if config.view_noise else torch.eye(3)
         hide = float(torch.rand((), generator=generator)) < config.scene_direction_dropout
-        return Noise(rotations, turn.to(self.box_low.device), hide)
+        return Noise(rotations, send(turn, self.box_low.device), hide)
 
     def _moving(self, parts: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
         """What the networks see: the person, and with ``ste`` scene rows inside the box as well."""
@@ -319,9 +328,8 @@ class HumanSceneModel(nn.Module):
     def _time_weights(self, times_us: Sequence[int]) -> Float[Tensor, "T F"]:
         """Linear interpolation between the training frames around each time; held at the ends."""
         anchors = self.get_buffer("frame_times")
-        times = torch.tensor(list(times_us), dtype=torch.float64, device=anchors.device).clamp(
-            anchors[0], anchors[-1]
-        )
+        times = send(torch.tensor(list(times_us), dtype=torch.float64), anchors.device)
+        times = times.clamp(anchors[0], anchors[-1])
         after = torch.searchsorted(anchors, times).clamp(1, max(len(anchors) - 1, 1))
         if len(anchors) == 1:
             return torch.ones(len(times), 1, device=anchors.device)

@@ -33,7 +33,8 @@ class SkinningTurns:
         else:
             looked_up = network(positions[self.turn :: self.turns])
             looked_up = self.turns * looked_up - (self.turns - 1) * looked_up.detach()
-            weights = torch.slice_scatter(self.kept, looked_up, 0, self.turn, None, self.turns)
+            kept = self.kept.to(positions.device)  # after a resume it is on the CPU
+            weights = torch.slice_scatter(kept, looked_up, 0, self.turn, None, self.turns)
             self.turn = (self.turn + 1) % self.turns
         self.kept = weights.detach()
         return weights

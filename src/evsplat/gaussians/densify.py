@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from evsplat.body.rotations import quaternion_to_matrix
+from evsplat.devices import send
 from evsplat.gaussians.gaussian_set import ATTRIBUTES, GaussianSet, Part, person_first
 from evsplat.gaussians.initialise import logit
 from evsplat.gaussians.row_adam import RowAdam
@@ -57,6 +58,10 @@ class ScreenStatistics:
         """Nothing seen yet."""
         return cls(*(torch.zeros(count, device=device) for _ in range(3)))
 
+    def to(self, device: torch.device) -> "ScreenStatistics":
+        """The same statistics on ``device``."""
+        return ScreenStatistics(*(value.to(device) for value in vars(self).values()))
+
     def add(
         self,
         rows: slice,
@@ -71,7 +76,8 @@ class ScreenStatistics:
         are the same in all renders.
         """
         # The T renders share one mean loss; 3DGS's threshold is for the loss of a single view.
-        scale = centers_gradient.new_tensor([width / 2, height / 2]) * len(centers_gradient)
+        half = torch.tensor([width / 2, height / 2], dtype=centers_gradient.dtype)
+        scale = send(half, centers_gradient.device) * len(centers_gradient)
         visible = radii > 0
         norms = (centers_gradient * scale).norm(dim=-1) * visible
         self.gradient_sum[rows] += norms.sum(0)

@@ -180,7 +180,6 @@ def compose(
     human = _human_start(config, capture, track, generator)
     scene, colours = _scene_start(config, capture, track, generator)
     gaussians = GaussianSet(human, scene)
-    objectives_track, track = track, track.to(device)
     model = HumanSceneModel(config.deform, config.semantics, track, times, gaussians).to(device)
 
     prior = SkinningPrior(surface.to(device), config.skinning_points)
@@ -197,7 +196,7 @@ def compose(
 
     return Composition(
         model=model,
-        objectives=_objectives(config, capture, objectives_track, prior),
+        objectives=_objectives(config, capture, track, prior, device),
         weights={
             "l1": config.loss.l1,
             "dssim": config.loss.dssim,
@@ -211,7 +210,7 @@ def compose(
         },
         optimisation=config.optimisation,
         densify={"human": config.densify_human, **_scene_limits(config)},
-        body_frames=BodyFrames(track.body, track.bones(torch.tensor(times))),
+        body_frames=BodyFrames(model.track.body, model.track.bones(times)),
         generator=generator,
     )
 
@@ -320,7 +319,11 @@ def _leg_share(body: Body, thighs: tuple[int, int]) -> Tensor:
 
 
 def _objectives(
-    config: PaperConfig, capture: Capture, track: BodyTrack, prior: SkinningPrior
+    config: PaperConfig,
+    capture: Capture,
+    track: BodyTrack,
+    prior: SkinningPrior,
+    device: torch.device | str,
 ) -> list[Objective]:
     frames = capture.train_frames
     bounds, boxes = {}, {}
@@ -333,7 +336,7 @@ def _objectives(
         box = body_box(vertices, camera)
         if box is not None:
             boxes[frame.name] = box
-    perceptual = make_perceptual(config.loss.perceptual)
+    perceptual = make_perceptual(config.loss.perceptual, device=device)
     objectives: list[Objective] = [
         Photometric(capture, boxes, dssim=config.loss.dssim != 0.0, perceptual=perceptual),
         prior,

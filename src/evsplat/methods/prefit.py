@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from evsplat.capture import Camera
 from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.devices import send
 from evsplat.gaussians import StaticScene
 from evsplat.objectives import SkinningPrior
 from evsplat.render import Splats, render
@@ -45,7 +46,8 @@ def fit_scene_colours(
         for group in adam.param_groups:
             group["lr"] = 1e-2 * 0.1 ** (step / steps)
         adam.zero_grad()
-        some = torch.randint(len(features), (COLOUR_BATCH,), generator=generator).to(colours.device)
+        some = torch.randint(len(features), (COLOUR_BATCH,), generator=generator)
+        some = send(some, colours.device)
         shown = directions[some] * (step % 2)
         (model.scene_colour(features[some], shown) - colours[some]).square().mean().backward()
         adam.step()

@@ -1,7 +1,8 @@
 """What an objective is: it names the times it needs, and compares what was rendered there."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from evsplat.capture import Capture, Frame
 from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.devices import DeviceCache
 from evsplat.gaussians import PosedGaussians
 
 
@@ -31,10 +33,21 @@ class Step:
     """Progress in nominal iterations (of 15,000)."""
     generator: torch.Generator
     """Randomness of the step; part of the checkpoint."""
+    data: DeviceCache
+    """Recorded data on the model's device."""
 
     def index(self, time_us: int) -> int:
         """Place of a time among the pictures."""
         return self.times_us.index(time_us)
+
+    def observed(self, frame: Frame) -> Float[Tensor, "H W 3"]:
+        """The recorded picture of a frame, on the model's device."""
+        return self.data.get(*picture(self.capture, frame))
+
+
+def picture(capture: Capture, frame: Frame) -> tuple[Hashable, Callable[[], Tensor]]:
+    """Key and source of a frame's recorded picture, as `DeviceCache` takes them."""
+    return ("image", frame.name), partial(capture.image, frame)
 
 
 class Objective(Protocol):
@@ -42,6 +55,10 @@ class Objective(Protocol):
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """Times, microseconds, whose renders the objective needs for a drawn frame."""
+        ...
+
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """Ask for the recorded data that the loss of a later step, of ``frame``, will need."""
         ...
 
     def loss(self, step: Step) -> dict[str, Tensor]:
@@ -63,6 +80,9 @@ class Objective(Protocol):
 
 class Stateless:
     """Base of objectives that remember nothing between steps."""
+
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """Nothing recorded is needed."""
 
     def rows_changed(self) -> None:
         """Nothing refers to rows."""

@@ -2,12 +2,14 @@
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
+from evsplat.devices import DeviceCache
 from evsplat.events import count_map
 from evsplat.imaging import log_brightness_change
 from evsplat.objectives.base import Stateless, Step
@@ -87,6 +89,12 @@ class EventChange(Stateless):
             return ()
         return self._pair(frame)
 
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """The event map of the frame and its neighbour."""
+        if self.times(frame, nominal):
+            before, after = self._pair(frame)
+            data.prefetch(("events", before, after), partial(self._map, before, after))
+
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``event``: the normalised difference, weighted by how active the pair is (A17)."""
         if not self.times(step.frame, step.nominal):
@@ -98,7 +106,7 @@ class EventChange(Stateless):
         change = log_brightness_change(
             step.rgb[step.index(before)], step.rgb[step.index(after)], eps=self.eps
         )
-        events = self._map(before, after).to(change)
+        events = step.data.get(("events", before, after), partial(self._map, before, after))
         return {"event": weight * event_loss(change, events, floor=self.floor)}
 
     def _pair(self, frame: Frame) -> tuple[int, int]:

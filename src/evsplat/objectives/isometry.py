@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Frame
 from evsplat.compiled import native, runs_native
+from evsplat.devices import DeviceCache, send
 from evsplat.neighbours import nearest
 from evsplat.objectives.base import Step
 
@@ -102,6 +103,9 @@ class Isometry:
         """None of its own: it looks at whatever is posed."""
         return ()
 
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """Nothing recorded is needed."""
+
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``isometry_centers`` and ``isometry_covariances``."""
         gaussians, posed = step.model.gaussians, step.posed.human
@@ -110,13 +114,15 @@ class Isometry:
             return {}
         canonical = gaussians.means  # the person's rows come first
         if self.age == 0 or self.age >= self.refresh:
-            self._search(canonical[:count])
+            self.neighbours = nearest(canonical[:count], NEIGHBOURS)[1]
+            self.age = 0
         self.age += 1
+        self.neighbours = self.neighbours.to(canonical.device)  # after a resume
         chosen = torch.arange(count)
         if self.samples < count:
             chosen = torch.randint(count, (self.samples,), generator=step.generator)
-        near = self.neighbours[chosen].to(canonical.device)
-        rows = torch.cat([chosen.to(canonical.device)[:, None], near], dim=1)
+        chosen = send(chosen, canonical.device)
+        rows = torch.cat([chosen[:, None], self.neighbours[chosen]], dim=1)
 
         at_rest = (gaussians.means, gaussians.quaternions, gaussians.scales_log)
         moved = (posed.means, posed.quaternions, posed.scales, posed.transforms)
@@ -134,7 +140,3 @@ class Isometry:
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Take back what `state` gave."""
         self.neighbours, self.age = state["neighbours"], int(state["age"])
-
-    def _search(self, canonical: Float[Tensor, "H 3"]) -> None:
-        self.neighbours = nearest(canonical, NEIGHBOURS)[1].cpu()
-        self.age = 0

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.objectives.base import Stateless, Step
+from evsplat.devices import DeviceCache
+from evsplat.objectives.base import Stateless, Step, picture
 from evsplat.similarity.perceptual import PerceptualMetric
 from evsplat.similarity.psnr_ssim import l1_and_ssim
 
@@ -28,6 +29,7 @@ class Photometric(Stateless):
         perceptual: PerceptualMetric | None,
     ) -> None:
         """``boxes``: posed body's pixel box (x0, y0, x1, y1) per training frame that shows it."""
+        self.capture = capture
         self.frames = {frame.mid_us: frame for frame in capture.train_frames}
         self.boxes, self.dssim, self.perceptual = boxes, dssim, perceptual
 
@@ -35,11 +37,15 @@ class Photometric(Stateless):
         """The middle of the drawn frame's exposure."""
         return (frame.mid_us,)
 
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """The recorded picture."""
+        data.prefetch(*picture(self.capture, frame))
+
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``l1``, ``dssim`` and ``perceptual`` as configured, means over pictures and pixels."""
         frames = [self.frames.get(time) for time in step.times_us]
         seen = [
-            (frame, rendered, step.capture.image(frame).to(rendered))
+            (frame, rendered, step.observed(frame))
             for frame, rendered in zip(frames, step.rgb, strict=True)
             if frame is not None
         ]

@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from evsplat.capture import Frame
+from evsplat.devices import DeviceCache
 from evsplat.objectives.base import Stateless, Step
 
 
@@ -41,12 +42,11 @@ class PackedBounds:
         masks = torch.stack(silhouette_bounds(silhouette, band_px)).numpy()
         return cls(np.packbits(masks), *silhouette.shape)
 
-    def masks(self) -> tuple[Bool[Tensor, "H W"], Bool[Tensor, "H W"]]:
+    def masks(self) -> Bool[Tensor, "2 H W"]:
         """Inside and outside, as `silhouette_bounds` gave them."""
         pixels = self.height * self.width
         masks = torch.from_numpy(np.unpackbits(self.bits, count=2 * pixels).view(bool))
-        inside, outside = masks.view(2, self.height, self.width)
-        return inside, outside
+        return masks.view(2, self.height, self.width)
 
 
 class RenderedSemantics(Stateless):
@@ -63,13 +63,19 @@ class RenderedSemantics(Stateless):
         """None of its own: it looks at the mid-exposures that others render."""
         return ()
 
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """The bounds at the frame's mid-exposure."""
+        if frame.mid_us in self.bounds:
+            data.prefetch(("bounds", frame.mid_us), self.bounds[frame.mid_us].masks)
+
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``semantic`` and the pressure ``binarise`` = mean m (1 - m) (A2)."""
         values: list[Float[Tensor, ""]] = []
         for time, drawn in zip(step.times_us, step.semantic, strict=True):
             if time not in self.bounds:
                 continue
-            inside, outside = (mask.to(drawn) for mask in self.bounds[time].masks())
+            masks = step.data.get(("bounds", time), self.bounds[time].masks)
+            inside, outside = masks.to(drawn.dtype)
             # The probability of what the pixel surely is: p inside, 1 - p outside, 1 between.
             right = torch.addcmul(1 - inside, inside - outside, drawn.clamp(1e-4, 1 - 1e-4))
             values.append(-right.log().mean())

@@ -8,6 +8,7 @@ from torch import Tensor
 from evsplat.body import SurfaceSamples
 from evsplat.capture import Frame
 from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.devices import send
 from evsplat.objectives.base import Stateless, Step
 
 
@@ -30,6 +31,7 @@ class SkinningPrior(Stateless):
         """The prior of a model at random surface points."""
         chosen = torch.randint(
             len(self.surface.points), (self.points_per_step,), generator=generator
-        ).to(self.surface.points.device)
+        )
+        chosen = send(chosen, self.surface.points.device)
         weights = model.skinning(model.normalise(self.surface.points[chosen]))
         return (weights - self.surface.weights[chosen]).square().sum(-1).mean()

@@ -8,6 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from evsplat.devices import send
+
 # Normalisation that the networks were trained with, for input in [-1, 1].
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
@@ -82,7 +84,8 @@ class Network:
         self, x: Float[Tensor, "B 3 H W"], parameters: Mapping[str, Tensor]
     ) -> list[Float[Tensor, "B C h w"]]:
         """Output of every stage; ``x`` is in [-1, 1]."""
-        x = (x - x.new_tensor(_SHIFT).view(3, 1, 1)) / x.new_tensor(_SCALE).view(3, 1, 1)
+        shift, scale = send(torch.tensor([_SHIFT, _SCALE], dtype=x.dtype), x.device)
+        x = (x - shift.view(3, 1, 1)) / scale.view(3, 1, 1)
         outputs = []
         for stage in self.stages:
             for layer in stage:

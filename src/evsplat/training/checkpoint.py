@@ -56,7 +56,8 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def load_model(model: HumanSceneModel, tensors: dict[str, Tensor], human_count: int) -> None:
     """Give a model the parameters of a checkpoint, whatever its number of Gaussians was."""
     entries = below("model", tensors)
-    rows = {name: entries[f"gaussians.{name}"] for name in ATTRIBUTES}
+    device = model.gaussians.means.device
+    rows = {name: entries[f"gaussians.{name}"].to(device) for name in ATTRIBUTES}
     model.gaussians.set_rows(rows, human_count)
     model.load_state_dict(entries)
 

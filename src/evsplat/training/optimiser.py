@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from evsplat.deform.human_scene import HumanSceneModel
@@ -63,8 +64,15 @@ class Optimiser:
         self.rows.zero_grad()
         self.networks.zero_grad(set_to_none=True)
 
-    def step(self, nominal: float) -> None:
-        """Mask what is frozen, clip the networks' gradient and step both Adams."""
+    def step(self, nominal: float, sound: Tensor | None = None) -> None:
+        """Mask what is frozen, clip the networks' gradient and step both Adams.
+
+        Where ``sound`` is false (one value, on the device) nothing moves; nobody waits for it.
+        """
+        if sound is not None:
+            # What gradient scaling sets to have a fused Adam leave out a step.
+            for _, adam in self._adams():
+                adam.found_inf = (~sound).float()  # type: ignore[attr-defined]
         gaussians = self.model.gaussians
         if nominal < self.config.human_start:
             for name in ATTRIBUTES:
@@ -79,8 +87,8 @@ class Optimiser:
         torch.nn.utils.clip_grad_norm_(parameters, self.config.rates.clip_networks)
         self.networks.step()
 
-    def finite(self) -> bool:
-        """Whether every gradient is finite."""
+    def finite(self) -> Bool[Tensor, ""]:
+        """Whether every gradient is finite, told on the device."""
         gradients = [
             p.grad
             for adam in (self.rows.adam, self.networks)
@@ -89,7 +97,7 @@ class Optimiser:
             if p.grad is not None
         ]
         # A sum is NaN or infinite exactly if an entry is (or it overflows, which is as bad).
-        return bool(torch.stack([g.sum() for g in gradients]).isfinite().all())
+        return torch.stack([g.sum() for g in gradients]).isfinite().all()
 
     def state(self) -> dict[str, Tensor]:
         """Moments and step counts, named by group and parameter number."""

@@ -59,6 +59,7 @@ def train(
     overrides: Sequence[str] = (),
     threads: int | None = None,
     seed: int | None = None,
+    device_memory_gb: float | None = None,
 ) -> Path:
     """Train ``method`` on a capture and return the run folder.
 
@@ -66,13 +67,17 @@ def train(
     it also shortens the schedule so that it is finished in time. The cheap fits before the first
     step count as training. ``resume`` goes on from the last
     checkpoint in ``out``. ``config`` is a run's config.yaml; ``overrides`` are ``key=value``
-    settings over it. Raises `Stopped` on Ctrl-C after saving.
+    settings over it. ``device_memory_gb`` bounds the pictures and event maps kept on a GPU (a
+    quarter of its free memory by default); the rest is copied ahead of its use. Raises `Stopped` on
+    Ctrl-C after saving.
     """
     device = choose_device(device)
     if iterations is not None and iterations < 1:
         raise ConfigError(f"--iterations {iterations}: expected at least 1.")
     if max_minutes is not None and max_minutes <= 0:
         raise ConfigError(f"--max-minutes {max_minutes:g}: expected a time above 0.")
+    if device_memory_gb is not None and device_memory_gb < 0:
+        raise ConfigError(f"--device-memory-gb {device_memory_gb:g}: expected 0 or more.")
     if threads is not None:
         if threads < 1:
             raise ConfigError(f"--threads {threads}: expected at least 1.")
@@ -111,7 +116,8 @@ def train(
         shrink=max_minutes is not None and iterations is None,
         seconds=time.perf_counter() - started,
     )
-    trainer = Trainer(composition, capture, clock)
+    cache_bytes = None if device_memory_gb is None else int(1e9 * device_memory_gb)
+    trainer = Trainer(composition, capture, clock, cache_bytes=cache_bytes)
     if checkpoint is not None:
         tensors, state = load_checkpoint(checkpoint)
         trainer.load_state(tensors, state)
@@ -156,8 +162,11 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
         while not clock.done and not clock.out_of_time:
             started = time.perf_counter()
             report = trainer.step()
+            logged = (clock.iteration + 1) % LOG_EVERY == 0
+            if report is not None and logged:
+                trainer.bad.settle()  # what a GPU has still to do belongs to this step's time
             clock.advance(time.perf_counter() - started)
-            if report is not None and (clock.iteration % LOG_EVERY == 0 or clock.done):
+            if report is not None and (logged or clock.done):
                 log.write(json.dumps(_log_line(trainer, report)) + "\n")
                 _show(bar, trainer, report)
             if interrupted:
@@ -182,7 +191,7 @@ def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
         "terms": report.terms,
         "psnr": report.psnr,
         **trainer.counts(),
-        "skipped": trainer.skipped,
+        "skipped": trainer.bad.settle(),
         "lr": rates,
     }
 

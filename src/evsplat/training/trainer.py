@@ -1,53 +1,80 @@
 """The training loop: draw a frame, render what the objectives need, compare, step, densify."""
 
-import logging
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.errors import DataError
+from evsplat.devices import DeviceCache, default_cache_bytes
 from evsplat.gaussians import ScreenStatistics, densify, flip_labels
 from evsplat.gaussians.densify import reset_opacities
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import weight_at
 from evsplat.objectives import Step
 from evsplat.render import Splats, render, split_channels
+from evsplat.training.bad_steps import BadSteps
 from evsplat.training.checkpoint import below, flatten, load_model
 from evsplat.training.clock import Clock
 from evsplat.training.optimiser import Optimiser
 
-logger = logging.getLogger(__name__)
-
-MAX_BAD_STEPS = 20
-"""Consecutive steps with a non-finite loss or gradient after which training stops."""
-
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step measured."""
+    """What one step measured. Reading a number waits for the device that computes it."""
 
-    loss: float
-    terms: dict[str, float]
-    """Unweighted."""
-    psnr: float
-    """Of the drawn frame's render against the recorded, blurry picture, dB."""
+    measured: Float[Tensor, " K"]
+    """Loss, PSNR and the terms."""
+    names: tuple[str, ...]
+    """Of the terms."""
+
+    @cached_property
+    def _numbers(self) -> list[float]:
+        return self.measured.tolist()
+
+    @property
+    def loss(self) -> float:
+        """What was minimised."""
+        return self._numbers[0]
+
+    @property
+    def psnr(self) -> float:
+        """Of the drawn frame's render against the recorded, blurry picture, dB."""
+        return self._numbers[1]
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """Of the loss, unweighted."""
+        return dict(zip(self.names, self._numbers[2:], strict=True))
 
 
 class Trainer:
     """Order and time of a training run; all state that a resume needs is in `state`."""
 
-    def __init__(self, composition: Composition, capture: Capture, clock: Clock) -> None:
-        """Start at the beginning of the schedule."""
+    def __init__(
+        self,
+        composition: Composition,
+        capture: Capture,
+        clock: Clock,
+        *,
+        cache_bytes: int | None = None,
+    ) -> None:
+        """Start at the beginning of the schedule.
+
+        ``cache_bytes`` bounds the recorded data kept on a GPU; None: a quarter of what is free.
+        """
         self.composition, self.capture, self.clock = composition, capture, clock
         self.model = composition.model
         self.device = self.model.box_low.device
         self.optimiser = Optimiser(self.model, composition.optimisation)
+        self.data = DeviceCache(
+            self.device, default_cache_bytes(self.device) if cache_bytes is None else cache_bytes
+        )
         self.queue: list[int] = []
-        self.bad_steps = 0
-        self.skipped = 0
+        self.bad = BadSteps(self.device, str(capture.path))
         self.previous_nominal = 0.0
         self.statistics = self._fresh_statistics()
 
@@ -68,8 +95,9 @@ class Trainer:
         pictures = split_channels(output.image, (3, 1))
         rgb, semantic = pictures[0], tuple(picture[..., 0] for picture in pictures[1])
         step = Step(
-            self.capture, self.model, frame, tuple(times), rgb, semantic, posed, nominal, generator
-        )
+            self.capture, self.model, frame, tuple(times), rgb, semantic, posed, nominal, generator,
+            self.data,
+        )  # fmt: skip
         terms: dict[str, Tensor] = {}
         for objective in self.composition.objectives:
             terms |= objective.loss(step)
@@ -79,16 +107,17 @@ class Trainer:
         ).sum()
 
         self.optimiser.zero_grad()
-        values = {name: float(value.detach()) for name, value in terms.items()}
-        if not bool(loss.isfinite()):
-            self._skip([name for name, value in values.items() if value != value] or ["loss"])
+        sound = loss.detach().isfinite()
+        if self.bad.refuse(sound, lambda: _not_numbers(terms) or ["loss"], self.clock.iteration):
             return None
         loss.backward()
-        if not self.optimiser.finite():
-            self._skip(["gradient"])
+        sound = sound & self.optimiser.finite()
+        if self.bad.refuse(sound, lambda: ["gradient"], self.clock.iteration):
             return None
-        self.bad_steps = 0
-        self.optimiser.step(nominal)
+        self.bad.count(sound)
+        # The host knows that the step is sound, or a GPU will know it.
+        unsure = None if self.bad.at_once else sound
+        self.optimiser.step(nominal, unsure)
         height, width = output.alpha.shape[1:]
         gaussians = self.model.gaussians
         for rows, layer, radii in (
@@ -96,11 +125,15 @@ class Trainer:
             (gaussians.scene, static, output.static_radii),
         ):
             assert layer.centers2d_offset is not None and layer.centers2d_offset.grad is not None
-            self.statistics.add(rows, layer.centers2d_offset.grad, radii, width, height)
+            gradient = layer.centers2d_offset.grad
+            if unsure is not None:
+                gradient, radii = (torch.where(unsure, v, 0) for v in (gradient, radii))
+            self.statistics.add(rows, gradient, radii, width, height)
         self._edit(frame, nominal)
         drawn = rgb[step.index(frame.mid_us)].detach()
-        error = (drawn.clamp(0, 1) - self.capture.image(frame).to(drawn)).square().mean()
-        return StepReport(float(loss.detach()), values, float(-10 * torch.log10(error)))
+        error = (drawn.clamp(0, 1) - step.observed(frame)).square().mean()
+        numbers = [loss, -10 * torch.log10(error), *terms.values()]
+        return StepReport(torch.stack([n.detach() for n in numbers]), tuple(terms))
 
     def counts(self) -> dict[str, int]:
         """Number of Gaussians per class."""
@@ -119,7 +152,7 @@ class Trainer:
         state = {
             "clock": asdict(self.clock),
             "queue": self.queue,
-            "skipped": self.skipped,
+            "skipped": self.bad.settle(),
             "previous_nominal": self.previous_nominal,
             "human_count": self.model.gaussians.human_count,
         }
@@ -130,7 +163,7 @@ class Trainer:
         load_model(self.model, tensors, state["human_count"])
         self.optimiser = Optimiser(self.model, self.composition.optimisation)
         self.optimiser.load_state(below("optimiser", tensors))
-        self.statistics = ScreenStatistics(**below("statistics", tensors))
+        self.statistics = ScreenStatistics(**below("statistics", tensors)).to(self.device)
         for number, objective in enumerate(self.composition.objectives):
             objective.load_state(below(f"objective{number}", tensors))
         self.model.skinning_turns.load_state(below("skinning_turns", tensors))
@@ -138,7 +171,8 @@ class Trainer:
         saved = state["clock"]
         for name in ("iteration", "fraction", "seconds", "step_seconds"):
             setattr(self.clock, name, saved[name])
-        self.queue, self.skipped = list(state["queue"]), state["skipped"]
+        self.queue = list(state["queue"])
+        self.bad.skipped = state["skipped"]
         self.previous_nominal = state["previous_nominal"]
 
     def _draw_frame(self) -> Frame:
@@ -147,7 +181,10 @@ class Trainer:
         if not self.queue:
             order = torch.randperm(len(frames), generator=self.composition.generator)
             self.queue = order.tolist()
-        return frames[self.queue.pop()]
+        frame = frames[self.queue.pop()]
+        for objective in self.composition.objectives if self.queue else ():
+            objective.prefetch(frames[self.queue[-1]], self.clock.nominal, self.data)
+        return frame
 
     def _edit(self, frame: Frame, nominal: float) -> None:
         """Edit the set where the schedule crosses a densification step."""
@@ -160,6 +197,7 @@ class Trainer:
         every = limits["human"].every
         if nominal // every == previous // every:
             return
+        self.bad.settle()
         densify(gaussians, rows, self.statistics, limits, nominal, self.composition.generator)
         if self.model.semantics != "fixed":
             drawn = self.capture.train_frames.index(frame)
@@ -173,18 +211,9 @@ class Trainer:
         means = self.model.gaussians.means
         return ScreenStatistics.zeros(len(means), means.device)
 
-    def _skip(self, culprits: list[str]) -> None:
-        self.bad_steps += 1
-        self.skipped += 1
-        logger.warning(
-            "step %d skipped: %s is not finite", self.clock.iteration, ", ".join(culprits)
-        )
-        if self.bad_steps >= MAX_BAD_STEPS:
-            raise DataError(
-                f"{self.capture.path}: {MAX_BAD_STEPS} steps in a row gave a non-finite "
-                f"{culprits[0]}; the last good checkpoint is kept. Lower the weight of that term "
-                "with --set, or check the poses with `evsplat inspect`."
-            )
+
+def _not_numbers(terms: dict[str, Tensor]) -> list[str]:
+    return [name for name, value in terms.items() if bool(value.isnan())]
 
 
 def _with_centers(layer: Splats) -> Splats:

@@ -1,0 +1,73 @@
+"""Steps with a value that is not finite: left out, counted, and an error when they go on."""
+
+import logging
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from evsplat.errors import DataError
+
+logger = logging.getLogger(__name__)
+
+MAX_BAD_STEPS = 20
+"""Consecutive steps with a non-finite loss or gradient after which training stops."""
+
+
+class BadSteps:
+    """Counts them. On the CPU each step is judged at once.
+
+    On a GPU the host would have to wait for every verdict. It stays on the device instead, where it
+    keeps the optimiser from moving anything, and the host reads the counts now and then (`settle`).
+    """
+
+    def __init__(self, device: torch.device, source: str) -> None:
+        """``source`` begins the message of the error."""
+        self.at_once = device.type == "cpu"
+        self.source = source
+        self.skipped = 0
+        """Ever, as far as the host knows."""
+        self._in_a_row = 0
+        self._found = torch.zeros(2, dtype=torch.long, device=device)  # in a row, not settled yet
+
+    def refuse(
+        self, sound: Bool[Tensor, ""], culprits: Callable[[], list[str]], iteration: int
+    ) -> bool:
+        """Whether the step ends here, its verdict being known and bad."""
+        if not self.at_once or bool(sound):
+            return False
+        found = culprits()
+        self.skipped += 1
+        self._in_a_row += 1
+        logger.warning("step %d skipped: %s is not finite", iteration, ", ".join(found))
+        self._stop_if_it_goes_on(found[0])
+        return True
+
+    def count(self, sound: Bool[Tensor, ""]) -> None:
+        """A step was made, or will have been left out by the device."""
+        if self.at_once:
+            self._in_a_row = 0
+            return
+        bad = (~sound).long()
+        in_a_row, new = self._found.unbind()
+        self._found = torch.stack([(in_a_row + 1) * bad, new + bad])
+
+    def settle(self) -> int:
+        """Take over what the device counted, which waits for it; the number of skipped steps."""
+        if not self.at_once:
+            self._in_a_row, new = self._found.tolist()
+            self._found[1] = 0
+            self.skipped += new
+            if new:
+                logger.warning("%d steps skipped: loss or gradient is not finite", new)
+            self._stop_if_it_goes_on("loss or gradient")
+        return self.skipped
+
+    def _stop_if_it_goes_on(self, culprit: str) -> None:
+        if self._in_a_row >= MAX_BAD_STEPS:
+            raise DataError(
+                f"{self.source}: {MAX_BAD_STEPS} steps in a row gave a non-finite {culprit}; the "
+                "last good checkpoint is kept. Lower the weight of that term with --set, or check "
+                "the poses with `evsplat inspect`."
+            )

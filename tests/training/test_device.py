@@ -1,0 +1,207 @@
+"""A training step on another device than the CPU: nothing mixes devices, nobody waits."""
+
+import math
+
+import pytest
+import torch
+
+from evsplat.capture import load_capture
+from evsplat.errors import DataError
+from evsplat.methods import compose, method_config
+from evsplat.render import api, cuda
+from evsplat.training.bad_steps import MAX_BAD_STEPS
+from evsplat.training.clock import Clock
+from evsplat.training.trainer import Trainer
+
+from .foreign_device import NAME, NEEDS_DATA, Descent, ForeignDevice, HostWaits, drawing
+
+SMALL = {
+    "human": {"count": 120},
+    "deform": {"width": 16, "colour_width": 16},
+    "isometry_samples": 64,
+}
+
+
+def quick(capture_path, **options):
+    """A trainer on the CPU in the middle of its schedule, without the fits before it."""
+    capture = load_capture(capture_path)
+    settings = method_config("paper", SMALL | options, where="test")
+    composition = compose(settings, capture, 0, fit=False)
+    return Trainer(composition, capture, Clock(100, fraction=0.5))
+
+
+def without_native(monkeypatch):
+    for module in (
+        "evsplat.deform.mlp",
+        "evsplat.deform.encodings",
+        "evsplat.similarity.psnr_ssim",
+    ):
+        monkeypatch.setattr(f"{module}.runs_native", lambda tensor: False)
+
+
+@pytest.mark.parametrize("encoding", ["oneblob", "hashgrid"])
+def test_plain_torch_takes_the_steps_that_native_takes(encoding, tiny_capture, monkeypatch):
+    """All but the rasteriser, which has tests of its own: what a GPU runs in their place."""
+    path = tiny_capture(width=64, height=48)
+    deform = SMALL["deform"] | {"encoding": encoding}
+    results = []
+    for native in (True, False):
+        if not native:
+            without_native(monkeypatch)
+        trainer = quick(path, deform=deform)
+        reports = [trainer.step() for _ in range(3)]
+        results.append(reports)
+    reports, expected_reports = results
+    for report, expected in zip(reports, expected_reports, strict=True):
+        assert report.names == expected.names
+        # After an Adam step, which divides by the gradient, tiny differences have grown.
+        torch.testing.assert_close(report.measured, expected.measured, rtol=2e-3, atol=1e-5)
+    torch.testing.assert_close(
+        reports[0].measured, expected_reports[0].measured, rtol=1e-5, atol=1e-6
+    )
+
+
+def test_gradients_of_the_first_step_are_those_of_native(tiny_capture, monkeypatch):
+    path = tiny_capture(width=64, height=48)
+    results = []
+    for native in (True, False):
+        if not native:
+            without_native(monkeypatch)
+        trainer = quick(path)
+        monkeypatch.setattr(trainer.optimiser, "step", lambda *_: None)
+        trainer.step()
+        results.append({n: p.grad for n, p in trainer.model.named_parameters()})
+    native, plain = results
+    assert native.keys() == plain.keys()
+    for name, expected in native.items():
+        if expected is None or expected.numel() == 0:
+            assert plain[name] is None
+            continue
+        error = ((plain[name] - expected).norm() / expected.norm().clamp_min(1e-12)).item()
+        assert error < 1e-4, (name, error)
+
+
+def test_verdicts_left_on_the_device_give_the_same_steps(tiny_capture):
+    """The way of a GPU, on the CPU: no step waits for its verdict; bad ones move nothing."""
+    path = tiny_capture()
+    at_once, later = quick(path), quick(path)
+    later.bad.at_once = False
+    for _ in range(3):
+        assert torch.equal(at_once.step().measured, later.step().measured)
+    for trainer in (at_once, later):
+        features = trainer.model.gaussians.features
+        whole = features.detach().clone()
+        features.data[0, 0] = math.nan
+        before = {k: v.clone() for k, v in trainer.state()[0].items() if "generator" not in k}
+        for _ in range(2):
+            trainer.step()
+        for name, value in trainer.state()[0].items():
+            if name in before and not name.startswith(("model.nominal", "objective")):
+                torch.testing.assert_close(value, before[name], rtol=0, atol=0, equal_nan=True)
+        assert trainer.bad.settle() == 2
+        features.data.copy_(whole)
+    assert torch.equal(at_once.step().measured, later.step().measured)
+    assert at_once.bad.skipped == later.bad.settle() == 2
+
+
+def test_bad_verdicts_without_end_stop_the_training(tiny_capture):
+    trainer = quick(tiny_capture())
+    trainer.bad.at_once = False
+    trainer.model.gaussians.features.data[0, 0] = math.nan
+    for _ in range(MAX_BAD_STEPS):
+        trainer.step()
+    with pytest.raises(DataError, match="20 steps in a row gave a non-finite loss or gradient"):
+        trainer.bad.settle()
+
+
+class Here:
+    """In place of `DeviceCache`, whose thread does not know the foreign device."""
+
+    def __init__(self, data):
+        self.data = data
+
+    def prefetch(self, key, make):
+        self.get(key, make)
+
+    def get(self, key, make):
+        if key not in self.data:
+            self.data[key] = make().to(NAME, non_blocking=True)
+        return self.data[key]
+
+
+@pytest.fixture
+def foreign(monkeypatch):
+    """The device, and a trainer factory for it with gsplat's functions as shapes."""
+
+    def make(capture_path, **settings):
+        capture = load_capture(capture_path)
+        camera = capture.cameras["main"]
+        gsplat = drawing(camera.width, camera.height)
+        backends = api._BACKENDS | {"gsplat": lambda *inputs: cuda.draw(gsplat, *inputs)}
+        monkeypatch.setattr(api, "_BACKENDS", backends)
+        monkeypatch.setattr(api, "_BACKEND_OF_DEVICE", {NAME: "gsplat"})
+        monkeypatch.setattr(torch.optim, "Adam", Descent)
+        torch.__future__.set_overwrite_module_params_on_conversion(True)
+        composition = compose(
+            method_config("paper", {**SMALL, **settings}, where="test"), capture, 0,
+            device=NAME, fit=False,
+        )  # fmt: skip
+        trainer = Trainer(composition, capture, Clock(100, fraction=0.5))
+        trainer.data = Here({})
+        return trainer
+
+    with ForeignDevice() as device:
+        yield device, make
+    torch.__future__.set_overwrite_module_params_on_conversion(False)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {
+            "deform": SMALL["deform"] | {"encoding": "hashgrid", "pose_correction_start": 0},
+            "loss": {"perceptual": "st_lpips"},
+        },
+    ],
+    ids=["default", "what can be switched on"],
+)
+def test_a_step_stays_on_its_device_and_never_waits(settings, foreign, tiny_capture):
+    device, make = foreign
+    trainer = make(tiny_capture(width=64, height=48), **settings)
+    trainer.previous_nominal = trainer.clock.nominal  # densification does wait
+    trainer.step()  # what is made once, such as the levels of the skeleton
+    device.may_wait = False
+    report = trainer.step()
+    assert {"l1", "dssim", "event", "semantic", "skinning", "isometry_centers"} <= {*report.names}
+    assert report.measured.device.type == NAME
+    for parameter in trainer.model.parameters():
+        assert parameter.device.type == NAME
+    assert trainer.statistics.gradient_sum.device.type == NAME
+
+
+def test_the_foreign_device_finds_what_waits_and_what_mixes(foreign):
+    device, _ = foreign
+    there = torch.ones(3, device=NAME)
+    for waits in (
+        lambda: there.sum().item(),
+        lambda: bool(there[0] > 0),
+        lambda: there[there > 0],
+        lambda: torch.nonzero(there),
+    ):
+        with pytest.raises(NEEDS_DATA):
+            waits()
+    with pytest.raises(Exception, match="same device"):
+        there + torch.ones(3)
+    torch.ones(3).to(NAME)
+    device.may_wait = False
+    torch.ones(3).to(NAME, non_blocking=True)
+    for copies in (
+        lambda: torch.ones(3).to(NAME),
+        lambda: there.cpu(),
+        lambda: torch.tensor([1.0, 2.0], device=NAME),
+        lambda: there.new_tensor([1.0, 2.0]),
+    ):
+        # PyTorch makes no tensor from a list there at all; on a GPU it would, and wait.
+        with pytest.raises((HostWaits, NotImplementedError)):
+            copies()
