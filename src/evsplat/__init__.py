@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from evsplat.capture import load_capture
+    from evsplat.capture.importers import import_capture
     from evsplat.capture.inspect import inspect_capture as inspect
     from evsplat.cli.demo import demo
     from evsplat.evaluation import evaluate_run as evaluate
@@ -40,6 +41,7 @@ __all__ = [
     "__version__",
     "demo",
     "evaluate",
+    "import_capture",
     "inspect",
     "load_capture",
     "load_run",
@@ -52,6 +54,7 @@ __all__ = [
 _LAZY = {
     "demo": "evsplat.cli.demo:demo",
     "evaluate": "evsplat.evaluation:evaluate_run",
+    "import_capture": "evsplat.capture.importers:import_capture",
     "inspect": "evsplat.capture.inspect:inspect_capture",
     "load_capture": "evsplat.capture:load_capture",
     "load_run": "evsplat.training.run:load_run",

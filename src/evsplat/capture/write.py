@@ -118,8 +118,8 @@ class CaptureWriter:
         sharp: np.ndarray | Path | str | None = None,
         mask: np.ndarray | Path | str | None = None,
         world_to_camera: ArrayLike | None = None,
-    ) -> None:
-        """Add the next frame; frames of a camera come in the order of time.
+    ) -> str:
+        """Add the next frame and give its split; frames of a camera come in the order of time.
 
         Pictures are arrays (H, W) or (H, W, 3), sRGB-coded: uint8, uint16 or floats in [0, 1]
         (stored as 8 bit), or the path of a PNG, JPEG or WebP file that is copied as it is. ``mask``
@@ -140,6 +140,7 @@ class CaptureWriter:
         if world_to_camera is not None:
             entry["world_to_camera"] = _numbers(world_to_camera)
         self._frames.append(entry)
+        return entry["split"]
 
     def add_novel_view(
         self, camera: str, frame: str, time_us: int, image: np.ndarray | Path | str

@@ -11,6 +11,7 @@ import evsplat
 from evsplat.cli.demo import demo
 from evsplat.cli.doctor import doctor
 from evsplat.cli.evaluate import evaluate
+from evsplat.cli.import_ import import_, import_with_kinds
 from evsplat.cli.inspect import inspect
 from evsplat.cli.render import render
 from evsplat.cli.report import report
@@ -19,8 +20,8 @@ from evsplat.cli.train import train
 from evsplat.errors import EvsplatError
 
 _VERBS: dict[str, Callable[..., Any]] = {
-    verb.__name__: verb
-    for verb in (demo, doctor, inspect, restore, train, evaluate, report, render)
+    verb.__name__.rstrip("_"): verb
+    for verb in (demo, doctor, import_, inspect, restore, train, evaluate, report, render)
 }
 _DESCRIPTION = (
     "A sharp 3D Gaussian person in a scene, from a blurry video and events.\n\n"
@@ -42,9 +43,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     logging.basicConfig(format="%(message)s")
     logging.getLogger("evsplat").setLevel(logging.INFO)
+    verbs = _VERBS
+    if arguments[:1] == ["import"]:
+        verbs = {**_VERBS, "import": import_with_kinds()}
     try:
         tyro.extras.subcommand_cli_from_dict(
-            _VERBS,
+            verbs,
             prog="evsplat",
             description=_DESCRIPTION,
             args=arguments or ["--help"],

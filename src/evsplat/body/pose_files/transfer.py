@@ -18,19 +18,23 @@ def skeleton_motion(
     *,
     world_from_sequence: Float[np.ndarray, "3 3"] | None = None,
     body_models: Path | str | None = None,
+    zero_joints: Float[np.ndarray, "22 3"] | None = None,
 ) -> SkeletonMotion:
     """The motion of the 22 joints without hands and face; times follow from ``sequence.fps``.
 
     ``world_from_sequence`` rotates the sequence's world, for example from y up to z up. Where no
-    frame rate is known, times count frames as seconds.
+    frame rate is known, times count frames as seconds. ``zero_joints`` are the subject's joints at
+    rest where they are known from elsewhere than the model.
     """
-    zero = rest_joints(
-        sequence.model,
-        sequence.betas,
-        sequence.gender,
-        body_models=body_models,
-        source=sequence.source,
-    )
+    zero = zero_joints
+    if zero is None:
+        zero = rest_joints(
+            sequence.model,
+            sequence.betas,
+            sequence.gender,
+            body_models=body_models,
+            source=sequence.source,
+        )
     vectors = sequence.poses[:, : len(NAMES)]
     local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
     world = local.copy()

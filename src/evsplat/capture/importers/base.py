@@ -1,0 +1,172 @@
+"""What importers share: the options all have, finding files, checking numbers, cameras."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from evsplat.capture.images import image_size, read_image
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import ConfigError, DataError
+
+GUIDE = "docs/import.md shows the tree"
+SHARP_EXPOSURE_US = 1_000
+"""Where a data set does not say how long the shutter was open, its pictures are taken as sharp."""
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+# Rotations of data sets are rounded; further off than this they are something else.
+_ROTATION_TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Importer:
+    """Options of one kind of source; `write` turns the source into a capture."""
+
+    blur_recipe: ClassVar[str | None] = None
+    """Recipe of `evsplat.synthesize` that makes the paper's blurry version of this data set."""
+
+    def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
+        """Read ``source`` into ``writer``; gives notes for the user.
+
+        ``smpl`` is the user's SMPL file or the folder that holds it, None where there is none.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class SourceCamera:
+    """A camera as a data set gives it, without the size of its pictures."""
+
+    K: Float[np.ndarray, "3 3"]
+    """Pixels of the pictures as stored; the centre of the first pixel is (0.5, 0.5)."""
+    world_to_camera: Float[np.ndarray, "4 4"]
+    distortion: tuple[float, ...] | None = None
+
+    def add_to(self, writer: CaptureWriter, name: str, picture: Path, shrink: int) -> None:
+        """Declare the camera with the size of one of its pictures, made smaller by ``shrink``."""
+        width, height = image_size(picture)
+        K = self.K.copy()
+        K[:2] /= shrink
+        writer.add_camera(
+            name,
+            width // shrink,
+            height // shrink,
+            K,
+            self.world_to_camera,
+            distortion=self.distortion,
+        )
+
+    def moved(self, world_from_new: Float[np.ndarray, "4 4"]) -> "SourceCamera":
+        """The same camera seen from another world."""
+        return replace(self, world_to_camera=self.world_to_camera @ world_from_new)
+
+
+def opencv_intrinsics(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """K of a library that puts the first pixel's centre at (0, 0), in the capture's convention."""
+    moved = np.array(K, dtype=np.float64)
+    moved[:2, 2] += 0.5
+    moved[0, 1] = 0.0
+    return moved
+
+
+def rigid(
+    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"], where: str
+) -> Float[np.ndarray, "4 4"]:
+    """4x4 transform of a rotation, freed from rounding, and a translation in metres."""
+    u, _, v = np.linalg.svd(rotation)
+    clean = u @ v
+    if np.linalg.det(clean) < 0 or np.abs(clean - rotation).max() > _ROTATION_TOLERANCE:
+        raise DataError(f"{where}: found a matrix that is no rotation, expected world to camera.")
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = clean, translation
+    return transform
+
+
+def picture(path: Path, shrink: int = 1) -> np.ndarray | Path:
+    """The pixels made smaller by the mean over squares, or the file itself where all stays."""
+    if shrink == 1:
+        return path
+    return shrunk(read_image(path), shrink)
+
+
+def shrunk(pixels: np.ndarray, factor: int) -> np.ndarray:
+    """Means over squares of ``factor`` pixels; what is left at the right and below is cut off."""
+    height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
+    cut = pixels[: height * factor, : width * factor]
+    squares = cut.reshape(height, factor, width, factor, *pixels.shape[2:])
+    means = squares.mean(axis=(1, 3), dtype=np.float64)
+    return means if pixels.dtype.kind == "f" else (means + 0.5).astype(pixels.dtype)
+
+
+def person_mask(path: Path, shrink: int, *, person_is: str = "nonzero") -> np.ndarray:
+    """(H, W) share of the person in [0, 1] of a label picture; a label is 0 on the background.
+
+    ``person_is`` "zero" turns the picture round (255 is the background there).
+    """
+    labels = read_image(path)
+    labels = labels if labels.ndim == 2 else labels.max(axis=2)
+    person = labels == 0 if person_is == "zero" else labels != 0
+    return shrunk(person.astype(np.float32), shrink)
+
+
+def need(path: Path, what: str) -> Path:
+    """``path``, or a `DataError` that says what was expected there."""
+    if not path.exists():
+        raise DataError(f"{path}: not found, expected {what}; {GUIDE}.")
+    return path
+
+
+def numbered(folder: Path, what: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Files of a folder by the last number in their names, in that order."""
+    need(folder, f"the folder of {what}")
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        digits = "".join(c if c.isdigit() else " " for c in path.stem).split()
+        if path.suffix.lower() not in suffixes or not digits:
+            continue
+        number = int(digits[-1])
+        if number in found:
+            raise DataError(
+                f"{path}: has the number {number} as has {found[number].name}, expected one file "
+                "per number; remove one."
+            )
+        found[number] = path
+    if not found:
+        kinds = ", ".join(suffixes)
+        raise DataError(f"{folder}: holds no numbered {kinds} file, expected {what}; {GUIDE}.")
+    return dict(sorted(found.items()))
+
+
+def table(container: Any, where: str, what: str) -> Mapping[str, Any]:
+    """A dictionary read from a file, or a `DataError` that says what it should hold."""
+    if not isinstance(container, Mapping):
+        raise DataError(f"{where}: found a {type(container).__name__}, expected {what}; {GUIDE}.")
+    return container
+
+
+def chosen_frames(frames: tuple[int, int] | None, available: list[int], source: Path) -> list[int]:
+    """The numbers of ``available`` in [start, stop); all of them without a choice."""
+    if frames is None:
+        return available
+    start, stop = frames
+    kept = [number for number in available if start <= number < stop]
+    if not kept:
+        raise ConfigError(
+            f"{source}: no frame in {start}..{stop - 1}; there are {available[0]}..{available[-1]}."
+        )
+    return kept
+
+
+def check_positive(**values: float) -> None:
+    """Options that must be above zero."""
+    for name, value in values.items():
+        if not value > 0:
+            raise ConfigError(f"{name} is {value}, expected a number above 0.")
+
+
+def exposure_around(time_us: float, exposure_us: float) -> tuple[int, int]:
+    """Start and end of an exposure whose middle is ``time_us``."""
+    start = round(time_us - exposure_us / 2)
+    return start, start + max(1, round(exposure_us))

@@ -1,0 +1,226 @@
+"""MMHPSD: the raw recording, and the two preprocessed releases (EventHPE's and the SNN paper's)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from tqdm import tqdm
+
+from evsplat.body.pose_files import PoseSequence, read_poses
+from evsplat.body.pose_files.fields import axis_angles, numbers
+from evsplat.body.pose_files.sequence import make_sequence
+from evsplat.capture.images import image_size
+from evsplat.capture.importers.base import (
+    GUIDE,
+    PICTURES,
+    SHARP_EXPOSURE_US,
+    Importer,
+    SourceCamera,
+    check_positive,
+    chosen_frames,
+    exposure_around,
+    need,
+    numbered,
+    opencv_intrinsics,
+    picture,
+)
+from evsplat.capture.importers.smpl import add_body, chosen_poses, unposed
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import DataError
+from evsplat.events import EventStream, open_recording
+from evsplat.safe_pickle import read_npz, read_pickle
+
+_FOCAL_PX, _CENTRE_PX, _CANVAS_PX = 1679.3, 641.0, 1280
+"""On the 800x1280 picture padded to a square; no distortion."""
+_JOINT_SAMPLES = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mmhpsd(Importer):
+    """MMHPSD, one action: the folder ROOT/ACTION of the raw data, or ROOT with --action."""
+
+    blur_recipe: ClassVar[str | None] = "mmhpsd-blur"
+
+    action: str | None = None
+    """Name of the action, such as subject01_group2_time3 (s1g2t3); needed for the releases."""
+    frames: tuple[int, int] | None = None
+    """First frame and one past the last; by default all that have a picture and a pose."""
+    shrink: int = 1
+    """Pictures and events are made smaller by this factor."""
+    fps: float = 15.0
+    """Frames per second; the data set has no time stamps."""
+    event_duty: float = 0.8
+    """Share of a frame's interval over which its events are spread: the sensor sends none while it
+    takes a full picture."""
+    gender: Literal["male", "neutral", "female"] = "male"
+    """SMPL model that the poses were fitted with."""
+
+    def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
+        """Read one action; see `Importer.write`."""
+        check_positive(shrink=self.shrink, fps=self.fps, event_duty=self.event_duty)
+        layout = _find(source, self.action)
+        pictures = numbered(layout.pictures, "grey pictures", PICTURES)
+        poses = numbered(layout.poses, "poses", (".pkl", ".npz"))
+        both = [number for number in pictures if number in poses]
+        if not both:
+            raise DataError(f"{layout.poses}: no number is that of a picture in {layout.pictures}.")
+        kept = chosen_frames(self.frames, both, source)
+        width, height = image_size(pictures[kept[0]])
+        _camera(width, height).add_to(writer, "main", pictures[kept[0]], self.shrink)
+        times = []
+        for number in tqdm(kept, desc="pictures", unit="frame", leave=False):
+            time_us = round(number * 1e6 / self.fps)
+            writer.add_frame(
+                f"{number:04d}",
+                "main",
+                picture(pictures[number], self.shrink),
+                exposure_around(time_us, SHARP_EXPOSURE_US),
+            )
+            times.append(time_us)
+        notes = [self._add_events(layout, writer, kept, (width, height))]
+        missing = len(pictures) - len(both)
+        if missing:
+            notes.append(f"{missing} pictures have no pose and were left out")
+        writer.provenance |= {
+            "source": "MMHPSD",
+            "layout": layout.name,
+            "sequence": layout.action,
+            "shrink": self.shrink,
+            "fps_nominal": self.fps,
+            "event_duty": self.event_duty,
+            "events": notes[0],
+        }
+        files = [poses[number] for number in kept]
+        released = files[0].suffix == ".npz"
+        sequence = _read_npz_poses(files, kept) if released else read_poses(layout.poses)
+        sequence = replace(chosen_poses(sequence, kept), gender=self.gender)
+        return notes + add_body(writer, times, sequence, smpl, rest_joints=_rest_joints(files))
+
+    def _add_events(
+        self, layout: "_Layout", writer: CaptureWriter, kept: list[int], size: tuple[int, int]
+    ) -> str:
+        """Write the events where they have a sign; gives a note."""
+        if layout.events is None:
+            return "events: this release holds binary pictures without polarity; simulate them"
+        files = numbered(layout.events, "events", (".csv", ".npz"))
+        files = {number: path for number, path in files.items() if number in kept}
+        if not any(open_recording(path).has_polarity for path in files.values()):
+            return "events: without polarity (all zero), so they were left out; simulate them"
+        count = writer.set_events(
+            self._events(files, size),
+            size[0] // self.shrink,
+            size[1] // self.shrink,
+            contrast_threshold=None,
+            simulated=False,
+        )
+        return f"events: {count:,} recorded ones; their times within a frame are reconstructed"
+
+    def _events(self, files: dict[int, Path], size: tuple[int, int]) -> Iterator[EventStream]:
+        """The events of a file belong between its picture and the next."""
+        interval_us = 1e6 / self.fps
+        for number, path in tqdm(files.items(), desc="events", unit="file", leave=False):
+            recording = open_recording(path, width=size[0], height=size[1])
+            stream = recording.read()
+            if not len(stream):
+                continue
+            span = max(1, int(stream.t[-1] - stream.t[0]))
+            place = (stream.t - stream.t[0]) / span
+            t = np.rint((number + self.event_duty * place) * interval_us).astype(np.int64)
+            x, y = stream.x // self.shrink, stream.y // self.shrink
+            inside = (x < size[0] // self.shrink) & (y < size[1] // self.shrink)
+            yield EventStream(t[inside], x[inside], y[inside], stream.p[inside])
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where an action's parts lie."""
+
+    name: str
+    action: str
+    pictures: Path
+    poses: Path
+    events: Path | None
+
+
+def _find(source: Path, action: str | None) -> _Layout:
+    need(source, "the folder of MMHPSD or of one action")
+    folder = source / action if action and (source / action).is_dir() else source
+    name = action or folder.resolve().name
+    if (folder / "event_camera").is_dir():
+        camera = folder / "event_camera"
+        inside, beside = folder / "pose_events", folder.resolve().parent / "pose_events" / name
+        above = folder.resolve().parents[1] / "pose_events" / name
+        poses = next((path for path in (inside, beside, above) if path.is_dir()), beside)
+        return _Layout("raw", name, camera / "full_pic", poses, camera / "events")
+    if action is None and any((source / f).is_dir() for f in ("events_256", "mmhpsd_events")):
+        raise DataError(f"{source}: holds many actions; choose one with --action.")
+    if (source / "full_pic_256").is_dir() or (source / "events_256").is_dir():
+        return _Layout(
+            "release A", name, source / "full_pic_256" / name, source / "pose_events" / name, None
+        )
+    if (source / "mmhpsd_events").is_dir():
+        own = source / "mmhpsd_events" / name
+        grey = source / "mmhpsd_grayscale_img" / name / "imgs"
+        return _Layout("release B", name, grey, own / "poses", own / "events")
+    raise DataError(
+        f"{source}: holds neither event_camera/ (raw), events_256/ and full_pic_256/ (release A) "
+        f"nor mmhpsd_events/ (release B), expected MMHPSD; {GUIDE}."
+    )
+
+
+def _camera(width: int, height: int) -> SourceCamera:
+    """The camera of a picture that shows the square canvas, or its middle columns."""
+    scale = height / _CANVAS_PX
+    centre = np.array([_CENTRE_PX - (_CANVAS_PX - width / scale) / 2, _CENTRE_PX])
+    K = np.array([[_FOCAL_PX, 0, centre[0]], [0, _FOCAL_PX, centre[1]], [0, 0, 1]])
+    K = opencv_intrinsics(K)
+    K[:2] *= scale
+    return SourceCamera(K, np.eye(4))
+
+
+def _read_npz_poses(paths: list[Path], frames: list[int]) -> PoseSequence:
+    """Poses of release B: one npz per frame."""
+    poses, shifts, shapes = [], [], []
+    for path in paths:
+        arrays, where = read_npz(path, what="pose of MMHPSD"), str(path)
+        poses.append(_joint_rotations(arrays, where))
+        shifts.append(numbers(arrays, "trans", (3,), where, flat=True))
+        shapes.append(numbers(arrays, "beta", (10,), where, flat=True))
+    return make_sequence(
+        model="smpl",
+        frames=frames,
+        poses=np.array(poses),
+        transl=np.array(shifts),
+        betas=np.array(shapes),
+        source=str(paths[0].parent),
+        world="camera",
+    )
+
+
+def _joint_rotations(arrays: dict[str, Any], where: str) -> np.ndarray:
+    """Axis-angle (24, 3), which the file holds so or as matrices."""
+    if np.asarray(arrays.get("body_pose")).size == 24 * 9:
+        matrices = numbers(arrays, "body_pose", (24, 3, 3), where, flat=True)
+        return axis_angles(matrices, f"{where}: body_pose")
+    return numbers(arrays, "body_pose", (24, 3), where, flat=True)
+
+
+def _rest_joints(paths: list[Path]) -> np.ndarray | None:
+    """From the posed joints that both releases keep."""
+    samples = []
+    for path in paths[:: max(1, len(paths) // _JOINT_SAMPLES)]:
+        where = str(path)
+        if path.suffix == ".npz":
+            arrays: dict[str, Any] = read_npz(path, what="pose of MMHPSD")
+            if "joints3d" not in arrays:
+                return None
+            poses = _joint_rotations(arrays, where)
+        else:
+            parts = read_pickle(path, what="pose of MMHPSD")
+            arrays = {"trans": parts[2], "joints3d": parts[3], "theta": parts[1]}
+            poses = numbers(arrays, "theta", (24, 3), where, flat=True)
+        joints = numbers(arrays, "joints3d", (24, 3), where, flat=True)
+        samples.append((poses, joints, numbers(arrays, "trans", (3,), where, flat=True)))
+    return unposed(samples)

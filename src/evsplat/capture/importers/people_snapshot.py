@@ -1,0 +1,187 @@
+"""PeopleSnapshot: one person turning before a fixed camera."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import h5py
+import numpy as np
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from evsplat.body.pose_files import PoseSequence
+from evsplat.body.pose_files.fields import numbers
+from evsplat.body.pose_files.sequence import make_sequence
+from evsplat.capture.importers.base import (
+    GUIDE,
+    SHARP_EXPOSURE_US,
+    Importer,
+    SourceCamera,
+    check_positive,
+    chosen_frames,
+    exposure_around,
+    need,
+    opencv_intrinsics,
+    rigid,
+    shrunk,
+)
+from evsplat.capture.importers.smpl import add_body, chosen_poses
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import DataError
+from evsplat.safe_pickle import read_pickle
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeopleSnapshot(Importer):
+    """PeopleSnapshot, one subject's folder, such as male-3-casual."""
+
+    frames: tuple[int, int] | None = None
+    """First frame and one past the last; by default all."""
+    shrink: int = 2
+    """Pictures are made smaller by this factor (1080 to 540 pixels)."""
+    gender: str | None = None
+    """male or female; by default what the folder's name begins with."""
+
+    def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
+        """Read one subject; see `Importer.write`."""
+        check_positive(shrink=self.shrink)
+        need(source, "one subject of PeopleSnapshot")
+        name = source.resolve().name
+        gender = self.gender or name.split("-")[0]
+        if gender not in ("male", "female", "neutral"):
+            raise DataError(
+                f"{source}: its name does not begin with male or female; give --gender."
+            )
+        video = _video(source, name)
+        sequence = _read_poses(
+            source / "reconstructed_poses.hdf5", source / "consensus.pkl", gender
+        )
+        count = len(sequence.frames)
+        kept = chosen_frames(self.frames, list(range(count)), source)
+        camera, width, height = _read_camera(source / "camera.pkl")
+        K = camera.K.copy()
+        K[:2] /= self.shrink
+        writer.add_camera(
+            "main",
+            width // self.shrink,
+            height // self.shrink,
+            K,
+            camera.world_to_camera,
+            distortion=camera.distortion,
+        )
+        times = []
+        with _Masks(source / "masks.hdf5", count) as masks:
+            for index, time_us, pixels in _decode(video, kept, count):
+                if pixels.shape[:2] != (height, width):
+                    raise DataError(
+                        f"{video}: has {pixels.shape[1]}x{pixels.shape[0]} pixels, expected "
+                        f"{width}x{height} of camera.pkl."
+                    )
+                writer.add_frame(
+                    f"{index:04d}",
+                    "main",
+                    shrunk(pixels, self.shrink),
+                    exposure_around(time_us, SHARP_EXPOSURE_US),
+                    mask=masks.at(index, self.shrink),
+                )
+                times.append(time_us)
+        writer.provenance |= {
+            "source": "PeopleSnapshot",
+            "sequence": name,
+            "frames": [kept[0], kept[-1] + 1],
+            "shrink": self.shrink,
+        }
+        return add_body(writer, times, chosen_poses(sequence, kept), smpl)
+
+
+def _video(source: Path, name: str) -> Path:
+    named = source / f"{name}.mp4"
+    found = [named] if named.exists() else sorted(source.glob("*.mp4"))
+    if len(found) != 1:
+        raise DataError(f"{source}: holds {len(found)} .mp4 files, expected {named.name}; {GUIDE}.")
+    return found[0]
+
+
+def _read_camera(path: Path) -> tuple[SourceCamera, int, int]:
+    data, where = read_pickle(need(path, "the camera"), what="camera"), str(path)
+
+    def get(key: str, count: int) -> np.ndarray:
+        return numbers(data, key, (count,), where, flat=True)
+
+    (fx, fy), (cx, cy) = get("camera_f", 2), get("camera_c", 2)
+    turn = Rotation.from_rotvec(get("camera_rt", 3)).as_matrix()
+    pose = rigid(turn, get("camera_t", 3), where)
+    K = opencv_intrinsics(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    camera = SourceCamera(K, pose, tuple(get("camera_k", 5).tolist()))
+    return camera, int(get("width", 1)[0]), int(get("height", 1)[0])
+
+
+def _read_poses(path: Path, consensus: Path, gender: str) -> PoseSequence:
+    need(path, "the poses")
+    try:
+        with h5py.File(path, "r") as file:
+            arrays = {
+                key: np.asarray(file[key]) for key in ("pose", "trans", "betas") if key in file
+            }
+    except OSError as error:
+        raise DataError(f"{path}: not a readable HDF5 file ({error}); copy it again.") from error
+    if "betas" not in arrays and consensus.exists():
+        shape = read_pickle(consensus, what="consensus shape")
+        arrays["betas"] = numbers(shape, "betas", (10,), str(consensus), flat=True)
+    shifts = numbers(arrays, "trans", (None, 3), str(path))
+    return make_sequence(
+        model="smpl",
+        frames=np.arange(len(shifts)),
+        poses=numbers(arrays, "pose", (len(shifts), 24, 3), str(path), flat=True),
+        transl=shifts,
+        betas=numbers(arrays, "betas", (10,), str(path), flat=True),
+        gender=gender,
+        source=str(path),
+        world="calibration",
+    )
+
+
+class _Masks:
+    """Rows of masks.hdf5; none where the file is missing."""
+
+    def __init__(self, path: Path, count: int) -> None:
+        self._file = h5py.File(path, "r") if path.exists() else None
+        if self._file is not None and (
+            "masks" not in self._file or len(self._file["masks"]) != count
+        ):
+            raise DataError(f"{path}: masks: expected {count} masks as there are poses.")
+
+    def __enter__(self) -> "_Masks":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def at(self, index: int, shrink: int) -> np.ndarray | None:
+        """(H, W) share of the person."""
+        if self._file is None:
+            return None
+        return shrunk((np.asarray(self._file["masks"][index]) != 0).astype(np.float32), shrink)
+
+
+def _decode(video: Path, kept: list[int], count: int) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Index, time and RGB pixels of the wanted frames, in order."""
+    wanted = set(kept)
+    try:
+        with av.open(str(video)) as container:
+            stream = container.streams.video[0]
+            rate = float(stream.average_rate or 30)
+            frames = tqdm(container.decode(stream), "pictures", count, unit="frame", leave=False)
+            for index, frame in enumerate(frames):
+                if index in wanted:
+                    yield index, round(index * 1e6 / rate), frame.to_ndarray(format="rgb24")
+                    wanted.discard(index)
+                if not wanted:
+                    return
+    except av.error.FFmpegError as error:
+        raise DataError(f"{video}: cannot be decoded ({error}); copy it again.") from error
+    raise DataError(
+        f"{video}: ends before frame {min(wanted)}, expected {count} frames as there are poses."
+    )

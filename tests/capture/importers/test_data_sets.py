@@ -1,0 +1,264 @@
+"""Every importer on a small tree of its layout: the body falls on the person in the picture."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import binary_dilation
+
+from evsplat.body import BodyTrack, load_body_track, silhouette
+from evsplat.body.smpl import ENVIRONMENT
+from evsplat.capture import Capture, load_capture, validate_capture
+from evsplat.capture.images import read_image
+from evsplat.capture.importers import import_capture
+from evsplat.capture.importers.base import shrunk
+
+from . import trees
+from .person import Person, View, write_smpl
+
+
+@pytest.fixture
+def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with SMPL of every gender; the environment leads nowhere."""
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    for gender in ("neutral", "male", "female"):
+        write_smpl(tmp_path / gender, gender)
+        target = tmp_path / "models" / "smpl"
+        target.mkdir(parents=True, exist_ok=True)
+        file = f"SMPL_{gender.upper()}.npz"
+        (tmp_path / gender / "smpl" / file).rename(target / file)
+    return tmp_path / "models"
+
+
+def run(kind: str, source: Path, out: Path, **options) -> Capture:
+    """Import, and find nothing wrong with the capture (that it has no events is no fault)."""
+    import_capture(kind, source, out, **options)
+    findings = [f for f in validate_capture(out) if f.field != "events"]
+    assert [f for f in findings if f.severity == "error"] == []
+    return load_capture(out)
+
+
+def track_of(capture: Capture, models: Path | None) -> BodyTrack:
+    """The body's motion, with the user's models where there are any."""
+    with pytest.MonkeyPatch.context() as patch:
+        if models is not None:
+            patch.setenv(ENVIRONMENT, str(models))
+        return load_body_track(capture)
+
+
+def misses(
+    capture: Capture, person: Person, views: list[View], rows: list[int], models: Path, shrink: int
+) -> np.ndarray:
+    """Pixels between each vertex of the capture's body and of the person, (frames, V)."""
+    track = track_of(capture, models)
+    found = []
+    for frame, row in zip(capture.frames, rows, strict=True):
+        vertices = track.vertices(frame.mid_us)
+        pixels, depth = capture.camera(frame).project(vertices)
+        assert (depth > 0).all()
+        expected = views[row].pixels(person.vertices(row), distorted=False)
+        expected = (expected + 0.5) / shrink
+        found.append(np.linalg.norm(pixels.numpy() - expected, axis=1))
+    return np.array(found)
+
+
+def beyond_a_pixel(capture: Capture, models: Path | None) -> float:
+    """Share of the person's pixels that lie more than one from the body, or the other way round."""
+    track = track_of(capture, models)
+    worst = 0.0
+    for frame in capture.frames:
+        stored = capture.mask(frame)
+        assert stored is not None
+        person = stored.numpy() > 0.5
+        camera = capture.camera(frame)
+        body = silhouette(track.vertices(frame.mid_us), track.body.faces, camera).numpy()
+        for one, other in ((person, body), (body, person)):
+            alone = one & ~binary_dilation(other, np.ones((3, 3)))
+            worst = max(worst, alone.sum() / person.sum())
+    return worst
+
+
+ROWS = list(range(trees.FRAMES))
+
+
+@pytest.mark.parametrize("layout", ["raw", "arah"])
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_zju_mocap(tmp_path: Path, models: Path, layout: str, shrink: int) -> None:
+    write = trees.write_zju_raw if layout == "raw" else trees.write_zju_arah
+    source = write(tmp_path / "CoreView_377")
+    capture = run(
+        "zju-mocap", source, tmp_path / "out", smpl=models, shrink=shrink, novel_cameras=("2", "7")
+    )
+    person, views = trees.zju_person(), trees.zju_views()
+    assert [frame.name for frame in capture.frames] == [f"{i:06d}" for i in ROWS]
+    assert [frame.mid_us for frame in capture.frames] == [20_000 * i for i in ROWS]
+    assert misses(capture, person, [views["1"]] * 6, ROWS, models, shrink).max() < 0.01
+    # the pictures, undistorted by the capture, and the body agree all along the outline
+    assert beyond_a_pixel(capture, models) < 0.005
+    assert {(v.camera, v.frame) for v in capture.novel_views} == {
+        (camera, frame.name) for camera in "27" for frame in capture.frames
+    }
+    track = track_of(capture, models)
+    for view in capture.novel_views[::5]:
+        pixels, _ = capture.cameras[view.camera].project(track.vertices(view.time_us))
+        row = int(view.frame)
+        expected = views[view.camera].pixels(person.vertices(row), distorted=False)
+        assert np.abs(pixels.numpy() - (expected + 0.5) / shrink).max() < 0.01
+    assert np.allclose(capture.body_file.betas, person.betas)
+    stored = read_image(source / ("Camera_B1" if layout == "raw" else "1") / "000002.jpg")
+    assert np.array_equal(read_image(capture.frames[2].image), shrunk(stored, shrink))
+
+
+@pytest.mark.parametrize("posed_with_shift", [True, False])
+def test_zju_mocap_without_a_body_model(
+    tmp_path: Path, models: Path, posed_with_shift: bool
+) -> None:
+    """The free body at the subject's own size, from ARAH's posed joints in either reading."""
+    source = trees.write_zju_arah(tmp_path / "377", posed_with_shift=posed_with_shift)
+    capture = run("zju-mocap", source, tmp_path / "out", shrink=1)
+    assert capture.body_file.model == "default"
+    person, view = trees.zju_person(), trees.zju_views()["1"]
+    track = load_body_track(capture)
+    names = {"left_knee": 4, "right_ankle": 8, "left_elbow": 18, "right_wrist": 21, "neck": 12}
+    ours = ("LeftLeg", "RightFoot", "LeftForeArm", "RightHand", "Neck")
+    errors = []
+    for row, frame in enumerate(capture.frames):
+        rotations, transl = track.at([frame.mid_us])
+        joints = track.body.joint_transforms(rotations, transl)[0, :, :3, 3]
+        chosen = joints[[track.body.joint_names.index(name) for name in ours]]
+        pixels, _ = capture.camera(frame).project(chosen)
+        expected = view.pixels(person.joints(row)[list(names.values())], distorted=False) + 0.5
+        errors.append(np.linalg.norm(pixels.numpy() - expected, axis=1))
+    # a pixel is 2.2 cm at the person
+    assert np.mean(errors) < 2.6 and np.max(errors) < 5.5
+
+
+def test_frames_are_chosen_by_number_and_by_subject(tmp_path: Path, models: Path) -> None:
+    source = trees.write_zju_arah(tmp_path / "CoreView_392")
+    capture = run("zju-mocap", source, tmp_path / "out", smpl=models, frames=(2, 5))
+    assert [frame.name for frame in capture.frames] == ["000002", "000003", "000004"]
+    views = [trees.zju_views()["1"]] * 6
+    assert misses(capture, trees.zju_person(), views, [2, 3, 4], models, 2).max() < 0.01
+    assert capture.provenance["frames"] == [2, 5]
+
+
+@pytest.mark.parametrize("shrink", [1, 4])
+def test_mmhpsd_raw_with_signed_events(tmp_path: Path, models: Path, shrink: int) -> None:
+    files = trees.write_mmhpsd_raw(tmp_path / "data", signed=True)
+    source = tmp_path / "data" / trees.ACTION
+    capture = run("mmhpsd", source, tmp_path / "out", smpl=models, shrink=shrink)
+    rows = list(range(1, trees.FRAMES))  # the first picture has no pose
+    assert [frame.name for frame in capture.frames] == [f"{i:04d}" for i in rows]
+    view = trees.mmhpsd_view(800, 1280)
+    assert misses(capture, trees.mmhpsd_person(), [view] * 6, rows, models, shrink).max() < 0.02
+    assert capture.body_file.gender == "male"
+    assert capture.events is not None and not capture.events_simulated
+    assert capture.contrast_threshold is None
+    first, period = capture.frames[0].mid_us, 1e6 / 15
+    assert abs(first - period) < 1
+    for number in rows[:-1]:
+        events = capture.events.between(round(number * period), round((number + 1) * period))
+        given = files[number]
+        # turned by half a turn, as the pictures are
+        x, y = (799 - given[:, 1]) // shrink, (1279 - given[:, 0]) // shrink
+        assert len(events) == len(given)
+        assert sorted(zip(events.x, events.y, events.p, strict=True)) == sorted(
+            zip(x, y, 2 * given[:, 4] - 1, strict=True)
+        )
+        share = (events.t - number * period) / period
+        inside = (given[:, 2] - given[0, 2]) / (given[-1, 2] - given[0, 2])
+        assert np.abs(share - 0.8 * inside).max() < 1e-4
+
+
+def test_mmhpsd_events_without_polarity_are_left_out(
+    tmp_path: Path, models: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    trees.write_mmhpsd_raw(tmp_path / "data", signed=False)
+    with caplog.at_level("INFO", "evsplat"):
+        capture = run("mmhpsd", tmp_path / "data" / trees.ACTION, tmp_path / "out", smpl=models)
+    assert capture.events is None
+    assert "without polarity" in capture.provenance["events"]
+    assert "without polarity" in caplog.text and "1 pictures have no pose" in caplog.text
+
+
+def test_mmhpsd_release_a(tmp_path: Path, models: Path) -> None:
+    trees.write_mmhpsd_a(tmp_path / "data")
+    capture = run("mmhpsd", tmp_path / "data", tmp_path / "out", smpl=models, action=trees.ACTION)
+    rows = list(range(1, trees.FRAMES))
+    view = trees.mmhpsd_view(256, 256)
+    assert misses(capture, trees.mmhpsd_person(), [view] * 6, rows, models, 1).max() < 0.01
+    assert capture.events is None and "without polarity" in capture.provenance["events"]
+    image = capture.image("0003")
+    assert torch.equal(image[..., 0], image[..., 1])
+
+
+@pytest.mark.parametrize("matrices", [True, False])
+def test_mmhpsd_release_b(tmp_path: Path, models: Path, matrices: bool) -> None:
+    files = trees.write_mmhpsd_b(tmp_path / "data", matrices=matrices)
+    capture = run("mmhpsd", tmp_path / "data", tmp_path / "out", smpl=models, action=trees.ACTION)
+    view = trees.mmhpsd_view(256, 256)
+    assert misses(capture, trees.mmhpsd_person(), [view] * 6, ROWS, models, 1).max() < 0.01
+    assert capture.events is not None and len(capture.events) == 200 * trees.FRAMES
+    events = capture.events.between(200_000, 266_000)
+    assert np.array_equal(np.stack([events.x, events.y], 1), files[3]["xy"])
+    assert np.array_equal(events.p, 2 * files[3]["p"] - 1)
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_neuman(tmp_path: Path, models: Path, uneven: bool) -> None:
+    """Also where the alignment scales the person differently in every frame."""
+    scales = trees.NEUMAN_SCALE * np.linspace(0.9, 1.1, trees.FRAMES) if uneven else None
+    source = trees.write_neuman(tmp_path / "lab", scales=scales)
+    capture = run("neuman", source, tmp_path / "out", smpl=models)
+    assert not capture.is_static_camera
+    views = [View(v.size, v.K, v.world_to_camera) for v in trees.neuman_views()]
+    assert misses(capture, trees.neuman_person(), views, ROWS, models, 1).max() < 0.02
+    assert beyond_a_pixel(capture, models) < 0.005
+    points = capture.initial_points()
+    assert points is not None
+    assert np.allclose(points[0], [[1, 0, -2], [0, 1 / 0.37, 2 / 0.37]], atol=1e-5)
+    assert np.allclose(points[1][0], [1, 0, 0.2], atol=0.01)
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_people_snapshot(tmp_path: Path, models: Path, shrink: int) -> None:
+    source = trees.write_people_snapshot(tmp_path / "female-1-casual")
+    capture = run("people-snapshot", source, tmp_path / "out", smpl=models, shrink=shrink)
+    rows = list(range(trees.SNAPSHOT_FRAMES))
+    person, view = trees.snapshot_person(), trees.snapshot_view()
+    assert misses(capture, person, [view] * 4, rows, models, shrink).max() < 0.01
+    assert capture.body_file.gender == "female"
+    assert [frame.mid_us for frame in capture.frames] == [0, 40_000, 80_000, 120_000]
+    assert beyond_a_pixel(capture, models) < 0.005
+    drawn = view.draw(person, 2)[0]
+    assert np.array_equal(read_image(capture.frames[2].image), shrunk(drawn, shrink))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6])
+def test_zju_mocap_blur_of_exfman(tmp_path: Path, models: Path, unit: float) -> None:
+    given = trees.write_zju_blur(tmp_path / "377", unit=unit)
+    capture = run("zju-mocap-blur", tmp_path / "377", tmp_path / "out", smpl=models)
+    views = [trees.blur_view()] * 6
+    # the data set has no betas: they are found again from the joints at rest
+    assert misses(capture, trees.zju_person(), views, ROWS, models, 1).max() < 0.3
+    assert capture.is_static_camera and capture.events_simulated
+    assert beyond_a_pixel(capture, models) < 0.005
+    for row, frame in enumerate(capture.frames):
+        assert frame.mid_us == 10_000 + 20_000 * row
+        start, end = frame.exposure_us
+        assert abs(end - start - 20_000 * (trees.BLUR_STEP - 1) / trees.BLUR_STEP) <= 1
+    assert capture.events is not None
+    events = capture.events._open()
+    order = np.argsort(given["tE"], kind="stable")
+    for column, key in (("x", "xE"), ("y", "yE")):
+        assert np.array_equal(events[f"events/{column}"][:], given[key][order])
+    assert np.array_equal(events["events/p"][:], given["pE"][order] > 0)
+    assert np.abs(events["events/t"][:] - given["tE"][order] / unit * 1e6).max() <= 0.5
+
+
+def test_zju_mocap_blur_without_a_body_model(tmp_path: Path, models: Path) -> None:
+    trees.write_zju_blur(tmp_path / "377", unit=1.0)
+    capture = run("zju-mocap-blur", tmp_path / "377", tmp_path / "out")
+    assert capture.body_file.model == "default"
+    assert beyond_a_pixel(capture, None) < 0.5
