@@ -12,6 +12,7 @@
 #include <optional>
 #include <stdexcept>
 
+#include "event_module.h"
 #include "hash_grid.h"
 #include "isometry.h"
 #include "levels.h"
@@ -443,6 +444,7 @@ NB_MODULE(_native, m) {
           nb::arg("position_grad").none(), nb::arg("threads"),
           "Adds to the table's gradient and writes that of the positions.");
     bind_sensor(m);
+    bind_events(m);
     m.def("nearest", &nearest, nb::arg("points"), nb::arg("queries").none(), nb::arg("index"), nb::arg("square"),
           nb::arg("threads"), "Nearest points of queries, or of the points themselves; squared distances.");
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");

@@ -81,13 +81,16 @@ def test_named_columns_and_units(tmp_path: Path) -> None:
     [
         ("", "empty|not a recording|holds no events"),
         ("hello world\n", "holds no events"),
-        ("t,x,y,on\n1,2,3,1\n2,3,4\n", "event"),
-        ("1 2 3 1\n2 3 4 x\n", "event"),
+        ("t,x,y,on\n1,2,3,1\n2,3,4\n3,4,5,1\n", "event 1 at byte 17 has another number"),
+        ("t x y p\n1 2 3 1\n2 3 4 x\n", "event 1 at byte 16 is not made of numbers"),
         ("5 9 8 1\n4 8 7 1\n", "4 columns are of no known order"),
         ("t x y p\n5 2 3 1\n4 2 3 1\n", "event 1 is at 4 us, after one at 5 us"),
-        ("t x y p\n5 2.5 3 1\n", "expected a whole number"),
+        (
+            "t x y p\n5 2.5 3 1\n",
+            "event 0 at byte 8 has a fraction where a whole number is expected",
+        ),
         ("t x y p\n5 2 3 7\n", "polarity of event 0 is 7"),
-        ("t x y p\n1 2 3 1\nnan 2 3 1\n", "time of event 1 is nan, expected a number"),
+        ("t x y p\n1 2 3 1\nnan 2 3 1\n", "event 1 at byte 16 is not made of numbers"),
     ],
 )
 def test_bad_text_is_a_data_error(tmp_path: Path, text: str, message: str) -> None:

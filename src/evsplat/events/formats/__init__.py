@@ -1,5 +1,6 @@
 """Formats of event recordings, one module each, chosen by the first bytes of a file."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -32,6 +33,23 @@ def _starts(*magics: bytes) -> Callable[[bytes], bool]:
     return lambda head: head.startswith(magics)
 
 
+_is_bag = _starts(b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\0")
+
+
+def _is_dat(head: bytes) -> bool:
+    return head.startswith(b"% Data file containing") or _is_header(head, rb"^% Version ")
+
+
+def _is_raw(head: bytes) -> bool:
+    return _is_header(head, rb"^% (evt |format EVT)")
+
+
+def _is_header(head: bytes, line: bytes) -> bool:
+    """Prophesee's "% key value" lines, this one among them."""
+    lines = re.match(rb"(% [^\n]*\n)*", head)
+    return lines is not None and re.search(line, lines[0], re.MULTILINE) is not None
+
+
 def _is_text(head: bytes) -> bool:
     return bool(head) and not set(head) - set(range(32, 127)) - set(b"\t\r\n\xef\xbb\xbf")
 
@@ -41,6 +59,12 @@ FORMATS = {
     entry.name: entry
     for entry in (
         Format("aedat4", _starts(b"#!AER-DAT4.0"), "aedat4:Aedat4"),
+        Format("aedat2", _starts(b"#!AER-DAT2.0"), "aedat2:Aedat2"),
+        Format("dat", _is_dat, "prophesee:Dat"),
+        Format("raw", _is_raw, "prophesee:Raw"),
+        Format("es", _starts(b"Event Stream"), "event_stream:EventStreamFile"),
+        Format("hdf5", _starts(b"\x89HDF\r\n\x1a\n"), "hdf5:Hdf5"),
+        Format("rosbag", _is_bag, "ros:RosBag"),
         Format("npz", _starts(b"PK\x03\x04", b"\x93NUMPY"), "npz:Npz"),
         Format("csv", _is_text, "text:Text"),
     )
@@ -51,7 +75,13 @@ def find_format(path: Path, name: str | None = None) -> Format:
     """The format of a file by its content; ``name`` must agree where it is given."""
     if name is not None and name not in FORMATS:
         raise ConfigError(f"format is {name!r}, expected one of {', '.join(FORMATS)}.")
-    head = peek(path, _HEAD_BYTES)
+    if path.is_dir():
+        # a ROS 2 bag is a folder
+        if not (path / "metadata.yaml").is_file():
+            raise DataError(f"{path}: a folder without metadata.yaml is no recording.")
+        head = b"SQLite format 3\0"
+    else:
+        head = peek(path, _HEAD_BYTES)
     found = next((entry for entry in FORMATS.values() if entry.matches(head)), None)
     if found is None:
         raise DataError(

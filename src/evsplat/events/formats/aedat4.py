@@ -28,6 +28,7 @@ MAGIC = b"#!AER-DAT4.0\r\n"
 _MAX_HEADER_BYTES = 16 << 20
 # DV writes packets of a few hundred kilobytes; a picture of 20 megapixels in colour has 60 MB.
 _MAX_PACKET_BYTES = 256 << 20
+_LZ4_MAX_RATIO = 256
 _EVENT = np.dtype(
     {
         "names": ["t", "x", "y", "p"],
@@ -133,14 +134,18 @@ class Aedat4(Source):
                 if not head and self._end is None:
                     return
                 number, size = struct.unpack("<ii", head) if len(head) == 8 else (-1, 0)
-                payload = reader.read(min(max(size, 0), _MAX_PACKET_BYTES))
-                if len(head) < 8 or size < 0 or len(payload) < size:
+                wanted = number == stream and size <= _MAX_PACKET_BYTES
+                if wanted:
+                    payload = reader.read(max(size, 0))
+                else:
+                    reader.skip_to(offset + 8 + max(size, 0))
+                if len(head) < 8 or size < 0 or reader.offset < offset + 8 + size:
                     self._damage.found(
                         f"ends in the middle of a packet, or is damaged, at byte {offset}",
                         repaired_by="keeps the packets before the cut",
                     )
                     return
-                if number != stream:
+                if not wanted:
                     continue
                 try:
                     data = self._decompress(payload)
@@ -213,7 +218,10 @@ def _decompressor(path: Path, compression: int) -> Callable[[bytes], bytes]:
 
 def _lz4(payload: bytes) -> bytes:
     unpacker = lz4.frame.LZ4FrameDecompressor()
-    data = unpacker.decompress(payload, max_length=_MAX_PACKET_BYTES)
+    # the buffer is made as large as this at once
+    announced = lz4.frame.get_frame_info(payload)["content_size"]
+    limit = min(announced or _LZ4_MAX_RATIO * len(payload), _MAX_PACKET_BYTES)
+    data = unpacker.decompress(payload, max_length=limit)
     if not unpacker.eof:
         raise ValueError("it ends early or unpacks to more than a packet can hold")
     return data

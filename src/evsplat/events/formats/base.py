@@ -132,7 +132,9 @@ class ByteReader:
         return data
 
     def skip_to(self, offset: int) -> None:
-        """Read on until ``offset`` or the end of the file."""
+        """Go on to ``offset`` or the end of the file."""
+        if not self.zipped:
+            self.offset = self._file.seek(min(offset, os.fstat(self._file.fileno()).st_size))
         while self.offset < offset and self.read(min(offset - self.offset, 1 << 20)):
             pass
 

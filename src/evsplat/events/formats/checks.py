@@ -1,6 +1,7 @@
 """Raw blocks become event streams: sorted, on the sensor, of known polarity, or a clear error."""
 
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,9 +10,19 @@ from evsplat.events.formats.base import BLOCK_EVENTS, Damage, RawEvents
 from evsplat.events.stream import EventStream
 
 _MAX_GAP_AT_WRAP_US = 60_000_000
-_WRAP_PERIODS_US = (1 << 31, 1 << 32)
+# Where a counter ends and where it begins again: unsigned and signed 32 bits, 31 bits
+_COUNTER_RANGES_US = ((1 << 32, 0), (1 << 31, -(1 << 31)), (1 << 31, 0))
+_MIN_BLOCK_EVENTS = 1 << 16
 _MAX_TIME_US = 1 << 60
 _SORTS = "sorts events that are out of order"
+
+
+class _Block(NamedTuple):
+    first: int
+    """Index of its first event in the file."""
+    stream: EventStream
+    rising: bool
+    """Whether its times are known to be in order, from the event before it on."""
 
 
 def checked(
@@ -51,50 +62,47 @@ class _Settled:
         self._shift_us = 0
         self._last_raw_us: int | None = None
 
-    def __iter__(self) -> Iterator[tuple[int, EventStream]]:
-        """Index of the first event in the file, and events whose order is as in the file."""
+    def __iter__(self) -> Iterator[_Block]:
         index = 0
-        for block in self._blocks:
-            if not len(block.t):
-                continue
-            t = self._unwrapped(block.t.astype(np.int64, copy=False), index)
+        for block in _gathered(self._blocks):
+            t, rising = self._unwrapped(block.t.astype(np.int64, copy=False), index)
             p, keep = self._polarity(block.p, index)
             keep = self._on_sensor(block.x, block.y, keep, index)
             x, y = block.x, block.y
             if keep is not None:
                 t, x, y, p = t[keep], x[keep], y[keep], p[keep]
-            yield (
-                index,
-                EventStream(t, x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False), p),
-            )
+            x, y = x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False)
+            yield _Block(index, EventStream(t, x, y, p), rising)
             index += len(block.t)
 
-    def _unwrapped(self, t: np.ndarray, index: int) -> np.ndarray:
-        """Times that go on where a 31- or 32-bit counter began again (repair), or an error."""
-        low, high = int(t.min()), int(t.max())
+    def _unwrapped(self, t: np.ndarray, index: int) -> tuple[np.ndarray, bool]:
+        """Times that go on where a counter began again (repair), and whether they are in order."""
+        before = int(t[0]) if self._last_raw_us is None else self._last_raw_us
+        self._last_raw_us = int(t[-1])
+        rising = t[0] >= before and not (t[1:] < t[:-1]).any()
+        low, high = (int(t[0]), int(t[-1])) if rising else (int(t.min()), int(t.max()))
         if low < -_MAX_TIME_US or high > _MAX_TIME_US:
             raise DataError(
                 f"{self._damage.path}: events {index} to {index + len(t) - 1} have times from "
                 f"{low} to {high} us; no recording is that long, check the file or time_unit."
             )
-        before = t[0] if self._last_raw_us is None else self._last_raw_us
-        self._last_raw_us = int(t[-1])
-        falls = np.diff(t, prepend=before)
-        if falls.min() > -(_WRAP_PERIODS_US[0] - _MAX_GAP_AT_WRAP_US):
-            return t + self._shift_us if self._shift_us else t
+        if rising:
+            return (t + self._shift_us if self._shift_us else t), True
         shifts = np.zeros(len(t), dtype=np.int64)
-        for period in _WRAP_PERIODS_US:
-            wrapped = (falls <= 0) & (falls >= -period) & (falls < _MAX_GAP_AT_WRAP_US - period)
-            shifts[wrapped] = period
+        previous = np.concatenate([[before], t[:-1]])
+        for top, bottom in _COUNTER_RANGES_US:
+            ends = (previous < top) & (previous >= top - _MAX_GAP_AT_WRAP_US)
+            begins = (t >= bottom) & (t < bottom + _MAX_GAP_AT_WRAP_US)
+            shifts[ends & begins] = top - bottom
         for at in np.flatnonzero(shifts):
             self._damage.found(
-                f"the time falls from {t[at] - falls[at]} to {t[at]} us at event {index + at}: its "
+                f"the time falls from {previous[at]} to {t[at]} us at event {index + at}: its "
                 f"{int(shifts[at]).bit_length() - 1}-bit counter began again",
                 repaired_by="adds up the periods of a counter that began again",
             )
         shifts = np.cumsum(shifts) + self._shift_us
         self._shift_us = int(shifts[-1])
-        return t + shifts
+        return t + shifts, False
 
     def _polarity(self, p: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Polarity +1/-1 (all 0 where there is none), and which events to keep (None: all)."""
@@ -144,28 +152,49 @@ def _signs(positive: np.ndarray) -> np.ndarray:
     return positive.view(np.int8) * np.int8(2) - np.int8(1)
 
 
-def _ascending(blocks: Iterable[tuple[int, EventStream]], damage: Damage) -> Iterator[EventStream]:
+def _gathered(blocks: Iterable[RawEvents]) -> Iterator[RawEvents]:
+    """Small blocks put together: what follows costs as much for ten events as for thousands."""
+    waiting: list[RawEvents] = []
+    count = 0
+    for block in blocks:
+        if len(block.t):
+            waiting.append(block)
+            count += len(block.t)
+        if count >= _MIN_BLOCK_EVENTS:
+            yield _joined(waiting)
+            waiting, count = [], 0
+    if waiting:
+        yield _joined(waiting)
+
+
+def _joined(blocks: list[RawEvents]) -> RawEvents:
+    if len(blocks) == 1:
+        return blocks[0]
+    return RawEvents(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
+
+
+def _ascending(blocks: Iterable[_Block], damage: Damage) -> Iterator[EventStream]:
     """The blocks as they are; an error where time goes back."""
     last_us: int | None = None
-    for index, block in blocks:
-        falls = np.diff(block.t, prepend=block.t[0] if last_us is None else last_us) < 0
-        if falls.any():
+    for first, block, rising in blocks:
+        if not rising:
+            previous = np.concatenate([[block.t[0] if last_us is None else last_us], block.t[:-1]])
+            falls = block.t < previous
             at = int(np.argmax(falls))
             damage.found(
-                f"event {index + at} is at {block.t[at]} us, after one at "
-                f"{block.t[at - 1] if at else last_us} us "
-                f"({int(falls.sum())} steps back among events {index} to {index + len(falls) - 1})",
+                f"event {first + at} is at {block.t[at]} us, after one at {previous[at]} us "
+                f"({int(falls.sum())} steps back among events {first} to {first + len(falls) - 1})",
                 repaired_by=_SORTS,
             )
         last_us = int(block.t[-1])
         yield block
 
 
-def _sorted(blocks: Iterable[tuple[int, EventStream]], damage: Damage) -> Iterator[EventStream]:
+def _sorted(blocks: Iterable[_Block], damage: Damage) -> Iterator[EventStream]:
     """All but the latest `BLOCK_EVENTS` of what was read so far, sorted; then the rest."""
     held: EventStream | None = None
     last_us: int | None = None
-    for _, block in blocks:
+    for _, block, _ in blocks:
         if last_us is not None and len(block) and int(block.t.min()) < last_us:
             on_time = block.t >= last_us
             damage.found(

@@ -1,14 +1,12 @@
 """Text tables (.txt, .csv, gzipped too) with named, positional or recognisable columns."""
 
-import io
-import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from evsplat.errors import DataError
+from evsplat import compiled
+from evsplat.errors import BackendError, DataError
 from evsplat.events.formats.base import (
     ByteReader,
     Damage,
@@ -16,193 +14,155 @@ from evsplat.events.formats.base import (
     ReadOptions,
     Source,
 )
-from evsplat.events.formats.columns import match_names
-from evsplat.events.formats.table import NO_POLARITY, Table, table_order
+from evsplat.events.formats.columns import guess_time_unit, match_names
+from evsplat.events.formats.table import NO_POLARITY, table_order, to_polarity
+from evsplat.events.formats.text_layout import MAX_LINE_BYTES, inspect_text
 
-_READ_BYTES = 4 << 20
-_MAX_LINE_BYTES = 4096
-_MAX_HEADER_LINES = 100
-_SAMPLE_LINES = 2000
+_READ_BYTES = 1 << 22
+_MIN_LINE_BYTES = 6
+_COMPONENTS = "txyp"
+_TIME_EXPONENTS = {"s": 6, "ms": 3, "us": 0, "ns": -3}
 # CeleX-V of the MMHPSD data set: 800 x 1280 pixels, counted from the opposite corner
 _MMHPSD_COLUMNS = ("y", "x", "t", "-", "p")
 _MMHPSD_SIZE = (800, 1280)
-_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 _PASSED_OVER = "-"
-
-
-@dataclass
-class _Layout:
-    delimiter: str | None
-    """None: any white space."""
-    count: int
-    """Fields per line."""
-    first_byte: int
-    """Where the events begin."""
-    names: list[str]
-    """Of the columns, where the file has them."""
-    width: int | None = None
-    height: int | None = None
+# TextError in native/event_text.h
+_ERRORS = (
+    "",
+    "has another number of fields",
+    "is not made of numbers",
+    "has a fraction where a whole number is expected",
+    "has a number that does not fit in 64 bits",
+)
 
 
 class Text(Source):
     """A text file with one event per line."""
 
     def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
+        if compiled.native is None:
+            raise BackendError(
+                f"{path}: reading text needs evsplat's compiled module, which cannot be loaded "
+                f"({compiled.import_error}); install evsplat again."
+            )
         self._path = path
         self._damage = damage
-        self.notes: list[str] = []
-        self._layout = _read_layout(path)
-        self.width, self.height = self._layout.width, self._layout.height
-        sample = self._sample()
+        self.notes = []
+        self._file = file = inspect_text(path)
+        self.width, self.height = file.width, file.height
         self._mmhpsd = options.columns == ("mmhpsd",)
-        self._columns = self._find_columns(sample, options)
+        columns = self._find_columns(options)
         if self._mmhpsd:
             self.width, self.height = _MMHPSD_SIZE
-        head = Table(path, self._named(sample), options.time_unit)
-        self._unit = head.unit
-        self.notes += head.notes
-        self.has_polarity = head.has_polarity or self._any_polarity()
-        if self.has_polarity and NO_POLARITY in self.notes:
-            self.notes.remove(NO_POLARITY)
+        self._roles = [_COMPONENTS.find(name) if name else -1 for name in columns]
+        self._unit = options.time_unit or self._find_unit(columns.index("t"))
+        self.has_polarity = "p" in columns and self._any_polarity()
+        if not self.has_polarity and len(file.sample):
+            self.notes.append(NO_POLARITY)
 
     def blocks(self) -> Iterator[RawEvents]:
         """A few megabytes of text at a time."""
         first = 0
-        for rows in self._tables():
-            events = Table(self._path, self._named(rows), self._unit).events(slice(None), first)
-            yield self._turned(events) if self._mmhpsd else events
-            first += len(rows)
+        for t, x, y, p in self._parsed():
+            p = to_polarity(p, str(self._path), first)
+            if self._mmhpsd:
+                x, y = _MMHPSD_SIZE[0] - 1 - x, _MMHPSD_SIZE[1] - 1 - y
+            yield RawEvents(t, x, y, p)
+            first += len(t)
 
-    def _find_columns(self, sample: np.ndarray, options: ReadOptions) -> dict[str, int]:
-        """Component -> index of its column."""
-        count = self._layout.count
-        given = options.columns
-        if given is None and self._layout.names:
-            named = match_names(self._layout.names)
+    def _find_columns(self, options: ReadOptions) -> list[str]:
+        """Component of each column, or "" to pass over it."""
+        file, given = self._file, options.columns
+        if given is None and file.names:
+            named = match_names(file.names)
             if not {"t", "x", "y"} <= set(named):
                 raise DataError(
-                    f"{self._path}: its columns are named {', '.join(self._layout.names)}; say "
-                    "which are t, x, y and p with columns."
+                    f"{self._path}: its columns are named {', '.join(file.names)}; say which are "
+                    "t, x, y and p with columns."
                 )
-            return {key: self._layout.names.index(name) for key, name in named.items()}
-        if given is None and count == len(_MMHPSD_COLUMNS):
-            self.notes.append("five columns without names: read as MMHPSD's v, u, t, -, polarity")
+            component = {name: key for key, name in named.items()}
+            return [component.get(name, "") for name in file.names]
+        if given is None and file.fields == len(_MMHPSD_COLUMNS) and not file.names:
+            self.notes.append(
+                "five columns without names are read as MMHPSD's v, u, in-pixel time, off-pixel "
+                "time, polarity"
+            )
             self._mmhpsd = True
         if self._mmhpsd:
             given = _MMHPSD_COLUMNS
         if given is None:
-            given = tuple(table_order(self._path, sample, options))
-        if not isinstance(given, tuple) or len(given) != count:
+            given = tuple(table_order(self._path, file.sample, options))
+        if not isinstance(given, tuple) or len(given) != file.fields:
             raise DataError(
-                f"{self._path}: has {count} columns, columns names {len(given)} ({given}); give "
-                "one name per column, '-' to pass over one."
+                f"{self._path}: has {file.fields} columns and columns names {len(given)}; give one "
+                "name per column, '-' to pass over one."
             )
-        columns = {name: index for index, name in enumerate(given) if name != _PASSED_OVER}
-        if not {"t", "x", "y"} <= set(columns) <= set("txyp"):
+        columns = [name for name in given if name != _PASSED_OVER]
+        if not {"t", "x", "y"} <= set(columns) <= set(_COMPONENTS) or len(set(columns)) < len(
+            columns
+        ):
             raise DataError(
-                f"{self._path}: columns is {','.join(given)}, expected t, x, y and perhaps p, "
-                "each once, and '-' for what to pass over."
+                f"{self._path}: columns is {','.join(given)}, expected t, x, y and perhaps p, each "
+                "once, and '-' for what to pass over."
             )
-        return columns
+        return ["" if name == _PASSED_OVER else name for name in given]
 
-    def _named(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        return {name: rows[:, index] for name, index in self._columns.items()}
+    def _find_unit(self, column: int) -> str:
+        """By how the times of the first lines are written."""
+        times = self._file.sample[:, column]
+        whole = not len(times) or self._file.whole_times[column]
+        unit = guess_time_unit(times.astype(np.int64) if whole else times)
+        if unit != "us":
+            self.notes.append(f"times are taken for {unit}: give time_unit if they are not")
+        return unit
 
     def _any_polarity(self) -> bool:
         """Whether an event anywhere has a polarity other than 0; reads until the first."""
-        if "p" not in self._columns:
-            return False
-        column = self._columns["p"]
-        return any(rows[:, column].any() for rows in self._tables())
+        return not len(self._file.sample) or any(p.any() for _, _, _, p in self._parsed())
 
-    def _turned(self, events: RawEvents) -> RawEvents:
-        width, height = _MMHPSD_SIZE
-        return events._replace(x=width - 1 - events.x, y=height - 1 - events.y)
-
-    def _sample(self) -> np.ndarray:
+    def _parsed(self) -> Iterator[np.ndarray]:
+        """Components (4, N) int64, times in microseconds, of a few megabytes of text at a time."""
         with ByteReader(self._path) as reader:
-            reader.skip_to(self._layout.first_byte)
-            lines = [reader.read_line(_MAX_LINE_BYTES) for _ in range(_SAMPLE_LINES)]
-        # the last line may be cut
-        return self._parse(b"".join(line for line in lines if line.endswith(b"\n")), 0)
-
-    def _tables(self) -> Iterator[np.ndarray]:
-        """Rows of numbers, (N, columns) float64, a few megabytes of text at a time."""
-        with ByteReader(self._path) as reader:
-            reader.skip_to(self._layout.first_byte)
-            rest, first = b"", 0
-            while data := reader.read(_READ_BYTES):
-                cut = data.rfind(b"\n") + 1
-                if cut or len(rest) > _MAX_LINE_BYTES:
-                    rows = self._parse(rest + data[:cut], first)
-                    first += len(rows)
-                    if len(rows):
-                        yield rows
-                    rest = b""
-                rest += data[cut:]
-            if rest.strip():
-                rows = self._parse(rest, first)
-                yield rows
-
-    def _parse(self, text: bytes, first: int) -> np.ndarray:
-        if not text.strip():
-            return np.zeros((0, self._layout.count))
-        try:
-            rows = np.loadtxt(
-                io.BytesIO(text), delimiter=self._layout.delimiter, ndmin=2, dtype=np.float64
-            )
-        except ValueError as error:
-            raise DataError(f"{self._path}: near event {first}: {error}.") from None
-        if rows.shape[1] != self._layout.count:
-            raise DataError(f"{self._path}: near event {first}: {rows.shape[1]} columns.")
-        return rows
-
-
-def _read_layout(path: Path) -> _Layout:
-    """Pass over comments and the header; the first line of numbers tells the fields."""
-    names: list[str] = []
-    size: list[int | None] = [None, None]
-    with ByteReader(path) as reader:
-        for _ in range(_MAX_HEADER_LINES):
-            start = reader.offset
-            raw = reader.read_line(_MAX_LINE_BYTES)
-            if not raw:
-                raise DataError(f"{path}: holds no events.")
-            line = raw.strip().removeprefix(b"\xef\xbb\xbf")
-            delimiter = next((d for d in (b",", b";", b"\t") if d in line), None)
-            fields = [field.strip() for field in line.lstrip(b"#% ").split(delimiter)]
-            if not fields or not fields[0]:
-                continue
-            if line[:1] in b"#%" or not all(_NUMBER.fullmatch(field) for field in fields):
-                if not all(re.fullmatch(rb"[\w@ .()\[\]-]+", field) for field in fields):
+            reader.skip_to(self._file.first_byte)
+            rest, first, last = b"", 0, False
+            while not last:
+                data = reader.read(_READ_BYTES)
+                last = not data
+                text = rest + data if rest else data
+                start = reader.offset - len(text)
+                if not last and b"\n" not in data and len(text) > MAX_LINE_BYTES:
                     raise DataError(
-                        f"{path}: line {raw[:60]!r} at byte {start} is neither numbers nor the "
-                        "names of columns; not a recording that evsplat reads."
+                        f"{self._path}: the line at byte {start} is longer than "
+                        f"{MAX_LINE_BYTES} bytes; not a line of numbers."
                     )
-                if len(fields) >= 3:
-                    names, size = _read_names([field.decode() for field in fields])
-                continue
-            if len(fields) == 2 and size == [None, None]:
-                # the first line of E2VID's text files is the size of the sensor
-                size = [int(float(field)) for field in fields]
-                continue
-            return _Layout(
-                delimiter.decode() if delimiter and delimiter != b"\t" else None,
-                len(fields),
-                start,
-                names if len(names) == len(fields) else [],
-                *size,
+                columns, taken = self._parse(text, start, first, last)
+                rest = text[taken:]
+                first += columns.shape[1]
+                if columns.shape[1]:
+                    yield columns
+
+    def _parse(self, text: bytes, start: int, first: int, last: bool) -> tuple[np.ndarray, int]:
+        """Columns of the whole lines, and the bytes taken."""
+        columns = np.empty((len(_COMPONENTS), len(text) // _MIN_LINE_BYTES + 2), dtype=np.int64)
+        if "p" not in [_COMPONENTS[role] for role in self._roles if role >= 0]:
+            columns[3] = 0
+        rows, taken, error, field = compiled.native.parse_events(
+            np.frombuffer(text, dtype=np.uint8),
+            last,
+            self._roles,
+            self._file.delimiter,
+            _TIME_EXPONENTS[self._unit],
+            columns,
+        )
+        if error:
+            line = text[taken:].split(b"\n", 1)[0][:60].decode("latin-1")
+            what = (
+                f"the line of event {first + rows} at byte {start + taken} {_ERRORS[error]} "
+                f"(field {field + 1} of {self._file.fields}: {line!r})"
             )
-    raise DataError(f"{path}: no line of numbers among its first {_MAX_HEADER_LINES}.")
-
-
-def _read_names(fields: list[str]) -> tuple[list[str], list[int | None]]:
-    """Names, and the sizes that ``x@320`` and ``y@240`` tell."""
-    names: list[str] = []
-    size: dict[str, int | None] = {"x": None, "y": None}
-    for field in fields:
-        name, _, tail = field.partition("@")
-        names.append(name.strip())
-        if tail.isdigit() and name.strip() in size:
-            size[name.strip()] = int(tail)
-    return names, [size["x"], size["y"]]
+            at_end = text.find(b"\n", taken) < 0 and last
+            if not at_end:
+                raise DataError(f"{self._path}: {what}.")
+            self._damage.found(what, repaired_by="leaves out a last line that was cut")
+            taken = len(text)
+        return columns[:, :rows], taken

@@ -1,0 +1,69 @@
+#include "event_module.h"
+
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <stdexcept>
+#include <tuple>
+
+#include "event_text.h"
+#include "event_words.h"
+
+namespace nb = nanobind;
+
+namespace evsplat {
+namespace {
+
+template <class T>
+using Column = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using State = nb::ndarray<int64_t, nb::shape<sizeof(EventState) / sizeof(int64_t)>, nb::c_contig, nb::device::cpu>;
+
+EventWords words_of(const std::string& kind) {
+    constexpr const char* names[] = {"evt2", "evt21", "evt21_swapped", "evt3", "es_dvs", "es_atis"};
+    for (int i = 0; i < 6; ++i)
+        if (kind == names[i]) return EventWords(i);
+    throw std::invalid_argument("evsplat._native: no event words " + kind);
+}
+
+std::tuple<size_t, size_t> decode(const std::string& kind, Column<const uint8_t> data, State state, Column<int64_t> t,
+                                  Column<uint16_t> x, Column<uint16_t> y, Column<int8_t> p) {
+    const EventWords words = words_of(kind);
+    const size_t capacity = t.size();
+    if (x.size() != capacity || y.size() != capacity || p.size() != capacity)
+        throw std::invalid_argument("evsplat._native: columns of different length");
+    size_t events = 0;
+    nb::gil_scoped_release release;
+    const size_t taken = decode_events(words, data.data(), data.size(), *reinterpret_cast<EventState*>(state.data()),
+                                       {t.data(), x.data(), y.data(), p.data(), capacity}, events);
+    return {taken, events};
+}
+
+std::tuple<size_t, size_t, int, int> parse(Column<const uint8_t> text, bool last, std::vector<int> roles,
+                                           const std::string& delimiter, int time_exponent,
+                                           nb::ndarray<int64_t, nb::ndim<2>, nb::c_contig, nb::device::cpu> columns) {
+    if (columns.shape(0) != kTextComponents || roles.empty())
+        throw std::invalid_argument("evsplat._native: columns are t, x, y, p");
+    for (const int role : roles)
+        if (role < -1 || role >= kTextComponents) throw std::invalid_argument("evsplat._native: no such role");
+    int64_t* pointers[kTextComponents];
+    for (int i = 0; i < kTextComponents; ++i) pointers[i] = columns.data() + i * columns.shape(1);
+    const TextLayout layout = {roles.data(), int(roles.size()), delimiter.empty() ? '\0' : delimiter[0], time_exponent};
+    nb::gil_scoped_release release;
+    const TextResult result = parse_events(reinterpret_cast<const char*>(text.data()), text.size(), last, layout,
+                                           columns.shape(1), pointers);
+    return {result.rows, result.bytes, int(result.error), result.field};
+}
+
+}  // namespace
+
+void bind_events(nb::module_& m) {
+    m.def("decode_events", &decode, nb::arg("kind"), nb::arg("data"), nb::arg("state"), nb::arg("t"), nb::arg("x"),
+          nb::arg("y"), nb::arg("p"), "Words into columns; gives the bytes taken and the events written.");
+    m.def("parse_events", &parse, nb::arg("text"), nb::arg("last"), nb::arg("roles"), nb::arg("delimiter"),
+          nb::arg("time_exponent"), nb::arg("columns"),
+          "Lines into columns t, x, y, p; gives rows, bytes, error and the field that it is in.");
+}
+
+}  // namespace evsplat

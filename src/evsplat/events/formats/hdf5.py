@@ -1,0 +1,211 @@
+"""HDF5 files of events: DSEC, our own, Metavision's /CD/events, and others with the usual names.
+
+Blosc and other packings need `hdf5plugin` (extra `recordings`); Prophesee's own (ECF) is not read.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.events.formats.base import (
+    BLOCK_EVENTS,
+    Damage,
+    RawEvents,
+    ReadOptions,
+    Source,
+)
+from evsplat.events.formats.columns import match_names
+from evsplat.events.formats.table import NO_POLARITY, Table, table_order
+
+MAGIC = b"\x89HDF\r\n\x1a\n"
+_PLACES = ("events", "CD/events", "/")
+_ECF = 36559
+# Filters that HDF5 and h5py bring with them: deflate, shuffle, checksum, scale-offset, lzf
+_BUILT_IN = (1, 2, 3, 4, 5, 6, 32000)
+# More events than this per stored byte of their times are not packed but absent.
+_MAX_EVENTS_PER_BYTE = 4096
+
+
+@dataclass(frozen=True)
+class _Column:
+    """Where a component is: a dataset, and perhaps a field or a column of it."""
+
+    dataset: str
+    field: str | None = None
+    index: int | None = None
+
+    def read(self, file: h5py.File, part: slice) -> np.ndarray:
+        dataset = file[self.dataset]
+        if self.index is not None:
+            return dataset[part, self.index]
+        return dataset[part] if self.field is None else dataset.fields(self.field)[part]
+
+
+class Hdf5(Source):
+    """Events of an HDF5 file, read slice by slice."""
+
+    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
+        self._path = path
+        self.notes = []
+        with _opened(path) as file:
+            self._columns = _find_columns(path, file, options)
+            self._count = self._check_columns(file)
+            self._offset_us = int(file["t_offset"][()]) if "t_offset" in file else 0
+            if abs(self._offset_us) > 1 << 60:
+                raise DataError(f"{path}: t_offset is {self._offset_us} us, which is no time.")
+            self.width, self.height = _size(file)
+            head = Table(path, self._slice(file, 0), options.time_unit)
+            self._unit = head.unit
+            self.has_polarity = head.has_polarity or self._any_polarity(file)
+        self.notes = [note for note in head.notes if note != NO_POLARITY]
+        if not self.has_polarity and "p" in self._columns:
+            self.notes.append(NO_POLARITY)
+
+    def blocks(self) -> Iterator[RawEvents]:
+        """Slices of the columns."""
+        with _opened(self._path) as file:
+            for first in range(0, self._count, BLOCK_EVENTS):
+                table = Table(self._path, self._slice(file, first), self._unit)
+                events = table.events(slice(None), first)
+                yield events._replace(t=events.t + self._offset_us) if self._offset_us else events
+
+    def _slice(self, file: h5py.File, first: int) -> dict[str, np.ndarray]:
+        part = slice(first, min(first + BLOCK_EVENTS, self._count))
+        datasets = {column.dataset for column in self._columns.values()}
+        if len(datasets) == 1 and len(self._columns) > 1:
+            # one compound or table: read and unpack it once
+            rows = file[datasets.pop()][part]
+            return {
+                key: rows[c.field] if c.field else rows[:, c.index]
+                for key, c in self._columns.items()
+            }
+        return {key: column.read(file, part) for key, column in self._columns.items()}
+
+    def _any_polarity(self, file: h5py.File) -> bool:
+        """Whether an event after the first slice has a polarity other than 0."""
+        if "p" not in self._columns:
+            return False
+        starts = range(BLOCK_EVENTS, self._count, BLOCK_EVENTS)
+        slices = (slice(first, first + BLOCK_EVENTS) for first in starts)
+        return any(self._columns["p"].read(file, part).any() for part in slices)
+
+    def _check_columns(self, file: h5py.File) -> int:
+        """The count of events, when all columns have it and can be unpacked."""
+        counts = {}
+        for key, column in self._columns.items():
+            dataset = file[column.dataset]
+            _check_filters(self._path, dataset)
+            counts[key] = len(dataset)
+        if len(set(counts.values())) != 1:
+            text = ", ".join(f"{key}: {count:,}" for key, count in counts.items())
+            raise DataError(f"{self._path}: its components differ in length ({text}).")
+        stored = file[self._columns["t"].dataset].id.get_storage_size()
+        if counts["t"] > _MAX_EVENTS_PER_BYTE * (stored + 1):
+            raise DataError(
+                f"{self._path}: announces {counts['t']:,} events but holds {stored:,} bytes of "
+                "times; copy the file again."
+            )
+        return counts["t"]
+
+
+def _find_columns(path: Path, file: h5py.File, options: ReadOptions) -> dict[str, _Column]:
+    given = options.columns
+    if isinstance(given, Mapping):
+        missing = [name for name in given.values() if name not in file]
+        if missing or not {"t", "x", "y"} <= set(given):
+            raise DataError(
+                f"{path}: columns is {dict(given)}, expected datasets for t, x, y and perhaps p"
+                + (f"; {missing[0]!r} is not in the file." if missing else ".")
+            )
+        return {key: _Column(name) for key, name in given.items()}
+    for place in _PLACES:
+        if place not in file:
+            continue
+        node = file[place]
+        if isinstance(node, h5py.Group):
+            keys = [key for key in node if isinstance(node.get(key), h5py.Dataset)]
+            keys = [key for key in keys if node[key].ndim == 1]
+            found = {
+                key: _Column(f"{place}/{name}".replace("//", "/"))
+                for key, name in match_names(keys).items()
+            }
+        elif node.dtype.names:
+            names = match_names(node.dtype.names)
+            found = {key: _Column(place, field=name) for key, name in names.items()}
+        elif node.ndim == 2 and node.shape[1] in (3, 4):
+            _check_filters(path, node)
+            order = given if isinstance(given, tuple) else None
+            order = order or tuple(table_order(path, node[:BLOCK_EVENTS], options))
+            found = {
+                name: _Column(place, index=i) for i, name in enumerate(order) if name in "txyp"
+            }
+        else:
+            continue
+        if {"t", "x", "y"} <= set(found):
+            return found
+    there = ", ".join(file) or "nothing"
+    raise DataError(
+        f"{path}: no events at /events, /CD/events or its root (there: {there}); say where they "
+        "are with columns, such as {'t': 'stream/time', ...}."
+    )
+
+
+def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
+    """Load the plugins that unpack a dataset, or say what is missing."""
+    properties = dataset.id.get_create_plist()
+    filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+    if _ECF in filters:
+        raise DataError(
+            f"{path}: packed with Prophesee's ECF, which only its own software unpacks; write it "
+            "as RAW or DAT with Metavision (metavision_file_to_dat) and read that."
+        )
+    others = [number for number in filters if number not in _BUILT_IN]
+    if others:
+        try:
+            import hdf5plugin  # noqa: F401 - registers the filters
+        except ImportError:
+            raise DataError(
+                f"{path}: packed with HDF5 filter {others[0]}; pip install 'evsplat[recordings]' "
+                "to read it."
+            ) from None
+
+
+def _size(file: h5py.File) -> tuple[int | None, int | None]:
+    """Width and height, where an attribute says."""
+    for place in _PLACES:
+        attributes = file[place].attrs if place in file else {}
+        if "width" in attributes and "height" in attributes:
+            return int(attributes["width"]), int(attributes["height"])
+        if "sensor_resolution" in attributes:  # e2vid: rows first
+            rows, columns = (int(n) for n in attributes["sensor_resolution"][:2])
+            return columns, rows
+        match = re.fullmatch(r"(\d+)x(\d+)", str(attributes.get("geometry", "")))
+        if match:
+            return int(match[1]), int(match[2])
+    return None, None
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (
+        OSError,
+        KeyError,
+        ValueError,
+        TypeError,
+        RuntimeError,
+        AttributeError,
+        IndexError,
+        OverflowError,
+        MemoryError,
+    ) as error:
+        reason = re.sub(r"\s+", " ", str(error))[:200]
+        raise DataError(f"{path}: its HDF5 content cannot be read ({reason}).") from None

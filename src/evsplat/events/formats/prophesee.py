@@ -1,0 +1,171 @@
+"""Prophesee's files: RAW (EVT 2, 2.1 in both layouts, 3) and DAT.
+
+Both begin with lines "% key value". https://docs.prophesee.ai/stable/data/file_formats
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.events.formats.base import (
+    ByteReader,
+    Damage,
+    RawEvents,
+    ReadOptions,
+    Source,
+)
+from evsplat.events.formats.words import WordDecoder
+
+_MAX_HEADER_LINES = 1000
+_MAX_LINE_BYTES = 4096
+_SAMPLE_BYTES = 1 << 16
+_EVT_VERSIONS = {"2": "evt2", "2.0": "evt2", "2.1": "evt21", "3": "evt3", "3.0": "evt3"}
+_FORMAT_NAMES = {"EVT2": "evt2", "EVT21": "evt21", "EVT3": "evt3"}
+# Types of EVT 2.1 words: events, time, trigger, others, continued
+_EVT21_TYPES = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
+_DAT_EVENT = np.dtype([("t", "<u4"), ("pixel", "<u4")])
+_DAT_EVENT_TYPES = (0x00, 0x0C)
+_DAT_READ_EVENTS = 1 << 17
+
+
+class _Header:
+    """Lines "% key value" at the beginning, and where they end."""
+
+    def __init__(self, reader: ByteReader) -> None:
+        self.values: dict[str, str] = {}
+        for _ in range(_MAX_HEADER_LINES):
+            self.end = reader.offset
+            if reader.read(2) != b"% ":
+                break
+            line = reader.read_line(_MAX_LINE_BYTES)
+            if not line.endswith(b"\n"):
+                raise DataError(f"{reader.path}: its header does not end (byte {reader.offset}).")
+            text = line.decode("latin-1").strip()
+            key, _, value = text.partition(" ")
+            self.values.setdefault(key.lower(), value.strip())
+            if text == "end":
+                self.end = reader.offset
+                break
+        else:
+            raise DataError(f"{reader.path}: more than {_MAX_HEADER_LINES} lines of header.")
+        self.width, self.height = self._size(reader.path)
+
+    def _size(self, path: Path) -> tuple[int | None, int | None]:
+        size = [
+            re.search(pattern, f"{key} {value}\n", re.IGNORECASE)
+            for key, value in self.values.items()
+            for pattern in (r"^geometry (\d+)x(\d+)\n", r"^format .*width=(\d+).*height=(\d+)")
+        ]
+        found = next((match.groups() for match in size if match), None)
+        tall = re.search(r"height=(\d+).*width=(\d+)", self.values.get("format", ""))
+        if found is None and tall:
+            found = tall.groups()[::-1]
+        if found is None and {"width", "height"} <= set(self.values):
+            found = (self.values["width"], self.values["height"])
+        if found is None:
+            return None, None
+        if not all(text.isdigit() and 0 < int(text) <= 1 << 16 for text in found):
+            raise DataError(f"{path}: its header gives a sensor of {' x '.join(found)} pixels.")
+        return int(found[0]), int(found[1])
+
+
+class Raw(Source):
+    """A RAW file; triggers and monitoring words are passed over."""
+
+    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
+        self._path = path
+        self._damage = damage
+        self.notes = []
+        with ByteReader(path) as reader:
+            header = _Header(reader)
+        self._start = header.end
+        self.width, self.height = header.width, header.height
+        format_name, _, details = header.values.get("format", "").partition(";")
+        version = header.values.get("evt", "")
+        kind = _FORMAT_NAMES.get(format_name.upper()) or _EVT_VERSIONS.get(version)
+        if kind is None:
+            raise DataError(
+                f"{path}: its header names neither EVT 2, 2.1 nor 3 (format {format_name!r}, evt "
+                f"{version!r})."
+            )
+        self._kind = self._layout_of_evt21(details) if kind == "evt21" else kind
+
+    def blocks(self) -> Iterator[RawEvents]:
+        """About a megabyte of words at a time."""
+        decoder = WordDecoder(self._kind, self._damage)
+        with ByteReader(self._path) as reader:
+            reader.skip_to(self._start)
+            yield from decoder.blocks(reader)
+        note = "events before the first time are left out, as they have none"
+        if decoder.untimed and not any(note in known for known in self.notes):
+            self.notes.append(f"{decoder.untimed:,} {note}")
+
+    def _layout_of_evt21(self, details: str) -> str:
+        """Which half of a word holds the type: the header says, or else the words do."""
+        if "endianness=legacy" in details:
+            return "evt21_swapped"
+        if "endianness=little" in details:
+            return "evt21"
+        with ByteReader(self._path) as reader:
+            reader.skip_to(self._start)
+            sample = reader.read(_SAMPLE_BYTES)
+        halves = np.frombuffer(sample[: len(sample) // 8 * 8], dtype="<u4").reshape(-1, 2)
+        fits = [bool(np.isin(halves[:, half] >> 28, _EVT21_TYPES).all()) for half in (1, 0)]
+        if len(halves) and fits[0] == fits[1]:
+            # both fit by chance only in a short file: times that rise decide
+            fits = [_rises(halves[:, half]) for half in (1, 0)]
+        if len(halves) and fits[0] == fits[1]:
+            raise DataError(
+                f"{self._path}: its EVT 2.1 words are of neither known layout; is it damaged?"
+            )
+        return "evt21" if not len(halves) or fits[0] else "evt21_swapped"
+
+
+def _rises(heads: np.ndarray) -> bool:
+    times = (heads[heads >> 28 == 0x8] & 0xFFFFFFF).astype(np.int64)
+    return len(times) > 0 and bool((np.diff(times) >= 0).all()) and heads[0] >> 28 in _EVT21_TYPES
+
+
+class Dat(Source):
+    """A DAT file of change-detection events: 32 bits of time, 14 of x, 14 of y, 4 of polarity."""
+
+    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
+        self._path = path
+        self._damage = damage
+        self.notes = []
+        with ByteReader(path) as reader:
+            header = _Header(reader)
+        with ByteReader(path) as reader:
+            reader.skip_to(header.end)
+            kind = reader.read(2)
+            self._start = reader.offset
+        if len(kind) < 2 or kind[0] not in _DAT_EVENT_TYPES or kind[1] != _DAT_EVENT.itemsize:
+            raise DataError(
+                f"{path}: after its header come bytes {kind.hex(' ') or 'none'}, expected an event "
+                "type of 0 or 12 and a size of 8."
+            )
+        self.width, self.height = header.width, header.height
+
+    def blocks(self) -> Iterator[RawEvents]:
+        """About a megabyte at a time."""
+        size = _DAT_EVENT.itemsize
+        with ByteReader(self._path) as reader:
+            reader.skip_to(self._start)
+            while data := reader.read(_DAT_READ_EVENTS * size):
+                whole = len(data) // size * size
+                events = np.frombuffer(data[:whole] if whole < len(data) else data, _DAT_EVENT)
+                pixel = events["pixel"]
+                yield RawEvents(
+                    events["t"].astype(np.int64),
+                    (pixel & 0x3FFF).astype(np.uint16),
+                    (pixel >> 14 & 0x3FFF).astype(np.uint16),
+                    pixel >> 28 & 1,
+                )
+                if whole < len(data):
+                    self._damage.found(
+                        f"ends in the middle of an event at byte {reader.offset}",
+                        repaired_by="keeps the events before the cut",
+                    )

@@ -1,0 +1,180 @@
+"""ROS 1 and 2 bags with dvs_msgs/EventArray or event_camera_msgs/EventPacket (EVT 3 inside).
+
+`rosbags` (extra `recordings`) opens the container; messages are unpacked here, because one Python
+object per event would be a thousand times slower.
+"""
+
+import re
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.events.formats.base import (
+    Damage,
+    RawEvents,
+    ReadOptions,
+    Source,
+    peek,
+)
+from evsplat.events.formats.words import WordDecoder
+
+ROS1_MAGIC = b"#ROSBAG V2.0"
+_ARRAY_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+_PACKET_TYPES = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
+_ENCODING = "evt3"
+_EVENT = [("x", "<u2"), ("y", "<u2"), ("seconds", "<u4"), ("nanoseconds", "<u4"), ("p", "u1")]
+_ROS1_EVENT = np.dtype(_EVENT)
+# ROS 2 begins every event at a multiple of four bytes
+_ROS2_EVENT = np.dtype([*_EVENT, ("padding", "V3")])
+
+
+class RosBag(Source):
+    """The first event topic of a bag: a .bag file, an .mcap or .db3 file or a ROS 2 folder.
+
+    Times of EventArray are those of ROS, times of EventPacket those of the sensor.
+    """
+
+    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
+        self._path = path
+        self._damage = damage
+        self.notes = []
+        types = _ARRAY_TYPES + _PACKET_TYPES
+        with _opened(path) as bag:
+            topics = {c.topic: c.msgtype for c in bag.connections if c.msgtype in types}
+            if not topics:
+                found = ", ".join(sorted({c.msgtype for c in bag.connections})) or "none"
+                raise DataError(f"{path}: holds no event messages (types there: {found}).")
+            self._topic = sorted(topics)[0]
+            self._type = topics[self._topic]
+            if len(topics) > 1:
+                self.notes.append(f"of the topics {', '.join(sorted(topics))} the first is read")
+            for _, message in self._messages(bag):
+                self.width, self.height = message.width, message.height
+                break
+
+    def blocks(self) -> Iterator[RawEvents]:
+        """One message at a time."""
+        decoder = WordDecoder(_ENCODING, self._damage)
+        with _opened(self._path) as bag:
+            for number, message in self._messages(bag):
+                if message.encoding:
+                    yield from self._packet(decoder, message, number)
+                else:
+                    yield _array(message)
+
+    def _packet(
+        self, decoder: WordDecoder, message: "_Message", number: int
+    ) -> Iterator[RawEvents]:
+        if message.encoding != _ENCODING:
+            raise DataError(
+                f"{self._path}: message {number} of {self._topic} is encoded as "
+                f"{message.encoding!r}, expected {_ENCODING!r}."
+            )
+        start = 0
+        while start + 1 < len(message.events):
+            events, taken = decoder.decode(message.events[start:], start)
+            start += taken
+            yield events
+
+    def _messages(self, bag: Any) -> Iterator[tuple[int, "_Message"]]:
+        connections = [c for c in bag.connections if c.topic == self._topic]
+        is_ros1 = "rosbag1" in type(bag).__module__
+        for number, (_, _, data) in enumerate(bag.messages(connections)):
+            try:
+                yield number, _read_message(data, is_ros1, self._type in _PACKET_TYPES)
+            except (struct.error, ValueError) as error:
+                self._damage.found(
+                    f"message {number} of {self._topic} is damaged ({error})",
+                    repaired_by="leaves out damaged messages",
+                )
+
+
+@dataclass(frozen=True)
+class _Message:
+    width: int
+    height: int
+    encoding: str
+    """Of a packet; empty for an array."""
+    events: bytes
+    kind: np.dtype
+    """Of an event of an array."""
+
+
+def _array(message: _Message) -> RawEvents:
+    events = np.frombuffer(message.events, message.kind)
+    t = events["seconds"].astype(np.int64) * 1_000_000 + events["nanoseconds"] // 1000
+    return RawEvents(t, events["x"], events["y"], events["p"])
+
+
+class _Cursor:
+    """Reads the fields of a message one after the other; ROS 2 aligns them, ROS 1 does not."""
+
+    def __init__(self, data: bytes, is_ros1: bool) -> None:
+        self._data = bytes(data)
+        self._aligned = not is_ros1
+        # ROS 2 messages begin with four bytes that say how they are encoded
+        self._begin = self._at = 0 if is_ros1 else 4
+        if self._aligned and self._data[:2] != b"\x00\x01":
+            raise ValueError("expected little-endian CDR")
+
+    def number(self, code: str) -> int:
+        size = struct.calcsize(code)
+        if self._aligned:
+            self._at += -(self._at - self._begin) % size
+        value = struct.unpack_from("<" + code, self._data, self._at)[0]
+        self._at += size
+        return int(value)
+
+    def take(self, size: int) -> bytes:
+        if self._at + size > len(self._data):
+            raise ValueError(f"{size} bytes announced, {len(self._data) - self._at} there")
+        self._at += size
+        return self._data[self._at - size : self._at]
+
+    def text(self) -> str:
+        return self.take(self.number("I")).rstrip(b"\0").decode("latin-1")
+
+
+def _read_message(data: bytes, is_ros1: bool, is_packet: bool) -> _Message:
+    fields = _Cursor(data, is_ros1)
+    for _ in range(3 if is_ros1 else 2):  # sequence number (ROS 1), seconds, nanoseconds
+        fields.number("I")
+    fields.text()
+    height, width = fields.number("I"), fields.number("I")
+    if not (0 < width <= 1 << 16 and 0 < height <= 1 << 16):
+        raise ValueError(f"a sensor of {width} x {height} pixels")
+    kind = _ROS1_EVENT if is_ros1 else _ROS2_EVENT
+    if not is_packet:
+        count = fields.number("I")
+        # the last event has no padding after it
+        padding = kind.itemsize - _ROS1_EVENT.itemsize if count else 0
+        events = fields.take(count * kind.itemsize - padding) + bytes(padding)
+        return _Message(width, height, "", events, kind)
+    fields.number("Q"), fields.number("Q")
+    encoding = fields.text()
+    fields.take(1)
+    return _Message(width, height, encoding or "unknown", fields.take(fields.number("I")), kind)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A reader of `rosbags`; what goes wrong in it is a `DataError`."""
+    try:
+        from rosbags import rosbag1, rosbag2
+    except ImportError:
+        raise DataError(f"{path}: to read ROS bags, pip install 'evsplat[recordings]'.") from None
+    try:
+        is_ros1 = path.is_file() and peek(path, len(ROS1_MAGIC)) == ROS1_MAGIC
+        with (rosbag1 if is_ros1 else rosbag2).Reader(path) as bag:
+            yield bag
+    except (DataError, GeneratorExit):
+        raise
+    except Exception as error:
+        reason = re.sub(r"\s+", " ", str(error))[:200]
+        raise DataError(f"{path}: the bag cannot be read ({reason}).") from None

@@ -1,0 +1,116 @@
+"""What a text file of events looks like: its header, its delimiter, the names of its columns."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.events.formats.base import ByteReader
+
+MAX_LINE_BYTES = 4096
+_MAX_HEADER_LINES = 100
+_SAMPLE_LINES = 2000
+_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_NAME = re.compile(rb"[\w@ .()\[\]/-]+")
+_DELIMITERS = (b",", b";")
+
+
+@dataclass(frozen=True)
+class TextFile:
+    """The shape of a text file."""
+
+    delimiter: str
+    """Between fields; empty: any white space."""
+    fields: int
+    """Per line."""
+    first_byte: int
+    """Where the first event begins."""
+    names: list[str]
+    """Of the columns; empty where the file does not say."""
+    width: int | None
+    height: int | None
+    sample: np.ndarray
+    """The first lines, (N, fields) float64."""
+    whole_times: list[bool]
+    """Per field, whether all of the sample is written without a fraction."""
+
+
+def inspect_text(path: Path) -> TextFile:
+    """Pass over comments and header; the first line of numbers tells delimiter and fields.
+
+    A file with a header that names columns and no line after it is an empty recording.
+    """
+    names: list[str] = []
+    size: tuple[int | None, int | None] = (None, None)
+    with ByteReader(path) as reader:
+        for _ in range(_MAX_HEADER_LINES):
+            start = reader.offset
+            raw = reader.read_line(MAX_LINE_BYTES)
+            if not raw:
+                if names:
+                    empty = np.zeros((0, len(names)))
+                    return TextFile("", len(names), start, names, *size, empty, [])
+                raise DataError(f"{path}: holds no events.")
+            line = raw.strip().removeprefix(b"\xef\xbb\xbf")
+            delimiter = next((d for d in _DELIMITERS if d in line), b"")
+            fields = _split(line.lstrip(b"#% "), delimiter)
+            if not fields or not fields[0]:
+                continue
+            is_comment = line[:1] in (b"#", b"%")
+            if is_comment or not all(_NUMBER.fullmatch(field) for field in fields):
+                if not is_comment and not all(_NAME.fullmatch(field) for field in fields):
+                    raise DataError(
+                        f"{path}: line {raw[:60]!r} at byte {start} is neither numbers nor names "
+                        "of columns; not a recording that evsplat reads."
+                    )
+                if len(fields) >= 3:
+                    names, size = _read_names([field.decode("latin-1") for field in fields])
+                continue
+            if len(fields) == 2 and size == (None, None):
+                # the first line of E2VID's text files is the size of the sensor
+                size = (int(float(fields[0])), int(float(fields[1])))
+                continue
+            lines = [raw] + [reader.read_line(MAX_LINE_BYTES) for _ in range(_SAMPLE_LINES)]
+            sample, whole = _read_sample(lines, delimiter, len(fields))
+            return TextFile(
+                delimiter.decode(),
+                len(fields),
+                start,
+                names if len(names) == len(fields) else [],
+                *size,
+                sample,
+                whole,
+            )
+    raise DataError(f"{path}: no line of numbers among its first {_MAX_HEADER_LINES}.")
+
+
+def _split(line: bytes, delimiter: bytes) -> list[bytes]:
+    return [field.strip() for field in line.split(delimiter or None)]
+
+
+def _read_sample(lines: list[bytes], delimiter: bytes, count: int) -> tuple[np.ndarray, list[bool]]:
+    """Numbers of the first lines, up to the first that is not made of them (the parser says so)."""
+    rows: list[list[float]] = []
+    whole = [True] * count
+    for line in lines:
+        fields = _split(line, delimiter)
+        if len(fields) != count or not all(_NUMBER.fullmatch(field) for field in fields):
+            break
+        rows.append([float(field) for field in fields])
+        for column, field in enumerate(fields):
+            whole[column] &= field.lstrip(b"+-").isdigit()
+    return np.array(rows, dtype=np.float64).reshape(-1, count), whole
+
+
+def _read_names(fields: list[str]) -> tuple[list[str], tuple[int | None, int | None]]:
+    """Names, and the sizes that ``x@320`` and ``y@240`` tell."""
+    names: list[str] = []
+    size: dict[str, int] = {}
+    for field in fields:
+        name, _, tail = field.partition("@")
+        names.append(name.strip())
+        if tail.isdigit():
+            size[name.strip()] = int(tail)
+    return names, (size.get("x"), size.get("y"))
