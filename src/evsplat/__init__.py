@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from evsplat.cli.demo import demo
     from evsplat.evaluation import evaluate_run as evaluate
     from evsplat.evaluation.report import write_report
+    from evsplat.events.convert import convert_recording as convert
     from evsplat.export import render_run
     from evsplat.restore import restore_capture
     from evsplat.training.run import load_run
@@ -39,6 +40,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "__version__",
+    "convert",
     "demo",
     "evaluate",
     "import_capture",
@@ -52,6 +54,7 @@ __all__ = [
 ]
 
 _LAZY = {
+    "convert": "evsplat.events.convert:convert_recording",
     "demo": "evsplat.cli.demo:demo",
     "evaluate": "evsplat.evaluation:evaluate_run",
     "import_capture": "evsplat.capture.importers:import_capture",

@@ -8,6 +8,7 @@ from typing import Any
 import tyro
 
 import evsplat
+from evsplat.cli.convert import convert
 from evsplat.cli.demo import demo
 from evsplat.cli.doctor import doctor
 from evsplat.cli.evaluate import evaluate
@@ -21,7 +22,10 @@ from evsplat.errors import EvsplatError
 
 _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
-    for verb in (demo, doctor, import_, inspect, restore, train, evaluate, report, render)
+    for verb in (
+        *(demo, doctor, import_, convert, inspect),
+        *(restore, train, evaluate, report, render),
+    )
 }
 _DESCRIPTION = (
     "A sharp 3D Gaussian person in a scene, from a blurry video and events.\n\n"

@@ -113,20 +113,23 @@ class Raw(Source):
             reader.skip_to(self._start)
             sample = reader.read(_SAMPLE_BYTES)
         halves = np.frombuffer(sample[: len(sample) // 8 * 8], dtype="<u4").reshape(-1, 2)
-        fits = [bool(np.isin(halves[:, half] >> 28, _EVT21_TYPES).all()) for half in (1, 0)]
-        if len(halves) and fits[0] == fits[1]:
-            # both fit by chance only in a short file: times that rise decide
-            fits = [_rises(halves[:, half]) for half in (1, 0)]
-        if len(halves) and fits[0] == fits[1]:
+        if not len(halves):
+            return "evt21"
+        scores = [_plausibility(halves[:, half], halves[:, 1 - half]) for half in (1, 0)]
+        if scores[0] == scores[1]:
             raise DataError(
                 f"{self._path}: its EVT 2.1 words are of neither known layout; is it damaged?"
             )
-        return "evt21" if not len(halves) or fits[0] else "evt21_swapped"
+        return "evt21" if scores[0] > scores[1] else "evt21_swapped"
 
 
-def _rises(heads: np.ndarray) -> bool:
-    times = (heads[heads >> 28 == 0x8] & 0xFFFFFFF).astype(np.int64)
-    return len(times) > 0 and bool((np.diff(times) >= 0).all()) and heads[0] >> 28 in _EVT21_TYPES
+def _plausibility(heads: np.ndarray, rests: np.ndarray) -> tuple[bool, int]:
+    """Whether all heads have a type, and how many are times, whose other half is empty.
+
+    Read the wrong way round, a time would be an event at (0, 0) with the highest of its 32 bits.
+    """
+    types = heads >> 28
+    return bool(np.isin(types, _EVT21_TYPES).all()), int(((types == 0x8) & (rests == 0)).sum())
 
 
 class Dat(Source):
