@@ -68,8 +68,8 @@ def rest_joints(
         if model == "smplx" and find_spec("mannequin") is not None:
             return _calibrated_rest_joints(betas)
         _log.warning(
-            "%s: no %s model, so average proportions stand for this person's: limbs can be off by "
-            "several degrees (upper arms of SMPL-X by up to 18). %s%s",
+            "%s: no %s model, so average proportions stand for this person's; limbs can be off by "
+            "several degrees. %s%s",
             source,
             model.upper(),
             error,

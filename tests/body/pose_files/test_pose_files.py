@@ -3,7 +3,9 @@
 import json
 import os
 import pickle
+import re
 import shutil
+from pathlib import Path
 
 import joblib
 import numpy as np
@@ -11,12 +13,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import axis_angle_to_matrix
+from evsplat.body import BodyTrack, axis_angle_to_matrix, load_body
 from evsplat.body.pose_files import read_poses, to_default_body
 from evsplat.body.pose_files.sequence import moved
 from evsplat.body.skeleton import find_skeleton
 from evsplat.body.smpl import ENVIRONMENT, smpl_body
 from evsplat.body.smpl_skeleton import NAMES, PARENTS
+from evsplat.capture.body_file import body_from_arrays, read_arrays
 from evsplat.errors import DataError
 
 from . import synthetic
@@ -297,3 +300,41 @@ def test_wrong_fields_are_named(tmp_path):
     synthetic.write_tram(folder, motion, (np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3))))
     with pytest.raises(DataError, match=r"has 3 cameras, but the person is there in frame 8"):
         read_poses(folder, world=True)
+
+
+DOCS = Path(__file__).parents[3] / "docs" / "poses.md"
+
+
+@pytest.mark.skipif(not DOCS.exists(), reason="not a source checkout")
+def test_the_documented_code_writes_a_body_file(tmp_path, models, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(ENVIRONMENT, str(models))
+    variables = {
+        "pose_file": write("wham", tmp_path / "wham").path,
+        "mid_exposure_us": 15_000 + 40_000 * np.arange(10),
+    }
+    blocks = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
+    for block, model, joints in zip(blocks, ("default", "smpl"), (31, 24), strict=True):
+        exec(block, variables)
+        written = body_from_arrays(Path("body.npz"), read_arrays(Path("body.npz")), "?")
+        assert written.model == model
+        track = BodyTrack(load_body(written)[0], written.times_us, written.poses, written.transl)
+        assert written.poses.shape == (5, joints, 3)
+        assert track.times_us.tolist() == [15_000 + 40_000 * f for f in (2, 3, 4, 7, 8)]
+
+
+def test_between_two_poses_the_body_turns_the_short_way(tmp_path):
+    """A tool's own vectors flip their sign at half a turn; the track must not spin there."""
+    motion = make_motion(0)
+    angles = np.array([3.0, 3.1, 3.2, 3.5, 3.6])
+    motion.poses[:, 0] = Rotation.from_rotvec(angles[:, None] * [0, 1.0, 0]).as_rotvec()
+    sequence = read_poses(synthetic.write_wham(tmp_path, motion))
+    body, poses, transl = to_default_body(sequence)
+    times = sequence.times_us(100)
+    track = BodyTrack(body, times, poses, transl)
+    rotations, _ = track.at(np.arange(times[0], times[-1], 500).tolist())
+    steps = Rotation.from_matrix(rotations[1:, 0].numpy()) * (
+        Rotation.from_matrix(rotations[:-1, 0].numpy()).inv()
+    )
+    assert steps.magnitude().max() < 0.02  # 0.1 rad per frame of 10 ms in steps of 0.5 ms
+    assert np.linalg.norm(np.diff(poses, axis=0), axis=-1)[:, 0].max() < 1  # a turn is 6.3
