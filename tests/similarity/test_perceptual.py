@@ -13,12 +13,12 @@ from evsplat.similarity.lpips import (
     HUB_FILES,
     NETWORKS,
     WEIGHTS_VARIABLE,
-    MissingWeights,
     load_lpips,
     lpips_heads,
 )
 from evsplat.similarity.st_lpips import NETWORK as ST_NETWORK
 from evsplat.similarity.st_lpips import load_st_lpips
+from evsplat.weights import MissingWeights
 
 needs_st_lpips = pytest.mark.skipif(
     importlib.util.find_spec("stlpips_pytorch") is None,

@@ -32,9 +32,10 @@ from evsplat.files import write_json
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
 from evsplat.render import choose_device
-from evsplat.similarity.lpips import MissingWeights, load_lpips
+from evsplat.similarity.lpips import load_lpips
 from evsplat.similarity.perceptual import PerceptualMetric
 from evsplat.similarity.st_lpips import load_st_lpips
+from evsplat.weights import MissingWeights
 
 logger = logging.getLogger(__name__)
 

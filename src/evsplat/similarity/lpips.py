@@ -1,12 +1,10 @@
 """LPIPS 0.1 on AlexNet and VGG16: the linear heads ship with us, the networks' weights do not."""
 
-import hashlib
 import os
 import re
-import zipfile
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,15 +12,12 @@ from torch import Tensor
 
 from evsplat.errors import WeightsError
 from evsplat.similarity.perceptual import Conv, Layer, MaxPool, Network, PerceptualMetric, Relu
+from evsplat.weights import MissingWeights, home_as_tilde, hub_folder, read_state, sha256_of
 
 LpipsName = Literal["alex", "vgg"]
 
 WEIGHTS_VARIABLE = "EVSPLAT_LPIPS_WEIGHTS"
 """Environment variable with a weight file, or a folder with files named as in the hub's cache."""
-
-
-class MissingWeights(WeightsError):
-    """Nobody has put the weights where they are looked for; the message says where to get them."""
 
 
 def _alexnet() -> Network:
@@ -83,33 +78,14 @@ def load_lpips(
         found = _look_in(place, name)
         if found is not None:
             return _metric(name, *found, device=device)
-    cached = Path(torch.hub.get_dir()) / "checkpoints" / HUB_FILES[name]
+    cached = hub_folder() / HUB_FILES[name]
     if cached.is_file():
         return _metric(name, cached, _read(cached), device=device)
     raise MissingWeights(
         f"{NETWORKS[name].name}: no weights. Fetch https://download.pytorch.org/models/"
-        f"{HUB_FILES[name]} and put it in {_home_as_tilde(cached.parent)}, or give its place with "
+        f"{HUB_FILES[name]} and put it in {home_as_tilde(cached.parent)}, or give its place with "
         f"--lpips-weights or {WEIGHTS_VARIABLE}."
     )
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def read_state(path: Path) -> dict[str, Any]:
-    """A state dict read without running anything that the file may contain."""
-    try:
-        state = torch.load(
-            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
-        )
-    except Exception as error:  # torch raises many kinds for files that are not its own
-        raise WeightsError(f"{path}: not a readable PyTorch weight file ({error}).") from error
-    if not isinstance(state, dict):
-        raise WeightsError(f"{path}: holds a {type(state).__name__}, expected a state dict.")
-    return state
 
 
 def _look_in(place: Path, name: LpipsName) -> tuple[Path, dict[str, Tensor]] | None:
@@ -164,8 +140,3 @@ def _metric(
     return PerceptualMetric(
         NETWORKS[name], parameters, lpips_heads(name), sha256=sha256_of(path), device=device
     )
-
-
-def _home_as_tilde(path: Path) -> str:
-    home = Path.home()
-    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)

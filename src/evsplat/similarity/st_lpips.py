@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 
 from evsplat.errors import WeightsError
-from evsplat.similarity.lpips import MissingWeights, read_state, sha256_of
 from evsplat.similarity.perceptual import Blur, Conv, MaxPool, Network, PerceptualMetric, Relu
+from evsplat.weights import MissingWeights, read_state, sha256_of
 
 PACKAGE = "stlpips_pytorch"
 
