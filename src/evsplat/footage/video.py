@@ -1,0 +1,117 @@
+"""A video file, decoded by FFmpeg (PyAV)."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+
+from evsplat.errors import DataError
+from evsplat.footage.footage import TimedPicture, times_of_rate
+
+# Transfer characteristics of ITU-T H.273: PQ and HLG code light in ways no other part understands.
+_HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
+_BT601, _BT709, _UNSPECIFIED = 5, 1, 2
+# Players take unmarked video of at least this height for BT.709, the rest for BT.601.
+_HD_HEIGHT = 720
+
+
+class VideoFootage:
+    """The first video stream of a file (`Footage`).
+
+    Times are those of the stream, the first 0, or even ones of ``fps``. Pictures are RGB (or grey),
+    upright, 16 bit where the video has more than 8.
+    """
+
+    def __init__(self, path: Path, fps: float | None) -> None:
+        self.path = path
+        first = next(self._decoded(), None)
+        if first is None:
+            raise DataError(f"{path}: the video holds no picture.")
+        if first.color_trc in _HDR_TRANSFERS:
+            raise DataError(
+                f"{path}: is HDR video ({_HDR_TRANSFERS[first.color_trc]}), expected sRGB or "
+                "BT.709; convert it to SDR first."
+            )
+        self.height, self.width = _pixels(first).shape[:2]
+        stamps = self._timestamps()
+        if fps is not None:
+            self.times_us = times_of_rate(len(stamps), fps)
+            return
+        self.times_us = np.round((stamps - stamps[0]) * 1e6).astype(np.int64)
+        if (np.diff(self.times_us) <= 0).any():
+            at = int(np.argmax(np.diff(self.times_us) <= 0)) + 1
+            raise DataError(
+                f"{path}: pictures {at - 1} and {at} have the same time; give the rate at which "
+                "they were taken with --source-fps."
+            )
+
+    def __iter__(self) -> Iterator[TimedPicture]:
+        """See `Footage`."""
+        count = 0
+        for time_us, frame in zip(self.times_us, self._decoded(), strict=False):
+            yield TimedPicture(f"{count:06d}", int(time_us), _pixels(frame))
+            count += 1
+        if count < len(self.times_us):
+            raise DataError(
+                f"{self.path}: only {count} of {len(self.times_us)} pictures can be decoded; the "
+                "file is damaged, encode it again."
+            )
+
+    def _timestamps(self) -> np.ndarray:
+        """Seconds of all pictures, ascending, without decoding them."""
+        with self._opened() as (container, stream):
+            stamps = [
+                packet.pts
+                for packet in container.demux(stream)
+                if packet.pts is not None and not packet.is_discard
+            ]
+            return np.sort(np.array(stamps, dtype=np.float64)) * float(stream.time_base)
+
+    def _decoded(self) -> Iterator[Any]:
+        with self._opened() as (container, stream):
+            stream.thread_type = "AUTO"
+            yield from container.decode(stream)
+
+    def _opened(self) -> "_Opened":
+        return _Opened(self.path)
+
+
+class _Opened:
+    """An open container and its video stream; what FFmpeg cannot read is a `DataError`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> tuple[Any, Any]:
+        try:
+            self.container = av.open(str(self.path))
+        except (av.error.FFmpegError, OSError) as error:
+            raise self._unreadable(error) from error
+        if not self.container.streams.video:
+            self.container.close()
+            raise DataError(f"{self.path}: holds no video stream.")
+        return self.container, self.container.streams.video[0]
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self.container.close()
+        if isinstance(error, av.error.FFmpegError):
+            raise self._unreadable(error) from error
+
+    def _unreadable(self, error: Exception) -> DataError:
+        return DataError(f"{self.path}: cannot be decoded as video ({error}).")
+
+
+def _pixels(frame: Any) -> np.ndarray:
+    """Upright pixels of a decoded frame."""
+    deep = any(component.bits > 8 for component in frame.format.components)
+    if frame.format.name.startswith("gray"):
+        pixels = frame.to_ndarray(format="gray16le" if deep else "gray")
+    else:
+        source = frame.colorspace
+        if source == _UNSPECIFIED and not frame.format.is_rgb:
+            source = _BT709 if frame.height >= _HD_HEIGHT else _BT601
+        name = "rgb48le" if deep else "rgb24"
+        pixels = frame.reformat(format=name, src_colorspace=source).to_ndarray()
+    return np.ascontiguousarray(np.rot90(pixels, frame.rotation // 90))

@@ -1,0 +1,111 @@
+"""Videos and folders of pictures: what was put in comes out, with its times."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from evsplat.errors import ConfigError, DataError
+from evsplat.footage import open_footage
+
+
+def write_video(path: Path, pictures: np.ndarray, stamps: list[int], rate: int = 1000) -> None:
+    """Lossless RGB (or 16-bit grey) video with the given times in units of 1 / rate seconds."""
+    deep = pictures.dtype == np.uint16
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=rate)
+        stream.height, stream.width = pictures.shape[1:3]
+        stream.pix_fmt = "gray16le" if deep else "bgr0"
+        stream.codec_context.time_base = stream.time_base = Fraction(1, rate)
+        for picture, stamp in zip(pictures, stamps, strict=True):
+            frame = av.VideoFrame.from_ndarray(picture, format="gray16le" if deep else "rgb24")
+            frame = frame if deep else frame.reformat(format="bgr0")
+            frame.pts, frame.time_base = stamp, Fraction(1, rate)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def some_pictures(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, 18, 26, 3), dtype=np.uint8)
+
+
+def test_video_gives_its_pixels_and_its_uneven_times(tmp_path):
+    pictures = some_pictures(5)
+    write_video(tmp_path / "clip.mkv", pictures, [40, 50, 75, 80, 120])
+    footage = open_footage(tmp_path / "clip.mkv")
+    assert (footage.width, footage.height) == (26, 18)
+    assert footage.times_us.tolist() == [0, 10_000, 35_000, 40_000, 80_000]
+    for turn in range(2):  # a second pass starts again
+        read = list(footage)
+        assert [picture.time_us for picture in read] == footage.times_us.tolist(), turn
+        assert np.array_equal([picture.pixels for picture in read], pictures)
+    assert [picture.name for picture in read] == [f"{i:06d}" for i in range(5)]
+
+
+def test_sixteen_bit_grey_video_keeps_its_depth(tmp_path):
+    pictures = np.random.default_rng(1).integers(0, 2**16, (3, 16, 16), dtype=np.uint16)
+    write_video(tmp_path / "deep.mkv", pictures, [0, 1, 2])
+    read = [picture.pixels for picture in open_footage(tmp_path / "deep.mkv")]
+    assert read[0].dtype == np.uint16 and np.array_equal(read, pictures)
+
+
+def test_given_rate_replaces_the_times_of_a_slow_motion_file(tmp_path):
+    write_video(tmp_path / "slow.mkv", some_pictures(4), [0, 33, 67, 100])
+    assert open_footage(tmp_path / "slow.mkv", 240).times_us.tolist() == [0, 4167, 8333, 12500]
+
+
+def test_colours_of_a_usual_video_survive(tmp_path):
+    """H.264 of large BT.709 colour patches: within rounding of yuv420p and its coding."""
+    from evsplat.export import write_video as write_h264
+
+    colours = np.random.default_rng(2).integers(30, 226, (3, 4, 3), dtype=np.uint8)
+    picture = np.kron(colours, np.ones((16, 16, 1), dtype=np.uint8))
+    write_h264(tmp_path / "clip.mp4", [picture] * 3, fps=25, crf=1)
+    footage = open_footage(tmp_path / "clip.mp4")
+    assert footage.times_us.tolist() == [0, 40_000, 80_000]
+    for read in footage:
+        centre = read.pixels[8::16, 8::16].astype(int)
+        assert np.abs(centre - colours).max() <= 6
+
+
+def test_folder_counts_numbers_as_numbers(tmp_path):
+    pictures = some_pictures(3)
+    for name, picture in zip(("f2.png", "f10.png", "f100.png"), pictures, strict=True):
+        Image.fromarray(picture).save(tmp_path / name)
+    (tmp_path / "notes.txt").write_text("no picture")
+    footage = open_footage(tmp_path, 50)
+    assert [picture.name for picture in footage] == ["f2", "f10", "f100"]
+    assert np.array_equal([picture.pixels for picture in footage], pictures)
+    assert footage.times_us.tolist() == [0, 20_000, 40_000]
+
+
+def test_folder_with_pictures_of_two_sizes_names_the_odd_one(tmp_path):
+    for name, size in (("a.png", 8), ("b.png", 9)):
+        Image.fromarray(np.zeros((size, 8), np.uint8)).save(tmp_path / name)
+    with pytest.raises(DataError, match=r"b\.png: has 8x9 pixels, expected 8x8"):
+        list(open_footage(tmp_path, 10))
+
+
+def test_what_is_no_footage_is_told(tmp_path):
+    with pytest.raises(DataError, match="no such video file"):
+        open_footage(tmp_path / "nothing.mp4")
+    with pytest.raises(ConfigError, match="--source-fps"):
+        open_footage(tmp_path)
+    with pytest.raises(DataError, match="holds no picture"):
+        open_footage(tmp_path, 10)
+    with pytest.raises(ConfigError, match="--source-fps -3"):
+        open_footage(tmp_path, -3)
+    (tmp_path / "noise.mp4").write_bytes(np.random.default_rng(0).bytes(4000))
+    with pytest.raises(DataError, match=r"noise\.mp4: cannot be decoded"):
+        open_footage(tmp_path / "noise.mp4")
+
+
+def test_damaged_video_is_not_taken_for_a_shorter_one(tmp_path):
+    write_video(tmp_path / "clip.mkv", some_pictures(20), list(range(20)))
+    footage = open_footage(tmp_path / "clip.mkv")
+    footage.times_us = np.arange(25)
+    with pytest.raises(DataError, match="only 20 of 25 pictures"):
+        list(footage)
