@@ -56,6 +56,11 @@ class Capture:
         return f"Capture({str(self.path)!r}, {len(self.frames)} frames)"
 
     @property
+    def metadata(self) -> Metadata:
+        """All of capture.json; what other parts need is given by the other members."""
+        return self._metadata
+
+    @property
     def train_frames(self) -> tuple[Frame, ...]:
         """Frames that training may use."""
         return tuple(frame for frame in self.frames if frame.split == "train")
@@ -138,9 +143,19 @@ class Capture:
         """What was added to the event file's times to bring them to the camera's clock."""
         return 0 if self._metadata.events is None else self._metadata.events.clock_offset_us
 
+    @property
+    def has_body(self) -> bool:
+        """Whether body and poses are given."""
+        return bool(self._metadata.body_model)
+
     @functools.cached_property
     def body_file(self) -> BodyFile:
-        """The body and its key poses as stored."""
+        """The body and its key poses as stored; a `DataError` where there are none."""
+        if not self.has_body:
+            raise DataError(
+                f"{self.path / 'capture.json'}: has no body; write body.npz with the poses and "
+                "name it under 'body' (docs/capture-format.md)."
+            )
         path = self._metadata.body_file
         return body_from_arrays(path, read_arrays(path), self._metadata.body_model)
 
@@ -148,7 +163,7 @@ class Capture:
     def dense_body_file(self) -> BodyFile | None:
         """True poses at many times (evaluation and ablation only); None where not given."""
         path = self.path / "body_dense.npz"
-        if not path.exists():
+        if not self.has_body or not path.exists():
             return None
         return body_from_arrays(path, read_arrays(path), self._metadata.body_model)
 

@@ -52,7 +52,8 @@ class InspectReport:
 def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     """Validate the capture fully and, where it has no errors, draw it into ``out_dir``.
 
-    Writes contact_sheet.png, events.png, body.png and timeline.png.
+    Writes contact_sheet.png, events.png, body.png and timeline.png, as far as there is something
+    to draw.
     """
     path, out_dir = Path(path), Path(out_dir)
     metadata, found = check_capture(path, deep=True)
@@ -61,8 +62,10 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     if metadata is None or not report.usable:
         return replace(report, summary=f"{path}\n{_findings_text(findings)}")
     capture = Capture(metadata)
-    track = load_body_track(capture)
-    drawings = {"contact_sheet": _contact_sheet(capture), "body": _body_sheet(capture, track)}
+    track = load_body_track(capture) if capture.has_body else None
+    drawings = {"contact_sheet": _contact_sheet(capture)}
+    if track is not None:
+        drawings["body"] = _body_sheet(capture, track)
     if capture.events is not None and len(capture.events):
         drawings["events"] = _events_sheet(capture)
     drawings["timeline"] = draw_timeline(capture)
@@ -88,7 +91,7 @@ def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, .
     return overlaps
 
 
-def _summary(capture: Capture, track: BodyTrack) -> str:
+def _summary(capture: Capture, track: BodyTrack | None) -> str:
     frames = capture.frames
     cameras = ", ".join(
         f"{name} {capture.cameras[name].width}x{capture.cameras[name].height}"
@@ -98,21 +101,17 @@ def _summary(capture: Capture, track: BodyTrack) -> str:
     exposure = float(np.median([frame.exposure_us[1] - frame.exposure_us[0] for frame in frames]))
     starts = [frame.exposure_us[0] for frame in frames]
     rate = f", {1e6 / np.median(np.diff(starts)):.4g} frames/s" if len(frames) > 1 else ""
-    body, key_times = track.body, capture.body_file.times_us
-    dense = capture.dense_body_file
     lines = [
         f"{capture.name}   {capture.path}",
         f"frames     {len(frames)}: {len(capture.train_frames)} train, {len(capture.test_frames)} "
         f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera",
         f"time       {(end - start) / 1e6:.3f} s{rate}, exposure {exposure / 1000:.4g} ms",
         f"events     {_events_text(capture)}",
-        f"body       {capture.body_file.model}: {len(body.parents)} joints, "
-        f"{len(body.rest_vertices):,} vertices; {len(key_times)} key poses from "
-        f"{key_times[0] / 1e6:.3f} to {key_times[-1] / 1e6:.3f} s"
-        + (f"; {len(dense.times_us)} dense true poses" if dense is not None else ""),
+        f"body       {_body_text(capture, track)}",
         f"truth      {_truth_text(capture)}",
     ]
-    overlaps = body_mask_overlap(capture, track, _spread(frames, DETAIL_FRAMES))
+    shown = _spread(frames, DETAIL_FRAMES)
+    overlaps = [] if track is None else body_mask_overlap(capture, track, shown)
     if overlaps:
         lines.append(
             f"fit        posed body over masks: IoU {np.mean(overlaps):.2f} "
@@ -135,6 +134,17 @@ def _events_text(capture: Capture) -> str:
         f"{'simulated' if capture.events_simulated else 'recorded'}, "
         + (f"C+ {thresholds[0]:g}, C- {thresholds[1]:g}" if thresholds else "C unknown")
         + (f", clock offset {capture.clock_offset_us} us" if capture.clock_offset_us else "")
+    )
+
+
+def _body_text(capture: Capture, track: BodyTrack | None) -> str:
+    if track is None:
+        return "none"
+    body, times, dense = track.body, capture.body_file.times_us, capture.dense_body_file
+    return (
+        f"{capture.body_file.model}: {len(body.parents)} joints, {len(body.rest_vertices):,} "
+        f"vertices; {len(times)} key poses from {times[0] / 1e6:.3f} to {times[-1] / 1e6:.3f} s"
+        + (f"; {len(dense.times_us)} dense true poses" if dense is not None else "")
     )
 
 

@@ -74,5 +74,6 @@ class Metadata:
     novel_views: tuple[NovelView, ...]
     body_file: Path
     body_model: str
+    """Empty where the capture has no body yet."""
     events: EventsEntry | None
     provenance: dict[str, Any]

@@ -70,7 +70,7 @@ class _Parser:
         top = self.fields("", document, (*known, "provenance"))
         cameras, distortions = self.cameras(top)
         frames = self.frames(top, cameras)
-        body = self.fields("body", top.get("body"), ("file", "model")) if top.has("body") else None
+        body = self.body(top)
         provenance = document.get("provenance", {})
         body_file = body.path("file", self.path) if body else None
         return Metadata(
@@ -309,6 +309,18 @@ class _Parser:
             if entry.valid and image is not None:
                 views.append(NovelView(index, camera, frame, time_us, image))
         return tuple(views)
+
+    def body(self, top: Fields) -> Fields | None:
+        if "body" in top.value and top.value["body"] is None:
+            self.findings.warning(
+                self.file,
+                "body",
+                "null: no body",
+                "a body and its poses",
+                "All methods need them and will refuse this capture.",
+            )
+            return None
+        return self.fields("body", top.get("body"), ("file", "model")) if top.has("body") else None
 
     def body_model(self, body: Fields) -> str:
         model = body.text("model")

@@ -29,7 +29,7 @@ def draw_timeline(capture: Capture) -> Image.Image:
         x = x_of(tick)
         _line(shapes, [(x, _BARS[0]), (x, _RATE[1] + 5)], (232, 235, 239), 1)
     _draw_exposures(capture, shapes, x_of)
-    for time_us in capture.body_file.times_us:
+    for time_us in _pose_times(capture):
         if start <= time_us <= end:
             x = x_of(float(time_us))
             _line(shapes, [(x, _POSES[0]), (x, _POSES[1])], INK, 1)
@@ -85,6 +85,10 @@ def _draw_rate(
     return peak
 
 
+def _pose_times(capture: Capture) -> list[int]:
+    return capture.body_file.times_us.tolist() if capture.has_body else []
+
+
 def _draw_labels(
     capture: Capture,
     draw: ImageDraw.ImageDraw,
@@ -93,8 +97,7 @@ def _draw_labels(
     peak: float,
 ) -> None:
     start, end = span
-    poses = len(capture.body_file.times_us)
-    subtitle = f"{len(capture.frames)} exposures, {poses} key poses"
+    subtitle = f"{len(capture.frames)} exposures, {len(_pose_times(capture))} key poses"
     if capture.events is not None:
         subtitle += f", {len(capture.events):,} events"
     header(

@@ -57,6 +57,7 @@ class CaptureWriter:
         self._frames: list[dict[str, Any]] = []
         self._novel_views: list[dict[str, Any]] = []
         self._body: dict[str, str] | None = None
+        self._without_body = False
         self._events: dict[str, Any] | None = None
         self._folder: Path | None = None
         self._overwrite = overwrite
@@ -181,6 +182,10 @@ class CaptureWriter:
         if dense is not None:
             _save_arrays(self._root / "body_dense.npz", _poses(*dense))
 
+    def leave_out_body(self) -> None:
+        """Say that nobody has posed the person yet; without this a capture needs `set_body`."""
+        self._without_body = True
+
     def set_events(
         self,
         events: EventStream | Iterable[EventStream],
@@ -261,7 +266,7 @@ class CaptureWriter:
         return stem + suffix
 
     def _finish(self) -> None:
-        if self._body is None:
+        if self._body is None and not self._without_body:
             raise DataError(f"{self.path}: the capture was given no body; call set_body.")
         document = {
             "format": FORMAT,
