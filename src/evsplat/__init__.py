@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from evsplat.events.convert import convert_recording as convert
     from evsplat.export import render_run
     from evsplat.restore import restore_capture
+    from evsplat.synthesis import synthesize
     from evsplat.training.run import load_run
     from evsplat.training.train import train
 
@@ -49,6 +50,7 @@ __all__ = [
     "load_run",
     "render_run",
     "restore_capture",
+    "synthesize",
     "train",
     "write_report",
 ]
@@ -63,6 +65,7 @@ _LAZY = {
     "load_run": "evsplat.training.run:load_run",
     "render_run": "evsplat.export:render_run",
     "restore_capture": "evsplat.restore:restore_capture",
+    "synthesize": "evsplat.synthesis:synthesize",
     "train": "evsplat.training:train",
     "write_report": "evsplat.evaluation.report:write_report",
 }

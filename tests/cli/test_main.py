@@ -11,7 +11,8 @@ import evsplat
 from evsplat.cli import main
 from evsplat.cli.demo import demo_capture
 
-VERBS = ("demo", "doctor", "inspect", "restore", "train", "evaluate", "report", "render")
+VERBS = ("demo", "doctor", "synthesize", "inspect", "restore", "train")
+VERBS += ("evaluate", "report", "render")
 
 
 def _outcome(capsys, *arguments):

@@ -7,7 +7,7 @@ from skimage.color import rgb2gray
 from evsplat.imaging import decode, encode, luminance
 
 
-@pytest.mark.parametrize("transfer", ["power", "srgb"])
+@pytest.mark.parametrize("transfer", ["power", "srgb", "linear"])
 @pytest.mark.parametrize("seed", range(3))
 def test_encode_undoes_decode(transfer, seed):
     values = torch.rand(1000, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -21,7 +21,7 @@ def test_srgb_curve_has_the_standards_values():
     assert torch.allclose(decode(coded, "srgb"), linear, atol=1e-7)
 
 
-@pytest.mark.parametrize("transfer", ["power", "srgb"])
+@pytest.mark.parametrize("transfer", ["power", "srgb", "linear"])
 def test_gradients_are_finite_at_black(transfer):
     black = torch.zeros(3, requires_grad=True)
     decode(black, transfer).sum().backward()

@@ -17,13 +17,14 @@ from evsplat.cli.inspect import inspect
 from evsplat.cli.render import render
 from evsplat.cli.report import report
 from evsplat.cli.restore import restore
+from evsplat.cli.synthesize import synthesize
 from evsplat.cli.train import train
 from evsplat.errors import EvsplatError
 
 _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
     for verb in (
-        *(demo, doctor, import_, convert, inspect),
+        *(demo, doctor, import_, convert, synthesize, inspect),
         *(restore, train, evaluate, report, render),
     )
 }

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-Transfer = Literal["power", "srgb"]
-"""``power``: exponent 2.2 (paper eq. 8); ``srgb``: the exact piecewise curve of IEC 61966-2-1."""
+Transfer = Literal["power", "srgb", "linear"]
+"""``power``: exponent 2.2 (paper eq. 8); ``srgb``: the exact piecewise curve of IEC 61966-2-1;
+``linear``: the values are light as they stand."""
 
 GAMMA = 2.2
 REC709 = (0.2126, 0.7152, 0.0722)
@@ -18,6 +19,8 @@ def decode(coded: Float[Tensor, "*shape"], transfer: Transfer = "power") -> Floa
     coded = coded.clamp_min(0.0)
     if transfer == "power":
         return coded**GAMMA
+    if transfer == "linear":
+        return coded
     return torch.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
 
 
@@ -28,6 +31,8 @@ def encode(
     linear = linear.clamp_min(0.0)
     if transfer == "power":
         return linear ** (1 / GAMMA)
+    if transfer == "linear":
+        return linear
     return torch.where(
         linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp_min(1e-8) ** (1 / 2.4) - 0.055
     )
