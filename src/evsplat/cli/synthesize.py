@@ -41,14 +41,10 @@ def synthesize(
     camera: Annotated[Path | None, option("JSON", default="a nominal one")] = None,
     overwrite: Flag = False,
 ) -> None:
-    """Make a capture of sharp footage: blurry frames, sharp truth, simulated events.
-
-    SOURCE: a video, a folder of pictures, or a capture whose frames are sharp.
-
-    The options are explained in docs/synthesize.md.
+    """Make a capture of sharp footage: blur and events (docs/synthesize.md).
 
     Args:
-        source: Sharp footage.
+        source: Video, folder of pictures, or capture with sharp frames.
         out: New capture folder.
         recipe: zju-mocap-blur or mmhpsd-blur.
         fps: Blurry frames per second.
