@@ -1,5 +1,6 @@
 """Reading the command line, and turning what goes wrong into a message and an exit code."""
 
+import functools
 import logging
 import sys
 from collections.abc import Callable, Sequence
@@ -49,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(format="%(message)s")
     logging.getLogger("evsplat").setLevel(logging.INFO)
     verbs = _VERBS
+    if not arguments or arguments[0].startswith("-"):
+        verbs = {name: _in_a_line(verb) for name, verb in _VERBS.items()}
     if arguments[:1] == ["import"]:
         verbs = {**_VERBS, "import": import_with_kinds()}
     try:
@@ -66,3 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"\nevsplat: {stop or 'Stopped.'}", file=sys.stderr)
         return _CODE_INTERRUPTED
     return 0
+
+
+def _in_a_line(verb: Callable[..., Any]) -> Callable[..., Any]:
+    """The verb with the first line of its description alone, so that the list fits a screen."""
+
+    @functools.wraps(verb)
+    def brief(*arguments: Any, **options: Any) -> Any:
+        return verb(*arguments, **options)
+
+    brief.__doc__ = (verb.__doc__ or "").partition("\n")[0]
+    return brief
