@@ -26,12 +26,13 @@ from evsplat.errors import DataError
 StandIns = Callable[[str, str], type | None]
 """Maps a module and a name in it to a class to build instead; it gets state by __setstate__."""
 
-_BROKEN = (
+BROKEN = (
     *(OSError, EOFError, ValueError, TypeError, KeyError, AttributeError, IndexError),
     *(AssertionError, OverflowError, MemoryError, RuntimeError, struct.error, zlib.error),
     *(lzma.LZMAError, pickle.UnpicklingError, zipfile.BadZipFile),
     *(SyntaxError, tokenize.TokenError),
 )
+"""What NumPy, zipfile and pickle raise on damaged files."""
 _UNPACK: dict[bytes, Callable[[bytes], bytes]] = {
     b"\x1f\x8b": gzip.decompress,
     b"BZ": bz2.decompress,
@@ -105,7 +106,7 @@ def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
             f"{path}: holds the pickled type {name}, which no {what} needs, so it was not loaded; "
             "get the file again from its official source."
         ) from None
-    except _BROKEN as error:
+    except BROKEN as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise DataError(f"{path}: not a readable {what} ({reason}).") from error
 

@@ -1,6 +1,5 @@
 """The body and its key poses as they stand in ``body.npz``."""
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int64
 
 from evsplat.errors import DataError
+from evsplat.safe_pickle import BROKEN
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +60,9 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             f"{path}: holds pickled Python objects, expected plain arrays only; save it with plain "
             "numeric and string arrays (np.savez never pickles those)."
         ) from None
-    except (OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise DataError(f"{path}: not a readable npz ({error}); write it anew.") from error
+    except BROKEN as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(f"{path}: not a readable npz ({said}); write it anew.") from error
 
 
 def body_from_arrays(path: Path, arrays: dict[str, np.ndarray], model: str) -> BodyFile:
