@@ -123,6 +123,7 @@ struct Kernels {
     // Sums over a band, and the gradient of the similarity.
     SsimSums (*ssim)(const SsimBand&);
     void (*log_brightness)(const LogBrightness&, size_t begin, size_t end);
+    void (*power)(const Power&, size_t begin, size_t end);
     void (*add_sign)(const float*, const float*, float, float, size_t, float*);
     // Points [begin, end).
     void (*skin)(const Skinning&, size_t begin, size_t end, float* moved, float* blended);
@@ -137,6 +138,7 @@ struct Kernels {
     extern const Kernels kernels;                \
     SsimSums ssim_band(const SsimBand&);         \
     void log_brightness(const LogBrightness&, size_t, size_t);                      \
+    void power(const Power&, size_t, size_t);                                       \
     void add_sign(const float*, const float*, float, float, size_t, float*);        \
     void skin(const Skinning&, size_t, size_t, float*, float*);                                  \
     void skin_backward(const Skinning&, const SkinningGrads&, const float*, size_t, size_t);     \

@@ -265,6 +265,13 @@ void picture_add_sign(In image, In reference, float by_difference, float scale, 
     add_sign(image.data(), reference.data(), by_difference, scale, image.size(), threads, grad.data());
 }
 
+void picture_power(In from, float exponent, Out value, std::optional<Out> slope, int threads) {
+    require(value.size() == from.size() && (!slope || slope->size() == from.size()), "the picture");
+    require(exponent > 1.f, "the exponent: above 1");
+    nb::gil_scoped_release release;
+    power({from.data(), exponent, value.data(), slope ? slope->data() : nullptr}, from.size(), threads);
+}
+
 // Planes (3, pixels).
 void picture_log_brightness(In coded, const std::array<float, 3>& weight, float gamma, float darkest, float eps,
                             Out value, std::optional<Out> slope, int threads) {
@@ -426,6 +433,8 @@ NB_MODULE(_native, m) {
     m.def("add_sign", &picture_add_sign, nb::arg("image"), nb::arg("reference"), nb::arg("by_difference"),
           nb::arg("scale"), nb::arg("grad"), nb::arg("threads"),
           "grad = by_difference * sign(image - reference) + scale * grad.");
+    m.def("power", &picture_power, nb::arg("given"), nb::arg("exponent"), nb::arg("value"), nb::arg("slope").none(),
+          nb::arg("threads"), "value = max(from, 0)^exponent, and its slope.");
     m.def("log_brightness", &picture_log_brightness, nb::arg("coded"), nb::arg("weight"), nb::arg("gamma"),
           nb::arg("darkest"), nb::arg("eps"), nb::arg("value"), nb::arg("slope").none(), nb::arg("threads"),
           "Logarithm of the luminance of (3, H, W) coded values, and its slope by each.");

@@ -24,6 +24,11 @@ void log_brightness(const LogBrightness& job, size_t count, int threads) {
     in_pieces(count, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
 }
 
+void power(const Power& job, size_t count, int threads) {
+    const auto kernel = select_kernels().power;
+    in_pieces(count, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+}
+
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count,
               int threads, float* grad) {
     const auto kernel = select_kernels().add_sign;

@@ -18,6 +18,16 @@ struct LogBrightness {
 
 void log_brightness(const LogBrightness&, size_t count, int threads);
 
+// value = max(from, 0)^exponent for an exponent above 1, over `count` values; `slope` is null or takes the
+// derivative. Both are zero below 1e-6.
+struct Power {
+    const float* from;
+    float exponent;
+    float *value, *slope;
+};
+
+void power(const Power&, size_t count, int threads);
+
 // grad = by_difference * sign(image - reference) + scale * grad, over `count` values.
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count,
               int threads, float* grad);

@@ -43,7 +43,28 @@ INLINE void pixels(const LogBrightness& job, size_t at, const Load& load_at, con
     for (int c = 0; c < 3; ++c) store_at(job.slope[c] + at, slope[c] / light);
 }
 
+INLINE void powers(const Power& job, const F given, F& value, F& slope) {
+    const F v = max(given, splat(1e-6f));
+    const F less = select(given >= 1e-6f, exp2(log2(v) * (job.exponent - 1.f)), F{});
+    value = less * v, slope = less * job.exponent;
+}
+
 }  // namespace
+
+void power(const Power& job, size_t begin, size_t end) {
+    F value, slope;
+    size_t at = begin;
+    for (; at + W <= end; at += W) {
+        powers(job, load(job.from + at), value, slope);
+        store(job.value + at, value);
+        if (job.slope) store(job.slope + at, slope);
+    }
+    for (; at < end; ++at) {
+        powers(job, splat(job.from[at]), value, slope);
+        job.value[at] = value[0];
+        if (job.slope) job.slope[at] = slope[0];
+    }
+}
 
 void log_brightness(const LogBrightness& job, size_t begin, size_t end) {
     size_t at = begin;

@@ -149,6 +149,9 @@ def add_sign(
     grad: Tensor,
     threads: int,
 ) -> None: ...
+def power(
+    given: Tensor, exponent: float, value: Tensor, slope: Tensor | None, threads: int
+) -> None: ...
 def log_brightness(
     coded: Tensor,
     weight: tuple[float, float, float],

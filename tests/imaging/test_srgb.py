@@ -32,3 +32,14 @@ def test_luminance_is_rec_709(seed=0):
     pixels = torch.rand(5, 7, 3, generator=torch.Generator().manual_seed(seed))
     peer = torch.from_numpy(rgb2gray(pixels.numpy()))  # scikit-image: 0.2125, 0.7154, 0.0721
     assert torch.allclose(luminance(pixels), peer, atol=3e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_power_and_its_gradient_equal_the_definition_in_float64(seed):
+    coded = 1.4 * torch.rand(7, 61, generator=torch.Generator().manual_seed(seed)) - 0.2
+    leaf = coded.clone().requires_grad_()
+    value = decode(leaf)
+    (gradient,) = torch.autograd.grad(value.sum(), leaf)
+    exact = coded.double().clamp_min(0)
+    assert (value - exact**2.2).abs().max() < 1e-6
+    assert (gradient - 2.2 * exact**1.2).abs().max() < 2e-6

@@ -7,7 +7,7 @@ import torch
 
 from evsplat.capture import load_capture
 from evsplat.errors import DataError
-from evsplat.methods import compose, method_config
+from evsplat.methods import TRAINABLE, compose, method_config
 from evsplat.render import api, cuda
 from evsplat.training.bad_steps import MAX_BAD_STEPS
 from evsplat.training.clock import Clock
@@ -133,7 +133,7 @@ class Here:
 def foreign(monkeypatch):
     """The device, and a trainer factory for it with gsplat's functions as shapes."""
 
-    def make(capture_path, **settings):
+    def make(capture_path, method="paper", **settings):
         capture = load_capture(capture_path)
         camera = capture.cameras["main"]
         gsplat = drawing(camera.width, camera.height)
@@ -142,8 +142,8 @@ def foreign(monkeypatch):
         monkeypatch.setattr(api, "_BACKEND_OF_DEVICE", {NAME: "gsplat"})
         monkeypatch.setattr(torch.optim, "Adam", Descent)
         torch.__future__.set_overwrite_module_params_on_conversion(True)
-        composition = compose(
-            method_config("paper", {**SMALL, **settings}, where="test"), capture, 0,
+        composition = TRAINABLE[method][1](
+            method_config(method, {**SMALL, **settings}, where="test"), capture, 0,
             device=NAME, fit=False,
         )  # fmt: skip
         trainer = Trainer(composition, capture, Clock(100, fraction=0.5))
@@ -159,12 +159,13 @@ def foreign(monkeypatch):
     "settings",
     [
         {},
+        {"method": "evsplat"},
         {
             "deform": SMALL["deform"] | {"encoding": "hashgrid", "pose_correction_start": 0},
             "loss": {"perceptual": "st_lpips"},
         },
     ],
-    ids=["default", "what can be switched on"],
+    ids=["paper", "evsplat", "what can be switched on"],
 )
 def test_a_step_stays_on_its_device_and_never_waits(settings, foreign, tiny_capture):
     device, make = foreign

@@ -40,13 +40,15 @@ import importlib, sys
 module = importlib.import_module("evsplat.training.train")
 module.CHECKPOINT_SECONDS = 0.0
 module.train(sys.argv[1], out=sys.argv[2], iterations=int(sys.argv[3]), resume=sys.argv[4] == "1",
-             overrides=sys.argv[5:], threads=1)
+             method=sys.argv[5], overrides=sys.argv[6:], threads=1)
 """
 
 
-def start(capture: Path, out: Path, iterations: int, *, resume: bool = False) -> subprocess.Popen:
-    overrides = () if resume else SMALL
-    command = [sys.executable, "-c", SCRIPT, capture, out, iterations, int(resume), *overrides]
+def start(
+    capture: Path, out: Path, iterations: int, *, resume: bool = False, method: str = "paper"
+) -> subprocess.Popen:
+    settings = (method,) if resume else (method, *SMALL)
+    command = [sys.executable, "-c", SCRIPT, capture, out, iterations, int(resume), *settings]
     return subprocess.Popen(
         [str(part) for part in command],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -77,14 +79,17 @@ def log_without_times(out: Path) -> list[dict]:
     return [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
 
 
-def test_killed_and_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tiny_capture, tmp_path):
+@pytest.mark.parametrize("method", ["paper", "evsplat"])
+def test_killed_and_resumed_run_equals_the_uninterrupted_one_bit_for_bit(
+    method, tiny_capture, tmp_path
+):
     capture = tiny_capture(frames=10)
     iterations = 40
-    whole = start(capture, tmp_path / "whole", iterations)
+    whole = start(capture, tmp_path / "whole", iterations, method=method)
     assert whole.wait(240) == 0, whole.stderr.read()
     for kill_at in (3, 17):
         broken = tmp_path / f"broken{kill_at}"
-        process = start(capture, broken, iterations)
+        process = start(capture, broken, iterations, method=method)
         wait_for_step(broken, kill_at, process)
         process.kill()  # SIGKILL: nothing can be tidied up
         process.wait()

@@ -12,6 +12,7 @@ from evsplat.body.rotations import (
 from evsplat.body.silhouette import body_box, silhouette
 from evsplat.body.surface import SurfaceSamples
 from evsplat.body.track import BodyTrack, load_body_track
+from evsplat.body.upright import up_axis
 
 __all__ = [
     "Body",
@@ -31,4 +32,5 @@ __all__ = [
     "retarget",
     "silhouette",
     "skin",
+    "up_axis",
 ]

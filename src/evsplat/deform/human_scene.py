@@ -9,19 +9,26 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from evsplat.body import BodyTrack, bounding_box, skin
+from evsplat.body import BodyTrack, bounding_box, skin, up_axis
 from evsplat.body.rotations import axis_angle_to_matrix, quaternion_multiply
 from evsplat.deform.colour import HumanColour, SceneColour, view_jitter
 from evsplat.deform.encodings import make_encoding
 from evsplat.deform.mlp import PointMLP, Precision, bfloat16_runs
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
+from evsplat.deform.shading import Shading, SurfaceNormals
+from evsplat.deform.shadow import BodyShadow
 from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.deform.skinning_turns import SkinningTurns
 from evsplat.devices import send
 from evsplat.gaussians import ATTRIBUTES, GaussianSet, PosedGaussians, PosedHuman, StaticScene
 
 logger = logging.getLogger(__name__)
+
+NORMAL_SAMPLES = 20_000
+"""Points of the body's surface among which a Gaussian finds its normal."""
+CASTERS = 400
+"""Points of the body that hide lights."""
 
 Semantics = Literal["fixed", "ste", "rendered"]
 
@@ -63,6 +70,13 @@ class DeformConfig:
     """Whether the scene's colour sees the view direction (paper eq. 7, A10)."""
     scene_direction_dropout: float = 0.5
     """How often a training step hides that direction; a static camera cannot teach it (A10)."""
+    networks_once: bool = False
+    """Look the person's networks up once per training step, at the drawn frame's middle, instead
+    of at each of its times, which lie within a frame of it."""
+    shading: bool = False
+    """The person's brightness depends on the surface's normal and place in the world."""
+    shadow_lights: int = 0
+    """Lights whose shadows of the person fall on the scene; 0 = no shadows."""
     pose_correction_start: float | None = None
     """Nominal iteration from which per-frame pose residuals are learned; null = never.
     3DGS-Avatar starts at 5000 (A9). Exact poses get worse by it, noisy ones better."""
@@ -124,6 +138,20 @@ class HumanSceneModel(nn.Module):
                 module.precision = config.precision
         frames = len(frame_times_us)
         # Zero, not random: what a frame has not learned must not show between frames.
+        self.sensor: nn.Module | None = None
+        """What is learned of the event camera, by methods that do."""
+        self.shading: Shading | None = None
+        self.shadow: BodyShadow | None = None
+        generator = torch.Generator().manual_seed(0)
+        self.surface_normals = SurfaceNormals(body.sample_surface(NORMAL_SAMPLES, generator))
+        if config.shading:
+            roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
+            middle = roots.mean(0)
+            radius = max(1.0, float((roots - middle).norm(dim=-1).max()))
+            self.shading = Shading(middle.float(), radius)
+        if config.shadow_lights:
+            casters = body.sample_surface(CASTERS, generator)
+            self.shadow = BodyShadow(casters, up_axis(track), config.shadow_lights)
         self.latents = nn.Parameter(torch.zeros(frames, config.latent_dim))
         self.rotation_residuals = nn.Parameter(torch.zeros(frames, joints, 3))
         self.translation_residuals = nn.Parameter(torch.zeros(frames, 3))
@@ -177,12 +205,16 @@ class HumanSceneModel(nn.Module):
         noise: Noise | None = None,
         hard_semantics: bool = False,
         share_skinning: bool = False,
+        networks_at_us: int | None = None,
     ) -> PosedGaussians:
         """All Gaussians in world space at ``times_us``, coloured for a camera at that centre.
 
         ``share_skinning`` reads the skinning weights once, at the mean of a Gaussian's deformed
         places, instead of at each (eq. 2): for the neighbouring times of a training step, whose
         deformations differ by less than the weights notice, this halves the network's cost.
+
+        ``networks_at_us`` is the time of the pose and latent that the non-rigid and colour networks
+        see, for all of ``times_us``; without it they see each time's own.
 
         ``hard_semantics`` puts the hard label into the semantic channel (evaluation); otherwise it
         is the soft attribute m.
@@ -191,7 +223,10 @@ class HumanSceneModel(nn.Module):
         parts = {name: gaussians.of_parts(getattr(gaussians, name)) for name in ATTRIBUTES}
         rotations, bones = self.pose(times_us)
         moving = self._moving(parts)
-        deformed, log_scales, quaternions, feature = self._non_rigid(moving, rotations, noise)
+        seen_times, seen = list(times_us), rotations
+        if networks_at_us is not None:
+            seen_times, seen = [networks_at_us], self.pose([networks_at_us])[0]
+        deformed, log_scales, quaternions, feature = self._non_rigid(moving, seen, noise)
         if share_skinning:
             shared = self.normalise(deformed.mean(0))
             weights = self.skinning_turns.weights(self.skinning, shared)[None]
@@ -204,15 +239,21 @@ class HumanSceneModel(nn.Module):
         if self.semantics == "ste":
             human_means, scene_means = self._straight_through(world, moving)
         human_features, scene_features = parts["features"]
+        middle = slice(None)
+        if networks_at_us is not None:
+            nearest = min(range(len(times_us)), key=lambda t: abs(times_us[t] - networks_at_us))
+            middle = slice(nearest, nearest + 1)
         rgb = self._human_rgb(
             human_features,
-            human_means,
-            transforms[:, people],
+            human_means[middle],
+            transforms[middle, people],
             feature[:, people],
             camera_center,
-            times_us,
+            seen_times,
             noise,
         )
+        if self.shading is not None:
+            rgb = rgb * self._shade(parts["means"][0], human_means, transforms[:, people])
         hidden = noise is not None and noise.hide_scene_direction
         directions = nn.functional.normalize(scene_means.detach() - camera_center, dim=-1)
         soft = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
@@ -224,7 +265,7 @@ class HumanSceneModel(nn.Module):
                 human_means,
                 quaternions[:, people].expand(times, -1, -1),
                 log_scales[:, people].exp().expand(times, -1, -1),
-                rgb,
+                rgb.expand(times, -1, -1),
                 transforms[:, people],
             ),
             scene=StaticScene(
@@ -237,6 +278,7 @@ class HumanSceneModel(nn.Module):
             scene_opacities=opacities[1],
             human_semantics=semantics[0],
             scene_semantics=semantics[1],
+            casters=None if self.shadow is None else self.shadow.place(bones),
         )
 
     def draw_noise(self, times: int, generator: torch.Generator) -> Noise:
@@ -304,6 +346,15 @@ class HumanSceneModel(nn.Module):
             quaternion_multiply(delta.rotation, nn.functional.normalize(quaternions, dim=-1)),
             delta.feature,
         )
+
+    def _shade(
+        self, canonical: Tensor, world: Tensor, transforms: Tensor
+    ) -> Float[Tensor, "T H 3"]:
+        """Factor of the light on the person's colours; geometry gets no gradient by it."""
+        assert self.shading is not None
+        normals = self.surface_normals.of(canonical)[None, ..., None]
+        turned = (transforms[..., :3, :3].detach() @ normals)[..., 0]
+        return self.shading(nn.functional.normalize(turned, dim=-1), world.detach())
 
     def _human_rgb(
         self,

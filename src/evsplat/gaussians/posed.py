@@ -43,6 +43,8 @@ class PosedGaussians:
     human_semantics: Float[Tensor, " H"]
     """Soft attribute m (or the hard label, for evaluation), drawn as a fourth channel."""
     scene_semantics: Float[Tensor, " S"]
+    casters: Float[Tensor, "T P 3"] | None = None
+    """Points of the body that hide the light; without them there are no shadows."""
 
     @property
     def times(self) -> int:

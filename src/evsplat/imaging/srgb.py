@@ -1,10 +1,13 @@
 """Between the coded values of a picture and linear light."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from evsplat.compiled import native, runs_native
 
 Transfer = Literal["power", "srgb", "linear"]
 """``power``: exponent 2.2 (paper eq. 8); ``srgb``: the exact piecewise curve of IEC 61966-2-1;
@@ -16,9 +19,12 @@ REC709 = (0.2126, 0.7152, 0.0722)
 
 def decode(coded: Float[Tensor, "*shape"], transfer: Transfer = "power") -> Float[Tensor, "*shape"]:
     """Linear light in [0, 1] of coded values in [0, 1]; values below 0 count as 0."""
-    coded = coded.clamp_min(0.0)
     if transfer == "power":
-        return coded**GAMMA
+        if coded.requires_grad and runs_native(coded):
+            linear: Tensor = _NativePower.apply(coded)
+            return linear
+        return coded.clamp_min(0.0) ** GAMMA
+    coded = coded.clamp_min(0.0)
     if transfer == "linear":
         return coded
     return torch.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
@@ -42,3 +48,23 @@ def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
     """Rec. 709 luminance of linear RGB, the quantity that an event pixel sees."""
     red, green, blue = linear_rgb.unbind(-1)
     return REC709[0] * red + REC709[1] * green + REC709[2] * blue
+
+
+class _NativePower(torch.autograd.Function):
+    """The power curve in the compiled module; the slope is found on the way forward."""
+
+    @staticmethod
+    def forward(ctx: Any, coded: Tensor) -> Tensor:
+        given = coded.detach().contiguous()
+        value = torch.empty_like(given)
+        slope = torch.empty_like(given) if ctx.needs_input_grad[0] else None
+        native.power(given, GAMMA, value, slope, torch.get_num_threads())
+        if slope is not None:
+            ctx.save_for_backward(slope)
+        return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        (slope,) = ctx.saved_tensors
+        return slope * upstream[0]

@@ -1,15 +1,21 @@
 """Methods: compositions of model, objectives and schedules, named in a typed configuration."""
 
 import difflib
+from collections.abc import Callable
 from typing import Any
 
 from evsplat.config import from_dict
 from evsplat.errors import ConfigError
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import NOMINAL_ITERATIONS
+from evsplat.methods.evsplat import EvsplatConfig
+from evsplat.methods.evsplat import compose as compose_evsplat
 from evsplat.methods.paper import PaperConfig, compose
 
-TRAINABLE = {"paper": (PaperConfig, compose)}
+TRAINABLE: dict[str, tuple[type[PaperConfig], Callable[..., Composition]]] = {
+    "evsplat": (EvsplatConfig, compose_evsplat),
+    "paper": (PaperConfig, compose),
+}
 """Configuration and composition of every method that is trained."""
 
 

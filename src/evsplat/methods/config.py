@@ -43,6 +43,10 @@ class LearningRates:
     """Both colour networks."""
     latents: float = 1e-3
     pose_correction: float = 1e-4
+    shading: float = 3e-3
+    shadow: float = 1e-2
+    sensor: float = 1e-3
+    """Logarithms of the contrast thresholds."""
     final: float = 0.1
     """Factor that every rate reaches at the end, exponentially."""
     means_final: float = 0.1

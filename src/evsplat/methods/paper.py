@@ -10,8 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from evsplat.body import Body, BodyTrack, body_box, load_body_track, silhouette
-from evsplat.body.canonical import find_legs
+from evsplat.body import BodyTrack, body_box, load_body_track, silhouette, up_axis
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
 from evsplat.errors import ConfigError, DataError
@@ -168,51 +167,88 @@ def compose(
 
     ``fit=False`` skips the cheap fits, for a model whose parameters are loaded afterwards.
     """
-    generator = torch.Generator().manual_seed(seed)
-    torch.manual_seed(seed)
-    track = load_body_track(capture)
-    frames = capture.train_frames
-    if not frames:
-        raise DataError(f"{capture.path}: no frame has split 'train'; nothing to learn from.")
-    times = [frame.mid_us for frame in frames]
-    surface = track.body.sample_surface(SURFACE_SAMPLES, generator)
+    build = Build.start(config, capture, seed, device=device, fit=fit)
+    return build.composition(_observed(config, capture, build.track, device))
 
-    human = _human_start(config, capture, track, generator)
-    scene, colours = _scene_start(config, capture, track, generator)
-    gaussians = GaussianSet(human, scene)
-    model = HumanSceneModel(config.deform, config.semantics, track, times, gaussians).to(device)
 
-    prior = SkinningPrior(surface.to(device), config.skinning_points)
-    if fit:
-        fit_skinning(model, prior, config.skinning_prefit_steps, generator)
-        if config.scene.kind == "median_backdrop":
-            camera = capture.camera(frames[0]).to(device)
-            fit_scene_colours(
-                model, camera, colours.to(device), config.scene.prefit_steps, generator
-            )
-            fit_scene(
-                model, camera, capture.median_background().to(device), config.scene.prefit_steps
-            )
+@dataclass(frozen=True)
+class Build:
+    """A model at its start, and what objectives are made from; shared by methods of this model."""
 
-    return Composition(
-        model=model,
-        objectives=_objectives(config, capture, track, prior, device),
-        weights={
-            "l1": config.loss.l1,
-            "dssim": config.loss.dssim,
-            "perceptual": config.loss.perceptual_weight,
-            "skinning": config.loss.skinning,
-            "isometry_centers": config.loss.isometry_centers,
-            "isometry_covariances": config.loss.isometry_covariances,
-            "semantic": config.loss.semantic,
-            "binarise": config.loss.binarise,
-            "event": config.event.weight,
-        },
-        optimisation=config.optimisation,
-        densify={"human": config.densify_human, **_scene_limits(config)},
-        body_frames=BodyFrames(model.track.body, model.track.bones(times)),
-        generator=generator,
-    )
+    config: PaperConfig
+    capture: Capture
+    track: BodyTrack
+    """On the CPU, where silhouettes are drawn."""
+    model: HumanSceneModel
+    prior: SkinningPrior
+    generator: torch.Generator
+
+    @classmethod
+    def start(
+        cls,
+        config: PaperConfig,
+        capture: Capture,
+        seed: int,
+        *,
+        device: torch.device | str,
+        fit: bool,
+    ) -> "Build":
+        """Place the Gaussians, make the networks and run the cheap fits."""
+        generator = torch.Generator().manual_seed(seed)
+        torch.manual_seed(seed)
+        track = load_body_track(capture)
+        frames = capture.train_frames
+        if not frames:
+            raise DataError(f"{capture.path}: no frame has split 'train'; nothing to learn from.")
+        times = [frame.mid_us for frame in frames]
+        surface = track.body.sample_surface(SURFACE_SAMPLES, generator)
+
+        human = _human_start(config, capture, track, generator)
+        scene, colours = _scene_start(config, capture, track, generator)
+        gaussians = GaussianSet(human, scene)
+        model = HumanSceneModel(config.deform, config.semantics, track, times, gaussians)
+        model = model.to(device)
+
+        prior = SkinningPrior(surface.to(device), config.skinning_points)
+        if fit:
+            steps = config.scene.prefit_steps
+            fit_skinning(model, prior, config.skinning_prefit_steps, generator)
+            if config.scene.kind == "median_backdrop":
+                camera = capture.camera(frames[0]).to(device)
+                fit_scene_colours(model, camera, colours.to(device), steps, generator)
+                fit_scene(model, camera, capture.median_background().to(device), steps)
+        return cls(config, capture, track, model, prior, generator)
+
+    def composition(self, observed: list[Objective]) -> Composition:
+        """Everything together; ``observed`` are the objectives that compare with recorded data."""
+        config, model = self.config, self.model
+        objectives = [
+            *observed,
+            self.prior,
+            Isometry(refresh=config.isometry_refresh, samples=config.isometry_samples),
+        ]
+        if config.semantics == "rendered":
+            objectives.append(RenderedSemantics(_bounds(config, self.capture, self.track)))
+        times = [frame.mid_us for frame in self.capture.train_frames]
+        return Composition(
+            model=model,
+            objectives=objectives,
+            weights={
+                "l1": config.loss.l1,
+                "dssim": config.loss.dssim,
+                "perceptual": config.loss.perceptual_weight,
+                "skinning": config.loss.skinning,
+                "isometry_centers": config.loss.isometry_centers,
+                "isometry_covariances": config.loss.isometry_covariances,
+                "semantic": config.loss.semantic,
+                "binarise": config.loss.binarise,
+                "event": config.event.weight,
+            },
+            optimisation=config.optimisation,
+            densify={"human": config.densify_human, **_scene_limits(config)},
+            body_frames=BodyFrames(model.track.body, model.track.bones(times)),
+            generator=self.generator,
+        )
 
 
 def _scene_limits(config: PaperConfig) -> dict[Part, DensifyConfig]:
@@ -272,7 +308,7 @@ def _scene_start(
                 "this capture's camera moves. Pass --set scene.kind=random_cube."
             )
         body = torch.cat([track.vertices(frame.mid_us)[::7] for frame in frames])
-        depth = backdrop_depth(camera, body, up=_up_axis(track), margin=start.backdrop_margin)
+        depth = backdrop_depth(camera, body, up=up_axis(track), margin=start.backdrop_margin)
         points, scales, colours = median_backdrop(
             camera,
             capture.median_background(),
@@ -291,59 +327,29 @@ def _scene_start(
     return values, colours
 
 
-def _up_axis(track: BodyTrack) -> Tensor:
-    """The signed world axis nearest to the body's own up direction in the middle of the track."""
-    body = track.body
-    legs = find_legs(body.parents.tolist(), body.joint_names)
-    rest = body.canonical_vertices()
-    if legs is None:
-        tallest = int((rest.amax(0) - rest.amin(0)).argmax())
-        below = rest[:, tallest] < rest[:, tallest].mean()
-    else:
-        below = _leg_share(body, (legs.left, legs.right)) > 0.5
-    posed = track.vertices(int(track.times_us[len(track.times_us) // 2]))
-    direction = posed[~below].mean(0) - posed[below].mean(0)
-    up = torch.zeros(3)
-    axis = int(direction.abs().argmax())
-    up[axis] = direction[axis].sign()
-    return up
-
-
-def _leg_share(body: Body, thighs: tuple[int, int]) -> Tensor:
-    """How much of each vertex's weight belongs to the joints from the thighs down."""
-    chain = set(thighs)
-    for joint, parent in enumerate(body.parents.tolist()):
-        if parent in chain:
-            chain.add(joint)
-    return body.weights[:, sorted(chain)].sum(-1)
-
-
-def _objectives(
-    config: PaperConfig,
-    capture: Capture,
-    track: BodyTrack,
-    prior: SkinningPrior,
-    device: torch.device | str,
-) -> list[Objective]:
-    frames = capture.train_frames
-    bounds, boxes = {}, {}
-    for frame in frames:
+def _bounds(config: PaperConfig, capture: Capture, track: BodyTrack) -> dict[int, PackedBounds]:
+    """Where the posed body says that the person is, by mid-exposure."""
+    bounds = {}
+    for frame in capture.train_frames:
         camera = capture.camera(frame)
-        vertices = track.vertices(frame.mid_us)
-        mask = silhouette(vertices, track.body.faces, camera)
+        mask = silhouette(track.vertices(frame.mid_us), track.body.faces, camera)
         band = max(1, round(config.semantic_band_px_at_256 * camera.height / 256))
         bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band)
-        box = body_box(vertices, camera)
-        if box is not None:
-            boxes[frame.name] = box
+    return bounds
+
+
+def _observed(
+    config: PaperConfig, capture: Capture, track: BodyTrack, device: torch.device | str
+) -> list[Objective]:
+    """The paper's terms: pictures at mid-exposure, events between neighbouring frames."""
+    boxes = {
+        frame.name: box
+        for frame in capture.train_frames
+        if (box := body_box(track.vertices(frame.mid_us), capture.camera(frame))) is not None
+    }
     perceptual = make_perceptual(config.loss.perceptual, device=device)
-    objectives: list[Objective] = [
-        Photometric(capture, boxes, dssim=config.loss.dssim != 0.0, perceptual=perceptual),
-        prior,
-        Isometry(refresh=config.isometry_refresh, samples=config.isometry_samples),
-    ]
-    if config.semantics == "rendered":
-        objectives.append(RenderedSemantics(bounds))
+    dssim = config.loss.dssim != 0.0
+    objectives: list[Objective] = [Photometric(capture, boxes, dssim=dssim, perceptual=perceptual)]
     if config.event.weight != 0.0:
         if capture.events is None:
             raise DataError(

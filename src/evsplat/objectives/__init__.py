@@ -2,13 +2,18 @@
 
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event import EventChange, event_loss
+from evsplat.objectives.event_windows import ContrastThresholds, EventWindows
+from evsplat.objectives.exposure import Exposure, motion_px, renders_for
 from evsplat.objectives.isometry import Isometry
 from evsplat.objectives.photometric import Photometric
 from evsplat.objectives.semantic import PackedBounds, RenderedSemantics, silhouette_bounds
 from evsplat.objectives.skinning import SkinningPrior
 
 __all__ = [
+    "ContrastThresholds",
     "EventChange",
+    "EventWindows",
+    "Exposure",
     "Isometry",
     "Objective",
     "PackedBounds",
@@ -17,5 +22,7 @@ __all__ = [
     "SkinningPrior",
     "Step",
     "event_loss",
+    "motion_px",
+    "renders_for",
     "silhouette_bounds",
 ]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Protocol
 
 import torch
@@ -13,6 +13,7 @@ from evsplat.capture import Capture, Frame
 from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.devices import DeviceCache
 from evsplat.gaussians import PosedGaussians
+from evsplat.imaging import decode
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,12 @@ class Step:
     """Randomness of the step; part of the checkpoint."""
     data: DeviceCache
     """Recorded data on the model's device."""
+
+    @cached_property
+    def linear(self) -> Float[Tensor, "T H W 3"]:
+        """The pictures in linear light, planar in memory."""
+        planes = torch.stack([picture.movedim(-1, 0) for picture in self.rgb])
+        return decode(planes).movedim(1, -1)
 
     def index(self, time_us: int) -> int:
         """Place of a time among the pictures."""

@@ -16,6 +16,7 @@ from evsplat.neighbours import nearest
 from evsplat.objectives.base import Step
 
 NEIGHBOURS = 4
+MOST_TIMES = 2
 
 
 def covariance6(matrix: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 6"]:
@@ -125,7 +126,14 @@ class Isometry:
         rows = torch.cat([chosen[:, None], self.neighbours[chosen]], dim=1)
 
         at_rest = (gaussians.means, gaussians.quaternions, gaussians.scales_log)
-        moved = (posed.means, posed.quaternions, posed.scales, posed.transforms)
+        # Two of the times are enough: a step's lie close to each other.
+        every = -(-len(posed.means) // MOST_TIMES)
+        moved = (
+            posed.means[::every],
+            posed.quaternions[::every],
+            posed.scales[::every],
+            posed.transforms[::every],
+        )
         centers, covariances = isometry_change(rows, at_rest, moved)
         return {"isometry_centers": centers, "isometry_covariances": covariances}
 

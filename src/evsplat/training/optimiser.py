@@ -42,6 +42,16 @@ class Optimiser:
                 0.0,
             ),
         ]
+        self.clipped = [parameter for parameters, *_ in groups for parameter in parameters]
+        groups += [
+            (list(part.parameters()), rate, 0.0)
+            for part, rate in (
+                (model.shading, rates.shading),
+                (model.shadow, rates.shadow),
+                (model.sensor, rates.sensor),
+            )
+            if part is not None
+        ]
         self.networks = torch.optim.Adam(
             [
                 {"params": parameters, "lr": rate, "base": rate, "weight_decay": decay}
@@ -83,8 +93,7 @@ class Optimiser:
         if gaussians.semantic_logits.grad is not None and not start <= nominal < end:
             gaussians.semantic_logits.grad = None
         self.rows.step()
-        parameters = [p for group in self.networks.param_groups for p in group["params"]]
-        torch.nn.utils.clip_grad_norm_(parameters, self.config.rates.clip_networks)
+        torch.nn.utils.clip_grad_norm_(self.clipped, self.config.rates.clip_networks)
         self.networks.step()
 
     def finite(self) -> Bool[Tensor, ""]:

@@ -13,6 +13,7 @@ import torch
 
 from evsplat.capture import Camera, Capture, load_capture
 from evsplat.config import load_yaml, to_dict
+from evsplat.deform.drawing import draw
 from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
@@ -106,11 +107,14 @@ class GaussianReconstruction:
         with torch.no_grad():
             camera = camera.to(self.model.box_low.device)
             posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
-            if parts == "scene":
-                output = render(posed.static(), camera)
-            else:
-                static = posed.static() if parts == "all" else None
-                output = render(posed.moving(), camera, static=static)
+            if parts == "all":
+                drawing = draw(self.model, posed, camera)
+                return Rendering(
+                    rgb=torch.stack(drawing.rgb).cpu().clamp(0, 1),
+                    alpha=drawing.output.alpha.cpu(),
+                    human=torch.stack(drawing.semantic).cpu().clamp(0, 1),
+                )
+            output = render(posed.moving() if parts == "human" else posed.static(), camera)
         times = len(times_us)
 
         def all_times(values: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,6 @@
 """The training loop: draw a frame, render what the objectives need, compare, step, densify."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -9,13 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
+from evsplat.deform.drawing import draw
 from evsplat.devices import DeviceCache, default_cache_bytes
 from evsplat.gaussians import ScreenStatistics, densify, flip_labels
 from evsplat.gaussians.densify import reset_opacities
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import weight_at
 from evsplat.objectives import Step
-from evsplat.render import Splats, render, split_channels
 from evsplat.training.bad_steps import BadSteps
 from evsplat.training.checkpoint import below, flatten, load_model
 from evsplat.training.clock import Clock
@@ -88,16 +88,29 @@ class Trainer:
         times = sorted({t for o in self.composition.objectives for t in o.times(frame, nominal)})
 
         camera = self.capture.camera(frame).to(self.device)
-        noise = self.model.draw_noise(len(times), generator)
-        posed = self.model.at(times, camera.center(), noise=noise, share_skinning=True)
-        moving, static = _with_centers(posed.moving()), _with_centers(posed.static())
-        output = render(moving, camera, static=static)
-        pictures = split_channels(output.image, (3, 1))
-        rgb, semantic = pictures[0], tuple(picture[..., 0] for picture in pictures[1])
+        once = self.model.config.networks_once
+        noise = self.model.draw_noise(1 if once else len(times), generator)
+        posed = self.model.at(
+            times,
+            camera.center(),
+            noise=noise,
+            share_skinning=True,
+            networks_at_us=frame.mid_us if once else None,
+        )
+        drawing = draw(self.model, posed, camera, center_gradients=True)
+        output = drawing.output
         step = Step(
-            self.capture, self.model, frame, tuple(times), rgb, semantic, posed, nominal, generator,
+            self.capture,
+            self.model,
+            frame,
+            tuple(times),
+            drawing.rgb,
+            drawing.semantic,
+            posed,
+            nominal,
+            generator,
             self.data,
-        )  # fmt: skip
+        )
         terms: dict[str, Tensor] = {}
         for objective in self.composition.objectives:
             terms |= objective.loss(step)
@@ -121,8 +134,8 @@ class Trainer:
         height, width = output.alpha.shape[1:]
         gaussians = self.model.gaussians
         for rows, layer, radii in (
-            (gaussians.human, moving, output.radii),
-            (gaussians.scene, static, output.static_radii),
+            (gaussians.human, drawing.moving, output.radii),
+            (gaussians.scene, drawing.static, output.static_radii),
         ):
             assert layer.centers2d_offset is not None and layer.centers2d_offset.grad is not None
             gradient = layer.centers2d_offset.grad
@@ -130,7 +143,7 @@ class Trainer:
                 gradient, radii = (torch.where(unsure, v, 0) for v in (gradient, radii))
             self.statistics.add(rows, gradient, radii, width, height)
         self._edit(frame, nominal)
-        drawn = rgb[step.index(frame.mid_us)].detach()
+        drawn = drawing.rgb[step.index(frame.mid_us)].detach()
         error = (drawn.clamp(0, 1) - step.observed(frame)).square().mean()
         numbers = [loss, -10 * torch.log10(error), *terms.values()]
         return StepReport(torch.stack([n.detach() for n in numbers]), tuple(terms))
@@ -148,6 +161,7 @@ class Trainer:
         for number, objective in enumerate(self.composition.objectives):
             tensors |= flatten(f"objective{number}", objective.state())
         tensors |= flatten("skinning_turns", self.model.skinning_turns.state())
+        tensors |= flatten("surface_normals", self.model.surface_normals.state())
         tensors["generator"] = self.composition.generator.get_state()
         state = {
             "clock": asdict(self.clock),
@@ -167,6 +181,7 @@ class Trainer:
         for number, objective in enumerate(self.composition.objectives):
             objective.load_state(below(f"objective{number}", tensors))
         self.model.skinning_turns.load_state(below("skinning_turns", tensors))
+        self.model.surface_normals.load_state(below("surface_normals", tensors))
         self.composition.generator.set_state(tensors["generator"])
         saved = state["clock"]
         for name in ("iteration", "fraction", "seconds", "step_seconds"):
@@ -203,6 +218,7 @@ class Trainer:
             drawn = self.capture.train_frames.index(frame)
             flip_labels(gaussians, rows, self.composition.body_frames, drawn)
         self.model.skinning_turns.rows_changed()
+        self.model.surface_normals.rows_changed()
         for objective in self.composition.objectives:
             objective.rows_changed()
         self.statistics = self._fresh_statistics()
@@ -214,9 +230,3 @@ class Trainer:
 
 def _not_numbers(terms: dict[str, Tensor]) -> list[str]:
     return [name for name, value in terms.items() if bool(value.isnan())]
-
-
-def _with_centers(layer: Splats) -> Splats:
-    """Ready to tell the gradients of the projected centres."""
-    shape = (*layer.means.shape[:2], 2)
-    return replace(layer, centers2d_offset=layer.means.new_zeros(shape).requires_grad_())

@@ -1,0 +1,101 @@
+"""Pictures of posed Gaussians, with the person's shadow on the scene."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.gaussians import PosedGaussians
+from evsplat.render import PinholeCamera, RenderOutput, Splats, render, split_channels
+
+_SHADOW_STEP_PX = 2
+"""Shadows are soft: they are looked up at every second pixel and interpolated."""
+_LEAST_SCENE = 1e-3
+"""Share of a pixel below which its scene has no place of its own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """Pictures of T times, and the two layers with what the rasteriser says of them."""
+
+    rgb: tuple[Float[Tensor, "H W 3"], ...]
+    semantic: tuple[Float[Tensor, "H W"], ...]
+    output: RenderOutput
+    moving: Splats
+    static: Splats
+
+
+def draw(
+    model: HumanSceneModel,
+    posed: PosedGaussians,
+    camera: PinholeCamera,
+    *,
+    center_gradients: bool = False,
+) -> Drawing:
+    """Draw person and scene; ``center_gradients`` makes the projected centres tell theirs.
+
+    With shadows the person's and the scene's share of each pixel are composited as channels of
+    their own, in one pass and in the right order of depth, and the scene's is multiplied.
+    """
+    moving, static = posed.moving(), posed.static()
+    shadow = model.shadow if posed.casters is not None else None
+    if shadow is not None:
+        moving, static = _in_layers(moving, static, camera)
+    if center_gradients:
+        moving, static = _with_centers(moving), _with_centers(static)
+    output = render(moving, camera, static=static)
+    if shadow is None:
+        rgb, semantic = split_channels(output.image, (3, 1))
+    else:
+        person, scene, depth, semantic = split_channels(output.image, (3, 3, 2, 1))
+        assert posed.casters is not None
+        # What hides the scene hides its shadow as well: the first picture's depth serves all.
+        places = _places(depth[0].detach(), camera)
+        light = _enlarge(shadow(posed.casters, places), camera)
+        rgb = tuple(
+            a + b * factor[..., None] for a, b, factor in zip(person, scene, light, strict=True)
+        )
+    return Drawing(rgb, tuple(s[..., 0] for s in semantic), output, moving, static)
+
+
+def _in_layers(moving: Splats, static: Splats, camera: PinholeCamera) -> tuple[Splats, Splats]:
+    """Channels person's RGB, scene's RGB, scene's depth and share, semantic attribute."""
+    rgb, semantic = moving.channels.split((3, 1), -1)
+    nothing = rgb.new_zeros(*rgb.shape[:2], 5)
+    moving = replace(moving, channels=torch.cat([rgb, nothing, semantic], -1))
+    rgb, semantic = static.channels.split((3, 1), -1)
+    pose = camera.world_to_camera
+    depth = (static.means.detach() @ pose[2, :3] + pose[2, 3])[..., None]
+    parts = [torch.zeros_like(rgb), rgb, depth, torch.ones_like(depth), semantic]
+    return moving, replace(static, channels=torch.cat(parts, -1))
+
+
+def _places(depth: Float[Tensor, "H W 2"], camera: PinholeCamera) -> Float[Tensor, "h w 3"]:
+    """World places of the scene at every second pixel."""
+    step = _SHADOW_STEP_PX
+    sums = F.avg_pool2d(depth.movedim(-1, 0), step, ceil_mode=True, count_include_pad=False)
+    z = sums[0] / sums[1].clamp_min(_LEAST_SCENE)
+    y, x = ((torch.arange(count, device=z.device) + 0.5) * step for count in z.shape)
+    K, pose = camera.K.to(z), camera.world_to_camera.detach()
+    rays = torch.stack(
+        [
+            ((x - K[0, 2]) / K[0, 0]).expand(z.shape),
+            ((y - K[1, 2]) / K[1, 1])[:, None].expand(z.shape),
+            torch.ones_like(z),
+        ],
+        -1,
+    )
+    return (rays * z[..., None] - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _enlarge(light: Float[Tensor, "T h w"], camera: PinholeCamera) -> Float[Tensor, "T H W"]:
+    full = F.interpolate(light[:, None], scale_factor=_SHADOW_STEP_PX, mode="bilinear")
+    return full[:, 0, : camera.height, : camera.width]
+
+
+def _with_centers(layer: Splats) -> Splats:
+    shape = (*layer.means.shape[:2], 2)
+    return replace(layer, centers2d_offset=layer.means.new_zeros(shape).requires_grad_())

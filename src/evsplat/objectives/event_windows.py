@@ -1,0 +1,92 @@
+"""Events at full time resolution: brightness change between any two rendered times."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from evsplat.capture import Capture, Frame
+from evsplat.devices import send
+from evsplat.events import EventStream
+from evsplat.imaging import luminance
+from evsplat.objectives.base import Stateless, Step
+
+
+class ContrastThresholds(nn.Module):
+    """How much the logarithm of brightness changes per event, for either polarity; learned."""
+
+    def __init__(self, on: float, off: float) -> None:
+        """Thresholds to start from, above 0."""
+        super().__init__()
+        self.logs = nn.Parameter(torch.tensor([on, off]).log())
+
+    def change(
+        self, on: Float[Tensor, "*shape"], off: Float[Tensor, "*shape"]
+    ) -> Float[Tensor, "*shape"]:
+        """Log-brightness change that counts of events of both polarities report."""
+        threshold = self.logs.exp()
+        return threshold[0] * on - threshold[1] * off
+
+
+class EventWindows(Stateless):
+    """Mean absolute difference between rendered change and events, amplitude kept (eq. 3).
+
+    Windows lie between neighbouring rendered times and from the first to the last. Besides the
+    times of other objectives one more is asked for, at random before or after the exposure, within
+    ``reach`` frame intervals, so that the gaps between exposures teach as well. All pixels count:
+    where there is no event, nothing changed.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        thresholds: ContrastThresholds,
+        generator: torch.Generator,
+        *,
+        start: float,
+        eps: float,
+        reach: float = 0.5,
+    ) -> None:
+        """``start`` in nominal iterations; ``eps`` is added to linear luminance."""
+        assert capture.events is not None
+        self.events, self.thresholds, self.generator = capture.events, thresholds, generator
+        self.start, self.eps, self.reach = start, eps, reach
+        mids = sorted(frame.mid_us for frame in capture.frames)
+        gaps = sorted(b - a for a, b in zip(mids, mids[1:], strict=False))
+        self.interval_us = gaps[len(gaps) // 2] if gaps else 0
+        self.range_us = (mids[0], mids[-1])
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """One time outside of the exposure."""
+        if nominal < self.start:
+            return ()
+        draw = torch.rand(2, generator=self.generator).tolist()
+        start, end = frame.exposure_us
+        far = int(draw[0] * self.reach * self.interval_us)
+        time = start - 1 - far if draw[1] < 0.5 else end + far
+        return (min(max(time, self.range_us[0]), self.range_us[1]),)
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """``event``: mean over windows, pixels and the whole span."""
+        if step.nominal < self.start or len(step.times_us) < 2:
+            return {}
+        times = step.times_us
+        stream = self.events.between(times[0], times[-1])
+        brightness = torch.log(luminance(step.linear) + self.eps)
+        on, off = send(self._counts(stream, times), brightness.device).unbind(1)
+        reported = self.thresholds.change(on, off)
+        changes = brightness[1:] - brightness[:-1]
+        windows = (changes - reported).abs().mean()
+        whole = (brightness[-1] - brightness[0] - reported.sum(0)).abs().mean()
+        return {"event": 0.5 * (windows + whole)}
+
+    def _counts(self, stream: EventStream, times: Sequence[int]) -> Float[Tensor, "T-1 2 H W"]:
+        """Events per window, polarity (brighter first) and pixel."""
+        height, width = self.events.height, self.events.width
+        window = np.searchsorted(times, stream.t, side="right") - 1
+        place = (window * 2 + (stream.p < 0)) * height + stream.y
+        size = (len(times) - 1) * 2 * height * width
+        counts = np.bincount(place * width + stream.x, minlength=size)
+        return torch.from_numpy(counts.astype(np.float32)).view(-1, 2, height, width)

@@ -1,0 +1,74 @@
+"""The picture term of a camera that integrates: blurry frame against the mean over its exposure."""
+
+from bisect import bisect_left
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from evsplat.body import BodyTrack
+from evsplat.capture import Capture, Frame
+from evsplat.devices import DeviceCache
+from evsplat.imaging import encode
+from evsplat.objectives.base import Stateless, Step, picture
+from evsplat.similarity.psnr_ssim import l1_and_ssim
+
+DARKEST_LINEAR = 1e-6
+"""Below this the slope of the transfer curve grows without bound; an 8-bit level is 5e-6."""
+VERTEX_STRIDE = 13
+"""Every so many vertices are enough to know how far the body moves."""
+
+
+def motion_px(capture: Capture, track: BodyTrack, frame: Frame) -> float:
+    """Largest path of a body vertex over a frame's exposure, pixels."""
+    camera = capture.camera(frame)
+    start, end = frame.exposure_us
+    ends = [camera.project(track.vertices(t)[::VERTEX_STRIDE])[0] for t in (start, end)]
+    return float((ends[1] - ends[0]).norm(dim=-1).max())
+
+
+def renders_for(motion: float, px_per_render: float, most: int) -> int:
+    """An odd number of renders, at least 3, so that one lies in the middle of the exposure."""
+    wanted = max(3.0, min(motion / px_per_render, float(most)))
+    return 2 * int((wanted - 1) / 2 + 0.5) + 1
+
+
+class Exposure(Stateless):
+    """L1 and D-SSIM between a blurry frame and the mean, in linear light, of K renders.
+
+    The exposure is cut into K equal strata; a render lies at a random place of each but the middle
+    one, whose is the middle. K grows with how far the body moves in the exposure, so that
+    neighbouring renders overlap.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        renders: dict[str, int],
+        generator: torch.Generator,
+    ) -> None:
+        """``renders``: K per training frame's name, odd."""
+        self.capture, self.renders, self.generator = capture, renders, generator
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """K distinct times, the middle of the exposure among them."""
+        start, end = frame.exposure_us
+        count = self.renders[frame.name]
+        places = torch.arange(count) + torch.rand(count, generator=self.generator)
+        drawn = [start + int(share * (end - start) / count) for share in places.tolist()]
+        drawn[count // 2] = frame.mid_us
+        return sorted(set(drawn))
+
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """The recorded picture."""
+        data.prefetch(*picture(self.capture, frame))
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """``l1`` and ``dssim`` of the drawn frame."""
+        start, end = step.frame.exposure_us
+        first, last = (bisect_left(step.times_us, time) for time in (start, end))
+        mean = step.linear[first:last].mean(0)
+        l1, similarity = l1_and_ssim(
+            encode(mean.clamp_min(DARKEST_LINEAR)), step.observed(step.frame)
+        )
+        return {"l1": l1, "dssim": 1 - similarity}

@@ -1,0 +1,61 @@
+"""The person's shading: one at the start, its polynomial in closed form, normals of the surface."""
+
+import pytest
+import torch
+
+from evsplat.body import SurfaceSamples
+from evsplat.deform.shading import Shading, SurfaceNormals
+
+
+def sphere(count: int, generator: torch.Generator) -> SurfaceSamples:
+    normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    return SurfaceSamples(2 * normals, normals, torch.ones(count, 1))
+
+
+def test_nothing_is_shaded_at_the_start():
+    shading = Shading(torch.zeros(3), 1.0)
+    normals, places = torch.randn(2, 2, 50, 3).unbind(0)
+    assert torch.equal(shading(normals, places), torch.ones(2, 50, 3))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lamp_above_is_a_cosine_and_grows_along_an_axis(seed):
+    generator = torch.Generator().manual_seed(seed)
+    shading = Shading(torch.tensor([1.0, 2.0, 3.0]), 4.0)
+    normals = sphere(40, generator).normals[None]
+    places = torch.tensor([1.0, 2.0, 3.0]) + torch.randn(1, 40, 3, generator=generator)
+    with torch.no_grad():
+        # The degree 1 harmonic of z is 0.4886 z, second of three; red brightens along x.
+        shading.coefficients[0, 2, 1] = 0.3
+        shading.coefficients[1, 0, 0] = 0.5
+    factor = shading(normals, places)
+    green = 1 + 0.3 * 0.4886025119 * normals[..., 2]
+    red = 1 + 0.5 * (places[..., 0] - 1) / 4
+    assert torch.allclose(factor[..., 0], red, atol=1e-6)
+    assert torch.allclose(factor[..., 1], green, atol=1e-6)
+    assert torch.equal(factor[..., 2], torch.ones(1, 40))
+
+
+def test_gradcheck():
+    shading = Shading(torch.zeros(3), 2.0).double()
+    with torch.no_grad():
+        shading.coefficients.normal_(std=0.05)
+    inputs = [torch.randn(2, 5, 3, dtype=torch.float64).requires_grad_() for _ in range(2)]
+    assert torch.autograd.gradcheck(lambda *x: shading(*x), inputs)
+    sums = lambda c: torch.func.functional_call(shading, {"coefficients": c}, tuple(inputs))  # noqa: E731
+    assert torch.autograd.gradcheck(sums, shading.coefficients.detach().requires_grad_())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_normals_are_those_of_the_nearest_surface_and_follow_changed_rows(seed):
+    generator = torch.Generator().manual_seed(seed)
+    normals = SurfaceNormals(sphere(20_000, generator))
+    radial = sphere(300, generator).normals
+    points = radial * (1 + 2 * torch.rand(300, 1, generator=generator))
+    assert ((normals.of(points) * radial).sum(-1) > 0.995).all()
+    assert torch.equal(normals.of(-points), normals.of(points))  # kept until rows change
+    resumed = SurfaceNormals(normals.surface)
+    resumed.load_state(normals.state())
+    assert torch.equal(resumed.of(-points), normals.of(points))
+    normals.rows_changed()
+    assert ((normals.of(-points) * -radial).sum(-1) > 0.995).all()

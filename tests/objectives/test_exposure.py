@@ -1,0 +1,62 @@
+"""The exposure's mean in linear light, its times, and how many renders it takes."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from evsplat.objectives import Exposure, renders_for
+from evsplat.similarity import ssim
+
+
+def frame(start: int = 1_000, end: int = 31_000) -> SimpleNamespace:
+    return SimpleNamespace(name="a", exposure_us=(start, end), mid_us=(start + end) // 2)
+
+
+@pytest.mark.parametrize("count", [3, 5, 7])
+@pytest.mark.parametrize("seed", range(3))
+def test_times_are_stratified_with_the_middle_among_them(count, seed):
+    generator = torch.Generator().manual_seed(seed)
+    objective = Exposure(None, {"a": count}, generator)
+    drawn = [objective.times(frame(), 0.0) for _ in range(50)]
+    width = 30_000 / count
+    for times in drawn:
+        assert len(times) == count and 16_000 in times
+        assert all(int((time - 1_000) // width) == k for k, time in enumerate(times))
+    assert len({times[0] for times in drawn}) > 40
+
+
+@pytest.mark.parametrize(
+    ("motion", "expected"), [(0.0, 3), (9.0, 3), (13.0, 5), (16.0, 5), (30.0, 7), (1e4, 7)]
+)
+def test_the_number_of_renders_is_odd_and_follows_the_motion(motion, expected):
+    assert renders_for(motion, 3.0, 7) == expected
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
+    generator = torch.Generator().manual_seed(seed)
+    pictures = torch.rand(4, 20, 24, 3, generator=generator, dtype=torch.float64)
+    observed = torch.rand(20, 24, 3, generator=generator, dtype=torch.float64)
+    step = SimpleNamespace(
+        frame=frame(),
+        times_us=(500, 2_000, 16_000, 30_999),
+        linear=pictures**2.2,
+        observed=lambda _: observed,
+    )
+    terms = Exposure(None, {"a": 3}, generator).loss(step)
+    blurry = (pictures[1:] ** 2.2).mean(0) ** (1 / 2.2)
+    assert float(terms["l1"]) == pytest.approx(float((blurry - observed).abs().mean()), rel=1e-9)
+    assert float(terms["dssim"]) == pytest.approx(1 - float(ssim(blurry, observed)), rel=1e-9)
+
+
+def test_a_black_exposure_has_a_finite_gradient():
+    pictures = torch.zeros(3, 16, 16, 3, requires_grad=True)
+    step = SimpleNamespace(
+        frame=frame(),
+        times_us=(2_000, 16_000, 30_000),
+        linear=pictures,
+        observed=lambda _: torch.ones(16, 16, 3),
+    )
+    Exposure(None, {"a": 3}, torch.Generator()).loss(step)["l1"].backward()
+    assert pictures.grad.isfinite().all()
