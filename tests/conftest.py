@@ -7,10 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
+import hypothesis
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
+
+# A busy machine is no failure.
+hypothesis.settings.register_profile("evsplat", deadline=None)
+hypothesis.settings.load_profile("evsplat")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONTRAST = 0.2

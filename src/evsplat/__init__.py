@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from evsplat.evaluation.report import write_report
     from evsplat.events.convert import convert_recording as convert
     from evsplat.export import render_run
+    from evsplat.footage.simulate import simulate
     from evsplat.restore import restore_capture
     from evsplat.synthesis import synthesize
     from evsplat.training.run import load_run
@@ -50,6 +51,7 @@ __all__ = [
     "load_run",
     "render_run",
     "restore_capture",
+    "simulate",
     "synthesize",
     "train",
     "write_report",
@@ -65,6 +67,7 @@ _LAZY = {
     "load_run": "evsplat.training.run:load_run",
     "render_run": "evsplat.export:render_run",
     "restore_capture": "evsplat.restore:restore_capture",
+    "simulate": "evsplat.footage.simulate:simulate",
     "synthesize": "evsplat.synthesis:synthesize",
     "train": "evsplat.training:train",
     "write_report": "evsplat.evaluation.report:write_report",

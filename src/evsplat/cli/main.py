@@ -18,6 +18,7 @@ from evsplat.cli.inspect import inspect
 from evsplat.cli.render import render
 from evsplat.cli.report import report
 from evsplat.cli.restore import restore
+from evsplat.cli.simulate import simulate
 from evsplat.cli.synthesize import synthesize
 from evsplat.cli.train import train
 from evsplat.errors import EvsplatError
@@ -25,7 +26,7 @@ from evsplat.errors import EvsplatError
 _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
     for verb in (
-        *(demo, doctor, import_, convert, synthesize, inspect),
+        *(demo, doctor, import_, convert, simulate, synthesize, inspect),
         *(restore, train, evaluate, report, render),
     )
 }
