@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 import tyro
 
 from evsplat.cli.options import Flag, option
 
 if TYPE_CHECKING:
-    from evsplat.capture.importers import Importer
+    from evsplat.capture.importers import Blur, Importer
 
 _Source = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
 _Capture = Annotated[Path, tyro.conf.arg(metavar="CAPTURE")]
@@ -19,6 +19,10 @@ Args:
     source: Folder of the data (docs/import.md shows each tree).
     out: Capture to write.
     smpl: Your SMPL model file, or the folder that holds it.
+    blur: Go on to the paper's version: blurry frames and simulated events. The sharp capture stays
+        beside it, with _sharp at the end of its name.
+    interpolation: How pictures between the frames are made for --blur.
+    weights: Checkpoint of Super SloMo for --blur.
     overwrite: Replace a capture that is there.
 """
 
@@ -56,7 +60,7 @@ class _Done:
 def _verb(kind: "type[Importer]") -> Callable[..., _Done]:
     """The import of one kind as a function whose signature is its command line."""
 
-    def run(
+    def plain(
         source: _Source,
         /,
         *,
@@ -65,18 +69,43 @@ def _verb(kind: "type[Importer]") -> Callable[..., _Done]:
         smpl: _Smpl = None,
         overwrite: Flag = False,
     ) -> _Done:
-        return _run(options, source, out, smpl, overwrite)
+        return _run(options, source, out, smpl, overwrite, None)
 
-    run.__annotations__["options"] = Annotated[kind, tyro.conf.arg(name="")]
-    run.__doc__ = f"{kind.__doc__}\n{_ARGUMENTS}"
-    return run
+    def with_blur(
+        source: _Source,
+        /,
+        *,
+        out: _Capture,
+        options: Any,
+        smpl: _Smpl = None,
+        blur: Flag = False,
+        interpolation: Annotated[
+            Literal["super-slomo", "flow"] | None, option("KIND", default="the recipe's")
+        ] = None,
+        weights: Annotated[Path | None, option("FILE", default="in torch's hub folder")] = None,
+        overwrite: Flag = False,
+    ) -> _Done:
+        from evsplat.capture.importers import Blur
+
+        going_on = Blur(interpolation, weights) if blur else None
+        return _run(options, source, out, smpl, overwrite, going_on)
+
+    chosen: Callable[..., _Done] = with_blur if kind.blur_recipe else plain
+    chosen.__annotations__["options"] = Annotated[kind, tyro.conf.arg(name="")]
+    chosen.__doc__ = f"{kind.__doc__}\n{_ARGUMENTS}"
+    return chosen
 
 
 def _run(
-    importer: "Importer", source: Path, out: Path, smpl: Path | None, overwrite: bool
+    importer: "Importer",
+    source: Path,
+    out: Path,
+    smpl: Path | None,
+    overwrite: bool,
+    blur: "Blur | None",
 ) -> _Done:
     from evsplat.capture.importers import run_importer
 
-    path = run_importer(importer, source, out, smpl=smpl, overwrite=overwrite)
+    path = run_importer(importer, source, out, smpl=smpl, overwrite=overwrite, blur=blur)
     print(f"written: {path}\nlook at it with: evsplat inspect {path}")
     return _Done()

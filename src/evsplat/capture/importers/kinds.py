@@ -1,12 +1,13 @@
 """The kinds of sources by name, and the one function that imports any of them."""
 
 import logging
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from evsplat.capture.importers.base import Importer
+from evsplat.capture.importers.folder import Folder
 from evsplat.capture.importers.mmhpsd import Mmhpsd
 from evsplat.capture.importers.neuman import Neuman
 from evsplat.capture.importers.people_snapshot import PeopleSnapshot
@@ -23,7 +24,18 @@ KINDS: dict[str, type[Importer]] = {
     "neuman": Neuman,
     "people-snapshot": PeopleSnapshot,
     "zju-mocap-blur": ZjuMocapBlur,
+    "folder": Folder,
 }
+
+
+@dataclass(frozen=True)
+class Blur:
+    """How an import goes on to blurry frames; None: as the recipe of the paper says."""
+
+    interpolation: str | None = None
+    """"super-slomo" or "flow"."""
+    weights: Path | None = None
+    """Checkpoint of Super SloMo."""
 
 
 def import_capture(
@@ -33,6 +45,7 @@ def import_capture(
     *,
     smpl: Path | str | None = None,
     overwrite: bool = False,
+    blur: Blur | bool = False,
     **options: Any,
 ) -> Path:
     """Turn a data set's sequence into a capture and give its folder (docs/import.md).
@@ -44,6 +57,8 @@ def import_capture(
         smpl: The user's SMPL file, or the folder that holds it; by default what the environment
             variable EVSPLAT_BODY_MODELS leads to. Without a model the free body is used.
         overwrite: Replace a capture that is there already.
+        blur: Go on to the paper's version of the data set, with blurry frames and simulated events
+            (`evsplat.synthesize`); the sharp capture stays beside it as ``<out>_sharp``.
         options: Fields of the kind's class in `KINDS`.
 
     Raises:
@@ -58,7 +73,9 @@ def import_capture(
         if name not in known:
             near = get_close_matches(name, known, 1, cutoff=0.0)[0]
             raise ConfigError(f"{name!r} is no option of {kind}; did you mean {near!r}?")
-    return run_importer(KINDS[kind](**options), source, out, smpl=smpl, overwrite=overwrite)
+    chosen = (Blur() if blur else None) if isinstance(blur, bool) else blur
+    importer = KINDS[kind](**options)
+    return run_importer(importer, source, out, smpl=smpl, overwrite=overwrite, blur=chosen)
 
 
 def run_importer(
@@ -68,11 +85,32 @@ def run_importer(
     *,
     smpl: Path | str | None = None,
     overwrite: bool = False,
+    blur: Blur | None = None,
 ) -> Path:
     """`import_capture` with the options as a checked object."""
-    out = Path(out)
-    with CaptureWriter(out, overwrite=overwrite) as writer:
-        notes = importer.write(Path(source), writer, None if smpl is None else Path(smpl))
+    source, out = Path(source), Path(out)
+    if blur is not None and importer.blur_recipe is None:
+        raise ConfigError(
+            f"the pictures of {type(importer).__name__} are not made blurry by a recipe of the "
+            "paper; import them and use 'evsplat synthesize'."
+        )
+    first = out if blur is None else out.with_name(f"{out.name}_sharp")
+    if blur is not None:
+        # an existing target is better found before the long work than after it
+        CaptureWriter(out, overwrite=overwrite)
+    with CaptureWriter(first, overwrite=overwrite) as writer:
+        notes = importer.write(source, writer, None if smpl is None else Path(smpl))
     for note in notes:
         logger.info("%s", note)
+    if blur is not None:
+        from evsplat.synthesis import synthesize
+
+        synthesize(
+            first,
+            out,
+            recipe=importer.blur_recipe,
+            weights=blur.weights,
+            overwrite=overwrite,
+            interpolation=blur.interpolation,
+        )
     return out

@@ -1,0 +1,240 @@
+"""Your own recording: pictures, events, poses of a tool and a camera, put together."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int64
+from tqdm import tqdm
+
+from evsplat.body.pose_files import PoseSequence, read_poses
+from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
+from evsplat.capture.importers.base import (
+    GUIDE,
+    Importer,
+    check_positive,
+    exposure_around,
+    need,
+    person_mask,
+    table,
+)
+from evsplat.capture.importers.smpl import add_body, chosen_poses
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import ConfigError, DataError
+from evsplat.events import open_recording
+from evsplat.files import read_json
+from evsplat.footage import Footage, open_footage
+
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Folder(Importer):
+    """Your own recording: pictures or a video, an event file, a pose file and a camera."""
+
+    images: Path | None = None
+    """Folder of pictures, or a video; by default SOURCE/images or the video in SOURCE."""
+    events: Path | None = None
+    """Event recording of any known format; by default SOURCE/events.* if there is one."""
+    poses: Path | None = None
+    """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE."""
+    camera: Path | None = None
+    """One camera as in capture.json; by default SOURCE/camera.json, else what the poses assume."""
+    masks: Path | None = None
+    """Masks of the person, named as the pictures; by default SOURCE/masks if there is one."""
+    fps: float | None = None
+    """Pictures per second; a video has its own."""
+    exposure_us: float | None = None
+    """How long the shutter was open; not needed with SOURCE/exposures.txt."""
+    start_us: int = 0
+    """Middle of the first exposure."""
+    clock_offset_us: int = 0
+    """Added to the events' times to get the clock of the pictures."""
+    contrast: tuple[float, float] | None = None
+    """Contrast thresholds of the sensor, brighter and darker, where they are known."""
+    person: str | None = None
+    """Which of several people in the pose file."""
+    repair: bool = False
+    """Read on where the event recording is damaged."""
+
+    def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
+        """Put the parts together; see `Importer.write`."""
+        need(source, "the folder of the recording")
+        if self.fps is not None:
+            check_positive(fps=self.fps)
+        images = self._images(source)
+        footage = open_footage(images, self._rate(source, images))
+        exposures = self._exposures(source, footage)
+        middles = exposures.sum(axis=1) // 2
+        path = self._poses(source)
+        size = footage.width, footage.height
+        motion = self._motion(path, size, smpl)
+        camera = self._camera(source, footage, motion)
+        writer.add_camera("main", *size, **camera)
+        seen = _frames_with_poses(motion, middles)
+        views = _camera_poses(motion)
+        masks = self.masks or source / "masks"
+        for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
+            if index not in seen:
+                continue
+            mask = masks / f"{timed.name}.png"
+            writer.add_frame(
+                timed.name,
+                "main",
+                timed.pixels,
+                (int(exposures[index, 0]), int(exposures[index, 1])),
+                mask=person_mask(mask, 1) if mask.exists() else None,
+                world_to_camera=views.get(index),
+            )
+        notes = self._add_events(source, writer, size)
+        if len(seen) < len(middles):
+            notes.append(f"{len(middles) - len(seen)} pictures have no pose and were left out")
+        writer.provenance |= {"source": "own recording", "notes": notes, "poses": path.name}
+        if isinstance(motion, PoseSequence):
+            kept = sorted(seen)
+            times = [int(middles[index]) for index in kept]
+            return notes + add_body(writer, times, chosen_poses(motion, kept), smpl)
+        writer.set_body(
+            motion.model,
+            motion.times_us,
+            motion.poses,
+            motion.transl,
+            rig=motion.rig,
+            betas=motion.betas,
+            gender=motion.gender,
+        )
+        return notes
+
+    def _images(self, source: Path) -> Path:
+        if self.images is not None:
+            return self.images
+        videos = [path for path in sorted(source.iterdir()) if path.suffix.lower() in _VIDEOS]
+        if (source / "images").is_dir() or len(videos) != 1:
+            return need(source / "images", "a folder of pictures, or one video beside it")
+        return videos[0]
+
+    def _rate(self, source: Path, images: Path) -> float | None:
+        if self.fps is not None or not images.is_dir():
+            return self.fps
+        if not (source / "exposures.txt").exists():
+            raise ConfigError(
+                f"{images}: pictures have no times; give --fps, or the start and end of every "
+                "exposure in exposures.txt."
+            )
+        # only counts the pictures: their times come from the list
+        return 1.0
+
+    def _exposures(self, source: Path, footage: Footage) -> Int64[np.ndarray, "N 2"]:
+        """Start and end of every picture's exposure."""
+        path, count = source / "exposures.txt", len(footage.times_us)
+        if path.exists():
+            try:
+                rows = np.loadtxt(path, ndmin=2)
+            except ValueError as error:
+                raise DataError(f"{path}: not a table of numbers ({error}).") from None
+            if rows.shape != (count, 2):
+                raise DataError(
+                    f"{path}: has {len(rows)} lines of {rows.shape[-1]} numbers, expected start "
+                    f"and end in microseconds of each of the {count} pictures."
+                )
+            return np.rint(rows).astype(np.int64)
+        if self.exposure_us is None:
+            raise ConfigError(
+                f"{source}: how long the shutter was open is not known; give --exposure-us, or the "
+                "start and end of every exposure in exposures.txt."
+            )
+        check_positive(exposure_us=self.exposure_us)
+        times = footage.times_us + self.start_us
+        return np.array([exposure_around(int(time), self.exposure_us) for time in times])
+
+    def _poses(self, source: Path) -> Path:
+        if self.poses is not None:
+            return need(self.poses, "the poses")
+        found = sorted(source.glob("poses.*")) + [
+            path for path in (source / "poses", source / "body.npz") if path.exists()
+        ]
+        if not found:
+            raise DataError(
+                f"{source}: holds no poses.*, poses/ or body.npz, expected the person's poses; "
+                f"{GUIDE}."
+            )
+        return found[0]
+
+    def _motion(
+        self, path: Path, size: tuple[int, int], smpl: Path | None
+    ) -> "PoseSequence | BodyFile":
+        if path.name == "body.npz":
+            return body_from_arrays(path, read_arrays(path), "")
+        return read_poses(path, person=self.person, image_size=size, body_models=smpl)
+
+    def _camera(
+        self, source: Path, footage: Footage, motion: "PoseSequence | BodyFile"
+    ) -> dict[str, Any]:
+        """K, pose and lens: of the file, else what the tool that made the poses assumed."""
+        path = self.camera or source / "camera.json"
+        if not path.exists():
+            K = motion.K if isinstance(motion, PoseSequence) else None
+            if K is None or self.camera is not None:
+                raise DataError(
+                    f"{path}: not found, expected the camera (width, height, K, world_to_camera); "
+                    f"{GUIDE}."
+                )
+            return {"K": K}
+        entry = table(read_json(path), str(path), "one camera as in capture.json")
+        for key, size in (("width", footage.width), ("height", footage.height)):
+            if entry.get(key, size) != size:
+                raise DataError(
+                    f"{path}: {key}: found {entry[key]}, expected {size} as the pictures have."
+                )
+        lens = entry.get("distortion") or {}
+        return {
+            "K": _matrix(entry, "K", 3, path),
+            "world_to_camera": _matrix(entry, "world_to_camera", 4, path)
+            if "world_to_camera" in entry
+            else None,
+            "distortion": lens.get("coefficients") if isinstance(lens, dict) else lens,
+        }
+
+    def _add_events(self, source: Path, writer: CaptureWriter, size: tuple[int, int]) -> list[str]:
+        path = self.events or next(iter(sorted(source.glob("events.*"))), None)
+        if path is None:
+            return ["events: none; simulate them, or give --events"]
+        recording = open_recording(
+            need(path, "the events"), width=size[0], height=size[1], repair=self.repair
+        )
+        if not recording.has_polarity:
+            return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
+        writer.set_events(
+            recording.chunks(),
+            *size,
+            contrast_threshold=self.contrast,
+            simulated=False,
+            clock_offset_us=self.clock_offset_us,
+        )
+        return list(recording.notes)
+
+
+def _matrix(entry: Any, key: str, size: int, path: Path) -> Float[np.ndarray, "N N"]:
+    try:
+        matrix = np.array(entry.get(key), dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (size, size):
+        raise DataError(f"{path}: {key}: expected {size}x{size} numbers.")
+    return matrix
+
+
+def _camera_poses(motion: "PoseSequence | BodyFile") -> dict[int, np.ndarray]:
+    """Of a moving camera, by the index of the picture; empty where it stands."""
+    if isinstance(motion, BodyFile) or motion.world_to_camera is None:
+        return {}
+    return dict(zip(motion.frames.tolist(), motion.world_to_camera, strict=True))
+
+
+def _frames_with_poses(motion: "PoseSequence | BodyFile", middles: np.ndarray) -> set[int]:
+    """Indices of pictures whose moment the poses cover."""
+    if isinstance(motion, PoseSequence):
+        return set(motion.frames.tolist()) & set(range(len(middles)))
+    first, last = motion.times_us[0], motion.times_us[-1]
+    return set(np.flatnonzero((middles >= first - 1) & (middles <= last + 1)).tolist())

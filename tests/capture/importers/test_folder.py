@@ -1,0 +1,186 @@
+"""Your own recording: parts found, paired by time and index, and what is missing named."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evsplat.body import load_body_track
+from evsplat.body.smpl import ENVIRONMENT
+from evsplat.capture import Capture, load_capture
+from evsplat.capture.importers import import_capture
+from evsplat.errors import ConfigError, DataError, EvsplatError
+
+from . import trees
+from .person import View, save, write_smpl
+
+COUNT, PERIOD_US, EXPOSURE_US = trees.FRAMES, 40_000, 30_000
+VIEW = View((128, 136), trees.zju_views()["1"].K, trees.zju_views()["1"].world_to_camera)
+
+
+def write_recording(root: Path) -> np.ndarray:
+    """Pictures, events (t, x, y, p, on their own clock), AMASS poses and a camera."""
+    person = trees.zju_person()
+    for index in range(COUNT):
+        picture, mask = trees.drawn(VIEW, person, index)
+        save(root / "images" / f"shot{index}.png", picture)
+        save(root / "masks" / f"shot{index}.png", mask)
+    rng = np.random.default_rng(2)
+    count = 400
+    t = np.sort(rng.integers(5_000, COUNT * PERIOD_US, count))
+    x, y = rng.integers(0, 128, count), rng.integers(0, 136, count)
+    rows = np.stack([t, x, y, rng.integers(0, 2, count)], axis=1)
+    np.savetxt(root / "events.csv", rows, "%d", ",", header="t,x,y,p", comments="")
+    np.savez(
+        root / "poses.npz",
+        poses=person.poses.reshape(COUNT, 72),
+        trans=person.transl,
+        betas=person.betas,
+        gender="neutral",
+    )
+    K = VIEW.K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    camera = {"K": K.tolist(), "world_to_camera": VIEW.world_to_camera.tolist()}
+    (root / "camera.json").write_text(json.dumps({"width": 128, "height": 136, **camera}))
+    return rows
+
+
+@pytest.fixture
+def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    (tmp_path / "mine").mkdir()
+    write_recording(tmp_path / "mine")
+    return tmp_path / "mine"
+
+
+def worst_miss(capture: Capture) -> float:
+    track = load_body_track(capture)
+    worst = 0.0
+    for frame in capture.frames:
+        row = int(frame.name.removeprefix("shot"))
+        seen, _ = capture.camera(frame).project(track.vertices(frame.mid_us))
+        person = VIEW.pixels(trees.zju_person().vertices(row), distorted=False) + 0.5
+        worst = max(worst, float(np.abs(seen.numpy() - person).max()))
+    return worst
+
+
+def test_parts_are_found_and_put_together(recording: Path, tmp_path: Path, monkeypatch) -> None:
+    models = write_smpl(tmp_path / "models")
+    options = {"fps": 25.0, "exposure_us": 30_000.0, "start_us": 16_000, "clock_offset_us": -700}
+    import_capture("folder", recording, tmp_path / "out", smpl=models, **options)
+    monkeypatch.setenv(ENVIRONMENT, str(models))
+    capture = load_capture(tmp_path / "out")
+    assert [frame.name for frame in capture.frames] == [f"shot{i}" for i in range(COUNT)]
+    for index, frame in enumerate(capture.frames):
+        start = 16_000 + index * PERIOD_US - EXPOSURE_US // 2
+        assert frame.exposure_us == (start, start + EXPOSURE_US)
+        assert capture.mask(frame) is not None
+    assert worst_miss(capture) < 0.01
+    assert capture.events is not None and len(capture.events) == 400
+    assert not capture.events_simulated and capture.contrast_threshold is None
+    rows = np.loadtxt(recording / "events.csv", delimiter=",", skiprows=1)
+    window = capture.events.between(50_000, 90_000)
+    chosen = rows[(rows[:, 0] - 700 >= 50_000) & (rows[:, 0] - 700 < 90_000)]
+    assert np.array_equal(window.t, chosen[:, 0] - 700)
+    assert np.array_equal(window.p, 2 * chosen[:, 3] - 1)
+
+
+def test_exposures_of_a_list_and_pictures_without_a_pose(
+    recording: Path, tmp_path: Path, monkeypatch
+) -> None:
+    models = write_smpl(tmp_path / "models")
+    starts = np.array([7, 41_000, 80_500, 121_000, 160_000, 203_000])
+    np.savetxt(recording / "exposures.txt", np.stack([starts, starts + 9_000], axis=1), "%d")
+    person = trees.zju_person()
+    np.savez(
+        recording / "poses.npz",
+        poses=person.poses[:4].reshape(4, 72),
+        trans=person.transl[:4],
+        betas=person.betas,
+        gender="neutral",
+    )
+    import_capture("folder", recording, tmp_path / "out", smpl=models)
+    monkeypatch.setenv(ENVIRONMENT, str(models))
+    capture = load_capture(tmp_path / "out")
+    assert [frame.exposure_us[0] for frame in capture.frames] == starts[:4].tolist()
+    assert worst_miss(capture) < 0.01
+    assert any("2 pictures have no pose" in note for note in capture.provenance["notes"])
+
+
+def test_a_rig_of_ones_own(recording: Path, tmp_path: Path, tiny_capture: Callable) -> None:
+    """body.npz as in a capture goes through as it is."""
+    tiny = load_capture(tiny_capture(frames=COUNT))
+    (recording / "poses.npz").unlink()
+    target = recording / "body.npz"
+    target.write_bytes((tiny.path / "body.npz").read_bytes())
+    import_capture(
+        "folder", recording, tmp_path / "out", fps=25.0, exposure_us=3e4, start_us=15_000
+    )
+    body = load_capture(tmp_path / "out").body_file
+    assert body.model == "rig" and np.array_equal(body.poses, tiny.body_file.poses)
+    assert np.array_equal(body.rest_vertices, tiny.body_file.rest_vertices)
+
+
+def rewrite_camera(root: Path, **changes) -> None:
+    path = root / "camera.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+FAULTS = {
+    "no exposure": (lambda root: None, {"fps": 25.0}, ConfigError, "give --exposure-us, or"),
+    "no pictures": (
+        lambda root: (root / "images").rename(root / "shots"),
+        {},
+        DataError,
+        "images: not found, expected a folder of pictures, or one video",
+    ),
+    "no rate": (lambda root: None, {"exposure_us": 1e4}, ConfigError, "--fps"),
+    "no poses": (
+        lambda root: (root / "poses.npz").unlink(),
+        {},
+        DataError,
+        r"mine: holds no poses\.\*, poses/ or body.npz",
+    ),
+    "no camera": (
+        lambda root: (root / "camera.json").unlink(),
+        {},
+        DataError,
+        "camera.json: not found, expected the camera",
+    ),
+    "another size": (
+        lambda root: rewrite_camera(root, width=64),
+        {},
+        DataError,
+        "camera.json: width: found 64, expected 128 as the pictures have",
+    ),
+    "bad K": (
+        lambda root: rewrite_camera(root, K=[1, 2]),
+        {},
+        DataError,
+        "camera.json: K: expected 3x3 numbers",
+    ),
+    "exposures of fewer": (
+        lambda root: (root / "exposures.txt").write_text("0 10\n20 30\n"),
+        {},
+        DataError,
+        r"exposures.txt: has 2 lines of 2 numbers, expected start and end .* of the 6 pictures",
+    ),
+    "event beside the sensor": (
+        lambda root: (root / "events.csv").write_text("t,x,y,p\n1,127,3,1\n2,128,3,0\n"),
+        {},
+        DataError,
+        "events.csv: ",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_missing_is_one_sentence(recording: Path, tmp_path: Path, fault: str) -> None:
+    change, options, error, message = FAULTS[fault]
+    change(recording)
+    options = options or {"fps": 25.0, "exposure_us": 3e4}
+    with pytest.raises(EvsplatError, match=message) as caught:
+        import_capture("folder", recording, tmp_path / "out", **options)
+    assert isinstance(caught.value, error)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
