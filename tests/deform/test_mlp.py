@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from evsplat._native import levels as native_levels
-from evsplat.deform.mlp import PointMLP, bfloat16_runs
+from evsplat.deform.mlp import PointMLP, bfloat16_runs, plain_mlp
 
 
 def plain(network, point, time=None, both=None):
@@ -229,3 +229,31 @@ def test_start_is_that_of_linear_layers_and_the_last_can_be_near_zero():
     assert abs(network.weights[0].abs().max().item() - 200**-0.5) < 1e-4
     assert abs(network.weights[-1].std().item() - 1e-4) < 1e-5
     assert (network.biases[-1] == 0).all()
+
+
+def test_plain_torch_multiplies_hidden_layers_in_bfloat16_as_a_gpu_does():
+    """By PyTorch's autocast, here on the CPU; the first layer sees positions and keeps its digits.
+
+    With one input in 300 the first layer's rounding would be 0.2, the others' is below 1e-2.
+    """
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    point = normal(50, 3) * 1e-3 + 300
+    first, bias = normal(16, 3), normal(1, 16)
+    bias = bias - first.sum(-1) * 300
+    layers = [normal(16, 16) / 4, normal(16), normal(5, 16) / 4, normal(5)]
+    inputs = [point, None, bias, first, normal(16, 0), *layers]
+    exact = plain_mlp(*(None if v is None else v.double() for v in inputs))
+    leaves = [layer.requires_grad_() for layer in layers]
+    rounded = plain_mlp(*inputs, bf16=True)
+    assert rounded.dtype == torch.float32
+    error = (rounded - exact).norm() / exact.norm()
+    assert 1e-5 < error < 2e-2
+    gradients = torch.autograd.grad(rounded.sum(), leaves)
+    expected = torch.autograd.grad(plain_mlp(*inputs).sum(), leaves)
+    for value, wanted in zip(gradients, expected, strict=True):
+        assert value.dtype == torch.float32
+        assert (value - wanted).norm() < 2e-2 * wanted.norm()

@@ -195,7 +195,7 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
         gaussians={"human": 10, "scene": 20},
     )
     module = ModuleType("evsplat.training.run")
-    module.load_run = lambda path: trained
+    module.load_run = lambda path, **_: trained
     monkeypatch.setitem(sys.modules, "evsplat.training.run", module)
     metrics = evaluate_run(out)
     assert json.loads((out / "metrics.json").read_text()) == metrics

@@ -78,7 +78,7 @@ class _Clock:
 def run(tmp_path, monkeypatch):
     """A folder that `load_run` takes for a run of the clock on the recording."""
     loaded = SimpleNamespace(capture=_Recording(), reconstruction=_Clock())
-    monkeypatch.setattr(rendering, "load_run", lambda path: loaded)
+    monkeypatch.setattr(rendering, "load_run", lambda path, **_: loaded)
     path = tmp_path / "run"
     path.mkdir()
     return path

@@ -159,7 +159,11 @@ def foreign(monkeypatch):
     "settings",
     [
         {},
-        {"method": "evsplat"},
+        {
+            "method": "evsplat",
+            "deform": SMALL["deform"]
+            | {"shading": True, "shadow_lights": 2, "networks_once": True},
+        },
         {
             "deform": SMALL["deform"] | {"encoding": "hashgrid", "pose_correction_start": 0},
             "loss": {"perceptual": "st_lpips"},

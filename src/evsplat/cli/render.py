@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from evsplat.cli.options import Flag, RunFolder, option
+from evsplat.cli.options import Device, Flag, RunFolder, option
 
 
 def render(
@@ -17,6 +17,7 @@ def render(
     parts: Literal["all", "human", "scene"] = "all",
     camera: Annotated[str | None, option("NAME", default="the recording one")] = None,
     beside: Flag = False,
+    device: Device = "auto",
 ) -> None:
     """Draw a run: the whole recording at any frame rate, or its test frames.
 
@@ -29,6 +30,7 @@ def render(
         parts: The person and the scene, or one of them.
         camera: A camera of the capture; it need not have recorded anything.
         beside: Put the blurry input frame at the left.
+        device: Where to draw.
     """
     from evsplat.export import render_run
 
@@ -41,5 +43,6 @@ def render(
         parts=parts,
         camera=camera,
         beside=beside,
+        device=device,
     )
     print(f"written: {path}")

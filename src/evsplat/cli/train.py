@@ -71,7 +71,7 @@ def train(
         print(f"run: {run}")
         return
     try:
-        evaluate_and_report(run)
+        evaluate_and_report(run, device=device)
     except KeyboardInterrupt:
         command = shlex.join(["evsplat", "evaluate", str(run)])
         raise KeyboardInterrupt(

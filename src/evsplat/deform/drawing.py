@@ -79,7 +79,7 @@ def _places(depth: Float[Tensor, "H W 2"], camera: PinholeCamera) -> Float[Tenso
     sums = F.avg_pool2d(depth.movedim(-1, 0), step, ceil_mode=True, count_include_pad=False)
     z = sums[0] / sums[1].clamp_min(_LEAST_SCENE)
     y, x = ((torch.arange(count, device=z.device) + 0.5) * step for count in z.shape)
-    K, pose = camera.K.to(z), camera.world_to_camera.detach()
+    K, pose = camera.K, camera.world_to_camera.detach()
     rays = torch.stack(
         [
             ((x - K[0, 2]) / K[0, 0]).expand(z.shape),

@@ -1,6 +1,7 @@
 """Position encodings: smooth one-blob and multi-resolution hash grid."""
 
 import math
+from importlib.util import find_spec
 from typing import Any, Literal, Protocol
 
 import torch
@@ -89,12 +90,24 @@ class HashGridEncoding(nn.Module):
         sizes = [min((cells + 1) ** 3, 2**log2_table) for cells in self.resolutions]
         self.offsets = tuple(sum(sizes[:level]) for level in range(levels + 1))
         self.table = nn.Parameter(torch.empty(sum(sizes), features).uniform_(-1e-4, 1e-4))
+        layout = [
+            (cells, start, size == (cells + 1) ** 3)
+            for cells, start, size in zip(self.resolutions, self.offsets, sizes, strict=False)
+        ]
+        self.layout: Tensor
+        self.register_buffer("layout", torch.tensor(layout, dtype=torch.int32), persistent=False)
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch D"]:
         """Encode positions in [0, 1]."""
         clamped = positions.clamp(0, 1).reshape(-1, 3)
-        lookup = _NativeLookup if runs_native(clamped) else _TorchLookup
-        encoded: Tensor = lookup.apply(clamped, self.table, self)
+        encoded: Tensor
+        if _runs_triton(clamped):
+            from evsplat.deform.hash_grid_triton import TritonLookup
+
+            encoded = TritonLookup.apply(clamped, self.table, self.layout, self.table_mask)
+        else:
+            lookup = _NativeLookup if runs_native(clamped) else _TorchLookup
+            encoded = lookup.apply(clamped, self.table, self)
         return encoded.T.unflatten(0, positions.shape[:-1])
 
     def cell(
@@ -114,6 +127,12 @@ class HashGridEncoding(nn.Module):
         x, y = x[:, None, None], y[:, None]
         entries = x + (y + z) if dense else (x ^ (y ^ z)).bitwise_and_(self.table_mask)
         return entries.add_(self.offsets[level]), scaled.sub_(corner)
+
+
+def _runs_triton(tensor: Tensor) -> bool:
+    """Whether Triton, which comes with PyTorch's CUDA builds for Linux, takes this tensor."""
+    on_gpu = tensor.device.type == "cuda" and tensor.dtype == torch.float32
+    return on_gpu and find_spec("triton") is not None
 
 
 class _NativeLookup(torch.autograd.Function):

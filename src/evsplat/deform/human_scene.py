@@ -1,6 +1,5 @@
 """A person and a scene in one Gaussian set, posed at any time: the paper's model (eq. 1-7)."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -13,7 +12,7 @@ from evsplat.body import BodyTrack, bounding_box, skin, up_axis
 from evsplat.body.rotations import axis_angle_to_matrix, quaternion_multiply
 from evsplat.deform.colour import HumanColour, SceneColour, view_jitter
 from evsplat.deform.encodings import make_encoding
-from evsplat.deform.mlp import PointMLP, Precision, bfloat16_runs
+from evsplat.deform.mlp import PointMLP, Precision
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
 from evsplat.deform.shading import Shading, SurfaceNormals
@@ -22,8 +21,6 @@ from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.deform.skinning_turns import SkinningTurns
 from evsplat.devices import send
 from evsplat.gaussians import ATTRIBUTES, GaussianSet, PosedGaussians, PosedHuman, StaticScene
-
-logger = logging.getLogger(__name__)
 
 NORMAL_SAMPLES = 20_000
 """Points of the body's surface among which a Gaussian finds its normal."""
@@ -56,8 +53,8 @@ class DeformConfig:
     latent_dim: int = 16
     """Size of the per-frame latent of the person's colour."""
     precision: Precision = "float32"
-    """bfloat16: the hidden layers multiply with 8 bits and sum with 24, on CPUs that can
-    (AVX-512 BF16; elsewhere a warning says that it is float32). See docs/performance.md."""
+    """bfloat16: the hidden layers multiply with 8 bits and sum with 24, on CPUs with AVX-512 BF16
+    and on GPUs; elsewhere a warning says that it is float32. See docs/performance.md."""
     non_rigid_start: float = 3_000
     """Nominal iteration at which the non-rigid network is switched on (A9)."""
     pose_noise: float = 0.1
@@ -131,8 +128,6 @@ class HumanSceneModel(nn.Module):
         self.scene_colour = SceneColour(
             view_dependent=config.scene_view_dependent, width=config.colour_width
         )
-        if config.precision == "bfloat16" and not bfloat16_runs():
-            logger.warning("This machine multiplies no bfloat16: the networks run in float32.")
         for module in self.modules():
             if isinstance(module, PointMLP):
                 module.precision = config.precision

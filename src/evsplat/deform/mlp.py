@@ -7,6 +7,7 @@ back, while they are in the cache; everywhere else plain torch does the same.
 """
 
 import math
+from contextlib import nullcontext
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -71,19 +72,25 @@ class PointMLP(nn.Module):
             bias = bias.expand(len(both), -1)
         layers = [layer for pair in zip(self.weights, self.biases, strict=True) for layer in pair]
         inputs = (point, both, bias, self.point_weight, self.both_weight, *layers)
+        bf16 = self.precision == "bfloat16" and bfloat16_runs(point.device)
         if runs_native(point):
             keep = torch.is_grad_enabled() and any(
                 tensor is not None and tensor.requires_grad for tensor in inputs
             )
-            bf16 = self.precision == "bfloat16" and bfloat16_runs()
             output: Tensor = _NativeMLP.apply(keep, bf16, *inputs)
             return output
-        return plain_mlp(*inputs)
+        return plain_mlp(*inputs, bf16=bf16)
 
 
-def bfloat16_runs() -> bool:
-    """Whether this machine multiplies bfloat16 in the compiled module (AVX-512 BF16)."""
-    return native is not None and native.has_bf16()
+def bfloat16_runs(device: torch.device | None = None) -> bool:
+    """Whether networks multiply bfloat16 there: a CPU with AVX-512 BF16, a GPU from Ampere on.
+
+    Without a device: the CPU.
+    """
+    if device is not None and device.type == "cuda":
+        return torch.cuda.get_device_capability(device) >= (8, 0)
+    on_cpu = device is None or device.type == "cpu"
+    return on_cpu and native is not None and native.has_bf16()
 
 
 def plain_mlp(
@@ -93,17 +100,21 @@ def plain_mlp(
     point_weight: Float[Tensor, "W A"],
     both_weight: Float[Tensor, "W C"],
     *layers: Tensor,
+    bf16: bool = False,
 ) -> Float[Tensor, "T N out"]:
     """The network in plain torch, on any device and in any precision.
 
-    ``bias`` is the first layer's, ``layers`` are weight and bias of each later layer.
+    ``bias`` is the first layer's, ``layers`` are weight and bias of each later layer, which are
+    multiplied in bfloat16 if ``bf16``.
     """
     hidden = (point @ point_weight.T) + bias[:, None]
     if both is not None:
         hidden = hidden + both @ both_weight.T
-    for weight, layer_bias in zip(layers[::2], layers[1::2], strict=True):
-        hidden = nn.functional.linear(nn.functional.leaky_relu(hidden, SLOPE), weight, layer_bias)
-    return hidden
+    with torch.autocast(point.device.type, torch.bfloat16) if bf16 else nullcontext():
+        for weight, layer_bias in zip(layers[::2], layers[1::2], strict=True):
+            inner = nn.functional.leaky_relu(hidden, SLOPE)
+            hidden = nn.functional.linear(inner, weight, layer_bias)
+    return hidden.float() if bf16 else hidden
 
 
 class _NativeMLP(torch.autograd.Function):

@@ -59,7 +59,8 @@ class SurfaceNormals:
     def of(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Unit normals at canonical centres."""
         if len(self.normals) != len(means):
-            _, index = nearest(self.surface.points, 1, means.detach().cpu())
+            self.surface = self.surface.to(means.device)
+            _, index = nearest(self.surface.points, 1, means.detach())
             self.normals = self.surface.normals[index[:, 0]]
         self.normals = self.normals.to(means.device)
         return self.normals

@@ -90,18 +90,23 @@ def evaluate(
     return result
 
 
-def evaluate_run(run_dir: Path | str, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
-    """Measure a trained run and write metrics.json, metrics.md, metrics.tex and pictures/."""
+def evaluate_run(
+    run_dir: Path | str, *, lpips_weights: Path | str | None = None, device: str = "auto"
+) -> dict[str, Any]:
+    """Measure a trained run and write metrics.json, metrics.md, metrics.tex and pictures/.
+
+    ``device`` is where it is drawn and compared, not where it was trained.
+    """
     from evsplat.training.run import load_run
 
-    run = load_run(Path(run_dir))
+    device = choose_device(device)
+    run = load_run(Path(run_dir), device=device)
     measured = evaluate(
         run.capture,
         run.reconstruction,
         out_dir=run.path,
         lpips_weights=lpips_weights,
-        # run.device is where it was trained, which may be another machine
-        device=choose_device("auto"),
+        device=device,
     )
     metrics = {
         "capture": measured.pop("capture"),

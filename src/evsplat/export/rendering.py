@@ -72,6 +72,7 @@ def render_run(
     parts: Parts = "all",
     camera: str | None = None,
     beside: bool = False,
+    device: str = "auto",
 ) -> Path:
     """Draw a run's reconstruction and return the file or folder that was written.
 
@@ -84,7 +85,7 @@ def render_run(
         raise ConfigError(f"--fps {fps:g}: expected a frame rate above 0 and at most 1000 Hz.")
     if not 0 < slow <= 10_000:
         raise ConfigError(f"--slow {slow:g}: expected a factor above 0 and at most 10000.")
-    loaded = load_run(Path(run))
+    loaded = load_run(Path(run), device=device)
     capture = loaded.capture
     if camera is not None and camera not in capture.cameras:
         known = ", ".join(capture.cameras)

@@ -13,6 +13,7 @@ from torch import Tensor
 from evsplat.body import BodyTrack, body_box, load_body_track, silhouette, up_axis
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
+from evsplat.deform.mlp import bfloat16_runs
 from evsplat.errors import ConfigError, DataError
 from evsplat.gaussians import BodyFrames, DensifyConfig, GaussianSet, Part
 from evsplat.gaussians.initialise import (
@@ -208,6 +209,8 @@ class Build:
         gaussians = GaussianSet(human, scene)
         model = HumanSceneModel(config.deform, config.semantics, track, times, gaussians)
         model = model.to(device)
+        if config.deform.precision == "bfloat16" and not bfloat16_runs(model.box_low.device):
+            logger.warning("This machine multiplies no bfloat16: the networks run in float32.")
 
         prior = SkinningPrior(surface.to(device), config.skinning_points)
         if fit:

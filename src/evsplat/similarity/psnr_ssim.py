@@ -104,11 +104,13 @@ def ssim_map(
         return across
 
     x, y = image.movedim(-1, 0), reference.movedim(-1, 0)
-    mean_x, mean_y = smooth(x), smooth(y)
+    # One call for all five: on a GPU it is the number of operations that counts.
+    smoothed = smooth(torch.cat([x, y, x * x, y * y, x * y])).split(len(x))
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = smoothed
     unbias = size**2 / (size**2 - 1) if settings.sample_covariance else 1.0
-    variance_x = unbias * (smooth(x * x) - mean_x**2)
-    variance_y = unbias * (smooth(y * y) - mean_y**2)
-    covariance = unbias * (smooth(x * y) - mean_x * mean_y)
+    variance_x = unbias * (mean_xx - mean_x**2)
+    variance_y = unbias * (mean_yy - mean_y**2)
+    covariance = unbias * (mean_xy - mean_x * mean_y)
     c1, c2 = settings.stabilisers
     luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
     structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
