@@ -22,6 +22,8 @@ EXPECTED = {
     "video (PyAV)",
     "demo capture",
     "SMPL bodies",
+    "optical flow",
+    "Super SloMo",
     "ST-LPIPS",
     "LPIPS alex",
     "LPIPS vgg",

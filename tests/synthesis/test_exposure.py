@@ -84,6 +84,14 @@ def test_lower_rate_takes_the_pictures_nearest_to_even_times():
     assert {e.end_us - e.start_us for e in plan.exposures} == {20_000}
 
 
+@pytest.mark.parametrize("count", range(20, 29))
+def test_spacing_stays_even_to_the_last_frame(count):
+    """The end of the footage may not draw the last frame nearer."""
+    times = np.round(np.arange(count) * 1e6 / 60).astype(int)
+    plan = plan_exposures(times, synthesis_settings(fps=15, duty=0.9, upsample=4))
+    assert set(np.diff([exposure.source for exposure in plan.exposures])) == {4}
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -61,6 +61,8 @@ def run_checks() -> Iterator[Check]:
         _video,
         _demo,
         _body_models,
+        _opencv,
+        _super_slomo,
         _st_lpips,
         lambda: _lpips("alex"),
         lambda: _lpips("vgg"),
@@ -119,6 +121,25 @@ def _body_models() -> Check:
     folder = os.environ.get("EVSPLAT_BODY_MODELS")
     files = f"files in {folder}" if folder else "set EVSPLAT_BODY_MODELS to your SMPL files"
     return Check(name, "ok", f"body-models {found}, {files}")
+
+
+def _opencv() -> Check:
+    name = "optical flow"
+    try:
+        cv2 = import_module("cv2")
+    except ImportError:
+        remedy = "Get it with: pip install 'evsplat[synthesize]'."
+        return Check(name, "optional", "OpenCV is not installed.", remedy)
+    return Check(name, "ok", f"OpenCV {cv2.__version__}")
+
+
+def _super_slomo() -> Check:
+    from evsplat.synthesis.super_slomo import find_checkpoint
+
+    try:
+        return Check("Super SloMo", "ok", f"weights {find_checkpoint()}")
+    except WeightsError as error:
+        return Check("Super SloMo", "optional", str(error))
 
 
 def _st_lpips() -> Check:

@@ -67,7 +67,7 @@ def plan_exposures(times_us: Int64[np.ndarray, "N"], settings: SynthesisSettings
             f"exposure of {2 * half_us / 1e6:.3f} s; give a shorter one."
         )
     if settings.fps is not None:
-        chosen = _spaced(times_us, chosen, period_us)
+        chosen = _spaced(times_us, chosen, period_us, gap_us)
     exposures = (
         Exposure(int(i), int(times_us[i]) - half_us, int(times_us[i]) + half_us) for i in chosen
     )
@@ -94,11 +94,14 @@ def _length_us(settings: SynthesisSettings, period_us: float, spacing_us: float)
 
 
 def _spaced(
-    times_us: Int64[np.ndarray, "N"], allowed: Int64[np.ndarray, "A"], period_us: float
+    times_us: Int64[np.ndarray, "N"],
+    allowed: Int64[np.ndarray, "A"],
+    period_us: float,
+    gap_us: float,
 ) -> Int64[np.ndarray, "M"]:
     """Of the allowed pictures those nearest to even times from the first of them on."""
     times = times_us[allowed]
-    wanted = np.arange(times[0], times[-1] + period_us / 2, period_us)
+    wanted = np.arange(times[0], times[-1] + gap_us / 2, period_us)
     after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
     before = np.maximum(after - 1, 0)
     nearer = np.where(wanted - times[before] < times[after] - wanted, before, after)

@@ -91,7 +91,7 @@ class SuperSloMo:
 
     def __init__(self, transfer: Transfer, weights: Path | str | None = None) -> None:
         self._transfer: Transfer = transfer
-        path = _checkpoint(weights)
+        path = find_checkpoint(weights)
         state = read_state(path)
         self.sha256 = sha256_of(path)
         self._flow, self._refine = (
@@ -165,7 +165,11 @@ def _as_input(coded: Float[np.ndarray, "H W C"]) -> Float[Tensor, "1 3 H2 W2"]:
     return F.pad(picture[None], padding, mode="replicate")
 
 
-def _checkpoint(weights: Path | str | None) -> Path:
+def find_checkpoint(weights: Path | str | None = None) -> Path:
+    """The checkpoint at ``weights``, the environment variable's place or torch's hub folder.
+
+    Raises `MissingWeights` where it is not.
+    """
     named = weights or os.environ.get(WEIGHTS_VARIABLE)
     path = Path(named or hub_folder() / FILE_NAME).expanduser()
     if path.is_file():
