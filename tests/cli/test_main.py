@@ -153,3 +153,12 @@ def test_the_verbs_are_functions_of_the_package(name):
 def test_unknown_attribute_of_the_package_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'trian'"):
         _ = evsplat.trian
+
+
+def test_ctrl_c_is_answered_with_a_word(capsys, monkeypatch, tmp_path):
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("evsplat.synthesis.synthesize", interrupted)
+    code, _, stderr = _outcome(capsys, "synthesize", "clip.mp4", "--out", str(tmp_path / "out"))
+    assert (code, stderr) == (130, "\nevsplat: Stopped.\n")

@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"evsplat: {error}", file=sys.stderr)
         return _CODE_BAD_INPUT
     except KeyboardInterrupt as stop:
-        print(f"\nevsplat: {stop or 'Stopped.'}", file=sys.stderr)
+        print(f"\nevsplat: {str(stop) or 'Stopped.'}", file=sys.stderr)
         return _CODE_INTERRUPTED
     return 0
 
