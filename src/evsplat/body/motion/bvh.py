@@ -1,0 +1,103 @@
+"""Biovision hierarchies (``.bvh``), what most motion tools export."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from evsplat.body.motion.world import down_the_tree, read_text, upright_world
+from evsplat.body.retarget import SkeletonMotion
+from evsplat.errors import DataError
+
+
+@dataclass
+class _Joint:
+    name: str
+    parent: int
+    offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+    channels: list[str] = field(default_factory=list)
+
+
+def read_bvh(path: Path) -> SkeletonMotion:
+    """The motion of a ``.bvh``.
+
+    The pose of all offsets is the zero pose: it must stand upright, which tells the axes. The unit
+    of length does not matter, because retargeting scales by the length of the legs.
+    """
+    words = iter(read_text(path).split())
+    try:
+        joints, frame_time, values = _read(words)
+    except StopIteration:
+        raise DataError(f"{path}: ends too early; copy it again.") from None
+    except (ValueError, IndexError) as error:
+        raise DataError(f"{path}: not a readable BVH file ({error}).") from None
+    if not joints or len(values) == 0 or not np.isfinite(values).all() or frame_time <= 0:
+        raise DataError(f"{path}: holds no joints, no frames or no frame time above zero.")
+    parents = [joint.parent for joint in joints]
+    local = np.tile(np.eye(3), (len(values), len(joints), 1, 1))
+    zero = np.zeros((len(joints), 3))
+    positions = np.tile(np.array(joints[0].offset), (len(values), 1))
+    column = 0
+    for index, joint in enumerate(joints):
+        zero[index] = joint.offset
+        if joint.parent >= 0:
+            zero[index] += zero[joint.parent]
+        for channel in joint.channels:
+            axis = channel[0].lower()
+            if channel.lower().endswith("rotation"):
+                turn = Rotation.from_euler(
+                    axis, values[:, column : column + 1], degrees=True
+                ).as_matrix()
+                local[:, index] = local[:, index] @ turn
+            elif joint.parent < 0:
+                positions[:, "xyz".index(axis)] = values[:, column]
+            column += 1
+    names = tuple(joint.name for joint in joints)
+    return SkeletonMotion(
+        joint_names=names,
+        parents=np.array(parents),
+        zero_joints=zero,
+        world_rotations=down_the_tree(local, parents),
+        root_positions=positions,
+        times_us=np.round(np.arange(len(values)) * frame_time * 1e6).astype(np.int64),
+        world_from_source=upright_world(parents, names, zero, str(path)),
+        source=str(path),
+    )
+
+
+def _read(words: Iterator[str]) -> tuple[list[_Joint], float, np.ndarray]:
+    joints: list[_Joint] = []
+    stack: list[int] = []
+    ends = 0
+    for word in words:
+        if word in ("ROOT", "JOINT"):
+            if word == "ROOT" and joints:
+                raise ValueError("several roots; save one person per file")
+            joints.append(_Joint(next(words), stack[-1] if stack else -1))
+            stack.append(len(joints) - 1)
+        elif word == "End":
+            ends += 1
+        elif word == "OFFSET":
+            offset = tuple(float(next(words)) for _ in range(3))
+            # an end site only says how long the last bone is
+            if not ends:
+                joints[-1].offset = offset
+        elif word == "CHANNELS":
+            joints[-1].channels = [next(words) for _ in range(int(next(words)))]
+        elif word == "}":
+            if ends:
+                ends -= 1
+            else:
+                stack.pop()
+        elif word == "MOTION":
+            break
+    header = [next(words) for _ in range(5)]
+    if header[0] != "Frames:" or header[2:4] != ["Frame", "Time:"]:
+        raise ValueError("MOTION must begin with Frames: and Frame Time:")
+    count, channels = int(header[1]), sum(len(joint.channels) for joint in joints)
+    values = np.array(list(words), dtype=np.float64)
+    if values.size != count * channels:
+        raise ValueError(f"{values.size} numbers, expected {count} frames of {channels}")
+    return joints, float(header[4]), values.reshape(count, channels)
