@@ -23,6 +23,7 @@
 #include "sensor_module.h"
 #include "skinning.h"
 #include "ssim.h"
+#include "zbuffer_module.h"
 
 namespace nb = nanobind;
 using namespace evsplat;
@@ -462,4 +463,5 @@ NB_MODULE(_native, m) {
     m.def("level", [] { return std::string(select_kernels().name); }, "SIMD level in use.");
     m.def("multiply_add", &multiply_add, nb::arg("rounds"),
           "Run independent multiply-adds; returns the floating-point operations done.");
+    bind_zbuffer(m);
 }

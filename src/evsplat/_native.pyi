@@ -1,5 +1,7 @@
 """Types of the extension module; see native/module.cpp."""
 
+from collections.abc import Sequence
+
 from numpy import ndarray
 from torch import Tensor
 
@@ -169,6 +171,61 @@ def nearest(
     square: Tensor,
     threads: int,
 ) -> None: ...
+
+class Light:
+    """A lamp, light from all around, and how surfaces answer; metres and texels."""
+
+    position: Sequence[float]
+    power: float
+    world_to_light: Sequence[float]
+    shadow_focal: float
+    shadow_radius: float
+    shadow_size: int
+    shadow_bias: float
+    ambient_below: Sequence[float]
+    ambient_above: Sequence[float]
+    rim: float
+    wrap: float
+    specular: float
+    shininess: float
+
+class Stage:
+    """A person in a room, drawn with a z-buffer."""
+
+    def __init__(
+        self,
+        corners: ndarray,
+        normals: ndarray,
+        uv: ndarray,
+        layer: ndarray,
+        tint: ndarray,
+        direct: ndarray,
+        ambient: ndarray,
+        room_texture: list[ndarray],
+        faces: ndarray,
+        person_uv: ndarray,
+        cutout: ndarray,
+        bones: ndarray,
+        weights: ndarray,
+        contact: ndarray,
+        rest_joints: ndarray,
+        atlas: list[ndarray],
+        alpha: ndarray,
+        light: Light,
+    ) -> None: ...
+    def draw(
+        self,
+        K: ndarray,
+        world_to_camera: ndarray,
+        bones: ndarray,
+        vertices: ndarray,
+        normals: ndarray,
+        shadows: bool,
+        samples: int,
+        image: ndarray,
+        threads: int,
+    ) -> None: ...
+
 def lanes() -> int: ...
 def has_bf16() -> bool: ...
 def levels() -> list[str]: ...
