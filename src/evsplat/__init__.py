@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from evsplat.export import render_run
     from evsplat.footage.simulate import simulate
     from evsplat.restore import restore_capture
+    from evsplat.staging import stage
     from evsplat.synthesis import synthesize
     from evsplat.training.run import load_run
     from evsplat.training.train import train
@@ -52,6 +53,7 @@ __all__ = [
     "render_run",
     "restore_capture",
     "simulate",
+    "stage",
     "synthesize",
     "train",
     "write_report",
@@ -68,6 +70,7 @@ _LAZY = {
     "render_run": "evsplat.export:render_run",
     "restore_capture": "evsplat.restore:restore_capture",
     "simulate": "evsplat.footage.simulate:simulate",
+    "stage": "evsplat.staging:stage",
     "synthesize": "evsplat.synthesis:synthesize",
     "train": "evsplat.training:train",
     "write_report": "evsplat.evaluation.report:write_report",

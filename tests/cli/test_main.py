@@ -11,7 +11,7 @@ import evsplat
 from evsplat.cli import main
 from evsplat.cli.demo import demo_capture
 
-VERBS = ("demo", "doctor", "simulate", "synthesize", "inspect", "restore", "train")
+VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "restore", "train")
 VERBS += ("evaluate", "report", "render")
 
 

@@ -19,6 +19,7 @@ from evsplat.cli.render import render
 from evsplat.cli.report import report
 from evsplat.cli.restore import restore
 from evsplat.cli.simulate import simulate
+from evsplat.cli.stage import stage
 from evsplat.cli.synthesize import synthesize
 from evsplat.cli.train import train
 from evsplat.errors import EvsplatError
@@ -26,7 +27,7 @@ from evsplat.errors import EvsplatError
 _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
     for verb in (
-        *(demo, doctor, import_, convert, simulate, synthesize, inspect),
+        *(demo, doctor, import_, convert, simulate, synthesize, stage, inspect),
         *(restore, train, evaluate, report, render),
     )
 }
