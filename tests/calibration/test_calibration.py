@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from evsplat.calibration import (
+    NoiseMeter,
     SensorEstimate,
     estimate_from_capture,
     estimate_from_pairs,
-    estimate_noise,
     exposure,
     pair,
     pair_indices,
@@ -143,12 +143,11 @@ def test_noise_rate_hot_pixels_and_polarity_are_found_beside_motion(seed) -> Non
     columns = np.concatenate([quiet, sweeps, hot], axis=1)
     t, x, y, p = columns[:, np.argsort(columns[0], kind="stable")]
     stream = EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
-    found = estimate_noise(
-        (stream.between(k * 5_000_000, (k + 1) * 5_000_000) for k in range(4)),
-        width,
-        height,
-        duration,
-    )
+    meter = NoiseMeter(width, height)
+    for k in range(4):
+        meter.add(stream.between(k * 5_000_000, (k + 1) * 5_000_000))
+    assert meter.total.sum() == len(stream)
+    found = meter.estimate(duration)
     assert found.rate_hz == pytest.approx(rate, rel=0.1)
     assert found.brighter_share == pytest.approx(0.9, abs=0.05)
     assert found.hot_pixels.tolist() == [[70, 31]]
@@ -163,7 +162,9 @@ def test_a_picture_that_moves_everywhere_has_no_noise_estimate() -> None:
         (pixel // 8).astype(np.uint16),
         np.ones(4_800, dtype=np.int8),
     )
-    assert estimate_noise([stream], 8, 6, 100_000).rate_hz is None
+    meter = NoiseMeter(8, 6)
+    meter.add(stream)
+    assert meter.estimate(100_000).rate_hz is None
 
 
 def test_the_davis_recording_gives_the_known_figures(recordings_root: Path) -> None:
@@ -188,7 +189,9 @@ def test_the_davis_recording_gives_the_known_figures(recordings_root: Path) -> N
     assert abs(found.clock.lag_us - 5_000) < 2_000
     assert found.thresholds.plus == pytest.approx(0.36, rel=0.1)
     assert found.thresholds.minus == pytest.approx(0.40, rel=0.1)
-    noise = estimate_noise([events], 346, 260, recorded[1] - recorded[0])
+    meter = NoiseMeter(346, 260)
+    meter.add(events)
+    noise = meter.estimate(recorded[1] - recorded[0])
     assert noise.rate_hz == pytest.approx(0.003, rel=0.3)
     assert noise.brighter_share > 0.9
 

@@ -13,7 +13,7 @@ from evsplat.calibration.brightness import (
     pair_indices,
 )
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
-from evsplat.calibration.noise import NoiseEstimate, estimate_noise
+from evsplat.calibration.noise import NoiseEstimate, NoiseMeter
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
 if TYPE_CHECKING:
@@ -24,12 +24,12 @@ __all__ = [
     "Exposure",
     "FramePair",
     "NoiseEstimate",
+    "NoiseMeter",
     "SensorEstimate",
     "ThresholdEstimate",
     "estimate_clock",
     "estimate_from_capture",
     "estimate_from_pairs",
-    "estimate_noise",
     "estimate_thresholds",
     "exposure",
     "pair",

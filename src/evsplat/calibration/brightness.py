@@ -18,6 +18,8 @@ DARKEST, BRIGHTEST = 0.02, 0.98
 """Coded values outside of this range are mostly noise, or clipped."""
 SHORTEST_GAP_US = 20_000
 """Frames that follow each other faster are skipped: little changes between them."""
+HISTORY_US = 100_000
+"""How far back the last event of a pixel is looked for."""
 MOST_EVENTS = 10_000
 """About a pair of frames; of more a part is taken."""
 
@@ -113,7 +115,8 @@ class PairEvents:
         """Read what ``counts`` needs for lags in the given range."""
         self.pair = pair
         start, end = pair.span_us
-        near = events.between(start + math.floor(lags_us[0]), end + math.ceil(lags_us[1]) + 1)
+        first = start + math.floor(lags_us[0]) - HISTORY_US
+        near = events.between(first, end + math.ceil(lags_us[1]) + 1)
         height, width = pair.change.shape
         if len(near) and (near.x.max() >= width or near.y.max() >= height):
             raise DataError(

@@ -59,9 +59,10 @@ def estimate_clock(
     correlations = _correlation(fine_sums.sum(0))
     if vertex is None or np.nanmax(correlations) < LEAST_CORRELATION:
         return None
-    lags = np.concatenate([coarse, fine])
+    beyond = (coarse < fine[0]) | (coarse > fine[-1])
+    lags = np.concatenate([coarse[beyond], fine])
     order = np.argsort(lags, kind="stable")
-    curve = np.concatenate([_correlation(sums.sum(0)), correlations])
+    curve = np.concatenate([_correlation(sums.sum(0))[beyond], correlations])
     return ClockEstimate(
         lag_us=vertex,
         spread_us=_jackknife(fine, fine_sums),

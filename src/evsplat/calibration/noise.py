@@ -1,6 +1,5 @@
 """Events that nothing in the scene has caused: background activity and hot pixels."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,40 +30,51 @@ class NoiseEstimate:
     """(x, y) of pixels that fire without cause, the most active first."""
 
 
-def estimate_noise(
-    chunks: Iterable[EventStream], width: int, height: int, duration_us: int
-) -> NoiseEstimate:
-    """Rate of unsupported events far from all supported ones, and hot pixels.
+class NoiseMeter:
+    """Gathers unsupported events piece by piece.
 
     Support is the usual background-activity test (Delbruck 2008): another event at one of the nine
-    pixels around within about 10 ms. A hot pixel fires at more than 5 Hz and ten times as often as
-    all but one of its eight neighbours. ``chunks`` are consecutive; events at their borders may
-    lose support.
+    pixels around within about 10 ms. Events at the borders of pieces may lose support.
     """
-    total = np.zeros(height * width, dtype=np.int64)
-    supported = np.zeros(height * width, dtype=bool)
-    lonely = np.zeros((2, height * width), dtype=np.int64)
-    for chunk in chunks:
+
+    def __init__(self, width: int, height: int) -> None:
+        self.total: Int64[np.ndarray, "H W"] = np.zeros((height, width), dtype=np.int64)
+        """Events so far per pixel."""
+        self._supported = np.zeros((height, width), dtype=bool)
+        self._lonely = np.zeros((2, height, width), dtype=np.int64)
+
+    def add(self, chunk: EventStream) -> None:
+        """Take in the next piece of the recording."""
+        height, width = self.total.shape
         pixel = chunk.y.astype(np.int64) * width + chunk.x
-        total += np.bincount(pixel, minlength=height * width)
         alone = ~_has_support(chunk, width, height)
-        supported[pixel[~alone]] = True
-        for row, side in zip(lonely, (chunk.p > 0, chunk.p <= 0), strict=True):
-            row += np.bincount(pixel[alone & side], minlength=height * width)
-    seconds = max(duration_us, 1) / 1e6
-    hot = _hot_pixels(total.reshape(height, width), seconds)
-    moved = binary_dilation(supported.reshape(height, width), iterations=QUIET_DISTANCE_PX)
-    quiet = ~moved.reshape(-1)
-    quiet[hot[:, 1] * width + hot[:, 0]] = False
-    if quiet.mean() < LEAST_QUIET_SHARE:
-        return NoiseEstimate(None, None, hot)
-    brighter, darker = lonely[:, quiet].sum(1)
-    events = int(brighter + darker)
-    return NoiseEstimate(
-        rate_hz=events / (float(quiet.sum()) * seconds),
-        brighter_share=float(brighter) / events if events else None,
-        hot_pixels=hot,
-    )
+        self._supported.reshape(-1)[pixel[~alone]] = True
+        for counts, side in (
+            (self.total, np.ones(len(chunk), dtype=bool)),
+            (self._lonely[0], alone & (chunk.p > 0)),
+            (self._lonely[1], alone & (chunk.p <= 0)),
+        ):
+            counts += np.bincount(pixel[side], minlength=width * height).reshape(height, width)
+
+    def estimate(self, duration_us: int) -> NoiseEstimate:
+        """Rate of unsupported events far from all supported ones, and hot pixels.
+
+        A hot pixel fires at more than 5 Hz and ten times as often as all but one of its eight
+        neighbours.
+        """
+        seconds = max(duration_us, 1) / 1e6
+        hot = _hot_pixels(self.total, seconds)
+        quiet = ~binary_dilation(self._supported, iterations=QUIET_DISTANCE_PX)
+        quiet[hot[:, 1], hot[:, 0]] = False
+        if quiet.mean() < LEAST_QUIET_SHARE:
+            return NoiseEstimate(None, None, hot)
+        brighter, darker = (int(side[quiet].sum()) for side in self._lonely)
+        events = brighter + darker
+        return NoiseEstimate(
+            rate_hz=events / (float(quiet.sum()) * seconds),
+            brighter_share=brighter / events if events else None,
+            hot_pixels=hot,
+        )
 
 
 def _has_support(chunk: EventStream, width: int, height: int) -> np.ndarray:

@@ -95,9 +95,7 @@ def _copy_files(making: Derivation) -> None:
     names -= {"capture.json"}
     names |= {entry[key] for entry in document["frames"] for key in _PICTURES if entry.get(key)}
     names |= {view["image"] for view in document.get("novel_views", [])}
-    names |= {document["body"]["file"]}
-    if document.get("events"):
-        names |= {document["events"]["file"]}
+    names |= {document[key]["file"] for key in ("body", "events") if document.get(key)}
     for name in sorted(names):
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise DataError(

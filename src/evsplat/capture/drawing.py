@@ -1,8 +1,10 @@
 """Small Pillow helpers: sheets of labelled tiles, outlines, colours."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import binary_dilation, binary_erosion
@@ -11,6 +13,9 @@ from torch import Tensor
 PAPER, INK, FAINT = (255, 255, 255), (38, 43, 51), (128, 136, 148)
 TRAIN, TEST = (38, 124, 160), (226, 114, 38)
 BRIGHTER, DARKER = (235, 40, 40), (40, 90, 245)
+CURVE = (108, 92, 168)
+OVERSAMPLING = 2
+"""Curves are drawn larger and reduced, because Pillow's lines have no soft edges."""
 _GAP, _LABEL_HEIGHT, _HEADER_HEIGHT, _BORDER = 10, 20, 62, 4
 
 
@@ -29,8 +34,8 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def split_colour(split: str) -> tuple[int, int, int]:
-    """One colour for train, another for test."""
-    return TRAIN if split == "train" else TEST
+    """One colour for train, another for test; "" is neither."""
+    return {"train": TRAIN, "test": TEST}.get(split, FAINT)
 
 
 def to_picture(image: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Image.Image:
@@ -55,7 +60,7 @@ def sheet(title: str, subtitle: str, tiles: list[Tile], columns: int) -> Image.I
     width = max(columns * cell_width + _GAP, 720)
     page = Image.new("RGB", (width, _HEADER_HEIGHT + rows * cell_height + _GAP), PAPER)
     draw = ImageDraw.Draw(page)
-    header(draw, title, subtitle, page.width, {tile.split for tile in tiles})
+    header(draw, title, subtitle, page.width, {tile.split for tile in tiles} - {""})
     for index, tile in enumerate(tiles):
         x = _GAP + index % columns * cell_width
         y = _HEADER_HEIGHT + index // columns * cell_height
@@ -80,6 +85,46 @@ def header(
         x -= 18
         draw.rectangle((x, 13, x + 12, 25), fill=split_colour(split))
         x -= 14
+
+
+def events_over(
+    image: Float[Tensor, "H W 3"], counts: Float[Tensor, "H W"]
+) -> Float[Tensor, "H W 3"]:
+    """Signed event counts over the greyed picture: red where brighter, blue where darker."""
+    grey = image.mean(-1, keepdim=True).expand(-1, -1, 3)
+    strength = (counts.abs() / 3).clamp(0, 1).sqrt()[..., None]
+    colour = torch.where(
+        counts[..., None] > 0, torch.tensor(BRIGHTER) / 255, torch.tensor(DARKER) / 255
+    )
+    return (0.25 + 0.6 * grey) * (1 - strength) + colour * strength
+
+
+def line(
+    draw: ImageDraw.ImageDraw,
+    points: Sequence[tuple[float, float]],
+    colour: tuple[int, int, int],
+    width: float,
+) -> None:
+    """A line through points in page coordinates, on a page that is `OVERSAMPLING` times larger."""
+    scaled = [(OVERSAMPLING * x, OVERSAMPLING * y) for x, y in points]
+    draw.line(scaled, fill=colour, width=round(OVERSAMPLING * width))
+
+
+def round_ticks(start: int, end: int) -> list[int]:
+    """Round numbers from ``start`` to ``end``, about ten of them."""
+    step = 1
+    for step in (m * 10**e for e in range(1, 12) for m in (1, 2, 5)):
+        if (end - start) / step <= 12:
+            break
+    return list(range(-(-start // step) * step, end + 1, step))
+
+
+def short_number(value: float) -> str:
+    """1234567 as '1.2M'."""
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= size:
+            return f"{value / size:.3g}{unit}"
+    return f"{value:.3g}"
 
 
 def draw_outline(

@@ -1,5 +1,6 @@
 """`evsplat inspect`: check a capture, sum it up in words and draw it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,20 +9,22 @@ import torch
 from PIL import Image
 
 from evsplat.body import BodyTrack, load_body_track, silhouette
+from evsplat.calibration import SensorEstimate, estimate_from_capture
 from evsplat.capture.camera import Camera
 from evsplat.capture.capture import Capture
 from evsplat.capture.drawing import (
-    BRIGHTER,
-    DARKER,
     Tile,
     draw_outline,
+    events_over,
     fit,
     sheet,
+    short_number,
     to_picture,
 )
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame
-from evsplat.capture.timeline import draw_timeline, short_number
+from evsplat.capture.sensor_report import clock_findings, sensor_lines
+from evsplat.capture.timeline import draw_timeline
 from evsplat.capture.validate import check_capture
 from evsplat.events import count_map
 from evsplat.files import atomic_path
@@ -57,11 +60,12 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     """
     path, out_dir = Path(path), Path(out_dir)
     metadata, found = check_capture(path, deep=True)
-    findings = tuple(found)
-    report = InspectReport(path, findings, "", ())
+    report = InspectReport(path, tuple(found), "", ())
     if metadata is None or not report.usable:
-        return replace(report, summary=f"{path}\n{_findings_text(findings)}")
+        return replace(report, summary=f"{path}\n{_findings_text(report.findings)}")
     capture = Capture(metadata)
+    estimate = estimate_from_capture(capture)
+    findings = (*found, *clock_findings(capture, estimate))
     track = load_body_track(capture) if capture.has_body else None
     drawings = {"contact_sheet": _contact_sheet(capture)}
     if track is not None:
@@ -69,14 +73,22 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     if capture.events is not None and len(capture.events):
         drawings["events"] = _events_sheet(capture)
     drawings["timeline"] = draw_timeline(capture)
+    pictures = save_drawings(drawings, out_dir)
+    summary = (
+        f"{_summary(capture, track, estimate)}\n{_findings_text(findings)}\npictures   {out_dir}: "
+    )
+    summary += ", ".join(picture.name for picture in pictures)
+    return replace(report, findings=findings, summary=summary, pictures=pictures)
+
+
+def save_drawings(drawings: Mapping[str, Image.Image], out_dir: Path) -> tuple[Path, ...]:
+    """Write each drawing as NAME.png; gives the files."""
     pictures = []
     for name, drawing in drawings.items():
         pictures.append(out_dir / f"{name}.png")
         with atomic_path(pictures[-1]) as temporary:
             drawing.save(temporary)
-    summary = f"{_summary(capture, track)}\n{_findings_text(findings)}\npictures   {out_dir}: "
-    summary += ", ".join(picture.name for picture in pictures)
-    return replace(report, summary=summary, pictures=tuple(pictures))
+    return tuple(pictures)
 
 
 def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, ...]) -> list[float]:
@@ -91,7 +103,7 @@ def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, .
     return overlaps
 
 
-def _summary(capture: Capture, track: BodyTrack | None) -> str:
+def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate | None) -> str:
     frames = capture.frames
     cameras = ", ".join(
         f"{name} {capture.cameras[name].width}x{capture.cameras[name].height}"
@@ -107,6 +119,7 @@ def _summary(capture: Capture, track: BodyTrack | None) -> str:
         f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera",
         f"time       {(end - start) / 1e6:.3f} s{rate}, exposure {exposure / 1000:.4g} ms",
         f"events     {_events_text(capture)}",
+        *(sensor_lines(estimate, capture.clock_offset_us) if capture.events is not None else []),
         f"body       {_body_text(capture, track)}",
         f"truth      {_truth_text(capture)}",
     ]
@@ -199,12 +212,7 @@ def _events_sheet(capture: Capture) -> Image.Image:
         camera = capture.camera(frame)
         stream = capture.events.between(start, start + EVENT_WINDOW_US)
         counts = count_map(stream, camera.height, camera.width)
-        grey = capture.image(frame).mean(-1, keepdim=True).expand(-1, -1, 3)
-        strength = (counts.abs() / 3).clamp(0, 1).sqrt()[..., None]
-        colour = torch.where(
-            counts[..., None] > 0, torch.tensor(BRIGHTER) / 255, torch.tensor(DARKER) / 255
-        )
-        mixed = (0.25 + 0.6 * grey) * (1 - strength) + colour * strength
+        mixed = events_over(capture.image(frame), counts)
         picture = to_picture(mixed, fit(camera.width, camera.height, 380))
         tiles.append(Tile(picture, f"{_label(frame)}   {len(stream):,} events", frame.split))
     subtitle = f"{EVENT_WINDOW_US / 1000:g} ms about mid-exposure; red: brighter, blue: darker"

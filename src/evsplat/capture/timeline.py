@@ -5,34 +5,43 @@ from collections.abc import Callable
 from PIL import Image, ImageDraw
 
 from evsplat.capture.capture import Capture
-from evsplat.capture.drawing import FAINT, INK, PAPER, font, header, split_colour
+from evsplat.capture.drawing import (
+    CURVE,
+    FAINT,
+    INK,
+    OVERSAMPLING,
+    PAPER,
+    font,
+    header,
+    line,
+    round_ticks,
+    short_number,
+    split_colour,
+)
 
 _WIDTH, _HEIGHT = 1400, 470
 _LEFT, _RIGHT = 96, 24
 _BARS, _POSES, _RATE = (84, 168), (190, 204), (238, 408)
-_CURVE = (108, 92, 168)
-# Drawn larger and reduced, because Pillow's lines have no soft edges.
-_OVERSAMPLING = 2
 _RATE_BINS = 400
 
 
 def draw_timeline(capture: Capture) -> Image.Image:
     """Exposures as bars (in two rows if they overlap), key poses as ticks, event rate below."""
     start, end = _span_us(capture)
-    page = Image.new("RGB", (_WIDTH * _OVERSAMPLING, _HEIGHT * _OVERSAMPLING), PAPER)
+    page = Image.new("RGB", (_WIDTH * OVERSAMPLING, _HEIGHT * OVERSAMPLING), PAPER)
     shapes = ImageDraw.Draw(page)
 
     def x_of(time_us: float) -> float:
         return _LEFT + (time_us - start) / (end - start) * (_WIDTH - _LEFT - _RIGHT)
 
-    for tick in _ticks(start, end):
+    for tick in round_ticks(start, end):
         x = x_of(tick)
-        _line(shapes, [(x, _BARS[0]), (x, _RATE[1] + 5)], (232, 235, 239), 1)
+        line(shapes, [(x, _BARS[0]), (x, _RATE[1] + 5)], (232, 235, 239), 1)
     _draw_exposures(capture, shapes, x_of)
     for time_us in _pose_times(capture):
         if start <= time_us <= end:
             x = x_of(float(time_us))
-            _line(shapes, [(x, _POSES[0]), (x, _POSES[1])], INK, 1)
+            line(shapes, [(x, _POSES[0]), (x, _POSES[1])], INK, 1)
     peak = _draw_rate(capture, shapes, x_of)
     page = page.resize((_WIDTH, _HEIGHT), Image.Resampling.LANCZOS)
     _draw_labels(capture, ImageDraw.Draw(page), x_of, (start, end), peak)
@@ -63,14 +72,14 @@ def _draw_exposures(
         top = _BARS[0] + frame.index % rows * height
         left, right = x_of(frame.exposure_us[0]), x_of(frame.exposure_us[1])
         box = (left, top + 2, max(right - 1, left + 1), top + height - 2)
-        draw.rectangle([_OVERSAMPLING * v for v in box], fill=split_colour(frame.split))
+        draw.rectangle([OVERSAMPLING * v for v in box], fill=split_colour(frame.split))
 
 
 def _draw_rate(
     capture: Capture, draw: ImageDraw.ImageDraw, x_of: Callable[[float], float]
 ) -> float:
     """Draw the filled curve; gives the events per second at its top."""
-    _line(draw, [(_LEFT, _RATE[1]), (_WIDTH - _RIGHT, _RATE[1])], FAINT, 1)
+    line(draw, [(_LEFT, _RATE[1]), (_WIDTH - _RIGHT, _RATE[1])], FAINT, 1)
     if capture.events is None or len(capture.events) == 0:
         return 0.0
     edges, rate = capture.events.rate(_RATE_BINS)
@@ -80,8 +89,8 @@ def _draw_rate(
         y = _RATE[1] - value / peak * (_RATE[1] - _RATE[0])
         points += [(x_of(edges[index]), y), (x_of(edges[index + 1]), y)]
     outline = [(points[0][0], _RATE[1]), *points, (points[-1][0], _RATE[1])]
-    draw.polygon([(_OVERSAMPLING * x, _OVERSAMPLING * y) for x, y in outline], fill=(222, 218, 240))
-    _line(draw, points, _CURVE, 1.5)
+    draw.polygon([(OVERSAMPLING * x, OVERSAMPLING * y) for x, y in outline], fill=(222, 218, 240))
+    line(draw, points, CURVE, 1.5)
     return peak
 
 
@@ -112,36 +121,9 @@ def _draw_labels(
     draw.text((10, (_RATE[0] + _RATE[1]) / 2), "events/s", fill=INK, font=font(14), anchor="lm")
     for value, y in ((peak, _RATE[0]), (0.0, _RATE[1])):
         draw.text((_LEFT - 6, y), short_number(value), fill=FAINT, font=font(12), anchor="rm")
-    for tick in _ticks(start, end):
+    for tick in round_ticks(start, end):
         draw.text(
             (x_of(tick), _RATE[1] + 10), f"{tick / 1e6:g}", fill=FAINT, font=font(13), anchor="mt"
         )
     centre = (_LEFT + _WIDTH - _RIGHT) / 2
     draw.text((centre, _HEIGHT - 26), "seconds", fill=FAINT, font=font(14), anchor="mt")
-
-
-def _ticks(start_us: int, end_us: int) -> list[int]:
-    """Round instants, about ten of them."""
-    step = 1
-    for step in (m * 10**e for e in range(1, 12) for m in (1, 2, 5)):
-        if (end_us - start_us) / step <= 12:
-            break
-    return list(range(-(-start_us // step) * step, end_us + 1, step))
-
-
-def _line(
-    draw: ImageDraw.ImageDraw,
-    points: list[tuple[float, float]],
-    colour: tuple[int, int, int],
-    width: float,
-) -> None:
-    scaled = [(_OVERSAMPLING * x, _OVERSAMPLING * y) for x, y in points]
-    draw.line(scaled, fill=colour, width=round(_OVERSAMPLING * width))
-
-
-def short_number(value: float) -> str:
-    """1234567 as '1.2M'."""
-    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
-        if value >= size:
-            return f"{value / size:.3g}{unit}"
-    return f"{value:.3g}"

@@ -1,9 +1,9 @@
-"""``evsplat inspect``: validate a capture, summarise and draw it."""
+"""``evsplat inspect``: validate a capture or look into a recording, summarise and draw it."""
 
 from pathlib import Path
 from typing import Annotated
 
-from evsplat.cli.options import CaptureFolder, option
+from evsplat.cli.options import CaptureFolder, Flag, option
 from evsplat.errors import DataError
 
 
@@ -12,18 +12,21 @@ def inspect(
     /,
     *,
     out: Annotated[Path | None, option("FOLDER", default="inspect/CAPTURE")] = None,
+    repair: Flag = False,
 ) -> None:
-    """Validate a capture, print a summary and draw it.
+    """Validate a capture, or look into an event recording; sum it up and draw it.
 
-    Pictures: contact sheet, events over images, posed body over images, timeline.
+    Draws frames, events, posed body, time and clocks, where there are any.
 
     Args:
-        capture: Capture folder (docs/capture-format.md).
+        capture: Capture folder (docs/capture-format.md), or an event file of any format.
         out: Folder for the pictures.
+        repair: Read on where an event file is damaged.
     """
-    from evsplat.capture.inspect import inspect_capture
+    from evsplat.capture.inspect_recording import inspect as inspect_path
 
-    report = inspect_capture(capture, out or Path("inspect") / capture.resolve().name)
+    name = capture.resolve().name
+    report = inspect_path(capture, out or Path("inspect") / name, repair=repair)
     if not report.usable:
         raise DataError(report.summary)
     print(report.summary)

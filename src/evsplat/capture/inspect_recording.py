@@ -1,0 +1,298 @@
+"""`evsplat inspect` for a bare event recording: what is in it, and how it fits its frames."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from PIL import Image
+
+from evsplat.calibration import (
+    MOST_PAIRS,
+    NoiseEstimate,
+    NoiseMeter,
+    SensorEstimate,
+    estimate_from_pairs,
+    exposure,
+    pair,
+    pair_indices,
+)
+from evsplat.capture.drawing import Tile, events_over, fit, sheet, short_number, to_picture
+from evsplat.capture.inspect import (
+    EVENT_WINDOW_US,
+    InspectReport,
+    inspect_capture,
+    save_drawings,
+)
+from evsplat.capture.plot import draw_curve
+from evsplat.capture.sensor_report import sensor_lines
+from evsplat.errors import DataError
+from evsplat.events import EventRecording, EventStream, RecordedFrame, count_map, open_recording
+
+MOST_EVENTS = 20_000_000
+"""Kept in memory to compare with frames and to draw; statistics are of the whole recording."""
+_RATE_BIN_US = 10_000
+_TILES = 8
+_SHOWN_HOT_PIXELS = 6
+
+
+def inspect(path: Path | str, out_dir: Path | str, *, repair: bool = False) -> InspectReport:
+    """Inspect a capture folder (`inspect_capture`) or an event recording (`inspect_recording`)."""
+    path = Path(path)
+    # a ROS 2 bag is a folder with a metadata.yaml
+    if path.is_file() or (path / "metadata.yaml").is_file():
+        return inspect_recording(path, out_dir, repair=repair)
+    return inspect_capture(path, out_dir)
+
+
+def inspect_recording(
+    path: Path | str, out_dir: Path | str, *, repair: bool = False
+) -> InspectReport:
+    """Sum up an event recording of any format and draw it into ``out_dir``.
+
+    Writes events.png and rate.png; where frames were recorded beside the events (AEDAT4) also
+    clock.png, how well both agree by the shift between their clocks. ``repair`` reads on where the
+    file is damaged.
+
+    Raises:
+        DataError: not a recording, or one without events.
+    """
+    path, out_dir = Path(path), Path(out_dir)
+    recording = open_recording(path, repair=repair)
+    totals = _Totals.of(recording)
+    spans = [frame.exposure_us for frame in recording.frames()]
+    frames = _chosen_frames(recording, spans, totals)
+    estimate = _estimate(frames, totals)
+    lag_us = estimate.clock.lag_us if estimate is not None else 0.0
+    lines = [
+        f"{path}",
+        f"format     {recording.format}, sensor {totals.width}x{totals.height}",
+        f"events     {totals.text(recording.has_polarity)}",
+        f"noise      {_noise_text(totals.noise)}",
+    ]
+    drawings = {
+        "events": _events_sheet(path.name, frames, totals, lag_us),
+        "rate": totals.draw(path.name),
+    }
+    if spans:
+        lines.append(f"frames     {_frames_text(spans, frames)}")
+        lines += sensor_lines(estimate, 0)
+    if estimate is not None:
+        clock = estimate.clock
+        drawings["clock"] = draw_curve(
+            f"{path.name}: clock",
+            "correlation of brightness change and event count, by how late the events are",
+            clock.lags_us,
+            clock.correlations,
+            x_label="milliseconds",
+            x_unit=1000.0,
+            marks=[clock.lag_us],
+        )
+    lines += [f"note       {note}" for note in recording.notes]
+    pictures = save_drawings(drawings, out_dir)
+    lines.append(f"pictures   {out_dir}: " + ", ".join(picture.name for picture in pictures))
+    return InspectReport(path, (), "\n".join(lines), pictures)
+
+
+@dataclass
+class _Totals:
+    """One pass over the recording."""
+
+    width: int
+    height: int
+    noise: NoiseEstimate
+    count: int
+    brighter: int
+    start_us: int
+    end_us: int
+    """One past the last event."""
+    rate: Float[np.ndarray, "B"]
+    """Events per second, in bins of 10 ms from ``start_us``."""
+    sample: EventStream
+    """The first `MOST_EVENTS` events."""
+
+    @classmethod
+    def of(cls, recording: EventRecording) -> "_Totals":
+        width, height = _sensor_size(recording)
+        meter = NoiseMeter(width, height)
+        gathered = _Gathered()
+        for chunk in recording.chunks():
+            if len(chunk):
+                meter.add(chunk)
+                gathered.add(chunk)
+        if not gathered.parts:
+            raise DataError(f"{recording.path}: holds no events; is it the right file?")
+        start, end = gathered.start_us, gathered.end_us
+        columns = (
+            np.concatenate([getattr(part, name) for part in gathered.parts]) for name in "txyp"
+        )
+        bins = np.concatenate(gathered.bins)
+        counts = np.bincount(bins[:, 0], bins[:, 1])
+        return cls(
+            width,
+            height,
+            meter.estimate(end - start),
+            gathered.count,
+            gathered.brighter,
+            start,
+            end,
+            counts / (_RATE_BIN_US / 1e6),
+            EventStream(*columns),
+        )
+
+    def text(self, has_polarity: bool) -> str:
+        seconds = (self.end_us - self.start_us) / 1e6
+        polarity = (
+            f"{100 * self.brighter / self.count:.1f} % brighter" if has_polarity else "no polarity"
+        )
+        return (
+            f"{self.count:,} over {seconds:.3f} s ({short_number(self.count / seconds)}/s, "
+            f"at most {short_number(float(self.rate.max()))}/s), {polarity}"
+        )
+
+    def draw(self, name: str) -> Image.Image:
+        time = np.arange(len(self.rate)) * _RATE_BIN_US
+        step = -(-len(time) // 2000)
+        shown = [self.rate[k : k + step].mean() for k in range(0, len(time), step)]
+        return draw_curve(
+            f"{name}: event rate",
+            f"{self.count:,} events; events per second over time",
+            time[::step].astype(np.float64),
+            np.array(shown),
+            x_label="seconds from the first event",
+            x_unit=1e6,
+        )
+
+
+@dataclass
+class _Gathered:
+    count: int = 0
+    brighter: int = 0
+    start_us: int = 0
+    end_us: int = 0
+    kept: int = 0
+    parts: list[EventStream] = field(default_factory=list)
+    bins: list[Int64[np.ndarray, "B 2"]] = field(default_factory=list)
+
+    def add(self, chunk: EventStream) -> None:
+        if not self.parts:
+            self.start_us = int(chunk.t[0])
+        self.count += len(chunk)
+        self.brighter += int((chunk.p > 0).sum())
+        self.end_us = int(chunk.t[-1]) + 1
+        self.bins.append(
+            np.stack(
+                np.unique((chunk.t - self.start_us) // _RATE_BIN_US, return_counts=True), axis=-1
+            )
+        )
+        if self.kept < MOST_EVENTS:
+            self.parts.append(chunk)
+            self.kept += len(chunk)
+
+
+def _sensor_size(recording: EventRecording) -> tuple[int, int]:
+    """As the file says, or as far as events reach."""
+    if recording.width is not None and recording.height is not None:
+        return recording.width, recording.height
+    width = height = 0
+    for chunk in recording.chunks():
+        if len(chunk):
+            width = max(width, int(chunk.x.max()) + 1)
+            height = max(height, int(chunk.y.max()) + 1)
+    return width, height
+
+
+def _chosen_frames(
+    recording: EventRecording, spans: list[tuple[int, int]], totals: _Totals
+) -> list[tuple[RecordedFrame, RecordedFrame]]:
+    """Pairs of frames that the events in memory cover; only these are kept."""
+    sample = totals.sample
+    first, last = int(sample.t[0]), int(sample.t[-1])
+    covered = [k for k, (start, end) in enumerate(spans) if first <= start and end <= last]
+    pairs = pair_indices([spans[k] for k in covered], MOST_PAIRS)
+    wanted = {covered[k] for both in pairs for k in both}
+    kept = {k: frame for k, frame in enumerate(recording.frames()) if k in wanted}
+    return [(kept[covered[i]], kept[covered[j]]) for i, j in pairs]
+
+
+def _estimate(
+    frames: list[tuple[RecordedFrame, RecordedFrame]], totals: _Totals
+) -> SensorEstimate | None:
+    pairs = [
+        # A DAVIS stores what it measures, without a transfer curve.
+        pair(
+            *(exposure(_unit(frame.image), frame.exposure_us, transfer="linear") for frame in both)
+        )
+        for both in frames
+    ]
+    t = totals.sample.t
+    return estimate_from_pairs(pairs, totals.sample, (int(t[0]), int(t[-1]) + 1))
+
+
+def _unit(image: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(image.astype(np.float32) / 255)
+
+
+def _noise_text(noise: NoiseEstimate) -> str:
+    if noise.rate_hz is None:
+        text = "not estimated: events all over the picture"
+    else:
+        share = noise.brighter_share
+        text = f"{noise.rate_hz:.2g} Hz per pixel where nothing moves"
+        text += "" if share is None else f" ({100 * share:.0f} % brighter)"
+    hot = noise.hot_pixels
+    if len(hot) == 0:
+        return f"{text}; no hot pixels"
+    shown = ", ".join(f"({x}, {y})" for x, y in hot[:_SHOWN_HOT_PIXELS])
+    more = ", ..." if len(hot) > _SHOWN_HOT_PIXELS else ""
+    return f"{text}; {len(hot)} hot pixels (x, y): {shown}{more}"
+
+
+def _frames_text(
+    spans: list[tuple[int, int]], frames: list[tuple[RecordedFrame, RecordedFrame]]
+) -> str:
+    starts = np.array([start for start, _ in spans])
+    text = f"{len(spans)}"
+    if frames:
+        height, width = frames[0][0].image.shape[:2]
+        text += f": {width}x{height}"
+    if len(spans) > 1:
+        text += f", {1e6 / np.median(np.diff(starts)):.4g} frames/s"
+    exposure_ms = np.median([end - start for start, end in spans]) / 1000
+    return f"{text}, exposure {exposure_ms:.4g} ms"
+
+
+def _events_sheet(
+    name: str,
+    frames: list[tuple[RecordedFrame, RecordedFrame]],
+    totals: _Totals,
+    lag_us: float,
+) -> Image.Image:
+    """Events over the frames of the same time or, without frames, over nothing."""
+    size = fit(totals.width, totals.height, 380)
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(_TILES, len(frames))).astype(int))
+    shown = [frames[k][0] for k in chosen]
+    blank = torch.full((totals.height, totals.width, 3), 0.25)
+    t = totals.sample.t
+    instants = np.linspace(t[0], t[-1], 2 * _TILES + 1)[1::2]
+    grounds = [(blank, int(time)) for time in instants]
+    if shown:
+        grounds = [
+            (_rgb(frame.image), round(sum(frame.exposure_us) / 2 + lag_us)) for frame in shown
+        ]
+    tiles = []
+    for ground, middle in grounds:
+        stream = totals.sample.between(middle - EVENT_WINDOW_US // 2, middle + EVENT_WINDOW_US // 2)
+        counts = count_map(stream, totals.height, totals.width)
+        picture = to_picture(events_over(ground, counts), size)
+        seconds = (middle - totals.start_us) / 1e6
+        tiles.append(Tile(picture, f"{seconds:.3f} s   {len(stream):,} events", ""))
+    over = "over the frames, the clock's lag taken out" if shown else "at eight instants"
+    subtitle = f"{EVENT_WINDOW_US / 1000:g} ms of events {over}; red: brighter, blue: darker"
+    return sheet(f"{name}: events", subtitle, tiles, columns=4)
+
+
+def _rgb(image: np.ndarray) -> torch.Tensor:
+    picture = _unit(image)
+    return picture if picture.ndim == 3 else picture[..., None].expand(-1, -1, 3)

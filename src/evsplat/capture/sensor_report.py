@@ -1,0 +1,58 @@
+"""What is said of an event sensor's clock and thresholds, and when to warn."""
+
+from evsplat.calibration import ClockEstimate, SensorEstimate
+from evsplat.capture.capture import Capture
+from evsplat.capture.finding import Finding, Findings
+
+MOST_LAG_US = 4_000
+"""Clocks that differ by more are worth a warning: events are late by a few ms by their nature."""
+
+
+def sensor_lines(estimate: SensorEstimate | None, clock_offset_us: int) -> list[str]:
+    """Clock and contrast in words; ``clock_offset_us`` is what was added to the events' times."""
+    if estimate is None:
+        return ["clock      not estimated: too little moves, or frames and events do not agree"]
+    clock, contrast = estimate.clock, estimate.thresholds
+    text = (
+        f"clock      events {_lag_text(clock)} (+-{clock.spread_us / 1000:.1f} ms; correlation "
+        f"{clock.correlation:.2f})"
+    )
+    if _differs(clock):
+        text += f"; clock_offset_us {_aligning_us(clock, clock_offset_us)} would align them"
+    lines = [text]
+    if contrast is not None:
+        lines.append(
+            f"contrast   C+ {contrast.plus:.3f}, C- {contrast.minus:.3f} fitted "
+            f"({contrast.pixels:,} pixels, residual {contrast.residual:.2f})"
+        )
+    return lines
+
+
+def _lag_text(clock: ClockEstimate) -> str:
+    return (
+        f"{'lag' if clock.lag_us > 0 else 'lead'} the frames by {abs(clock.lag_us) / 1000:.1f} ms"
+    )
+
+
+def _differs(clock: ClockEstimate) -> bool:
+    return abs(clock.lag_us) > max(MOST_LAG_US, 3 * clock.spread_us)
+
+
+def _aligning_us(clock: ClockEstimate, clock_offset_us: int) -> int:
+    """A lag is taken back by an offset of the other sign."""
+    return 100 * round((clock_offset_us - clock.lag_us) / 100)
+
+
+def clock_findings(capture: Capture, estimate: SensorEstimate | None) -> list[Finding]:
+    """A warning where the estimated clock is far from what capture.json says."""
+    if estimate is None or not _differs(estimate.clock):
+        return []
+    findings = Findings()
+    findings.warning(
+        capture.path / "capture.json",
+        "events.clock_offset_us",
+        f"{capture.clock_offset_us}, with which events {_lag_text(estimate.clock)}",
+        "events and frames on one clock",
+        f"Try {_aligning_us(estimate.clock, capture.clock_offset_us)}.",
+    )
+    return findings.items

@@ -1,0 +1,101 @@
+"""`evsplat inspect` of bare recordings, and the clock's warning for captures."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from evsplat.capture.inspect import inspect_capture
+from evsplat.capture.inspect_recording import inspect, inspect_recording
+from evsplat.errors import DataError
+
+Factory = Callable[..., Path]
+
+
+def _save(path: Path, *, seconds: float = 2.0, brighter: float = 0.75, seed: int = 0) -> Path:
+    rng = np.random.default_rng(seed)
+    count = 4_000
+    t = np.sort(rng.integers(0, int(seconds * 1e6), count))
+    t[0], t[-1] = 0, int(seconds * 1e6) - 1
+    p = np.zeros(count, dtype=np.int8)
+    p[: int(brighter * count)] = 1
+    x, y = rng.integers(0, 40, count), rng.integers(0, 30, count)
+    x[0], y[0] = 39, 29
+    np.savez(path, t=t, x=x.astype(np.uint16), y=y.astype(np.uint16), p=rng.permutation(p))
+    return path
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_counts_rate_size_and_polarity_are_right(tmp_path: Path, seed: int) -> None:
+    report = inspect_recording(_save(tmp_path / "events.npz", seed=seed), tmp_path / "out")
+    assert report.usable
+    for words in ("npz, sensor 40x30", "4,000 over 2.000 s (2k/s", "75.0 % brighter"):
+        assert words in report.summary
+    assert "clock" not in report.summary and "frames" not in report.summary
+    assert [picture.name for picture in report.pictures] == ["events.png", "rate.png"]
+    for picture in report.pictures:
+        with Image.open(picture) as image:
+            assert len(np.unique(np.asarray(image.convert("L")))) > 30
+
+
+def test_a_long_recording_is_summed_up_but_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("evsplat.capture.inspect_recording.MOST_EVENTS", 1)
+    report = inspect_recording(_save(tmp_path / "events.npz"), tmp_path / "out")
+    assert "4,000 over 2.000 s" in report.summary
+
+
+def test_files_are_recordings_and_folders_are_captures(
+    tiny_capture: Factory, tmp_path: Path
+) -> None:
+    path = tiny_capture()
+    assert "train" in inspect(path, tmp_path / "one").summary
+    assert "sensor" in inspect(_save(tmp_path / "events.npz"), tmp_path / "two").summary
+    nothing = inspect(tmp_path / "nothing", tmp_path / "three")
+    assert not nothing.usable and not (tmp_path / "three").exists()
+
+
+def test_what_is_no_recording_is_one_error(tmp_path: Path) -> None:
+    (tmp_path / "notes.bin").write_bytes(b"\x00\x01 not events")
+    with pytest.raises(DataError, match="notes.bin"):
+        inspect(tmp_path / "notes.bin", tmp_path / "out")
+    np.savez(tmp_path / "none.npz", **{key: np.zeros(0, dtype=np.uint16) for key in "txyp"})
+    with pytest.raises(DataError, match="no events"):
+        inspect_recording(tmp_path / "none.npz", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_wrong_clock_offset_is_a_warning_that_says_what_to_try(
+    tiny_capture: Factory, tmp_path: Path
+) -> None:
+    path = tiny_capture(frames=20, width=96, height=72)
+    assert inspect_capture(path, tmp_path / "right").findings == ()
+    document = json.loads((path / "capture.json").read_text())
+    document["events"]["clock_offset_us"] = 9_000
+    (path / "capture.json").write_text(json.dumps(document))
+    report = inspect_capture(path, tmp_path / "wrong")
+    (finding,) = report.findings
+    assert report.usable and finding.field == "events.clock_offset_us"
+    assert "lag the frames" in finding.found
+    assert abs(int(finding.remedy.strip("Try .").replace(".", ""))) < 3_000
+    assert f"warning: {finding}" in report.summary
+
+
+def test_the_davis_recording_is_read_with_its_frames(recordings_root: Path, tmp_path: Path) -> None:
+    report = inspect(recordings_root / "davis346.aedat4", tmp_path)
+    for words in (
+        "aedat4, sensor 346x260",
+        "78,830 over 2.360 s",
+        "59: 346x260, 25 frames/s, exposure 0.5 ms",
+        "events lag the frames by 5.",
+        "would align them",
+        "C+ 0.3",
+        "C- 0.4",
+    ):
+        assert words in report.summary
+    names = [picture.name for picture in report.pictures]
+    assert names == ["events.png", "rate.png", "clock.png"]
