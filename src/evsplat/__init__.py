@@ -8,8 +8,8 @@ The verbs of the command line are functions here, imported on first use:
     ev.write_report(run)
     ev.render_run(run, slow=8)
 
-``evsplat render`` is `render_run` here and ``evsplat restore`` is `restore_capture`, because
-``evsplat.render`` and ``evsplat.restore`` are the packages that do it.
+``evsplat render`` is `render_run` here, ``restore`` is `restore_capture` and ``masks`` is
+`mask_capture`, because these words are names of packages.
 """
 
 import os
@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from evsplat.capture import load_capture
     from evsplat.capture.importers import import_capture
-    from evsplat.capture.inspect import inspect_capture as inspect
+    from evsplat.capture.inspect_recording import inspect
     from evsplat.cli.demo import demo
     from evsplat.evaluation import evaluate_run as evaluate
     from evsplat.evaluation.report import write_report
     from evsplat.events.convert import convert_recording as convert
     from evsplat.export import render_run
     from evsplat.footage.simulate import simulate
+    from evsplat.masks import mask_capture
     from evsplat.restore import restore_capture
     from evsplat.staging import stage
     from evsplat.synthesis import synthesize
@@ -50,6 +51,7 @@ __all__ = [
     "inspect",
     "load_capture",
     "load_run",
+    "mask_capture",
     "render_run",
     "restore_capture",
     "simulate",
@@ -64,9 +66,10 @@ _LAZY = {
     "demo": "evsplat.cli.demo:demo",
     "evaluate": "evsplat.evaluation:evaluate_run",
     "import_capture": "evsplat.capture.importers:import_capture",
-    "inspect": "evsplat.capture.inspect:inspect_capture",
+    "inspect": "evsplat.capture.inspect_recording:inspect",
     "load_capture": "evsplat.capture:load_capture",
     "load_run": "evsplat.training.run:load_run",
+    "mask_capture": "evsplat.masks:mask_capture",
     "render_run": "evsplat.export:render_run",
     "restore_capture": "evsplat.restore:restore_capture",
     "simulate": "evsplat.footage.simulate:simulate",

@@ -11,8 +11,8 @@ import evsplat
 from evsplat.cli import main
 from evsplat.cli.demo import demo_capture
 
-VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "restore", "train")
-VERBS += ("evaluate", "report", "render")
+VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "masks")
+VERBS += ("restore", "train", "evaluate", "report", "render")
 
 
 def _outcome(capsys, *arguments):
@@ -24,7 +24,7 @@ def _outcome(capsys, *arguments):
     return code, *capsys.readouterr()
 
 
-@pytest.mark.parametrize("verb", ["inspect", "restore", "train"])
+@pytest.mark.parametrize("verb", ["inspect", "masks", "restore", "train"])
 def test_missing_capture_is_one_message_and_code_2(capsys, tmp_path, verb):
     out = ["--out", str(tmp_path / "out")]
     code, stdout, stderr = _outcome(capsys, verb, str(tmp_path / "nothing"), *out)
@@ -113,7 +113,7 @@ def test_help_fits_a_screen_of_80_by_45(capsys, monkeypatch, verb):
 
 def test_every_option_of_train_and_render_is_explained(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
-    for verb in ("train", "render", "demo", "restore"):
+    for verb in ("train", "render", "demo", "restore", "masks"):
         _, stdout, _ = _outcome(capsys, verb, "--help")
         options = [line.strip("│ ") for line in stdout.splitlines()]
         found = 0

@@ -15,6 +15,7 @@ from evsplat.cli.doctor import doctor
 from evsplat.cli.evaluate import evaluate
 from evsplat.cli.import_ import import_, import_with_kinds
 from evsplat.cli.inspect import inspect
+from evsplat.cli.masks import masks
 from evsplat.cli.render import render
 from evsplat.cli.report import report
 from evsplat.cli.restore import restore
@@ -28,7 +29,7 @@ _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
     for verb in (
         *(demo, doctor, import_, convert, simulate, synthesize, stage, inspect),
-        *(restore, train, evaluate, report, render),
+        *(masks, restore, train, evaluate, report, render),
     )
 }
 _DESCRIPTION = (

@@ -1,0 +1,34 @@
+"""What finds the person in a capture's frames, and which ways there are."""
+
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.capture import Capture, Frame
+from evsplat.masks.background import BackgroundDifference
+from evsplat.masks.rvm import RobustVideoMatting
+from evsplat.masks.silhouette import PosedBody
+
+
+class Masker(Protocol):
+    """Finds the person from a capture's pictures and poses; never from its truth or its masks."""
+
+    name: str
+
+    def masks(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
+        """Each frame in order with the share of the person per pixel, in [0, 1]."""
+        ...
+
+    def provenance(self) -> dict[str, Any]:
+        """How the masks were made, as JSON values."""
+        ...
+
+
+MASKERS: dict[str, Callable[..., Masker]] = {
+    "background": BackgroundDifference,
+    "silhouette": PosedBody,
+    "rvm": RobustVideoMatting,
+}
+"""By name; called with the capture and the masker's own options as keywords."""

@@ -1,0 +1,71 @@
+"""The posed body's silhouette as a person mask."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from evsplat.body import BodyTrack, load_body_track, silhouette
+from evsplat.capture import Camera, Capture, Frame
+from evsplat.errors import ConfigError
+
+OVERSAMPLING = 4
+"""Pixels are tested on a grid that is finer by this, so that the edge of a mask is soft."""
+
+
+class PosedBody:
+    """Where the posed body is at mid-exposure, widened by a margin for clothes and hair."""
+
+    name = "silhouette"
+
+    def __init__(self, capture: Capture, *, margin_px: float = 0.0) -> None:
+        """``margin_px``: widen the silhouette by this many pixels on all sides.
+
+        Raises:
+            ConfigError: the margin is below 0.
+            DataError: the capture has no body poses.
+        """
+        if margin_px < 0:
+            raise ConfigError(f"margin {margin_px:g}: expected pixels, 0 or more.")
+        self._track = load_body_track(capture)
+        self._margin_px = margin_px
+
+    def masks(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
+        """Each frame in order with the body's share of each pixel."""
+        for frame in capture.frames:
+            yield (
+                frame,
+                soft_silhouette(
+                    self._track, frame.mid_us, capture.camera(frame), margin_px=self._margin_px
+                ),
+            )
+
+    def provenance(self) -> dict[str, Any]:
+        """The margin."""
+        return {"margin_px": self._margin_px}
+
+
+def soft_silhouette(
+    track: BodyTrack, time_us: int, camera: Camera, *, margin_px: float = 0.0
+) -> Float[Tensor, "H W"]:
+    """Share of each pixel that the posed body covers, in [0, 1]."""
+    fine = track_silhouette(track, time_us, enlarged(camera, OVERSAMPLING))
+    if margin_px > 0 and bool(fine.any()):
+        outside = torch.from_numpy(distance_transform_edt(~fine.numpy()))
+        fine = outside <= margin_px * OVERSAMPLING
+    pooled = torch.nn.functional.avg_pool2d(fine.float()[None, None], OVERSAMPLING)
+    return pooled[0, 0]
+
+
+def track_silhouette(track: BodyTrack, time_us: int, camera: Camera) -> Bool[Tensor, "H W"]:
+    """Pixels whose centre the posed body covers."""
+    return silhouette(track.vertices(time_us), track.body.faces, camera)
+
+
+def enlarged(camera: Camera, factor: int) -> Camera:
+    """The camera with ``factor`` times as many pixels each way (pixel centres at +0.5)."""
+    K = camera.K * torch.tensor([factor, factor, 1.0])[:, None]
+    return Camera(camera.width * factor, camera.height * factor, K, camera.world_to_camera)
