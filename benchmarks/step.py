@@ -113,7 +113,12 @@ def build(size: int, human: int, scene: int, renders: int, precision: Precision)
 
 
 def build_on(
-    path: Path, human: int | None, scene: int | None, renders: int, precision: Precision
+    path: Path,
+    human: int | None,
+    scene: int | None,
+    renders: int,
+    precision: Precision,
+    device: str = "cpu",
 ) -> Trainer:
     """A training in the middle of its schedule, with everything switched on."""
     config = PaperConfig()
@@ -124,7 +129,7 @@ def build_on(
         densify_human=dataclasses.replace(config.densify_human, max_count=human or 10_000),
     )
     capture = load_capture(path)
-    composition = compose(config, capture, 0, fit=False)
+    composition = compose(config, capture, 0, device=device, fit=False)
     composition.objectives.append(MoreTimes(renders))
     composition.weights["more_times"] = 1e-6
     if scene is not None:
