@@ -226,6 +226,23 @@ class Stage:
         threads: int,
     ) -> None: ...
 
+def decode_events(
+    kind: str,
+    data: ndarray,
+    state: ndarray,
+    t: ndarray,
+    x: ndarray,
+    y: ndarray,
+    p: ndarray,
+) -> tuple[int, int]: ...
+def parse_events(
+    text: ndarray,
+    last: bool,
+    roles: list[int],
+    delimiter: str,
+    time_exponent: int,
+    columns: ndarray,
+) -> tuple[int, int, int, int]: ...
 def lanes() -> int: ...
 def has_bf16() -> bool: ...
 def levels() -> list[str]: ...

@@ -24,6 +24,7 @@ EXPECTED = {
     "SMPL bodies",
     "optical flow",
     "Super SloMo",
+    "event recordings",
     "ST-LPIPS",
     "LPIPS alex",
     "LPIPS vgg",

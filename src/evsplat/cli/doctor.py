@@ -63,6 +63,7 @@ def run_checks() -> Iterator[Check]:
         _body_models,
         _opencv,
         _super_slomo,
+        _recordings,
         _st_lpips,
         lambda: _lpips("alex"),
         lambda: _lpips("vgg"),
@@ -140,6 +141,16 @@ def _super_slomo() -> Check:
         return Check("Super SloMo", "ok", f"weights {find_checkpoint()}")
     except WeightsError as error:
         return Check("Super SloMo", "optional", str(error))
+
+
+def _recordings() -> Check:
+    name = "event recordings"
+    parts = ("hdf5plugin", "rosbags", "zstandard")
+    absent = [part for part in parts if find_spec(part) is None]
+    if absent:
+        detail = f"ROS bags, packed HDF5, Zstandard: {', '.join(absent)} not installed."
+        return Check(name, "optional", detail, "Get it with: pip install 'evsplat[recordings]'.")
+    return Check(name, "ok", "every format: docs/event-formats.md")
 
 
 def _st_lpips() -> Check:

@@ -1,5 +1,6 @@
 """NumPy files in the key sets of the field."""
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,14 @@ def test_pickles_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "e.npy", np.array([{"t": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(DataError, match="Python objects"):
         open_recording(tmp_path / "e.npy")
+
+
+def test_gzipped_archive_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    np.save(tmp_path / "e.npy", np.zeros((2, 4)))
+    packed = tmp_path / "e.npy.gz"
+    packed.write_bytes(gzip.compress((tmp_path / "e.npy").read_bytes()))
+    with pytest.raises(DataError, match="a gzipped npz file; gunzip it first"):
+        open_recording(packed)
 
 
 def test_event_beside_the_sensor_is_an_error_or_left_out(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.events.formats.base import Damage, ReadOptions, Source, peek
+from evsplat.events.formats.base import Damage, ReadOptions, Source, is_gzipped, peek
 
 _HEAD_BYTES = 4096
 
@@ -21,6 +21,8 @@ class Format:
     """Whether a file that begins with these bytes is of this format."""
     reader: str
     """``module:class``, imported at first use."""
+    is_stream: bool = True
+    """Read from the first byte to the last, so that it may be gzipped."""
 
     def open(self, path: Path, options: ReadOptions, damage: Damage) -> Source:
         """Read the header."""
@@ -63,9 +65,9 @@ FORMATS = {
         Format("dat", _is_dat, "prophesee:Dat"),
         Format("raw", _is_raw, "prophesee:Raw"),
         Format("es", _starts(b"Event Stream"), "event_stream:EventStreamFile"),
-        Format("hdf5", _starts(b"\x89HDF\r\n\x1a\n"), "hdf5:Hdf5"),
-        Format("rosbag", _is_bag, "ros:RosBag"),
-        Format("npz", _starts(b"PK\x03\x04", b"\x93NUMPY"), "npz:Npz"),
+        Format("hdf5", _starts(b"\x89HDF\r\n\x1a\n"), "hdf5:Hdf5", is_stream=False),
+        Format("rosbag", _is_bag, "ros:RosBag", is_stream=False),
+        Format("npz", _starts(b"PK\x03\x04", b"\x93NUMPY"), "npz:Npz", is_stream=False),
         Format("csv", _is_text, "text:Text"),
     )
 }
@@ -88,6 +90,8 @@ def find_format(path: Path, name: str | None = None) -> Format:
             f"{path}: not a recording that evsplat reads (begins with {head[:16]!r}); expected one "
             f"of {', '.join(FORMATS)}."
         )
+    if not found.is_stream and path.is_file() and is_gzipped(path):
+        raise DataError(f"{path}: a gzipped {found.name} file; gunzip it first.")
     if name is not None and found.name != name:
         raise DataError(f"{path}: its content is {found.name}, not {name}.")
     return found

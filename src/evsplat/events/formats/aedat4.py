@@ -51,14 +51,11 @@ class Aedat4(Source):
         self.path = path
         self.notes: list[str] = []
         self._damage = damage
-        with ByteReader(path) as reader:
-            header = self._read_header(reader)
-            self._first_packet = reader.offset
-        compression = header.integer(0, "i")
-        table_position = header.integer(1, "q", default=-1)
+        compression, table_position, description = self._read_header()
+        # the table of packets at the end is not needed; 0 or -1 where there is none
         self._end = table_position if table_position > 0 else None
         self._decompress = _decompressor(path, compression)
-        streams = self._streams(bytes(header.vector(2, 1)))
+        streams = self._streams(description)
         self._events = self._choose(streams, "EVTS")
         self._frames = self._choose(streams, "FRME")
         if self._events is None:
@@ -74,8 +71,7 @@ class Aedat4(Source):
                 self._broken(offset, str(error))
                 continue
             events = np.frombuffer(elements, dtype=_EVENT)
-            # bit 0 is the polarity, the rest of the byte is padding
-            yield RawEvents(events["t"], events["x"], events["y"], events["p"] & 1)
+            yield RawEvents(events["t"], events["x"], events["y"], events["p"])
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Packets of the frame stream."""
@@ -89,15 +85,19 @@ class Aedat4(Source):
                 continue
             yield frame
 
-    def _read_header(self, reader: ByteReader) -> Table:
-        if reader.read(len(MAGIC)) != MAGIC:
-            raise DataError(f"{self.path}: not an AEDAT4 file (does not begin with #!AER-DAT4.0).")
-        size = int.from_bytes(reader.read(4), "little")
-        data = reader.read(size) if size <= _MAX_HEADER_BYTES else b""
+    def _read_header(self) -> tuple[int, int, bytes]:
+        """Compression, where the packets end, and the XML description of the streams."""
+        with ByteReader(self.path) as reader:
+            if reader.read(len(MAGIC)) != MAGIC:
+                raise DataError(f"{self.path}: its first line is not that of AEDAT 4.0.")
+            size = int.from_bytes(reader.read(4), "little")
+            data = reader.read(size) if size <= _MAX_HEADER_BYTES else b""
+            self._first_packet = reader.offset
         try:
             if len(data) < size or not size:
                 raise FlatbufferError(f"{size} bytes announced, {len(data)} there")
-            return Table.root(data)
+            table = Table.root(data)
+            return table.integer(0, "i"), table.integer(1, "q", -1), bytes(table.vector(2, 1))
         except FlatbufferError as error:
             raise DataError(f"{self.path}: its AEDAT4 header is damaged ({error}).") from None
 
@@ -134,10 +134,9 @@ class Aedat4(Source):
                 if not head and self._end is None:
                     return
                 number, size = struct.unpack("<ii", head) if len(head) == 8 else (-1, 0)
-                wanted = number == stream and size <= _MAX_PACKET_BYTES
-                if wanted:
-                    payload = reader.read(max(size, 0))
-                else:
+                wanted = number == stream and 0 <= size <= _MAX_PACKET_BYTES
+                payload = reader.read(size) if wanted else b""
+                if not wanted:
                     reader.skip_to(offset + 8 + max(size, 0))
                 if len(head) < 8 or size < 0 or reader.offset < offset + 8 + size:
                     self._damage.found(
@@ -145,9 +144,11 @@ class Aedat4(Source):
                         repaired_by="keeps the packets before the cut",
                     )
                     return
-                if not wanted:
+                if number != stream:
                     continue
                 try:
+                    if not wanted:
+                        raise ValueError(f"it has {size} bytes")
                     data = self._decompress(payload)
                     if data[8:12] != identifier:
                         raise ValueError(f"it is no {identifier.decode()} buffer")
@@ -217,11 +218,12 @@ def _decompressor(path: Path, compression: int) -> Callable[[bytes], bytes]:
 
 
 def _lz4(payload: bytes) -> bytes:
-    unpacker = lz4.frame.LZ4FrameDecompressor()
-    # the buffer is made as large as this at once
     announced = lz4.frame.get_frame_info(payload)["content_size"]
-    limit = min(announced or _LZ4_MAX_RATIO * len(payload), _MAX_PACKET_BYTES)
-    data = unpacker.decompress(payload, max_length=limit)
+    if max(announced, _LZ4_MAX_RATIO * len(payload)) <= _MAX_PACKET_BYTES:
+        return lz4.frame.decompress(payload)
+    # slower, because the buffer is made as large as the limit at once
+    unpacker = lz4.frame.LZ4FrameDecompressor()
+    data = unpacker.decompress(payload, max_length=_MAX_PACKET_BYTES)
     if not unpacker.eof:
         raise ValueError("it ends early or unpacks to more than a packet can hold")
     return data

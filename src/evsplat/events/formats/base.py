@@ -16,6 +16,8 @@ from evsplat.errors import DataError
 
 BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
+_BUFFER_BYTES = 1 << 16
+_SEEK_BYTES = 1 << 12
 
 
 class RawEvents(NamedTuple):
@@ -94,11 +96,12 @@ class ByteReader:
         self.path = path
         self.offset = 0
         try:
-            self._file = open(path, "rb")  # noqa: SIM115 - closed in __exit__
+            self._file = open(path, "rb", buffering=_BUFFER_BYTES)  # noqa: SIM115 - see __exit__
         except FileNotFoundError:
             raise DataError(f"{path}: file not found.") from None
         except OSError as error:
             raise DataError(f"{path}: cannot be opened ({error.strerror}).") from None
+        self._size = os.fstat(self._file.fileno()).st_size
         self.zipped = self._file.read(2) == b"\x1f\x8b"
         self._file.seek(0)
         self._stream = gzip.GzipFile(fileobj=self._file) if self.zipped else self._file
@@ -114,12 +117,6 @@ class ByteReader:
     ) -> None:
         self._file.close()
 
-    @property
-    def progress(self) -> float:
-        """Share of the file read so far, 0 to 1."""
-        size = os.fstat(self._file.fileno()).st_size
-        return min(1.0, self._file.tell() / size) if size else 1.0
-
     def read(self, count: int) -> bytes:
         """``count`` bytes, fewer only at the end of the file."""
         try:
@@ -133,8 +130,8 @@ class ByteReader:
 
     def skip_to(self, offset: int) -> None:
         """Go on to ``offset`` or the end of the file."""
-        if not self.zipped:
-            self.offset = self._file.seek(min(offset, os.fstat(self._file.fileno()).st_size))
+        if not self.zipped and offset - self.offset > _SEEK_BYTES:
+            self.offset = self._file.seek(min(offset, self._size))
         while self.offset < offset and self.read(min(offset - self.offset, 1 << 20)):
             pass
 
@@ -148,6 +145,12 @@ class ByteReader:
             ) from None
         self.offset += len(line)
         return line
+
+
+def is_gzipped(path: Path) -> bool:
+    """Whether the file is a gzip file, whatever its name."""
+    with ByteReader(path) as reader:
+        return reader.zipped
 
 
 def peek(path: Path, count: int) -> bytes:

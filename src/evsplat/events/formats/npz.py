@@ -1,6 +1,7 @@
 """.npz and .npy files with one array per component, or one table of them; never unpickled."""
 
 import re
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -134,6 +135,7 @@ def _as_data_error(path: Path) -> Iterator[None]:
         RuntimeError,
         MemoryError,
         OverflowError,
+        tokenize.TokenError,
         zipfile.BadZipFile,
         zlib.error,
     ) as error:

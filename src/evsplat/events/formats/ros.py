@@ -28,10 +28,12 @@ ROS1_MAGIC = b"#ROSBAG V2.0"
 _ARRAY_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 _PACKET_TYPES = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 _ENCODING = "evt3"
-_EVENT = [("x", "<u2"), ("y", "<u2"), ("seconds", "<u4"), ("nanoseconds", "<u4"), ("p", "u1")]
-_ROS1_EVENT = np.dtype(_EVENT)
-# ROS 2 begins every event at a multiple of four bytes
-_ROS2_EVENT = np.dtype([*_EVENT, ("padding", "V3")])
+_PIXEL = [("x", "<u2"), ("y", "<u2")]
+_TIME_AND_POLARITY = [("seconds", "<u4"), ("nanoseconds", "<u4"), ("p", "u1")]
+_ROS1_EVENT = np.dtype([*_PIXEL, *_TIME_AND_POLARITY])
+# ROS 2 aligns each number, not each event: all events but the first begin two bytes after a
+# multiple of four, so that two bytes of padding come before their time and one after them.
+_ROS2_EVENT = np.dtype([*_PIXEL, ("", "V2"), *_TIME_AND_POLARITY, ("", "V1")])
 
 
 class RosBag(Source):
@@ -152,9 +154,9 @@ def _read_message(data: bytes, is_ros1: bool, is_packet: bool) -> _Message:
     kind = _ROS1_EVENT if is_ros1 else _ROS2_EVENT
     if not is_packet:
         count = fields.number("I")
-        # the last event has no padding after it
-        padding = kind.itemsize - _ROS1_EVENT.itemsize if count else 0
-        events = fields.take(count * kind.itemsize - padding) + bytes(padding)
+        events = fields.take(count * kind.itemsize - (0 if is_ros1 or not count else 3))
+        if not is_ros1 and count:
+            events = events[:4] + bytes(2) + events[4:] + bytes(1)
         return _Message(width, height, "", events, kind)
     fields.number("Q"), fields.number("Q")
     encoding = fields.text()

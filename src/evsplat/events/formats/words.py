@@ -41,7 +41,7 @@ class WordDecoder:
 
         Also the bytes taken. ``offset`` is where in the file ``data`` begins, for errors.
         """
-        # a byte is two events at most (EVT 2.1: 32 in 8 bytes would be 4, and the block caps it)
+        # room for one more word of 32 events at least; what does not fit waits for the next call
         capacity = min(BLOCK_EVENTS, 4 * len(data)) + 32
         t = np.empty(capacity, dtype=np.int64)
         x, y = np.empty(capacity, dtype=np.uint16), np.empty(capacity, dtype=np.uint16)

@@ -1,0 +1,206 @@
+"""HDF5 files and ROS bags in the layouts of the field."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as FolderWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from evsplat.errors import DataError
+from evsplat.events import EventStream, open_recording, read_events
+
+from . import encoders
+from .helpers import HEIGHT, WIDTH, random_stream, same
+
+EVENT_MSG = "uint16 x\nuint16 y\n{time} ts\nbool polarity\n"
+ARRAY_MSG = "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
+PACKET_MSG = (
+    "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\n"
+    "string encoding\nbool is_bigendian\nuint8[] events\n"
+)
+
+
+def _dsec(file: h5py.File, s: EventStream) -> None:
+    """Blosc with zstd, uint32 times from zero, the start in t_offset."""
+    packing = dict(chunks=(500,), **hdf5plugin.Blosc(cname="zstd"))
+    columns = {"t": (s.t - 1000).astype("u4"), "x": s.x, "y": s.y, "p": (s.p > 0).astype("u1")}
+    for name, values in columns.items():
+        file.create_dataset(f"events/{name}", data=values, **packing)
+    file["t_offset"] = np.int64(1000)
+
+
+def _metavision(file: h5py.File, s: EventStream) -> None:
+    kind = [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")]
+    rows = np.array(list(zip(s.x, s.y, s.p > 0, s.t, strict=True)), dtype=kind)
+    file.create_dataset("CD/events", data=rows, chunks=(300,), compression="gzip")
+    file.attrs["geometry"] = "320x240"
+
+
+def _e2vid(file: h5py.File, s: EventStream) -> None:
+    file["events/ts"], file["events/xs"] = s.t * 1e-6, s.x.astype("i2")
+    file["events/ys"], file["events/ps"] = s.y.astype("i2"), s.p > 0
+    file.attrs["sensor_resolution"] = (240, 320)
+
+
+def _v2e(file: h5py.File, s: EventStream) -> None:
+    table = np.stack([s.t, s.x, s.y, s.p > 0], axis=1)
+    file.create_dataset("events", data=table.astype("u4"), chunks=(100, 4), compression="gzip")
+
+
+@pytest.mark.parametrize("write", [_dsec, _metavision, _e2vid, _v2e])
+def test_hdf5_layouts_give_the_same_events(
+    tmp_path: Path, write: Callable[[h5py.File, EventStream], None]
+) -> None:
+    s = random_stream(21, 2_345, first_us=5_000)
+    with h5py.File(tmp_path / "e.anything", "w") as file:
+        write(file, s)
+    recording = open_recording(tmp_path / "e.anything")
+    assert recording.format == "hdf5" and recording.has_polarity
+    assert same(recording.read(), s)
+    known = write in (_metavision, _e2vid)
+    assert (recording.width, recording.height) == ((320, 240) if known else (None, None))
+
+
+def test_named_datasets(tmp_path: Path) -> None:
+    s = random_stream(22, 100)
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        file["left/stamp"], file["left/u"], file["left/v"] = s.t, s.x, s.y
+    with pytest.raises(DataError, match="no events at /events.*there: left.*columns"):
+        open_recording(tmp_path / "e.h5")
+    where = {"t": "left/stamp", "x": "left/u", "y": "left/v"}
+    recording = open_recording(tmp_path / "e.h5", columns=where)
+    assert not recording.has_polarity and np.array_equal(recording.read().x, s.x)
+
+
+def test_prophesees_own_packing_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        properties.set_chunk((10,))
+        properties.set_filter(36559, h5py.h5z.FLAG_OPTIONAL, ())
+        kind = h5py.h5t.py_create(np.dtype([("x", "u2"), ("y", "u2"), ("p", "i2"), ("t", "i8")]))
+        file.create_group("CD")
+        space = h5py.h5s.create_simple((10,))
+        h5py.h5d.create(file.id, b"CD/events", kind, space, properties)
+    with pytest.raises(DataError, match="packed with Prophesee's ECF"):
+        open_recording(tmp_path / "e.h5")
+
+
+def test_a_shape_without_content_is_refused(tmp_path: Path) -> None:
+    """A damaged length must not become hours of zeros."""
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        for name in "txyp":
+            file.create_dataset(f"events/{name}", (10**12,), "i8", chunks=(1000,))
+    with pytest.raises(DataError, match="announces 1,000,000,000,000 events but holds 0 bytes"):
+        open_recording(tmp_path / "e.h5")
+
+
+def test_ros1_bag_of_event_arrays(tmp_path: Path) -> None:
+    s = random_stream(23, 1_000, first_us=1_600_000_000_000_000)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(EVENT_MSG.format(time="time"), "dvs_msgs/msg/Event"))
+    store.register(get_types_from_msg(ARRAY_MSG, "dvs_msgs/msg/EventArray"))
+    with BagWriter(tmp_path / "e.bag") as bag:
+        topic = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
+        other = bag.add_connection("/clock", "std_msgs/msg/String", typestore=store)
+        for number, message in enumerate(_arrays(store, s)):
+            data = store.serialize_ros1(message, "dvs_msgs/msg/EventArray")
+            bag.write(topic, number + 1, data)
+            text = store.types["std_msgs/msg/String"](data="tick")
+            bag.write(other, number + 1, store.serialize_ros1(text, "std_msgs/msg/String"))
+    recording = open_recording(tmp_path / "e.bag")
+    assert (recording.format, recording.width, recording.height) == ("rosbag", WIDTH, HEIGHT)
+    assert same(recording.read(), s)
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+@pytest.mark.parametrize("packets", [False, True])
+def test_ros2_folder_and_single_file(tmp_path: Path, storage: StoragePlugin, packets: bool) -> None:
+    """Arrays by an independent serialiser of CDR; packets cut anywhere between words of EVT 3."""
+    s = random_stream(24, 1_003, first_us=1_000_000)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    time = "builtin_interfaces/Time"
+    store.register(get_types_from_msg(EVENT_MSG.format(time=time), "dvs_msgs/msg/Event"))
+    store.register(get_types_from_msg(ARRAY_MSG, "dvs_msgs/msg/EventArray"))
+    store.register(get_types_from_msg(PACKET_MSG, "event_camera_msgs/msg/EventPacket"))
+    kind = "event_camera_msgs/msg/EventPacket" if packets else "dvs_msgs/msg/EventArray"
+    messages = _packets(store, s) if packets else _arrays(store, s)
+    with FolderWriter(tmp_path / "bag", version=9, storage_plugin=storage) as bag:
+        topic = bag.add_connection("/camera/events", kind, typestore=store)
+        for number, message in enumerate(messages):
+            bag.write(topic, number + 1, store.serialize_cdr(message, kind))
+    single = next(p for p in (tmp_path / "bag").iterdir() if p.suffix in (".db3", ".mcap"))
+    for path in (tmp_path / "bag", single):
+        recording = open_recording(path)
+        assert (recording.format, recording.width, recording.height) == ("rosbag", WIDTH, HEIGHT)
+        assert same(recording.read(), s)
+
+
+def test_a_bag_without_events_says_what_it_holds(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with BagWriter(tmp_path / "e.bag") as bag:
+        bag.add_connection("/clock", "std_msgs/msg/String", typestore=store)
+    with pytest.raises(DataError, match="no event messages.*std_msgs/msg/String"):
+        open_recording(tmp_path / "e.bag")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DataError, match="without metadata.yaml"):
+        read_events(tmp_path / "folder")
+
+
+def _header(store):
+    types = store.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    fields = dict(stamp=stamp, frame_id="dvs")
+    kind = types["std_msgs/msg/Header"]
+    return kind(seq=0, **fields) if "seq" in kind.__dataclass_fields__ else kind(**fields)
+
+
+def _arrays(store, s: EventStream):
+    event, time = store.types["dvs_msgs/msg/Event"], store.types["builtin_interfaces/msg/Time"]
+    array = store.types["dvs_msgs/msg/EventArray"]
+    rows = encoders.rows(s)
+    for first in range(0, len(rows), 170):
+        events = [
+            event(x=x, y=y, ts=time(sec=t // 1_000_000, nanosec=t % 1_000_000 * 1000), polarity=on)
+            for t, x, y, on in rows[first : first + 170]
+        ]
+        yield array(header=_header(store), height=HEIGHT, width=WIDTH, events=events)
+
+
+def _packets(store, s: EventStream):
+    words = encoders.evt3(s, "")
+    packet = store.types["event_camera_msgs/msg/EventPacket"]
+    for number, first in enumerate(range(0, len(words), 502)):
+        yield packet(
+            header=_header(store),
+            height=HEIGHT,
+            width=WIDTH,
+            seq=number,
+            time_base=0,
+            encoding="evt3",
+            is_bigendian=False,
+            events=np.frombuffer(words[first : first + 502], dtype=np.uint8),
+        )
+
+
+def test_a_damaged_message_is_an_error_or_left_out(tmp_path: Path) -> None:
+    s = random_stream(25, 340)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(EVENT_MSG.format(time="time"), "dvs_msgs/msg/Event"))
+    store.register(get_types_from_msg(ARRAY_MSG, "dvs_msgs/msg/EventArray"))
+    with BagWriter(tmp_path / "e.bag") as bag:
+        topic = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
+        for number, message in enumerate(_arrays(store, s)):
+            data = bytes(store.serialize_ros1(message, "dvs_msgs/msg/EventArray"))
+            bag.write(topic, number + 1, data[:-5] if number == 1 else data)
+    with pytest.raises(DataError, match="message 1 of /dvs/events is damaged"):
+        read_events(tmp_path / "e.bag")
+    recording = open_recording(tmp_path / "e.bag", repair=True)
+    first = EventStream(*(getattr(s, name)[:170] for name in ("t", "x", "y", "p")))
+    assert same(recording.read(), first)
+    assert recording.notes == ["repaired: leaves out damaged messages (1)"]
