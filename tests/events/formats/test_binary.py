@@ -94,6 +94,16 @@ def test_streaming_gives_the_same_in_chunks_of_bounded_size(tmp_path: Path) -> N
     assert same(window, s.between(1_000_003, 2_000_000))
 
 
+def test_an_address_that_begins_like_a_comment_is_an_event(tmp_path: Path) -> None:
+    """Row 119 of a DAVIS346 has addresses whose first byte is #."""
+    zeros = np.zeros(1, dtype=np.int64)
+    s = EventStream(zeros, np.array([130], "u2"), np.array([119], "u2"), np.array([-1], "i1"))
+    data = encoders.aedat2(s, "Davis346B", 346, 260)
+    assert data[-8:-7] == b"#"
+    (tmp_path / "e.aedat").write_bytes(data)
+    assert same(read_events(tmp_path / "e.aedat"), s)
+
+
 def test_dvs128_has_the_polarity_of_jaer(tmp_path: Path) -> None:
     s = random_stream(11, 100)
     s = EventStream(s.t, s.x % 128, s.y % 128, s.p)

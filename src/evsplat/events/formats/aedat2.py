@@ -21,6 +21,7 @@ from evsplat.events.formats.base import (
 )
 
 MAGIC = b"#!AER-DAT2.0"
+_CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f]")
 _MAX_LINE_BYTES = 1 << 16
 _MAX_HEADER_BYTES = 16 << 20
 _READ_EVENTS = 1 << 17
@@ -111,8 +112,8 @@ class Aedat2(Source):
             while True:
                 self._start = reader.offset
                 line = reader.read_line(_MAX_LINE_BYTES)
-                # an address may begin with the byte #: it is no line of text then
-                is_text = line.endswith(b"\r\n") or line.isascii() and line.rstrip().isascii()
+                # an address may begin with the byte # too; what follows has control characters
+                is_text = line.endswith(b"\n") and not _CONTROL.search(line.rstrip(b"\r\n"))
                 if not line.startswith(b"#") or not is_text:
                     return b"".join(lines).decode("latin-1")
                 lines.append(line)
