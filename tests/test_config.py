@@ -1,6 +1,6 @@
 """Configuration: round trips and errors that help."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import pytest
@@ -8,6 +8,7 @@ import pytest
 from evsplat.config import from_dict, load_yaml, override, save_yaml, to_dict
 from evsplat.errors import ConfigError
 from evsplat.methods import PaperConfig, method_config
+from evsplat.methods.evsplat import EvsplatConfig
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,11 @@ class Inner:
 class Outer:
     inner: Inner = field(default_factory=Inner)
     flag: bool = False
+
+
+@dataclass(frozen=True)
+class Owner:
+    outer: Outer = field(default_factory=lambda: Outer(Inner(rate=0.5), flag=True))
 
 
 def test_every_value_survives_yaml(tmp_path):
@@ -77,3 +83,13 @@ def test_damaged_yaml_is_named(tmp_path):
     path.write_text("- 1\n- 2\n")
     with pytest.raises(ConfigError, match="expected a mapping"):
         load_yaml(path)
+
+
+def test_a_section_given_in_part_keeps_what_its_owner_set():
+    found = from_dict(Owner, {"outer": {"inner": {"kind": "b"}}}, where="test")
+    assert found == Owner(Outer(Inner(rate=0.5, kind="b"), flag=True))
+
+
+def test_a_method_keeps_its_parts_when_one_setting_of_them_changes():
+    config = method_config("evsplat", {"deform": {"width": 16}}, where="test")
+    assert config.deform == replace(EvsplatConfig().deform, width=16)

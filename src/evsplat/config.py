@@ -76,7 +76,7 @@ def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, An
 def _convert(kind: Any, value: Any, where: str, key: str) -> Any:
     """``value`` as the annotated type ``kind``, or a `ConfigError` about ``key``."""
     if dataclasses.is_dataclass(kind):
-        return _convert_dataclass(kind, value, where, key)
+        return _convert_dataclass(kind, value, where, key, None)
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Literal:
         if value in arguments:
@@ -115,11 +115,17 @@ def _convert(kind: Any, value: Any, where: str, key: str) -> Any:
     raise _wrong(where, key, value, names.get(kind, str(kind)))
 
 
-def _convert_dataclass(kind: Any, value: Any, where: str, key: str) -> Any:
+def _convert_dataclass(kind: Any, value: Any, where: str, key: str, start: Any) -> Any:
+    """``value`` over ``start``, an instance, or over the defaults of ``kind`` where that is None.
+
+    A section that is given in part keeps the defaults that its owner gives it, which need not be
+    those of its type.
+    """
     if not isinstance(value, dict):
         raise _wrong(where, key, value, "a section with keys")
     hints = get_type_hints(kind)
-    names = [f.name for f in dataclasses.fields(kind)]
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    names = list(fields)
     converted = {}
     for name, item in value.items():
         full = f"{key}.{name}" if key else str(name)
@@ -128,8 +134,19 @@ def _convert_dataclass(kind: Any, value: Any, where: str, key: str) -> Any:
             section = f"{key}." if key else ""
             hint = f" Did you mean {section}{near[0]}?" if near else ""
             raise ConfigError(f"{where}: unknown setting {full}.{hint}")
-        converted[name] = _convert(hints[name], item, where, full)
-    return kind(**converted)
+        if dataclasses.is_dataclass(hints[name]):
+            inner = _default(fields[name]) if start is None else getattr(start, name)
+            converted[name] = _convert_dataclass(hints[name], item, where, full, inner)
+        else:
+            converted[name] = _convert(hints[name], item, where, full)
+    return kind(**converted) if start is None else dataclasses.replace(start, **converted)
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    """What a field is when nothing is given; None where it must be given."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return None if field.default is dataclasses.MISSING else field.default
 
 
 def _wrong(where: str, key: str, value: Any, expected: str) -> ConfigError:
