@@ -28,6 +28,7 @@ EXPECTED = {
     "ST-LPIPS",
     "LPIPS alex",
     "LPIPS vgg",
+    "RVM masks",
 }
 
 

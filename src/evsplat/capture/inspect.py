@@ -130,6 +130,10 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
             f"fit        posed body over masks: IoU {np.mean(overlaps):.2f} "
             f"(least {min(overlaps):.2f}; clothes and hair are not part of the body)"
         )
+    for verb in ("restored", "masks"):
+        made = capture.provenance.get(verb)
+        if isinstance(made, dict) and "with" in made:
+            lines.append(f"{verb:10} with {made['with']}")
     if "text" in capture.provenance:
         lines.append(f"made       {capture.provenance['text']}")
     return "\n".join(lines)

@@ -67,7 +67,7 @@ def inspect_recording(
     lag_us = estimate.clock.lag_us if estimate is not None else 0.0
     lines = [
         f"{path}",
-        f"format     {recording.format}, sensor {totals.width}x{totals.height}",
+        f"format     {recording.format}, sensor {_size_text(recording, totals)}",
         f"events     {totals.text(recording.has_polarity)}",
         f"noise      {_noise_text(totals.noise)}",
     ]
@@ -189,6 +189,11 @@ class _Gathered:
         if self.kept < MOST_EVENTS:
             self.parts.append(chunk)
             self.kept += len(chunk)
+
+
+def _size_text(recording: EventRecording, totals: _Totals) -> str:
+    size = f"{totals.width}x{totals.height}"
+    return size if recording.width else f"{size} as far as events reach"
 
 
 def _sensor_size(recording: EventRecording) -> tuple[int, int]:

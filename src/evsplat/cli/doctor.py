@@ -67,6 +67,7 @@ def run_checks() -> Iterator[Check]:
         _st_lpips,
         lambda: _lpips("alex"),
         lambda: _lpips("vgg"),
+        _rvm,
     )
     for check in checks:
         yield check()
@@ -169,6 +170,15 @@ def _lpips(network: Literal["alex", "vgg"]) -> Check:
     except WeightsError as error:
         return Check(name, "optional", str(error))
     return Check(name, "ok", "weights found")
+
+
+def _rvm() -> Check:
+    from evsplat.masks.rvm import find_weights
+
+    try:
+        return Check("RVM masks", "ok", f"{find_weights()}")
+    except WeightsError as error:
+        return Check("RVM masks", "optional", str(error))
 
 
 def _version(distribution: str) -> str | None:

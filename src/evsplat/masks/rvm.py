@@ -17,6 +17,7 @@ from torch import Tensor
 
 from evsplat.capture import Capture, Frame
 from evsplat.errors import WeightsError
+from evsplat.weights import MissingWeights, home_as_tilde, hub_folder, sha256_of
 
 WEIGHTS_VARIABLE = "EVSPLAT_RVM"
 """Environment variable with the TorchScript file, or a folder that holds it."""
@@ -60,7 +61,7 @@ class RobustVideoMatting:
 
     def provenance(self) -> dict[str, Any]:
         """The file that was used."""
-        return {"weights": self._path.name}
+        return {"weights": self._path.name, "sha256": sha256_of(self._path)}
 
     def _step(
         self, picture: Float[Tensor, "1 3 H W"], states: list[Tensor | None], ratio: float
@@ -88,17 +89,17 @@ def find_weights(weights: Path | str | None = None) -> Path:
                 if file.is_file():
                     return file
             raise WeightsError(f"{path}: no such file, and no folder with {FILE}. {_advice()}")
-    cached = Path(torch.hub.get_dir()) / "checkpoints"
+    cached = hub_folder()
     for file in (cached / FILE, cached / OTHER_FILE):
         if file.is_file():
             return file
-    raise WeightsError(f"RobustVideoMatting: no network. {_advice()}")
+    raise MissingWeights(f"RobustVideoMatting: no network. {_advice()}")
 
 
 def _advice() -> str:
     return (
         f"Fetch {FILE} (15 MB, or {OTHER_FILE}, 103 MB) from {SOURCE} and give its place with "
-        f"--weights or {WEIGHTS_VARIABLE}, or put it in {torch.hub.get_dir()}/checkpoints."
+        f"--weights or {WEIGHTS_VARIABLE}, or put it in {home_as_tilde(hub_folder())}."
     )
 
 
