@@ -1,5 +1,6 @@
 """A training step on another device than the CPU: nothing mixes devices, nobody waits."""
 
+import importlib.util
 import math
 
 import pytest
@@ -164,12 +165,16 @@ def foreign(monkeypatch):
             "deform": SMALL["deform"]
             | {"shading": True, "shadow_lights": 2, "networks_once": True},
         },
-        {
-            "deform": SMALL["deform"] | {"encoding": "hashgrid", "pose_correction_start": 0},
-            "loss": {"perceptual": "st_lpips"},
-        },
+        {"deform": SMALL["deform"] | {"encoding": "hashgrid", "pose_correction_start": 0}},
+        pytest.param(
+            {"loss": {"perceptual": "st_lpips"}},
+            marks=pytest.mark.skipif(
+                importlib.util.find_spec("stlpips_pytorch") is None,
+                reason="the weights of ST-LPIPS come with the extra `perceptual`",
+            ),
+        ),
     ],
-    ids=["paper", "evsplat", "what can be switched on"],
+    ids=["paper", "evsplat", "what can be switched on", "perceptual"],
 )
 def test_a_step_stays_on_its_device_and_never_waits(settings, foreign, tiny_capture):
     device, make = foreign
