@@ -87,8 +87,9 @@ bool set_up(const Point& a, const Point& b, const Point& c, int width, int heigh
     }
     t.determinant = a.x * t.e[0][0] + a.y * t.e[0][1] + a.z * t.e[0][2];
     if (!(std::abs(t.determinant) > 1e-9 * std::abs(a.z * b.z * c.z))) return false;
+    const double inverse = 1 / t.determinant;
     for (auto& edge : t.e)
-        for (double& value : edge) value /= t.determinant;
+        for (double& value : edge) value *= inverse;
     return true;
 }
 
@@ -178,7 +179,7 @@ class ShadowMap {
   public:
     ShadowMap(const Light& light, const Person& person, const Vec* vertices)
         : light_(light), size_(light.shadow_size), blocks_((size_ + kBlock - 1) / kBlock), depth_(size_t(size_) * size_),
-          near_(size_t(blocks_) * blocks_) {
+          nearest_(size_t(blocks_) * blocks_), x0_(size_), y0_(size_) {
         std::fill_n(depth_.data(), depth_.size(), kFar);
         Buffer<Point> seen(person.vertices);
         const double focal = light.shadow_focal, centre = 0.5 * size_;
@@ -189,8 +190,9 @@ class ShadowMap {
         for (size_t f = 0; f < person.triangles; ++f) {
             const int32_t* c = person.faces + 3 * f;
             Triangle t;
-            if (set_up(seen[c[0]], seen[c[1]], seen[c[2]], size_, size_, t))
-                fill(t, size_, depth_.data(), [](size_t, float, float, float) { return true; });
+            if (!set_up(seen[c[0]], seen[c[1]], seen[c[2]], size_, size_, t)) continue;
+            fill(t, size_, depth_.data(), [](size_t, float, float, float) { return true; });
+            x0_ = std::min(x0_, t.x0), x1_ = std::max(x1_, t.x1), y0_ = std::min(y0_, t.y0), y1_ = std::max(y1_, t.y1);
         }
         mark_blocks();
         for (int k = 0; k < kTaps; ++k) {
@@ -207,8 +209,8 @@ class ShadowMap {
         if (p.z <= kNear) return 1;
         const float x = p.x / p.z * light_.shadow_focal + 0.5f * size_, y = p.y / p.z * light_.shadow_focal + 0.5f * size_;
         if (!(x >= 0 && y >= 0 && x < size_ && y < size_)) return 1;
-        if (!near_[size_t(y / kBlock) * blocks_ + size_t(x / kBlock)]) return 1;
         const float limit = p.z - light_.shadow_bias, margin = light_.shadow_radius + 2;
+        if (nearest_[size_t(y / kBlock) * blocks_ + size_t(x / kBlock)] > limit) return 1;
         const bool inside = x >= margin && y >= margin && x < size_ - margin && y < size_ - margin;
         return inside ? mean<true>(x, y, limit) : mean<false>(x, y, limit);
     }
@@ -241,30 +243,33 @@ class ShadowMap {
         return float(depth_[size_t(y) * size_ + x] > limit);
     }
 
-    // near_: blocks from which a tap can reach a texel that the person covers.
+    // nearest_: for each block, the least depth that a tap from there can meet.
     void mark_blocks() {
-        std::fill_n(near_.data(), near_.size(), uint8_t(0));
+        std::fill_n(nearest_.data(), nearest_.size(), kFar);
         const int reach = int(std::ceil((light_.shadow_radius + 1) / kBlock));
-        for (int by = 0; by < blocks_; ++by)
-            for (int bx = 0; bx < blocks_; ++bx) {
-                if (!covered(bx, by)) continue;
+        for (int by = y0_ / kBlock; by * kBlock <= y1_; ++by)
+            for (int bx = x0_ / kBlock; bx * kBlock <= x1_; ++bx) {
+                const float least = least_depth(bx, by);
+                if (least == kFar) continue;
                 for (int y = std::max(0, by - reach); y <= std::min(blocks_ - 1, by + reach); ++y)
                     for (int x = std::max(0, bx - reach); x <= std::min(blocks_ - 1, bx + reach); ++x)
-                        near_[size_t(y) * blocks_ + x] = 1;
+                        nearest_[size_t(y) * blocks_ + x] = std::min(nearest_[size_t(y) * blocks_ + x], least);
             }
     }
 
-    bool covered(int bx, int by) const {
+    float least_depth(int bx, int by) const {
+        float least = kFar;
         for (int y = by * kBlock; y < std::min(size_, (by + 1) * kBlock); ++y)
             for (int x = bx * kBlock; x < std::min(size_, (bx + 1) * kBlock); ++x)
-                if (depth_[size_t(y) * size_ + x] != kFar) return true;
-        return false;
+                least = std::min(least, depth_[size_t(y) * size_ + x]);
+        return least;
     }
 
     const Light& light_;
     int size_, blocks_;
     Buffer<float> depth_;
-    Buffer<uint8_t> near_;
+    Buffer<float> nearest_;
+    int x0_, x1_ = -1, y0_, y1_ = -1;  // texels that the person covers lie within, ends included
     float taps_[kTaps][2];
 };
 

@@ -117,7 +117,7 @@ class Stage {
             // a camera that stands still sees the same room in every call
             if (!(layers_.view == view) || layers_.samples != samples) layers_ = zbuffer::draw_room(room_, view, samples);
         }
-        parallel_for(threads, times, [&](size_t t) {
+        run(threads, times, [&](size_t t) {
             const zbuffer::Pose pose = {bones.data() + t * 16 * person_.joints, vertices.data() + t * step,
                                         normals.data() + t * step};
             float* out = image.data() + t * 4 * width * height;

@@ -14,7 +14,7 @@ _STEP_S = 1e-3
 
 
 class Cloth:
-    """Displacement of the garments along their normals over time.
+    """Displacement of the garments outward along their normals over time.
 
     A sum of sine waves over the mesh at rest, each driven by its own mixture of the joint angles
     through a damped oscillator: the same pose gives the same wrinkles, fast motion makes them swing
@@ -46,8 +46,12 @@ class Cloth:
         swing = np.stack([np.interp(seconds, self._seconds, wave) for wave in self._swing.T], 1)
         swing = swing.astype(np.float32)
         normals = self.character.normals
-        height = swing @ self._height.T
+        wave = swing @ self._height.T
+        # outward only (half the wave plus a rounded half of its size): skin must not come through
+        size = np.sqrt(wave**2 + (self.character.cloth * np.float32(self.amplitude_m)) ** 2)
+        height = (wave + size) / 2
         slope = np.einsum("tk,vk,kc->tvc", swing, self._slope, self._waves.astype(np.float32))
+        slope *= 0.5 * (1 + wave / np.maximum(size, 1e-9))[..., None]
         slope -= (slope * normals).sum(-1, keepdims=True) * normals
         tilted = normals - slope
         tilted /= np.linalg.norm(tilted, axis=-1, keepdims=True)
