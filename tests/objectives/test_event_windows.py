@@ -85,6 +85,17 @@ def test_learned_thresholds_come_back(seed):
     )
 
 
+def test_thresholds_are_held_where_they_started():
+    thresholds = ContrastThresholds(0.2, 0.3)
+    assert float(thresholds.apart()) == 0.0
+    with torch.no_grad():
+        thresholds.logs += torch.tensor([0.1, -0.3])
+    assert float(thresholds.apart()) == pytest.approx((0.01 + 0.09) / 2)
+    resumed = ContrastThresholds(1.0, 1.0)
+    resumed.load_state_dict(thresholds.state_dict())
+    assert float(resumed.apart()) == pytest.approx(0.05)
+
+
 def test_a_time_outside_of_the_exposure_is_asked_for_after_the_start():
     capture, _ = scene(0)
     objective = make(capture, 0.2, 0.2)

@@ -17,7 +17,7 @@ from evsplat.calibration.noise import NoiseEstimate, NoiseMeter
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
 if TYPE_CHECKING:
-    from evsplat.capture import Capture
+    from evsplat.capture import Capture, Frame
 
 __all__ = [
     "ClockEstimate",
@@ -58,15 +58,19 @@ def estimate_from_pairs(
     return SensorEstimate(clock, estimate_thresholds(pairs, events, recorded_us, clock.lag_us))
 
 
-def estimate_from_capture(capture: "Capture") -> SensorEstimate | None:
+def estimate_from_capture(
+    capture: "Capture", *, frames: "Sequence[Frame] | None" = None
+) -> SensorEstimate | None:
     """Estimate from at most 60 pairs of consecutive frames; None where that is not possible.
+
+    ``frames`` are those whose pictures may be looked at, in the order of time; without it all.
 
     The lag is what is left after the capture's own ``clock_offset_us``. A moving camera changes
     nothing: both sides see what moves in the picture.
     """
     if capture.events is None or len(capture.events) == 0:
         return None
-    frames = capture.frames
+    frames = capture.frames if frames is None else frames
     indices = pair_indices([frame.exposure_us for frame in frames], MOST_PAIRS)
     pairs = [
         pair(*(exposure(capture.image(frames[i]), frames[i].exposure_us) for i in both))

@@ -5,10 +5,12 @@ compared at any time and with their amplitude, by learned contrast thresholds; t
 depends on how the surface is turned and where it stands; the person casts shadows on the scene.
 """
 
-from dataclasses import dataclass, field
+import logging
+from dataclasses import dataclass, field, replace
 
 import torch
 
+from evsplat.calibration import estimate_from_capture
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig
 from evsplat.methods.composition import Composition
@@ -22,8 +24,10 @@ from evsplat.objectives import (
     renders_for,
 )
 
+logger = logging.getLogger(__name__)
+
 UNKNOWN_THRESHOLD = 0.2
-"""Contrast threshold to start from where the capture does not say one."""
+"""Contrast threshold to start from where neither the capture nor its frames tell one."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class WindowConfig:
     """First nominal iteration."""
     eps: float = 0.004
     """Added to linear luminance: darker than this a sensor sees nothing."""
+    contrast_weight: float = 1.0
+    """Weight of the squared distance of the thresholds' logarithms from where they started."""
     reach: float = 0.5
     """How far before or after an exposure windows reach, in frame intervals."""
 
@@ -80,8 +86,9 @@ def compose(
     }
     observed: list[Objective] = [Exposure(capture, renders, build.generator)]
     if capture.events is not None and config.event.weight != 0.0:
-        on, off = capture.contrast_threshold or (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD)
-        thresholds = ContrastThresholds(on, off).to(device)
+        # A loaded model brings its own.
+        known = _thresholds(capture) if fit else (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD)
+        thresholds = ContrastThresholds(*known).to(device)
         build.model.sensor = thresholds
         windows = config.windows
         observed.append(
@@ -94,4 +101,22 @@ def compose(
                 reach=windows.reach,
             )
         )
-    return build.composition(observed)
+    composition = build.composition(observed)
+    weights = {**composition.weights, "contrast": config.windows.contrast_weight}
+    return replace(composition, weights=weights)
+
+
+def _thresholds(capture: Capture) -> tuple[float, float]:
+    """C+ and C-: the capture's, or those at which training frames and events agree best."""
+    if capture.contrast_threshold is not None:
+        return capture.contrast_threshold
+    estimate = estimate_from_capture(capture, frames=capture.train_frames)
+    if estimate is None or estimate.thresholds is None:
+        logger.warning(
+            "%s: contrast thresholds are neither given nor to be found from frames and events; "
+            "starting from %g.", capture.path, UNKNOWN_THRESHOLD,
+        )  # fmt: skip
+        return UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD
+    found = estimate.thresholds
+    logger.info("contrast thresholds found: C+ %.3f, C- %.3f", found.plus, found.minus)
+    return found.plus, found.minus

@@ -15,12 +15,23 @@ from evsplat.objectives.base import Stateless, Step
 
 
 class ContrastThresholds(nn.Module):
-    """How much the logarithm of brightness changes per event, for either polarity; learned."""
+    """How much the logarithm of brightness changes per event, for either polarity; learned.
+
+    Events alone would have them shrink: the mean absolute difference to a change that is not yet
+    reconstructed is smallest when events mean little. `apart` is what holds them.
+    """
+
+    start_logs: Tensor
 
     def __init__(self, on: float, off: float) -> None:
-        """Thresholds to start from, above 0."""
+        """Thresholds to start from and to stay near, above 0."""
         super().__init__()
-        self.logs = nn.Parameter(torch.tensor([on, off]).log())
+        self.register_buffer("start_logs", torch.tensor([on, off]).log())
+        self.logs = nn.Parameter(self.start_logs.clone())
+
+    def apart(self) -> Float[Tensor, ""]:
+        """Squared distance of the logarithms from where they started, mean over polarities."""
+        return (self.logs - self.start_logs).square().mean()
 
     def change(
         self, on: Float[Tensor, "*shape"], off: Float[Tensor, "*shape"]
@@ -69,7 +80,7 @@ class EventWindows(Stateless):
         return (min(max(time, self.range_us[0]), self.range_us[1]),)
 
     def loss(self, step: Step) -> dict[str, Tensor]:
-        """``event``: mean over windows, pixels and the whole span."""
+        """``event``: mean over windows, pixels and the whole span; ``contrast``: `apart`."""
         if step.nominal < self.start or len(step.times_us) < 2:
             return {}
         times = step.times_us
@@ -80,7 +91,7 @@ class EventWindows(Stateless):
         changes = brightness[1:] - brightness[:-1]
         windows = (changes - reported).abs().mean()
         whole = (brightness[-1] - brightness[0] - reported.sum(0)).abs().mean()
-        return {"event": 0.5 * (windows + whole)}
+        return {"event": 0.5 * (windows + whole), "contrast": self.thresholds.apart()}
 
     def _counts(self, stream: EventStream, times: Sequence[int]) -> Float[Tensor, "T-1 2 H W"]:
         """Events per window, polarity (brighter first) and pixel."""
