@@ -35,13 +35,12 @@ from torch import Tensor
 from evsplat import _native
 from evsplat.capture import Frame, load_capture
 from evsplat.cli.demo import demo_capture
-from evsplat.deform import human_scene
+from evsplat.deform import drawing, human_scene
 from evsplat.deform.mlp import Precision
 from evsplat.gaussians import ATTRIBUTES, GaussianSet
 from evsplat.methods import PaperConfig, compose
 from evsplat.objectives.base import Stateless, Step
 from evsplat.render import native as native_backend
-from evsplat.training import trainer as trainer_module
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
@@ -206,7 +205,7 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
     watch.calls(model.human_colour, "forward", "human colour")
     watch.calls(model.scene_colour, "forward", "scene colour")
     watch.calls(model, "at", "posing, rest")
-    watch.calls(trainer_module, "render", "render")
+    watch.calls(drawing, "render", "render")
     for objective in trainer.composition.objectives:
         watch.calls(objective, "loss", f"loss {type(objective).__name__}")
     watch.calls(trainer.optimiser, "step", "optimiser")
