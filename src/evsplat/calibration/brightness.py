@@ -12,6 +12,7 @@ from torch import Tensor
 
 from evsplat.errors import DataError
 from evsplat.events import EventStream
+from evsplat.events.maps import event_pixels
 from evsplat.imaging.srgb import Transfer, decode, luminance
 
 DARKEST, BRIGHTEST = 0.02, 0.98
@@ -118,12 +119,7 @@ class PairEvents:
         first = start + math.floor(lags_us[0]) - HISTORY_US
         near = events.between(first, end + math.ceil(lags_us[1]) + 1)
         height, width = pair.change.shape
-        if len(near) and (near.x.max() >= width or near.y.max() >= height):
-            raise DataError(
-                f"events reach pixel x={near.x.max()}, y={near.y.max()}, but the frames have "
-                f"{width}x{height} pixels; frames and events must share their pixels."
-            )
-        pixel = near.y.astype(np.int64) * width + near.x
+        pixel = event_pixels(near, height, width, "frames and events must share their pixels")
         share = max(1, len(near) // MOST_EVENTS)
         # A stride that has no factor in common with the width meets all columns.
         while math.gcd(share, width) > 1:

@@ -2,7 +2,8 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,36 +16,36 @@ from torch import Tensor
 from evsplat.errors import DataError
 
 
-def read_image(path: Path) -> np.ndarray:
-    """The stored pixels: (H, W) or (H, W, 3), uint8 or uint16; transparency is dropped."""
+@contextmanager
+def opened_picture(
+    path: Path, problem: str = "cannot be decoded as a picture"
+) -> Iterator[Image.Image]:
+    """A picture file to decode in the block; what goes wrong there is a `DataError`."""
     try:
         with Image.open(path) as image:
-            if image.mode in ("RGB", "RGBA") and _has_16_bits(image):
-                return _read_16_bit_colour(path)
-            if image.mode in ("L", "RGB", "I;16"):
-                return np.array(image)
-            if image.mode == "I;16B":
-                return np.array(image).astype(np.uint16)
-            return np.array(image.convert("L" if image.mode in ("1", "LA") else "RGB"))
+            yield image
     except FileNotFoundError:
         raise DataError(f"{path}: file not found.") from None
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        raise DataError(
-            f"{path}: cannot be decoded as a picture ({error}); save it again as PNG."
-        ) from error
+        raise DataError(f"{path}: {problem} ({error}); save it again as PNG.") from error
+
+
+def read_image(path: Path) -> np.ndarray:
+    """The stored pixels: (H, W) or (H, W, 3), uint8 or uint16; transparency is dropped."""
+    with opened_picture(path) as image:
+        if image.mode in ("RGB", "RGBA") and _has_16_bits(image):
+            return _read_16_bit_colour(path)
+        if image.mode in ("L", "RGB", "I;16"):
+            return np.array(image)
+        if image.mode == "I;16B":
+            return np.array(image).astype(np.uint16)
+        return np.array(image.convert("L" if image.mode in ("1", "LA") else "RGB"))
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header, without decoding the pixels."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found.") from None
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        raise DataError(
-            f"{path}: not a readable picture ({error}); save it again as PNG."
-        ) from error
+    with opened_picture(path, "not a readable picture") as image:
+        return image.size
 
 
 def to_unit_range(pixels: np.ndarray) -> Float[Tensor, "..."]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from jaxtyping import Bool, Float
@@ -90,6 +90,22 @@ class Noise:
     hide_scene_direction: bool
 
 
+class RowCache(Protocol):
+    """Values per Gaussian that are looked up now and then, and kept between steps."""
+
+    def rows_changed(self) -> None:
+        """Row numbers mean other Gaussians now."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """What a resume needs."""
+        ...
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state` gave."""
+        ...
+
+
 class HumanSceneModel(nn.Module):
     """Gaussians, networks and the body track; `at` poses them at given times.
 
@@ -132,14 +148,17 @@ class HumanSceneModel(nn.Module):
             if isinstance(module, PointMLP):
                 module.precision = config.precision
         frames = len(frame_times_us)
-        # Zero, not random: what a frame has not learned must not show between frames.
         self.sensor: nn.Module | None = None
         """What is learned of the event camera, by methods that do."""
         self.shading: Shading | None = None
         self.shadow: BodyShadow | None = None
+        self.row_caches: dict[str, RowCache] = {"skinning_turns": self.skinning_turns}
+        """What is kept per Gaussian between steps, by the name it has in a checkpoint."""
         generator = torch.Generator().manual_seed(0)
-        self.surface_normals = SurfaceNormals(body.sample_surface(NORMAL_SAMPLES, generator))
         if config.shading:
+            surface = body.sample_surface(NORMAL_SAMPLES, generator)
+            self.surface_normals = SurfaceNormals(surface)
+            self.row_caches["surface_normals"] = self.surface_normals
             roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
             middle = roots.mean(0)
             radius = max(1.0, float((roots - middle).norm(dim=-1).max()))
@@ -147,6 +166,7 @@ class HumanSceneModel(nn.Module):
         if config.shadow_lights:
             casters = body.sample_surface(CASTERS, generator)
             self.shadow = BodyShadow(casters, up_axis(track), config.shadow_lights)
+        # Zero, not random: what a frame has not learned must not show between frames.
         self.latents = nn.Parameter(torch.zeros(frames, config.latent_dim))
         self.rotation_residuals = nn.Parameter(torch.zeros(frames, joints, 3))
         self.translation_residuals = nn.Parameter(torch.zeros(frames, 3))

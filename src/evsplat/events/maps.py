@@ -20,12 +20,12 @@ VoxelScaling = Literal["none", "standard"]
 
 def count_map(stream: EventStream, height: int, width: int) -> Float[Tensor, "H W"]:
     """Sum of polarities per pixel (the event map E of paper eq. 8)."""
-    return _sums(_pixels(stream, height, width), stream.p, (height, width))
+    return _sums(event_pixels(stream, height, width), stream.p, (height, width))
 
 
 def polarity_counts(stream: EventStream, height: int, width: int) -> Float[Tensor, "2 H W"]:
     """Number of ON and of OFF events per pixel."""
-    place = _pixels(stream, height, width) + (stream.p < 0) * (height * width)
+    place = event_pixels(stream, height, width) + (stream.p < 0) * (height * width)
     return _sums(place, None, (2, height, width))
 
 
@@ -46,7 +46,7 @@ def voxel_grid(
     if bins < 1:
         raise ValueError(f"a voxel grid needs at least one bin, not {bins}")
     stream, start, end = _within(stream, window_us)
-    place = _pixels(stream, height, width)
+    place = event_pixels(stream, height, width)
     if bins == 1 or end <= start:
         grid = torch.zeros(bins, height, width)
         grid[0] = _sums(place, stream.p, (height, width))
@@ -74,7 +74,7 @@ def time_surface(
     stream, _, now = _within(stream, None if time_us is None else (_EARLIEST, time_us))
     last = np.full(2 * height * width, -np.inf)
     # of several values for one place NumPy keeps the last
-    last[_pixels(stream, height, width) + (stream.p < 0) * (height * width)] = stream.t
+    last[event_pixels(stream, height, width) + (stream.p < 0) * (height * width)] = stream.t
     surface = np.exp((last - now) / decay_us).reshape(2, height, width)
     return torch.from_numpy(surface.astype(np.float32))
 
@@ -92,12 +92,17 @@ def _within(stream: EventStream, window_us: tuple[int, int] | None) -> tuple[Eve
     return stream.between(start, end + 1), start, end
 
 
-def _pixels(stream: EventStream, height: int, width: int) -> Int64[np.ndarray, "N"]:
-    """Place of each event in a flat map; a `DataError` where one lies outside."""
+def event_pixels(
+    stream: EventStream,
+    height: int,
+    width: int,
+    advice: str = "give the size of the sensor that recorded them",
+) -> Int64[np.ndarray, "N"]:
+    """Place of each event in a flat map; a `DataError` with ``advice`` where one lies outside."""
     if len(stream) and (stream.x.max() >= width or stream.y.max() >= height):
         raise DataError(
             f"events reach pixel x={stream.x.max()}, y={stream.y.max()}, outside of a map of "
-            f"{width}x{height} pixels; give the size of the sensor that recorded them."
+            f"{width}x{height} pixels; {advice}."
         )
     return stream.y.astype(np.int64) * width + stream.x
 

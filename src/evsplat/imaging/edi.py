@@ -15,6 +15,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from evsplat.errors import DataError
+from evsplat.events.maps import event_pixels
 from evsplat.events.stream import EventStream
 from evsplat.imaging.srgb import Transfer, decode, encode
 
@@ -56,7 +57,7 @@ def log_gain(
     start, end = exposure_us
     if end <= start:
         raise DataError(f"an exposure from {start} to {end} us has no length; give start < end.")
-    pixel = _pixels(events, height, width)
+    pixel = event_pixels(events, height, width, "frames and events must share their pixels")
     steps = np.where(events.p > 0, contrast_threshold[0], -contrast_threshold[1])
     first, last = np.searchsorted(events.t, exposure_us)
     inside = slice(first, max(first, last))
@@ -101,12 +102,3 @@ def _running_sum(
     starts = np.flatnonzero(np.r_[True, group[1:] != group[:-1]])
     before = (total - values)[starts]
     return total - np.repeat(before, np.diff(np.r_[starts, len(values)]))
-
-
-def _pixels(events: EventStream, height: int, width: int) -> Int64[np.ndarray, "N"]:
-    if len(events) and (events.x.max() >= width or events.y.max() >= height):
-        raise DataError(
-            f"events reach pixel x={events.x.max()}, y={events.y.max()}, outside of a picture of "
-            f"{width}x{height} pixels; frames and events must share their pixels."
-        )
-    return events.y.astype(np.int64) * width + events.x

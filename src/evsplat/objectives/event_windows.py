@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.capture import Capture, Frame
 from evsplat.devices import send
-from evsplat.events import EventStream
+from evsplat.events import EventStream, polarity_counts
 from evsplat.imaging import luminance
 from evsplat.objectives.base import Stateless, Step
 
@@ -95,9 +94,6 @@ class EventWindows(Stateless):
 
     def _counts(self, stream: EventStream, times: Sequence[int]) -> Float[Tensor, "T-1 2 H W"]:
         """Events per window, polarity (brighter first) and pixel."""
-        height, width = self.events.height, self.events.width
-        window = np.searchsorted(times, stream.t, side="right") - 1
-        place = (window * 2 + (stream.p < 0)) * height + stream.y
-        size = (len(times) - 1) * 2 * height * width
-        counts = np.bincount(place * width + stream.x, minlength=size)
-        return torch.from_numpy(counts.astype(np.float32)).view(-1, 2, height, width)
+        size = self.events.height, self.events.width
+        windows = zip(times, times[1:], strict=False)
+        return torch.stack([polarity_counts(stream.between(*ends), *size) for ends in windows])

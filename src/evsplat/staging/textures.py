@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8
-from PIL import Image, UnidentifiedImageError
 
-from evsplat.errors import DataError
+from evsplat.capture.images import opened_picture
 
 GAMMA = 2.2
 """Pictures are decoded and encoded with this power, as the rest of the project does."""
@@ -14,15 +13,8 @@ GAMMA = 2.2
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
     """A picture with its transparency (opaque where it has none)."""
-    try:
-        with Image.open(path) as image:
-            return np.array(image.convert("RGBA"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found.") from None
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        raise DataError(
-            f"{path}: cannot be decoded as a picture ({error}); save it again as PNG."
-        ) from error
+    with opened_picture(path) as image:
+        return np.array(image.convert("RGBA"))
 
 
 def pyramid(

@@ -160,8 +160,8 @@ class Trainer:
         tensors |= flatten("statistics", vars(self.statistics))
         for number, objective in enumerate(self.composition.objectives):
             tensors |= flatten(f"objective{number}", objective.state())
-        tensors |= flatten("skinning_turns", self.model.skinning_turns.state())
-        tensors |= flatten("surface_normals", self.model.surface_normals.state())
+        for name, cache in self.model.row_caches.items():
+            tensors |= flatten(name, cache.state())
         tensors["generator"] = self.composition.generator.get_state()
         state = {
             "clock": asdict(self.clock),
@@ -180,8 +180,8 @@ class Trainer:
         self.statistics = ScreenStatistics(**below("statistics", tensors)).to(self.device)
         for number, objective in enumerate(self.composition.objectives):
             objective.load_state(below(f"objective{number}", tensors))
-        self.model.skinning_turns.load_state(below("skinning_turns", tensors))
-        self.model.surface_normals.load_state(below("surface_normals", tensors))
+        for name, cache in self.model.row_caches.items():
+            cache.load_state(below(name, tensors))
         self.composition.generator.set_state(tensors["generator"])
         saved = state["clock"]
         for name in ("iteration", "fraction", "seconds", "step_seconds"):
@@ -217,10 +217,8 @@ class Trainer:
         if self.model.semantics != "fixed":
             drawn = self.capture.train_frames.index(frame)
             flip_labels(gaussians, rows, self.composition.body_frames, drawn)
-        self.model.skinning_turns.rows_changed()
-        self.model.surface_normals.rows_changed()
-        for objective in self.composition.objectives:
-            objective.rows_changed()
+        for keeper in (*self.model.row_caches.values(), *self.composition.objectives):
+            keeper.rows_changed()
         self.statistics = self._fresh_statistics()
 
     def _fresh_statistics(self) -> ScreenStatistics:
