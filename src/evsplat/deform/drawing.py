@@ -1,6 +1,7 @@
 """Pictures of posed Gaussians, with the person's shadow on the scene."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -59,6 +60,27 @@ def draw(
             a + b * factor[..., None] for a, b, factor in zip(person, scene, light, strict=True)
         )
     return Drawing(rgb, tuple(s[..., 0] for s in semantic), output, moving, static)
+
+
+def draw_depth(
+    posed: PosedGaussians, camera: PinholeCamera, *, parts: Literal["all", "human", "scene"] = "all"
+) -> Float[Tensor, "T H W"]:
+    """Mean of z in the camera over what each pixel shows, metres; 0 where it shows nothing.
+
+    The scene alone is drawn once: T is then 1.
+    """
+    moving, static = _showing_depth(posed.moving(), camera), _showing_depth(posed.static(), camera)
+    if parts == "all":
+        output = render(moving, camera, static=static)
+    else:
+        output = render(moving if parts == "human" else static, camera)
+    covered = output.alpha.clamp_min(_LEAST_SCENE)
+    return output.image[..., 0] / covered * (output.alpha > _LEAST_SCENE)
+
+
+def _showing_depth(layer: Splats, camera: PinholeCamera) -> Splats:
+    pose = camera.world_to_camera
+    return replace(layer, channels=(layer.means @ pose[2, :3] + pose[2, 3])[..., None])
 
 
 def _in_layers(moving: Splats, static: Splats, camera: PinholeCamera) -> tuple[Splats, Splats]:

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.body import BodyTrack
 from evsplat.capture.camera import Camera
 
 Parts = Literal["all", "human", "scene"]
@@ -36,4 +37,29 @@ class Reconstruction(Protocol):
 
         ``parts`` leaves out the scene ("human") or the person ("scene"); what is left out is black.
         """
+        ...
+
+
+@runtime_checkable
+class Posable(Protocol):
+    """A reconstruction whose person can be made to move as it was never seen to."""
+
+    @property
+    def track(self) -> BodyTrack:
+        """The recorded motion and its body."""
+        ...
+
+    def following(self, track: BodyTrack) -> Reconstruction:
+        """The same person and scene with the motion ``track`` (same body, own times) instead."""
+        ...
+
+
+@runtime_checkable
+class WithDepth(Protocol):
+    """A reconstruction that knows how far away what it draws is."""
+
+    def depth(
+        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
+    ) -> Float[Tensor, "T H W"]:
+        """Mean of z in the camera over what a pixel shows, metres; 0 where it shows nothing."""
         ...

@@ -1,5 +1,6 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
+import copy
 import json
 import platform
 from collections.abc import Sequence
@@ -10,10 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, load_capture
 from evsplat.config import load_yaml, to_dict
-from evsplat.deform.drawing import draw
+from evsplat.deform.drawing import draw, draw_depth
 from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
@@ -126,6 +130,35 @@ class GaussianReconstruction:
             alpha=all_times(output.alpha),
             human=all_times(output.image[..., 3].clamp(0, 1)),
         )
+
+    def depth(
+        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
+    ) -> Float[Tensor, "T H W"]:
+        """Mean depth of what is drawn; see `WithDepth`."""
+        with torch.no_grad():
+            camera = camera.to(self.model.box_low.device)
+            posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+            depth = draw_depth(posed, camera, parts=parts).cpu()
+        return depth.expand(len(times_us), *depth.shape[1:])
+
+    @property
+    def track(self) -> BodyTrack:
+        """The recorded motion and its body."""
+        return self.model.track
+
+    def following(self, track: BodyTrack) -> "GaussianReconstruction":
+        """The same person doing what ``track`` says; see `Posable`.
+
+        What was learned of single frames does not belong to another motion: pose residuals are left
+        out, and the colour takes the mean of the latents.
+        """
+        model = copy.deepcopy(self.model)
+        model.track = track.to(model.box_low.device)
+        with torch.no_grad():
+            model.latents.copy_(model.latents.mean(0))
+            model.rotation_residuals.zero_()
+            model.translation_residuals.zero_()
+        return GaussianReconstruction(self.name, model)
 
 
 @dataclass(frozen=True)
