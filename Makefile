@@ -27,6 +27,8 @@ setup: $(STAMP)
 $(STAMP): $(SET_UP_INPUTS)
 	@PYTHON="$(PYTHON)" sh tools/make_venv.sh "$(VENV)"
 	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev]"
+# Not in an extra, because it declares torchvision, which it never imports.
+	$(BIN)/python -m pip install --constraint constraints.txt --no-deps event-pienet
 	@touch $@
 
 clean:

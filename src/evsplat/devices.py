@@ -7,6 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import torch
 from torch import Tensor
 
+from evsplat.errors import BackendError, ConfigError
+
 
 def send(tensor: Tensor, device: torch.device | str) -> Tensor:
     """``tensor`` on ``device``; the host does not wait for the copy.
@@ -20,6 +22,19 @@ def send(tensor: Tensor, device: torch.device | str) -> Tensor:
     if device.type == "cuda" and not tensor.requires_grad:
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
+
+
+def network_device(asked: str) -> torch.device:
+    """Where a network of plain PyTorch runs; unlike rendering it needs no kernels of others."""
+    if asked not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"--device {asked}: expected auto, cpu or cuda.")
+    there = torch.cuda.is_available()
+    if asked == "cuda" and not there:
+        raise BackendError(
+            f"--device cuda: torch {torch.__version__} finds no usable GPU (`evsplat doctor` says "
+            "what it lacks); compute with --device cpu."
+        )
+    return torch.device("cpu" if asked == "cpu" or not there else "cuda")
 
 
 def default_cache_bytes(device: torch.device) -> int:

@@ -24,6 +24,7 @@ EXPECTED = {
     "SMPL bodies",
     "optical flow",
     "Super SloMo",
+    "PIE-Net",
     "event recordings",
     "ST-LPIPS",
     "LPIPS alex",

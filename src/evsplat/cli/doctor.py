@@ -63,6 +63,7 @@ def run_checks() -> Iterator[Check]:
         _body_models,
         _opencv,
         _super_slomo,
+        _pienet,
         _recordings,
         _st_lpips,
         lambda: _lpips("alex"),
@@ -142,6 +143,16 @@ def _super_slomo() -> Check:
         return Check("Super SloMo", "ok", f"weights {find_checkpoint()}")
     except WeightsError as error:
         return Check("Super SloMo", "optional", str(error))
+
+
+def _pienet() -> Check:
+    from evsplat.restore.pienet import DISTRIBUTION, find_weights
+
+    try:
+        found = find_weights()
+        return Check("PIE-Net", "ok", f"{found.name} of {DISTRIBUTION} {_version(DISTRIBUTION)}")
+    except WeightsError as error:
+        return Check("PIE-Net", "optional", str(error))
 
 
 def _recordings() -> Check:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from evsplat.capture import Capture, Frame
 from evsplat.restore.edi import Edi
+from evsplat.restore.pienet import PieNet
 
 
 class Restorer(Protocol):
@@ -24,5 +25,5 @@ class Restorer(Protocol):
         ...
 
 
-RESTORERS: dict[str, Callable[..., Restorer]] = {"edi": Edi}
+RESTORERS: dict[str, Callable[..., Restorer]] = {"edi": Edi, "pienet": PieNet}
 """By name; called with the capture and the restorer's own options as keywords."""

@@ -1,0 +1,135 @@
+"""Pictures from events alone, by a recurrent network, coloured with the blurry frame.
+
+E2VID and its successors give one grey picture per window of events, known up to brightness and
+contrast and unknown where nothing has moved yet. A static camera sees no events of the scene, so
+the frames of a capture keep their own pixels there, and elsewhere their colour.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from evsplat.capture import Capture, Frame
+from evsplat.errors import DataError
+from evsplat.events import EventStream
+from evsplat.events.maps import polarity_counts
+from evsplat.imaging.srgb import REC709
+
+MATCHED_OVER = 0.02
+"""Standard deviation, over the picture's shorter side, of the weights of brightness matching."""
+_LEAST_VARIANCE = 1e-5
+_OFFSET = 0.02
+
+
+class IntensityNetwork(Protocol):
+    """Gives a grey picture per window of events, keeping what earlier windows have shown."""
+
+    device: torch.device
+    weights: Path
+
+    def reset(self) -> None:
+        """Forget all windows so far."""
+        ...
+
+    def step(self, events: EventStream, height: int, width: int) -> Float[Tensor, "H W"]:
+        """Intensity at the end of a window, in no known unit."""
+        ...
+
+    def provenance(self) -> dict[str, Any]:
+        """Weights and settings, as JSON values."""
+        ...
+
+
+class FromEvents:
+    """Each frame at mid-exposure, its brightness from events and its colour from the blurry frame.
+
+    The events between the mid-exposures of neighbouring frames are one window; the first begins
+    one such interval early, as far as there are events.
+    """
+
+    name: str
+
+    def __init__(self, capture: Capture, network: IntensityNetwork) -> None:
+        """Raises `DataError` where the capture has no events."""
+        if capture.events is None:
+            raise DataError(
+                f"{capture.path}: has no events, which {self.name} makes its pictures of; record "
+                "or simulate them first."
+            )
+        self._network = network
+
+    def restore(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
+        """Each frame in order of time with its picture at mid-exposure."""
+        assert capture.events is not None
+        frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
+        interval = frames[1].mid_us - frames[0].mid_us if len(frames) > 1 else frames[0].mid_us
+        before = frames[0].mid_us - interval
+        self._network.reset()
+        for frame in frames:
+            blurry = capture.image(frame)
+            height, width = blurry.shape[:2]
+            window = capture.events.between(before, frame.mid_us)
+            intensity = self._network.step(window, height, width).cpu()
+            moved = polarity_counts(capture.events.between(*frame.exposure_us), height, width)
+            yield frame, with_brightness(blurry, intensity, moved.sum(0) > 0)
+            before = frame.mid_us
+
+    def provenance(self) -> dict[str, Any]:
+        """The network's, and how its pictures became frames."""
+        return {
+            **self._network.provenance(),
+            "colour": "of the blurry frame, brightness from events where the exposure saw any",
+            "brightness_matched_over": MATCHED_OVER,
+        }
+
+
+def with_brightness(
+    blurry: Float[Tensor, "H W 3"],
+    intensity: Float[Tensor, "H W"],
+    moved: Float[Tensor, "H W"],
+    *,
+    over: float = MATCHED_OVER,
+) -> Float[Tensor, "H W 3"]:
+    """The blurry picture with ``intensity`` as its brightness where ``moved`` is true.
+
+    Intensity is first given the mean and the spread that the blurry picture's luma has around each
+    pixel (Gaussian weights, standard deviation ``over`` times the shorter side): blur keeps what is
+    larger than itself, and the network knows nothing of absolute brightness. All channels are then
+    multiplied alike, so the hue stays that of the blurry picture.
+    """
+    sigma = over * min(blurry.shape[:2])
+    luma = blurry @ torch.tensor(REC709).to(blurry)
+    mean, spread = _around(luma, sigma)
+    own_mean, own_spread = _around(intensity.to(blurry), sigma)
+    matched = ((intensity.to(blurry) - own_mean) * (spread / own_spread) + mean).clamp(0, 1)
+    share = F.max_pool2d(moved.to(blurry)[None], 3, 1, 1)
+    share = F.avg_pool2d(share, 3, 1, 1, count_include_pad=False)[0]
+    gain = 1 + share * ((matched + _OFFSET) / (luma + _OFFSET) - 1)
+    return (blurry * gain[..., None]).clamp(0, 1)
+
+
+def _around(
+    values: Float[Tensor, "H W"], sigma: float
+) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """Weighted mean and standard deviation around each pixel."""
+    mean = _blurred(values, sigma)
+    # Deviations are taken from one value for all, else the difference of squares loses its digits.
+    centred = values - values.mean()
+    variance = _blurred(centred**2, sigma) - (mean - values.mean()) ** 2
+    return mean, variance.clamp_min(_LEAST_VARIANCE).sqrt()
+
+
+def _blurred(values: Float[Tensor, "H W"], sigma: float) -> Float[Tensor, "H W"]:
+    """Gaussian mean, cut off at three standard deviations and at the border of the picture."""
+    radius = max(1, round(3 * sigma))
+    at = torch.arange(-radius, radius + 1).to(values)
+    weights = torch.exp(-0.5 * (at / max(sigma, 1e-3)) ** 2)
+    both = torch.stack((values, torch.ones_like(values)))[:, None]
+    both = F.conv2d(both, weights[None, None, :, None], padding=(radius, 0))
+    both = F.conv2d(both, weights[None, None, None, :], padding=(0, radius))
+    return both[0, 0] / both[1, 0]
