@@ -1,14 +1,14 @@
 """Pictures of posed Gaussians, with the person's shadow on the scene."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.deform.shadow import BodyShadow
 from evsplat.gaussians import PosedGaussians
 from evsplat.render import PinholeCamera, RenderOutput, Splats, render, split_channels
 
@@ -25,18 +25,34 @@ class Drawing:
     rgb: tuple[Float[Tensor, "H W 3"], ...]
     semantic: tuple[Float[Tensor, "H W"], ...]
     output: RenderOutput
+    posed: PosedGaussians
     moving: Splats
     static: Splats
 
+    def center_gradients(self) -> tuple[Float[Tensor, "T H 2"], Float[Tensor, "1 S 2"]]:
+        """Gradients of the projected centres of person and scene, per pixel, after backward."""
+        moving, static = self.moving.centers2d_offset, self.static.centers2d_offset
+        assert moving is not None and moving.grad is not None
+        assert static is not None and static.grad is not None
+        return moving.grad, static.grad
+
+
+class _Drawable(Protocol):
+    @property
+    def shadow(self) -> BodyShadow | None: ...
+
 
 def draw(
-    model: HumanSceneModel,
+    model: _Drawable,
     posed: PosedGaussians,
     camera: PinholeCamera,
     *,
     center_gradients: bool = False,
+    background: Float[Tensor, "3"] | None = None,
 ) -> Drawing:
     """Draw person and scene; ``center_gradients`` makes the projected centres tell theirs.
+
+    ``background`` is the sRGB colour behind all of it, black without.
 
     With shadows the person's and the scene's share of each pixel are composited as channels of
     their own, in one pass and in the right order of depth, and the scene's is multiplied.
@@ -47,7 +63,8 @@ def draw(
         moving, static = _in_layers(moving, static, camera)
     if center_gradients:
         moving, static = _with_centers(moving), _with_centers(static)
-    output = render(moving, camera, static=static)
+    behind = None if background is None else _behind(background, moving)
+    output = render(moving, camera, static=static, background=behind)
     if shadow is None:
         rgb, semantic = split_channels(output.image, (3, 1))
     else:
@@ -59,7 +76,15 @@ def draw(
         rgb = tuple(
             a + b * factor[..., None] for a, b, factor in zip(person, scene, light, strict=True)
         )
-    return Drawing(rgb, tuple(s[..., 0] for s in semantic), output, moving, static)
+    return Drawing(rgb, tuple(s[..., 0] for s in semantic), output, posed, moving, static)
+
+
+def _behind(rgb: Float[Tensor, "3"], layer: Splats) -> Float[Tensor, "C"]:
+    """A background of all channels: nothing stands there but the scene's colour."""
+    rest = layer.channels.shape[-1] - 3
+    # With layers, the scene's colour comes after the person's.
+    first = 3 if rest > 3 else 0
+    return F.pad(rgb, (first, rest - first))
 
 
 def draw_depth(

@@ -1,8 +1,9 @@
 """A person and a scene in one Gaussian set, posed at any time: the paper's model (eq. 1-7)."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,9 +11,12 @@ from torch import Tensor, nn
 
 from evsplat.body import BodyTrack, bounding_box, skin, up_axis
 from evsplat.body.rotations import axis_angle_to_matrix, quaternion_multiply
+from evsplat.capture import Camera, Frame
 from evsplat.deform.colour import HumanColour, SceneColour, view_jitter
+from evsplat.deform.drawing import Drawing, draw
 from evsplat.deform.encodings import make_encoding
 from evsplat.deform.mlp import PointMLP, Precision
+from evsplat.deform.model import RowCache
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
 from evsplat.deform.shading import Shading, SurfaceNormals
@@ -90,22 +94,6 @@ class Noise:
     hide_scene_direction: bool
 
 
-class RowCache(Protocol):
-    """Values per Gaussian that are looked up now and then, and kept between steps."""
-
-    def rows_changed(self) -> None:
-        """Row numbers mean other Gaussians now."""
-        ...
-
-    def state(self) -> dict[str, Tensor]:
-        """What a resume needs."""
-        ...
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state` gave."""
-        ...
-
-
 class HumanSceneModel(nn.Module):
     """Gaussians, networks and the body track; `at` poses them at given times.
 
@@ -153,7 +141,6 @@ class HumanSceneModel(nn.Module):
         self.shading: Shading | None = None
         self.shadow: BodyShadow | None = None
         self.row_caches: dict[str, RowCache] = {"skinning_turns": self.skinning_turns}
-        """What is kept per Gaussian between steps, by the name it has in a checkpoint."""
         generator = torch.Generator().manual_seed(0)
         if config.shading:
             surface = body.sample_surface(NORMAL_SAMPLES, generator)
@@ -186,6 +173,16 @@ class HumanSceneModel(nn.Module):
         self.nominal = nominal
         self.track = self.track.to(self.box_low.device)
         return self
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        return self.box_low.device
+
+    @property
+    def sets(self) -> dict[str, GaussianSet]:
+        """The one set of both classes."""
+        return {"gaussians": self.gaussians}
 
     @property
     def non_rigid_active(self) -> bool:
@@ -295,6 +292,37 @@ class HumanSceneModel(nn.Module):
             scene_semantics=semantics[1],
             casters=None if self.shadow is None else self.shadow.place(bones),
         )
+
+    def training_drawing(
+        self,
+        times_us: Sequence[int],
+        frame: Frame,
+        camera: Camera,
+        generator: torch.Generator,
+    ) -> Drawing:
+        """Pictures of a training step, with all its noise; see `Model`."""
+        once = self.config.networks_once
+        posed = self.at(
+            times_us,
+            camera.center(),
+            noise=self.draw_noise(1 if once else len(times_us), generator),
+            share_skinning=True,
+            networks_at_us=frame.mid_us if once else None,
+        )
+        return draw(self, posed, camera, center_gradients=True)
+
+    def following(self, track: BodyTrack) -> "HumanSceneModel":
+        """The same person doing what ``track`` says, see `Model`.
+
+        Pose residuals are left out, and the colour takes the mean of the latents.
+        """
+        model = copy.deepcopy(self)
+        model.track = track.to(self.device)
+        with torch.no_grad():
+            model.latents.copy_(model.latents.mean(0))
+            model.rotation_residuals.zero_()
+            model.translation_residuals.zero_()
+        return model
 
     def draw_noise(self, times: int, generator: torch.Generator) -> Noise:
         """The random perturbations of one training step."""

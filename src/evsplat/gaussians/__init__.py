@@ -2,7 +2,7 @@
 
 from evsplat.gaussians.densify import DensifyConfig, Edit, ScreenStatistics, densify
 from evsplat.gaussians.flip import BodyFrames, flip_labels
-from evsplat.gaussians.gaussian_set import ATTRIBUTES, FEATURE_DIM, GaussianSet, Part
+from evsplat.gaussians.gaussian_set import ATTRIBUTES, FEATURE_DIM, GaussianSet, Part, Rows, Shape
 from evsplat.gaussians.posed import PosedGaussians, PosedHuman, StaticScene
 from evsplat.gaussians.row_adam import RowAdam
 
@@ -17,7 +17,9 @@ __all__ = [
     "PosedGaussians",
     "PosedHuman",
     "RowAdam",
+    "Rows",
     "ScreenStatistics",
+    "Shape",
     "StaticScene",
     "densify",
     "flip_labels",

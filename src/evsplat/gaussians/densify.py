@@ -8,7 +8,7 @@ from torch import Tensor
 
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.devices import send
-from evsplat.gaussians.gaussian_set import ATTRIBUTES, GaussianSet, Part, person_first
+from evsplat.gaussians.gaussian_set import Part, Rows, Shape, person_first
 from evsplat.gaussians.initialise import logit
 from evsplat.gaussians.row_adam import RowAdam
 
@@ -102,7 +102,7 @@ class Edit:
 
 
 def densify(
-    gaussians: GaussianSet,
+    gaussians: Rows,
     optimiser: RowAdam,
     statistics: ScreenStatistics,
     limits: dict[Part, DensifyConfig],
@@ -114,14 +114,15 @@ def densify(
     ``limits`` may name ``human`` and ``scene``; a class without limits is left alone. Optimiser
     moments follow kept rows and start at zero for new ones.
     """
+    due = {part: limit for part, limit in limits.items() if limit.start <= nominal < limit.end}
+    if not due:
+        return Edit()
+    shape = gaussians.shape()
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     clone, split = torch.zeros_like(keep), torch.zeros_like(keep)
-    for part, limit in limits.items():
+    for part, limit in due.items():
         rows = gaussians.rows_of(part)
-        if limit.start <= nominal < limit.end:
-            keep[rows], clone[rows], split[rows] = _decide(
-                gaussians, statistics, rows, limit, nominal
-            )
+        keep[rows], clone[rows], split[rows] = _decide(shape, statistics, rows, limit, nominal)
     if bool(keep.all()) and not bool((clone | split).any()):
         return Edit()
 
@@ -132,9 +133,9 @@ def densify(
     fresh = torch.ones(len(source), dtype=torch.bool, device=keep.device)
     fresh[: len(survivors)] = False
 
-    values = {name: getattr(gaussians, name).detach()[source] for name in ATTRIBUTES}
+    values = {name: getattr(gaussians, name).detach()[source] for name in gaussians.attributes}
     first_child = len(source) - len(children)
-    offsets = _offsets_inside(gaussians, children, generator)
+    offsets = _offsets_inside(shape, children, generator)
     values["means"][first_child:] += offsets
     values["scales_log"][first_child:] -= torch.log(torch.tensor(1.6))
     rebuild(gaussians, optimiser, values, source, fresh, gaussians.human_mask()[source])
@@ -142,7 +143,7 @@ def densify(
 
 
 def rebuild(
-    gaussians: GaussianSet,
+    gaussians: Rows,
     optimiser: RowAdam,
     values: dict[str, Tensor],
     source: Int[Tensor, " M"],
@@ -156,27 +157,27 @@ def rebuild(
     """
     order, human_count = person_first(is_human, torch.arange(len(source), device=source.device))
     gaussians.set_rows({name: value[order] for name, value in values.items()}, human_count)
-    parameters = {name: getattr(gaussians, name) for name in ATTRIBUTES}
+    parameters = {name: getattr(gaussians, name) for name in gaussians.attributes}
     optimiser.move_rows(parameters, source[order], fresh[order])
 
 
-def reset_opacities(gaussians: GaussianSet, optimiser: RowAdam, rows: slice) -> None:
+def reset_opacities(gaussians: Rows, optimiser: RowAdam, rows: slice) -> None:
     """Lower the opacities of ``rows`` to at most 0.01 and forget their moments."""
     with torch.no_grad():
-        gaussians.opacity_logits[rows].clamp_max_(logit(0.01))
+        gaussians.get_parameter("opacity_logits")[rows].clamp_max_(logit(0.01))
     optimiser.forget("opacity_logits", rows)
 
 
 def _decide(
-    gaussians: GaussianSet,
+    shape: Shape,
     statistics: ScreenStatistics,
     rows: slice,
     limit: DensifyConfig,
     nominal: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Which rows of one class are kept, cloned and split."""
-    largest = gaussians.scales_log.detach()[rows].amax(-1).exp()
-    keep = gaussians.opacities().detach()[rows] >= limit.prune_opacity
+    largest = shape.scales[rows].amax(-1)
+    keep = shape.opacities[rows] >= limit.prune_opacity
     if nominal >= limit.prune_after:
         if limit.prune_screen_px is not None:
             keep &= statistics.radius_px[rows] <= limit.prune_screen_px
@@ -195,10 +196,10 @@ def _decide(
 
 
 def _offsets_inside(
-    gaussians: GaussianSet, rows: Int[Tensor, " M"], generator: torch.Generator
+    shape: Shape, rows: Int[Tensor, " M"], generator: torch.Generator
 ) -> Float[Tensor, "M 3"]:
     """One random offset per row, drawn from the row's own Gaussian, metres."""
-    scales = gaussians.scales_log.detach()[rows].exp()
+    scales = shape.scales[rows]
     noise = torch.randn(len(rows), 3, generator=generator).to(scales.device) * scales
-    rotation = quaternion_to_matrix(gaussians.quaternions.detach()[rows])
+    rotation = quaternion_to_matrix(shape.quaternions[rows])
     return (rotation @ noise[..., None])[..., 0]

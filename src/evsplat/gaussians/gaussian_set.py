@@ -1,6 +1,7 @@
 """The one set of Gaussians: person and scene together, told apart by a semantic attribute."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -21,34 +22,35 @@ Part = Literal["human", "scene"]
 """The two classes."""
 
 
-class GaussianSet(nn.Module):
-    """Parameters of ``N`` Gaussians; rows ``[0, human_count)`` are the person's.
+@dataclass(frozen=True)
+class Shape:
+    """What densification must know of ``N`` Gaussians as they are drawn; without gradient."""
 
-    The person's Gaussians live in canonical metres, those of the scene in world metres (A6). The
-    hard label is the row's place, not a tensor: it changes at densification steps only, when
-    ``rebuild`` moves rows, so a row can never be in one class and be treated as the other.
+    scales: Float[Tensor, "N 3"]
+    """Standard deviations, metres."""
+    quaternions: Float[Tensor, "N 4"]
+    opacities: Float[Tensor, " N"]
+
+
+class Rows(nn.Module):
+    """Learned values per Gaussian, of any names; rows ``[0, human_count)`` are the person's.
+
+    The hard label is the row's place, not a tensor: it changes at densification steps only, when
+    ``rebuild`` moves rows, so a row can never be in one class and be treated as the other. A set
+    that densifies has ``means`` and ``scales_log``, on which the sizes of its Gaussians depend.
     """
 
     means: nn.Parameter
     """(N, 3) centre, metres."""
     scales_log: nn.Parameter
-    """(N, 3) natural logarithm of the standard deviations, metres."""
-    quaternions: nn.Parameter
-    """(N, 4) rotation (w, x, y, z), normalised where it is used."""
-    opacity_logits: nn.Parameter
-    """(N,) opacity before the sigmoid."""
-    features: nn.Parameter
-    """(N, 32) input of the colour networks."""
-    semantic_logits: nn.Parameter
-    """(N,) l in ``m = sigmoid(l)``, the probability of "person" (paper eq. 4-5, A1)."""
 
-    def __init__(self, human: Mapping[str, Tensor], scene: Mapping[str, Tensor]) -> None:
-        """Join the two starts; every mapping holds all of `ATTRIBUTES`."""
+    def __init__(self, values: Mapping[str, Tensor], human_count: int) -> None:
+        """``values`` name the attributes, each with a leading axis of rows."""
         super().__init__()
-        self.human_count = len(human["means"])
-        for name in ATTRIBUTES:
-            values = torch.cat([human[name], scene[name]]).float()
-            setattr(self, name, nn.Parameter(values))
+        self.attributes = tuple(values)
+        self.human_count = human_count
+        for name, value in values.items():
+            setattr(self, name, nn.Parameter(value.float()))
 
     def __len__(self) -> int:
         """Number of Gaussians of both classes."""
@@ -73,6 +75,49 @@ class GaussianSet(nn.Module):
         """Rows of one class by its name."""
         return self.human if part == "human" else self.scene
 
+    def holds(self, part: Part) -> bool:
+        """Whether Gaussians of this class can be in the set."""
+        return True
+
+    def human_mask(self) -> Bool[Tensor, " N"]:
+        """Hard label h per row."""
+        mask = torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
+        mask[self.human] = True
+        return mask
+
+    def set_rows(self, values: Mapping[str, Tensor], human_count: int) -> None:
+        """Replace all rows, person first; the parameters become new objects."""
+        for name in self.attributes:
+            setattr(self, name, nn.Parameter(values[name].detach().contiguous()))
+        self.human_count = human_count
+
+    def shape(self) -> Shape:
+        """Sizes, rotations and opacities as they are drawn."""
+        raise NotImplementedError
+
+
+class GaussianSet(Rows):
+    """Person and scene in one set.
+
+    The person's Gaussians live in canonical metres, those of the scene in world metres (A6).
+    """
+
+    scales_log: nn.Parameter
+    """(N, 3) natural logarithm of the standard deviations, metres."""
+    quaternions: nn.Parameter
+    """(N, 4) rotation (w, x, y, z), normalised where it is used."""
+    opacity_logits: nn.Parameter
+    """(N,) opacity before the sigmoid."""
+    features: nn.Parameter
+    """(N, 32) input of the colour networks."""
+    semantic_logits: nn.Parameter
+    """(N,) l in ``m = sigmoid(l)``, the probability of "person" (paper eq. 4-5, A1)."""
+
+    def __init__(self, human: Mapping[str, Tensor], scene: Mapping[str, Tensor]) -> None:
+        """Join the two starts; every mapping holds all of `ATTRIBUTES`."""
+        joined = {name: torch.cat([human[name], scene[name]]) for name in ATTRIBUTES}
+        super().__init__(joined, len(human["means"]))
+
     def of_parts(self, values: Float[Tensor, "N *rest"]) -> tuple[Tensor, Tensor]:
         """Values per row, apart for person and scene.
 
@@ -89,17 +134,11 @@ class GaussianSet(nn.Module):
         """Soft probability of "person", m in (0, 1) (paper eq. 5)."""
         return torch.sigmoid(self.semantic_logits)
 
-    def human_mask(self) -> Bool[Tensor, " N"]:
-        """Hard label h per row."""
-        mask = torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
-        mask[self.human] = True
-        return mask
-
-    def set_rows(self, values: Mapping[str, Tensor], human_count: int) -> None:
-        """Replace all rows, person first; the parameters become new objects."""
-        for name in ATTRIBUTES:
-            setattr(self, name, nn.Parameter(values[name].detach().contiguous()))
-        self.human_count = human_count
+    def shape(self) -> Shape:
+        """Read from the attributes."""
+        return Shape(
+            self.scales_log.detach().exp(), self.quaternions.detach(), self.opacities().detach()
+        )
 
 
 def person_first(

@@ -22,11 +22,10 @@ class RowAdam:
             fused=True,
         )
 
-    def set_factor(self, factor: float, only: dict[str, float] | None = None) -> None:
-        """Multiply all base learning rates by ``factor``, or by ``only[name]`` where given."""
+    def set_factors(self, factors: dict[str, float]) -> None:
+        """Multiply each attribute's learning rate at the start by its factor."""
         for group in self.adam.param_groups:
-            name = group["name"]
-            group["lr"] = self.base_rates[name] * (only or {}).get(name, factor)
+            group["lr"] = self.base_rates[group["name"]] * factors[group["name"]]
 
     def zero_grad(self) -> None:
         """Drop gradients."""

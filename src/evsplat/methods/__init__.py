@@ -7,31 +7,33 @@ from typing import Any
 from evsplat.config import from_dict
 from evsplat.errors import ConfigError
 from evsplat.methods.composition import Composition
-from evsplat.methods.config import NOMINAL_ITERATIONS
+from evsplat.methods.config import NOMINAL_ITERATIONS, MethodConfig
 from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.evsplat import compose as compose_evsplat
 from evsplat.methods.paper import PaperConfig, compose
 
-TRAINABLE: dict[str, tuple[type[PaperConfig], Callable[..., Composition]]] = {
+TRAINABLE: dict[str, tuple[type[Any], Callable[..., Composition]]] = {
     "evsplat": (EvsplatConfig, compose_evsplat),
     "paper": (PaperConfig, compose),
 }
 """Configuration and composition of every method that is trained."""
 
 
-def method_config(method: str, values: dict[str, Any], *, where: str) -> PaperConfig:
+def method_config(method: str, values: dict[str, Any], *, where: str) -> MethodConfig:
     """The configuration of a method with ``values`` over its defaults."""
     if method not in TRAINABLE:
         near = difflib.get_close_matches(method, TRAINABLE, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         raise ConfigError(f"--method {method}: unknown; methods are {', '.join(TRAINABLE)}.{hint}")
-    return from_dict(TRAINABLE[method][0], values, where=where)
+    config: MethodConfig = from_dict(TRAINABLE[method][0], values, where=where)
+    return config
 
 
 __all__ = [
     "NOMINAL_ITERATIONS",
     "TRAINABLE",
     "Composition",
+    "MethodConfig",
     "PaperConfig",
     "compose",
     "method_config",

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import torch
 
-from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.deform.model import Model
 from evsplat.gaussians import BodyFrames, DensifyConfig, Part
-from evsplat.methods.config import OptimisationConfig, Weight
+from evsplat.methods.config import Weight
+from evsplat.methods.rates import Learning
 from evsplat.objectives import Objective
 
 
@@ -14,14 +15,14 @@ from evsplat.objectives import Objective
 class Composition:
     """A method put together for one capture; the loop knows nothing else of it."""
 
-    model: HumanSceneModel
+    model: Model
     objectives: list[Objective]
     weights: dict[str, Weight]
     """Weight per named term; a term without one is an error of the method."""
-    optimisation: OptimisationConfig
+    learning: Learning
     densify: dict[Part, DensifyConfig]
-    """Limits for ``human`` and ``scene``."""
-    body_frames: BodyFrames
-    """The body at the training frames, for Gaussians that change class."""
+    """Limits for ``human`` and ``scene``; classes in one set are edited at the same steps."""
+    body_frames: BodyFrames | None
+    """The body at the training frames, for Gaussians that change class; None where none does."""
     generator: torch.Generator
     """All randomness of the training; part of the checkpoint."""

@@ -1,6 +1,7 @@
 """Settings shared by methods that train a Gaussian set."""
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 Weight = float | tuple[tuple[float, float], ...]
 """A constant, or (nominal iteration, value) pairs: piecewise constant from each iteration on."""
@@ -69,3 +70,19 @@ class OptimisationConfig:
     """Nominal iteration until which the person's Gaussians are frozen while skinning settles."""
     semantics_window: tuple[float, float] = (1_000, 12_000)
     """Nominal iterations in which the semantic attribute learns (A2)."""
+
+
+class Iterations(Protocol):
+    """How long."""
+
+    @property
+    def iterations(self) -> int:
+        """Training steps; all schedules stretch with it."""
+
+
+class MethodConfig(Protocol):
+    """What every method's configuration has; a frozen dataclass."""
+
+    @property
+    def optimisation(self) -> Iterations:
+        """How long, and whatever else the method says of its optimisation."""

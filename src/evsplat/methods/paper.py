@@ -26,6 +26,7 @@ from evsplat.gaussians.initialise import (
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import OptimisationConfig, Weight
 from evsplat.methods.prefit import fit_scene, fit_scene_colours, fit_skinning
+from evsplat.methods.rates import learning_of
 from evsplat.objectives import (
     EventChange,
     Isometry,
@@ -247,9 +248,11 @@ class Build:
                 "binarise": config.loss.binarise,
                 "event": config.event.weight,
             },
-            optimisation=config.optimisation,
+            learning=learning_of(model, config.optimisation),
             densify={"human": config.densify_human, **_scene_limits(config)},
-            body_frames=BodyFrames(model.track.body, model.track.bones(times)),
+            body_frames=None
+            if config.semantics == "fixed"
+            else BodyFrames(model.track.body, model.track.bones(times)),
             generator=self.generator,
         )
 

@@ -3,39 +3,55 @@
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.deform.drawing import Drawing
+from evsplat.deform.model import Model
 from evsplat.devices import DeviceCache
 from evsplat.gaussians import PosedGaussians
 from evsplat.imaging import decode
 
+ModelType = TypeVar("ModelType", bound=Model)
+
 
 @dataclass(frozen=True)
-class Step:
+class Step(Generic[ModelType]):
     """One training step: renders of the union of all times that the objectives asked for."""
 
     capture: Capture
-    model: HumanSceneModel
+    model: ModelType
     frame: Frame
     """The drawn training frame."""
     times_us: tuple[int, ...]
     """Sorted and distinct; the order of the pictures below."""
-    rgb: tuple[Float[Tensor, "H W 3"], ...]
-    semantic: tuple[Float[Tensor, "H W"], ...]
-    """The soft attribute composited with the colour's weights, in [0, 1]."""
-    posed: PosedGaussians
+    drawing: Drawing
+    """The pictures and what they were drawn from."""
     nominal: float
     """Progress in nominal iterations (of 15,000)."""
     generator: torch.Generator
     """Randomness of the step; part of the checkpoint."""
     data: DeviceCache
     """Recorded data on the model's device."""
+
+    @property
+    def rgb(self) -> tuple[Float[Tensor, "H W 3"], ...]:
+        """The pictures, sRGB."""
+        return self.drawing.rgb
+
+    @property
+    def semantic(self) -> tuple[Float[Tensor, "H W"], ...]:
+        """The soft attribute composited with the colour's weights, in [0, 1]."""
+        return self.drawing.semantic
+
+    @property
+    def posed(self) -> PosedGaussians:
+        """The Gaussians in the world."""
+        return self.drawing.posed
 
     @cached_property
     def linear(self) -> Float[Tensor, "T H W 3"]:

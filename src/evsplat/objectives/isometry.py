@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Frame
 from evsplat.compiled import native, runs_native
+from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.devices import DeviceCache, send
 from evsplat.neighbours import nearest
 from evsplat.objectives.base import Step
@@ -107,7 +108,7 @@ class Isometry:
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
         """Nothing recorded is needed."""
 
-    def loss(self, step: Step) -> dict[str, Tensor]:
+    def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
         """``isometry_centers`` and ``isometry_covariances``."""
         gaussians, posed = step.model.gaussians, step.posed.human
         count = gaussians.human_count

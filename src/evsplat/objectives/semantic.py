@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from evsplat.capture import Frame
+from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.devices import DeviceCache
 from evsplat.objectives.base import Stateless, Step
 
@@ -68,7 +69,7 @@ class RenderedSemantics(Stateless):
         if frame.mid_us in self.bounds:
             data.prefetch(("bounds", frame.mid_us), self.bounds[frame.mid_us].masks)
 
-    def loss(self, step: Step) -> dict[str, Tensor]:
+    def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
         """``semantic`` and the pressure ``binarise`` = mean m (1 - m) (A2)."""
         values: list[Float[Tensor, ""]] = []
         for time, drawn in zip(step.times_us, step.semantic, strict=True):

@@ -23,7 +23,7 @@ class SkinningPrior(Stateless):
         """None: the prior lives in canonical space."""
         return ()
 
-    def loss(self, step: Step) -> dict[str, Tensor]:
+    def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
         """``skinning``."""
         return {"skinning": self.of(step.model, step.generator)}
 

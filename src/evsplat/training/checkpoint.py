@@ -9,10 +9,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.deform.model import Model
 from evsplat.errors import DataError
 from evsplat.files import atomic_path
-from evsplat.gaussians import ATTRIBUTES
 
 KEEP = 2
 """Checkpoints kept in a run; the one before the last survives a disk that fills up."""
@@ -53,12 +52,13 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, state
 
 
-def load_model(model: HumanSceneModel, tensors: dict[str, Tensor], human_count: int) -> None:
+def load_model(model: Model, tensors: dict[str, Tensor], human_count: int) -> None:
     """Give a model the parameters of a checkpoint, whatever its number of Gaussians was."""
     entries = below("model", tensors)
-    device = model.gaussians.means.device
-    rows = {name: entries[f"gaussians.{name}"].to(device) for name in ATTRIBUTES}
-    model.gaussians.set_rows(rows, human_count)
+    for name, rows in model.sets.items():
+        device = rows.means.device
+        values = {key: entries[f"{name}.{key}"].to(device) for key in rows.attributes}
+        rows.set_rows(values, human_count)
     model.load_state_dict(entries)
 
 

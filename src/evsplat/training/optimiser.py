@@ -4,58 +4,38 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool
-from torch import Tensor, nn
+from torch import Tensor
 
-from evsplat.deform.human_scene import HumanSceneModel
-from evsplat.gaussians import ATTRIBUTES, RowAdam
-from evsplat.methods.config import NOMINAL_ITERATIONS, LearningRates, OptimisationConfig
+from evsplat.deform.model import Model
+from evsplat.gaussians import RowAdam
+from evsplat.methods.rates import Learning
 
 
 class Optimiser:
-    """Both Adams with one schedule."""
+    """One Adam per set of Gaussians and one of all networks, with one clock."""
 
-    def __init__(self, model: HumanSceneModel, config: OptimisationConfig) -> None:
-        """Group the model's parameters by learning rate."""
-        rates = config.rates
-        self.config, self.model = config, model
-        gaussians = model.gaussians
-        self.rows = RowAdam(
-            {name: getattr(gaussians, name) for name in ATTRIBUTES},
-            {name: getattr(rates, name) for name in ATTRIBUTES},
-        )
-        groups: list[tuple[list[nn.Parameter], float, float]] = [
-            (list(model.skinning.parameters()), rates.skinning, 0.0),
-            (
-                [*model.non_rigid.parameters(), *model.pose_encoder.parameters()],
-                rates.non_rigid,
-                0.0,
-            ),
-            (
-                [*model.human_colour.parameters(), *model.scene_colour.parameters()],
-                rates.colour,
-                0.0,
-            ),
-            ([model.latents], rates.latents, rates.latent_weight_decay),
-            (
-                [model.rotation_residuals, model.translation_residuals],
-                rates.pose_correction,
-                0.0,
-            ),
-        ]
-        self.clipped = [parameter for parameters, *_ in groups for parameter in parameters]
-        groups += [
-            (list(part.parameters()), rate, 0.0)
-            for part, rate in (
-                (model.shading, rates.shading),
-                (model.shadow, rates.shadow),
-                (model.sensor, rates.sensor),
+    def __init__(self, model: Model, learning: Learning) -> None:
+        """Take the model's parameters as ``learning`` groups them."""
+        self.model, self.learning = model, learning
+        self.rows = {
+            name: RowAdam(
+                {attribute: rows.get_parameter(attribute) for attribute in rows.attributes},
+                {
+                    attribute: learning.rows[name][attribute].rate.start
+                    for attribute in rows.attributes
+                },
             )
-            if part is not None
-        ]
+            for name, rows in model.sets.items()
+        }
+        self.clipped = [p for group in learning.networks if group.clipped for p in group.parameters]
         self.networks = torch.optim.Adam(
             [
-                {"params": parameters, "lr": rate, "base": rate, "weight_decay": decay}
-                for parameters, rate, decay in groups
+                {
+                    "params": group.parameters,
+                    "lr": group.rate.start,
+                    "weight_decay": group.weight_decay,
+                }
+                for group in learning.networks
             ],
             eps=1e-15,
             fused=True,
@@ -63,19 +43,21 @@ class Optimiser:
 
     def set_progress(self, nominal: float) -> None:
         """Set all learning rates for a nominal iteration."""
-        rates = self.config.rates
-        factor = decay(rates, rates.final, nominal)
-        self.rows.set_factor(factor, {"means": decay(rates, rates.means_final, nominal)})
-        for group in self.networks.param_groups:
-            group["lr"] = group["base"] * factor
+        for name, adam in self.rows.items():
+            rates = self.learning.rows[name]
+            adam.set_factors({key: row.rate.factor(nominal) for key, row in rates.items()})
+        groups = zip(self.networks.param_groups, self.learning.networks, strict=True)
+        for group, network in groups:
+            group["lr"] = network.rate.start * network.rate.factor(nominal)
 
     def zero_grad(self) -> None:
         """Drop all gradients."""
-        self.rows.zero_grad()
+        for adam in self.rows.values():
+            adam.zero_grad()
         self.networks.zero_grad(set_to_none=True)
 
     def step(self, nominal: float, sound: Tensor | None = None) -> None:
-        """Mask what is frozen, clip the networks' gradient and step both Adams.
+        """Mask what is frozen, clip the networks' gradient and step all Adams.
 
         Where ``sound`` is false (one value, on the device) nothing moves; nobody waits for it.
         """
@@ -83,24 +65,24 @@ class Optimiser:
             # What gradient scaling sets to have a fused Adam leave out a step.
             for _, adam in self._adams():
                 adam.found_inf = (~sound).float()  # type: ignore[attr-defined]
-        gaussians = self.model.gaussians
-        if nominal < self.config.human_start:
-            for name in ATTRIBUTES:
-                gradient = getattr(gaussians, name).grad
-                if gradient is not None:
-                    gradient[gaussians.human] = 0
-        start, end = self.config.semantics_window
-        if gaussians.semantic_logits.grad is not None and not start <= nominal < end:
-            gaussians.semantic_logits.grad = None
-        self.rows.step()
-        torch.nn.utils.clip_grad_norm_(self.clipped, self.config.rates.clip_networks)
+        for name, rows in self.model.sets.items():
+            for attribute in rows.attributes:
+                parameter = rows.get_parameter(attribute)
+                start, end = self.learning.rows[name][attribute].window
+                if not start <= nominal < end:
+                    parameter.grad = None
+                elif nominal < self.learning.human_start and parameter.grad is not None:
+                    parameter.grad[rows.human] = 0
+            self.rows[name].step()
+        if self.learning.clip is not None:
+            torch.nn.utils.clip_grad_norm_(self.clipped, self.learning.clip)
         self.networks.step()
 
     def finite(self) -> Bool[Tensor, ""]:
         """Whether every gradient is finite, told on the device."""
         gradients = [
             p.grad
-            for adam in (self.rows.adam, self.networks)
+            for _, adam in self._adams()
             for group in adam.param_groups
             for p in group["params"]
             if p.grad is not None
@@ -122,19 +104,22 @@ class Optimiser:
         for label, adam in self._adams():
             states: dict[int, dict[str, Any]] = {}
             for name, value in flat.items():
-                which, number, key = name.split(".")
+                which, number, key = name.rsplit(".", 2)
                 if which == label:
                     states.setdefault(int(number), {})[key] = value
             adam.load_state_dict(
                 {"state": states, "param_groups": adam.state_dict()["param_groups"]}
             )
 
-    def _adams(self) -> tuple[tuple[str, torch.optim.Adam], ...]:
-        return ("rows", self.rows.adam), ("networks", self.networks)
+    def learning_rates(self) -> dict[str, float]:
+        """Of the Gaussians' attributes, for the log."""
+        several = len(self.rows) > 1
+        return {
+            f"{name}.{group['name']}" if several else group["name"]: group["lr"]
+            for name, adam in self.rows.items()
+            for group in adam.adam.param_groups
+        }
 
-
-def decay(rates: LearningRates, final: float, nominal: float) -> float:
-    """Factor that is 1 during the constant part and falls exponentially to ``final`` at the end."""
-    progress = nominal / NOMINAL_ITERATIONS
-    falling = max(0.0, progress - rates.constant) / (1 - rates.constant)
-    return final ** min(falling, 1.0)
+    def _adams(self) -> list[tuple[str, torch.optim.Adam]]:
+        rows = [(name, adam.adam) for name, adam in self.rows.items()]
+        return [*rows, ("networks", self.networks)]

@@ -1,6 +1,5 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
-import copy
 import json
 import platform
 from collections.abc import Sequence
@@ -18,10 +17,10 @@ from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, load_capture
 from evsplat.config import load_yaml, to_dict
 from evsplat.deform.drawing import draw, draw_depth
-from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.deform.model import Model
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
-from evsplat.methods import TRAINABLE, PaperConfig, method_config
+from evsplat.methods import TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
 from evsplat.render import choose_device, render
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, load_model
@@ -104,12 +103,12 @@ class GaussianReconstruction:
     """A trained model, drawn from any camera at any time of the recording."""
 
     name: str
-    model: HumanSceneModel
+    model: Model
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
         with torch.no_grad():
-            camera = camera.to(self.model.box_low.device)
+            camera = camera.to(self.model.device)
             posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
             if parts == "all":
                 drawing = draw(self.model, posed, camera)
@@ -136,7 +135,7 @@ class GaussianReconstruction:
     ) -> Float[Tensor, "T H W"]:
         """Mean depth of what is drawn; see `WithDepth`."""
         with torch.no_grad():
-            camera = camera.to(self.model.box_low.device)
+            camera = camera.to(self.model.device)
             posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
             depth = draw_depth(posed, camera, parts=parts).cpu()
         return depth.expand(len(times_us), *depth.shape[1:])
@@ -147,18 +146,8 @@ class GaussianReconstruction:
         return self.model.track
 
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
-        """The same person doing what ``track`` says; see `Posable`.
-
-        What was learned of single frames does not belong to another motion: pose residuals are left
-        out, and the colour takes the mean of the latents.
-        """
-        model = copy.deepcopy(self.model)
-        model.track = track.to(model.box_low.device)
-        with torch.no_grad():
-            model.latents.copy_(model.latents.mean(0))
-            model.rotation_residuals.zero_()
-            model.translation_residuals.zero_()
-        return GaussianReconstruction(self.name, model)
+        """The same person doing what ``track`` says; see `Posable`."""
+        return GaussianReconstruction(self.name, self.model.following(track))
 
 
 @dataclass(frozen=True)
@@ -166,7 +155,7 @@ class Run:
     """A trained run, ready to be drawn."""
 
     path: Path
-    config: PaperConfig
+    config: MethodConfig
     method: str
     capture: Capture
     reconstruction: Reconstruction
@@ -177,7 +166,7 @@ class Run:
     """Number of Gaussians, ``human`` and ``scene``."""
 
 
-def read_config(folder: RunFolder) -> tuple[str, PaperConfig, dict[str, Any]]:
+def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     """Method, configuration and facts of a run folder."""
     if not folder.config.exists():
         raise DataError(f"{folder.path}: not a run folder, config.yaml is missing.")
@@ -186,7 +175,7 @@ def read_config(folder: RunFolder) -> tuple[str, PaperConfig, dict[str, Any]]:
     return method, method_config(method, values, where=str(folder.config)), read_json(folder.facts)
 
 
-def config_values(method: str, config: PaperConfig) -> dict[str, Any]:
+def config_values(method: str, config: MethodConfig) -> dict[str, Any]:
     """What config.yaml holds."""
     return {"method": method, **to_dict(config)}
 
@@ -204,7 +193,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto") -> Run:
     compose = TRAINABLE[method][1]
     composition = compose(config, capture, facts["seed"], device=device, fit=False)
     load_model(composition.model, tensors, state["human_count"])
-    gaussians = composition.model.gaussians
+    sets = composition.model.sets.values()
     return Run(
         path=folder.path,
         config=config,
@@ -214,5 +203,8 @@ def load_run(run_dir: Path | str, *, device: str = "auto") -> Run:
         iteration=state["clock"]["iteration"],
         train_seconds=state["clock"]["seconds"],
         device=facts["device"],
-        gaussians={"human": gaussians.human_count, "scene": gaussians.scene_count},
+        gaussians={
+            "human": sum(rows.human_count for rows in sets),
+            "scene": sum(rows.scene_count for rows in sets),
+        },
     )

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from evsplat.capture import load_capture
 from evsplat.config import load_yaml, override, save_yaml
 from evsplat.errors import ConfigError, DataError
-from evsplat.methods import TRAINABLE, PaperConfig, method_config
+from evsplat.methods import TRAINABLE, MethodConfig, method_config
 from evsplat.methods.config import Weight
 from evsplat.render import choose_device
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
@@ -133,7 +133,7 @@ def train(
     return folder.path
 
 
-def schedule_table(settings: PaperConfig, weights: dict[str, Weight]) -> str:
+def schedule_table(settings: MethodConfig, weights: dict[str, Weight]) -> str:
     """Every weight over nominal iterations, one line each."""
     lines = [f"schedule of {settings.optimisation.iterations} iterations (nominal units):"]
     for name, weight in weights.items():
@@ -182,7 +182,6 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
 
 def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
     clock = trainer.clock
-    rates = {g["name"]: g["lr"] for g in trainer.optimiser.rows.adam.param_groups}
     return {
         "iteration": clock.iteration,
         "nominal": round(clock.nominal, 3),
@@ -192,7 +191,7 @@ def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
         "psnr": report.psnr,
         **trainer.counts(),
         "skipped": trainer.bad.settle(),
-        "lr": rates,
+        "lr": trainer.optimiser.learning_rates(),
     }
 
 

@@ -1,5 +1,6 @@
 """The training loop: draw a frame, render what the objectives need, compare, step, densify."""
 
+import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -9,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.deform.drawing import draw
+from evsplat.deform.drawing import Drawing
 from evsplat.devices import DeviceCache, default_cache_bytes
-from evsplat.gaussians import ScreenStatistics, densify, flip_labels
+from evsplat.gaussians import GaussianSet, Part, Rows, ScreenStatistics, densify, flip_labels
 from evsplat.gaussians.densify import reset_opacities
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import weight_at
@@ -20,6 +21,9 @@ from evsplat.training.bad_steps import BadSteps
 from evsplat.training.checkpoint import below, flatten, load_model
 from evsplat.training.clock import Clock
 from evsplat.training.optimiser import Optimiser
+
+PARTS: tuple[Part, Part] = ("human", "scene")
+"""In the order of a drawing's layers."""
 
 
 @dataclass(frozen=True)
@@ -68,15 +72,15 @@ class Trainer:
         """
         self.composition, self.capture, self.clock = composition, capture, clock
         self.model = composition.model
-        self.device = self.model.box_low.device
-        self.optimiser = Optimiser(self.model, composition.optimisation)
+        self.device = self.model.device
+        self.optimiser = Optimiser(self.model, composition.learning)
         self.data = DeviceCache(
             self.device, default_cache_bytes(self.device) if cache_bytes is None else cache_bytes
         )
         self.queue: list[int] = []
         self.bad = BadSteps(self.device, str(capture.path))
         self.previous_nominal = 0.0
-        self.statistics = self._fresh_statistics()
+        self.statistics = {name: _fresh(rows) for name, rows in self.model.sets.items()}
 
     def step(self) -> StepReport | None:
         """One optimisation step; None when it was skipped because a value was not finite."""
@@ -88,25 +92,13 @@ class Trainer:
         times = sorted({t for o in self.composition.objectives for t in o.times(frame, nominal)})
 
         camera = self.capture.camera(frame).to(self.device)
-        once = self.model.config.networks_once
-        noise = self.model.draw_noise(1 if once else len(times), generator)
-        posed = self.model.at(
-            times,
-            camera.center(),
-            noise=noise,
-            share_skinning=True,
-            networks_at_us=frame.mid_us if once else None,
-        )
-        drawing = draw(self.model, posed, camera, center_gradients=True)
-        output = drawing.output
+        drawing = self.model.training_drawing(times, frame, camera, generator)
         step = Step(
             self.capture,
             self.model,
             frame,
             tuple(times),
-            drawing.rgb,
-            drawing.semantic,
-            posed,
+            drawing,
             nominal,
             generator,
             self.data,
@@ -131,17 +123,7 @@ class Trainer:
         # The host knows that the step is sound, or a GPU will know it.
         unsure = None if self.bad.at_once else sound
         self.optimiser.step(nominal, unsure)
-        height, width = output.alpha.shape[1:]
-        gaussians = self.model.gaussians
-        for rows, layer, radii in (
-            (gaussians.human, drawing.moving, output.radii),
-            (gaussians.scene, drawing.static, output.static_radii),
-        ):
-            assert layer.centers2d_offset is not None and layer.centers2d_offset.grad is not None
-            gradient = layer.centers2d_offset.grad
-            if unsure is not None:
-                gradient, radii = (torch.where(unsure, v, 0) for v in (gradient, radii))
-            self.statistics.add(rows, gradient, radii, width, height)
+        self._count(drawing, unsure)
         self._edit(frame, nominal)
         drawn = drawing.rgb[step.index(frame.mid_us)].detach()
         error = (drawn.clamp(0, 1) - step.observed(frame)).square().mean()
@@ -150,14 +132,18 @@ class Trainer:
 
     def counts(self) -> dict[str, int]:
         """Number of Gaussians per class."""
-        gaussians = self.model.gaussians
-        return {"human": gaussians.human_count, "scene": gaussians.scene_count}
+        sets = self.model.sets.values()
+        return {
+            "human": sum(rows.human_count for rows in sets),
+            "scene": sum(rows.scene_count for rows in sets),
+        }
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """All tensors and all numbers that a resume needs."""
         tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
         tensors |= flatten("optimiser", self.optimiser.state())
-        tensors |= flatten("statistics", vars(self.statistics))
+        for name, statistics in self.statistics.items():
+            tensors |= flatten(f"statistics.{name}", vars(statistics))
         for number, objective in enumerate(self.composition.objectives):
             tensors |= flatten(f"objective{number}", objective.state())
         for name, cache in self.model.row_caches.items():
@@ -168,16 +154,19 @@ class Trainer:
             "queue": self.queue,
             "skipped": self.bad.settle(),
             "previous_nominal": self.previous_nominal,
-            "human_count": self.model.gaussians.human_count,
+            "human_count": self.counts()["human"],
         }
         return tensors, state
 
     def load_state(self, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:
         """Go back to the moment of `state`; the clock's limits stay those of this run."""
         load_model(self.model, tensors, state["human_count"])
-        self.optimiser = Optimiser(self.model, self.composition.optimisation)
+        self.optimiser = Optimiser(self.model, self.composition.learning)
         self.optimiser.load_state(below("optimiser", tensors))
-        self.statistics = ScreenStatistics(**below("statistics", tensors)).to(self.device)
+        self.statistics = {
+            name: ScreenStatistics(**below(f"statistics.{name}", tensors)).to(self.device)
+            for name in self.model.sets
+        }
         for number, objective in enumerate(self.composition.objectives):
             objective.load_state(below(f"objective{number}", tensors))
         for name, cache in self.model.row_caches.items():
@@ -201,29 +190,51 @@ class Trainer:
             objective.prefetch(frames[self.queue[-1]], self.clock.nominal, self.data)
         return frame
 
-    def _edit(self, frame: Frame, nominal: float) -> None:
-        """Edit the set where the schedule crosses a densification step."""
-        gaussians, rows = self.model.gaussians, self.optimiser.rows
-        limits = self.composition.densify
-        previous, self.previous_nominal = self.previous_nominal, nominal
-        for part, limit in limits.items():
-            if any(previous < reset <= nominal for reset in limit.opacity_reset):
-                reset_opacities(gaussians, rows, gaussians.rows_of(part))
-        every = limits["human"].every
-        if nominal // every == previous // every:
-            return
-        self.bad.settle()
-        densify(gaussians, rows, self.statistics, limits, nominal, self.composition.generator)
-        if self.model.semantics != "fixed":
-            drawn = self.capture.train_frames.index(frame)
-            flip_labels(gaussians, rows, self.composition.body_frames, drawn)
-        for keeper in (*self.model.row_caches.values(), *self.composition.objectives):
-            keeper.rows_changed()
-        self.statistics = self._fresh_statistics()
+    def _count(self, drawing: Drawing, unsure: Tensor | None) -> None:
+        """Add the step to the statistics, nothing where ``unsure`` is false."""
+        height, width = drawing.output.alpha.shape[1:]
+        gradients = drawing.center_gradients()
+        radii = (drawing.output.radii, drawing.output.static_radii)
+        for name, rows in self.model.sets.items():
+            for part, gradient, radius in zip(PARTS, gradients, radii, strict=True):
+                place = rows.rows_of(part)
+                if place.start == place.stop:
+                    continue
+                if unsure is not None:
+                    gradient, radius = (torch.where(unsure, v, 0) for v in (gradient, radius))
+                self.statistics[name].add(place, gradient, radius, width, height)
 
-    def _fresh_statistics(self) -> ScreenStatistics:
-        means = self.model.gaussians.means
-        return ScreenStatistics.zeros(len(means), means.device)
+    def _edit(self, frame: Frame, nominal: float) -> None:
+        """Edit the sets where the schedule crosses a densification step."""
+        generator, edited = self.composition.generator, False
+        previous, self.previous_nominal = self.previous_nominal, nominal
+        for name, rows in self.model.sets.items():
+            optimiser = self.optimiser.rows[name]
+            limits = {
+                part: limit for part, limit in self.composition.densify.items() if rows.holds(part)
+            }
+            for part, limit in limits.items():
+                if any(previous < reset <= nominal for reset in limit.opacity_reset):
+                    reset_opacities(rows, optimiser, rows.rows_of(part))
+            every = next((limit.every for limit in limits.values()), math.inf)
+            if nominal // every == previous // every:
+                continue
+            if not edited:
+                self.bad.settle()
+            edited = True
+            densify(rows, optimiser, self.statistics[name], limits, nominal, generator)
+            if self.composition.body_frames is not None:
+                assert isinstance(rows, GaussianSet)  # only there classes share a set
+                drawn = self.capture.train_frames.index(frame)
+                flip_labels(rows, optimiser, self.composition.body_frames, drawn)
+            self.statistics[name] = _fresh(rows)
+        for keeper in (*self.model.row_caches.values(), *self.composition.objectives):
+            if edited:
+                keeper.rows_changed()
+
+
+def _fresh(rows: Rows) -> ScreenStatistics:
+    return ScreenStatistics.zeros(len(rows), rows.means.device)
 
 
 def _not_numbers(terms: dict[str, Tensor]) -> list[str]:
