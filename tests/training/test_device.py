@@ -187,7 +187,7 @@ def test_a_step_stays_on_its_device_and_never_waits(settings, foreign, tiny_capt
     assert report.measured.device.type == NAME
     for parameter in trainer.model.parameters():
         assert parameter.device.type == NAME
-    assert trainer.statistics.gradient_sum.device.type == NAME
+    assert trainer.statistics["gaussians"].gradient_sum.device.type == NAME
 
 
 def test_the_foreign_device_finds_what_waits_and_what_mixes(foreign):
