@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.capture import Camera, Frame
 from evsplat.errors import ConfigError, DataError
-from evsplat.export import camera_at, render_run, rendered_instants, rendering
+from evsplat.export import render_run, rendering
+from evsplat.film import camera_at, rendered_instants
 from evsplat.methods.reconstruction import Rendering
 
 WIDTH, HEIGHT = 20, 14
@@ -77,7 +78,9 @@ class _Clock:
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """A folder that `load_run` takes for a run of the clock on the recording."""
-    loaded = SimpleNamespace(capture=_Recording(), reconstruction=_Clock())
+    loaded = SimpleNamespace(
+        capture=_Recording(), reconstruction=_Clock(), method="clock", iteration=1, train_seconds=1
+    )
     monkeypatch.setattr(rendering, "load_run", lambda path, **_: loaded)
     path = tmp_path / "run"
     path.mkdir()

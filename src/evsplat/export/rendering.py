@@ -1,176 +1,150 @@
-"""Drawing a trained run: its test frames, or the whole recording at any frame rate."""
+"""Drawing a trained run: its test frames, or a film of the recording or of another motion."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image
-from scipy.spatial.transform import Rotation, Slerp
-from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.capture import Camera, Capture, Frame
 from evsplat.errors import ConfigError, DataError
-from evsplat.export.video import write_pictures, write_video
-from evsplat.methods.reconstruction import Parts, Reconstruction
+from evsplat.evaluation.pictures import to_bytes
+from evsplat.events import SensorSettings
+from evsplat.export.video import write_animation, write_pictures, write_video
+from evsplat.film.events import copy_events, event_picture, event_pictures, simulate_film
+from evsplat.film.film import Film
+from evsplat.film.kept import KeptPictures, Shot, plan_of
+from evsplat.film.looks import Look, depth_colours
+from evsplat.film.scene import Scene, recorded_by
+from evsplat.methods.trivial import nearest_in_time
 from evsplat.training.run import load_run
 
-_TIMES_AT_ONCE = 8
+_NEAREST = 0.6
+"""Depth that gets the lightest colour, as a share of the distance to the person."""
+_VIDEO, _ANIMATION = (".mp4",), (".gif", ".webp")
 
-
-@dataclass(frozen=True)
-class Instant:
-    """One picture to draw."""
-
-    name: str
-    """File name without ending, where pictures are written one by one."""
-    time_us: int
-    frame: Frame
-    """The recorded frame nearest in time: the picture for ``beside``."""
-
-
-def rendered_instants(
-    capture: Capture,
-    what: Literal["sequence", "test"],
-    *,
-    rate_hz: float = 30.0,
-    camera: str | None = None,
-) -> list[Instant]:
-    """Say which instants are drawn.
-
-    ``test``: mid-exposure of each held-out frame. ``sequence``: from the first to the last
-    mid-exposure (poses are known between them), ``rate_hz`` instants per second of the recording.
-    Frames are those of ``camera`` where it recorded any, else those of the first camera.
-    """
-    frames = _recorded_by(capture, camera)
-    if what == "test":
-        frames = [frame for frame in frames if frame.split == "test"]
-        if not frames:
-            raise DataError(f"{capture.path}: no frame has split 'test'; render the sequence.")
-        return [Instant(frame.name, frame.mid_us, frame) for frame in frames]
-    mids = np.array([frame.mid_us for frame in frames])
-    count = 1 + int((mids[-1] - mids[0]) * rate_hz / 1e6)
-    times = mids[0] + np.rint(np.arange(count) * (1e6 / rate_hz)).astype(np.int64)
-    nearest = np.searchsorted((mids[1:] + mids[:-1]) / 2, times)
-    return [
-        Instant(f"{index:05d}", int(time), frames[near])
-        for index, (time, near) in enumerate(zip(times, nearest, strict=True))
-    ]
+Picture = UInt8[np.ndarray, "H W C"]
 
 
 def render_run(
     run: Path | str,
     *,
-    what: Literal["sequence", "test"] = "sequence",
     out: Path | str | None = None,
-    fps: float = 30.0,
-    slow: float = 1.0,
-    parts: Parts = "all",
-    camera: str | None = None,
-    beside: bool = False,
+    events_out: Path | str | None = None,
     device: str = "auto",
+    film: Film | None = None,
+    **options: object,
 ) -> Path:
     """Draw a run's reconstruction and return the file or folder that was written.
 
-    An ``out`` that ends in .mp4 becomes a video, any other a folder of PNG files; without it
-    ``run/renders/`` receives ``sequence*.mp4`` or ``test*/``. ``slow`` is how many times slower
-    than life the sequence plays: ``fps * slow`` instants per second are drawn. ``beside`` puts
-    the blurry frame nearest in time at the left. Nothing is left behind when it is interrupted.
+    What is drawn is a `Film`, whose fields can be given as ``options``. An ``out`` that ends in
+    .mp4, .webp or .gif becomes a video or animation, any other a folder of PNG files; without it
+    ``run/renders/`` receives it. ``events_out`` takes the simulated events of ``show="events"``,
+    in any format that `evsplat.events.write_events` knows.
+
+    Pictures are kept beside the result in ``NAME.partial`` until it is complete: when stopped, the
+    same call goes on from there.
     """
-    if not 0 < fps <= 1000:
-        raise ConfigError(f"--fps {fps:g}: expected a frame rate above 0 and at most 1000 Hz.")
-    if not 0 < slow <= 10_000:
-        raise ConfigError(f"--slow {slow:g}: expected a factor above 0 and at most 10000.")
+    if film is not None and options:
+        raise ConfigError(f"give a film or its fields, not both: {', '.join(options)}.")
+    film = film or Film(**options)  # type: ignore[arg-type]
+    out = Path(run) / "renders" / film.file_name() if out is None else Path(out)
+    ours = out.parent == Path(run) / "renders"
+    _check_output(film, out, events_out, ours=ours)
     loaded = load_run(Path(run), device=device)
-    capture = loaded.capture
-    if camera is not None and camera not in capture.cameras:
-        known = ", ".join(capture.cameras)
-        raise ConfigError(f"--camera {camera}: the capture has no such camera, only {known}.")
-    instants = rendered_instants(capture, what, rate_hz=fps * slow, camera=camera)
-    pictures = _pictures(
-        loaded.reconstruction, capture, instants, camera=camera, parts=parts, beside=beside
+    if film.camera is not None and film.camera not in loaded.capture.cameras:
+        known = ", ".join(loaded.capture.cameras)
+        raise ConfigError(f"--camera {film.camera}: the capture has no such camera, only {known}.")
+    scene = Scene.of(film, loaded.capture, loaded.reconstruction)
+    look = Look(film.show, film.parts, film.transparent)
+    plan = plan_of(
+        scene.shots, look, film, loaded.method, loaded.iteration, loaded.train_seconds, *scene.poses
     )
-    named = zip((instant.name for instant in instants), pictures, strict=True)
-    if out is None:
-        suffix = "".join(f"-{part}" for part in (parts, camera) if part not in (None, "all"))
-        name = f"{what}{suffix}{'-beside' if beside else ''}"
-        path = Path(run) / "renders" / (f"{name}.mp4" if what == "sequence" else name)
-    else:
-        path = Path(out)
-    if path.suffix.lower() == ".mp4":
-        write_video(path, pictures, fps=fps)
-    else:
-        write_pictures(path, named, replace=out is None)
-    return path
+    kept = KeptPictures(out.with_name(out.name + ".partial"), plan)
+    kept.fill(scene.reconstruction, look, scene.shots)
+    _write(film, scene, kept, out, events_out, replace=ours)
+    kept.remove()
+    return out
 
 
-def _recorded_by(capture: Capture, camera: str | None) -> list[Frame]:
-    """Return the frames of one camera in the order of time."""
-    recording = {frame.camera for frame in capture.frames}
-    name = camera if camera in recording else capture.frames[0].camera
-    return sorted((f for f in capture.frames if f.camera == name), key=lambda f: f.mid_us)
+def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours: bool) -> None:
+    """Refuse before hours of drawing what could not be written after them."""
+    suffix = out.suffix.lower()
+    if film.transparent and suffix in _VIDEO:
+        raise ConfigError(
+            "--transparent: mp4 cannot hold it; give --out a name in .webp or .gif or a folder."
+        )
+    if events_out is not None and film.show != "events":
+        raise ConfigError("--events: goes with --show events, which simulates them.")
+    if suffix == ".gif" and film.fps > 50:
+        raise ConfigError(f"--fps {film.fps:g}: a GIF plays at most 50 pictures a second.")
+    if suffix not in (*_VIDEO, *_ANIMATION):
+        if out.exists() and not out.is_dir():
+            raise DataError(f"{out}: is a file; give a folder or a name in .mp4, .webp or .gif.")
+        if not ours and out.is_dir() and any(out.iterdir()):
+            raise DataError(f"{out}: the folder is not empty; give a new one to --out.")
 
 
-def camera_at(capture: Capture, name: str, time_us: int) -> Camera:
-    """Return a camera of the capture at any time.
-
-    A moving one is interpolated between the mid-exposures of its frames, where its poses are
-    known: centre linearly, orientation along the shortest rotation; beyond the ends it stands.
-    """
-    frames = [frame for frame in capture.frames if frame.camera == name]
-    if all(frame.world_to_camera is None for frame in frames):
-        return capture.cameras[name]
-    frames.sort(key=lambda frame: frame.mid_us)
-    mids = np.array([frame.mid_us for frame in frames])
-    after = int(np.clip(np.searchsorted(mids, time_us), 1, max(len(frames) - 1, 1)))
-    ends = [capture.camera(frame) for frame in frames[after - 1 : after + 1]]
-    if len(ends) == 1:
-        return ends[0]
-    share = float(np.clip((time_us - mids[after - 1]) / (mids[after] - mids[after - 1]), 0, 1))
-    rotations = np.stack([end.world_to_camera[:3, :3].double().numpy() for end in ends])
-    rotation = Slerp([0, 1], Rotation.from_matrix(rotations))(share).as_matrix()
-    center = torch.lerp(ends[0].center().double(), ends[1].center().double(), share).numpy()
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation, -rotation @ center
-    return replace(ends[0], world_to_camera=torch.from_numpy(world_to_camera).float())
-
-
-@torch.no_grad()
-def _pictures(
-    reconstruction: Reconstruction,
-    capture: Capture,
-    instants: Sequence[Instant],
+def _write(
+    film: Film,
+    scene: Scene,
+    kept: KeptPictures,
+    out: Path,
+    events_out: Path | str | None,
     *,
-    camera: str | None,
-    parts: Parts,
-    beside: bool,
-) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-    """Draw the instants in order, several at once where the camera stands still."""
-    at_once = _TIMES_AT_ONCE if capture.is_static_camera else 1
-    with tqdm(total=len(instants), unit="picture", desc="render", dynamic_ncols=True) as progress:
-        for start in range(0, len(instants), at_once):
-            batch = instants[start : start + at_once]
-            view = camera_at(capture, camera or batch[0].frame.camera, batch[0].time_us)
-            rgb = reconstruction.render(view, [i.time_us for i in batch], parts=parts).rgb
-            for instant, image in zip(batch, rgb, strict=True):
-                picture = _to_bytes(image)
-                if beside:
-                    picture = _side_by_side(_to_bytes(capture.image(instant.frame)), picture)
-                yield picture
-                progress.update()
+    replace: bool,
+) -> None:
+    """Make the result of the kept pictures."""
+    suffix = out.suffix.lower()
+    folder = suffix not in (*_VIDEO, *_ANIMATION)
+    shots = scene.shots
+    names = [shot.name for shot in shots]
+    if film.show == "events":
+        settings = film.sensor or SensorSettings()
+        store = simulate_film(kept, shots, settings)
+        if events_out is not None:
+            copy_events(store, events_out, shots, settings)
+        shots = shots[: -1 : scene.step]
+        names = [f"{index:05d}" for index in range(len(shots))]
+        pictures: Iterator[Picture] = event_pictures(store, scene.edges_us())
+    elif film.show == "depth" and not folder:
+        nearest = _NEAREST * scene.person_m()
+        pictures = (depth_colours(kept.read(shot), nearest) for shot in shots)
+    else:
+        pictures = (kept.read(shot) for shot in shots)
+    if film.beside:
+        pictures = _beside(film, scene, shots, pictures)
+    told = tqdm(
+        pictures, total=len(shots), unit="picture", desc="write", dynamic_ncols=True, leave=False
+    )
+    if folder:
+        named = zip(names, told, strict=True)
+        write_pictures(out, named, replace=replace)
+    elif suffix in _VIDEO:
+        write_video(out, told, fps=film.fps)
+    else:
+        write_animation(out, told, fps=film.fps)
 
 
-def _to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    return (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+def _beside(
+    film: Film, scene: Scene, shots: Sequence[Shot], pictures: Iterator[Picture]
+) -> Iterator[Picture]:
+    """The recorded frame or recorded events at the left of each picture."""
+    capture = scene.capture
+    frames = recorded_by(capture, film.camera)
+    windows = zip(scene.edges_us()[:-1], scene.edges_us()[1:], strict=True)
+    for shot, picture in zip(shots, pictures, strict=True):
+        if film.show == "events":
+            assert capture.events is not None
+            recorded = capture.events.between(*next(windows))
+            left = event_picture(recorded, capture.events.height, capture.events.width)
+        else:
+            left = to_bytes(capture.image(nearest_in_time(frames, shot.time_us)))
+        yield _side_by_side(left, picture)
 
 
-def _side_by_side(
-    left: UInt8[np.ndarray, "H W 3"], right: UInt8[np.ndarray, "H2 W2 3"]
-) -> UInt8[np.ndarray, "H2 W3 3"]:
+def _side_by_side(left: Picture, right: Picture) -> Picture:
     """Join two pictures; the left one is scaled to the height of the right one."""
     if left.shape[0] != right.shape[0]:
         width = round(left.shape[1] * right.shape[0] / left.shape[0])

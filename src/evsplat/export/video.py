@@ -1,4 +1,4 @@
-"""Writing pictures as an H.264 video or as a folder of PNG files, whole or not at all."""
+"""Writing pictures as H.264 video, WebP or GIF animation or PNG files, whole or not at all."""
 
 import shutil
 import tempfile
@@ -63,13 +63,92 @@ def write_video(
     return count
 
 
+def write_animation(
+    path: Path | str, pictures: Iterable[UInt8[np.ndarray, "H W C"]], *, fps: float
+) -> int:
+    """Write a .webp or .gif that plays for ever and return how many pictures there were.
+
+    RGBA keeps its transparency: all of it in WebP, one bit in GIF. WebP is lossy at a quality that
+    is hard to tell from the original; GIF has 255 colours per picture and counts time in 1/100 s,
+    so that pictures of some rates stand unequally long but the whole is as long as it should be.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in (".gif", ".webp"):
+        raise ConfigError(f"{path}: animations end in .webp or .gif.")
+    if not 0 < fps <= (50 if kind == ".gif" else 1000):
+        raise ConfigError(f"--fps {fps:g}: expected above 0 Hz, at most 50 for .gif, 1000 else.")
+    with atomic_path(path) as temporary:
+        count = (_write_gif if kind == ".gif" else _write_webp)(temporary, pictures, fps)
+        if not count:
+            raise DataError(f"{path}: there is no picture to write.")
+    return count
+
+
+def _write_webp(path: Path, pictures: Iterable[UInt8[np.ndarray, "H W C"]], fps: float) -> int:
+    import av
+
+    if "libwebp_anim" not in av.codecs_available:
+        raise BackendError(
+            "The installed PyAV has no encoder of animated WebP (libwebp_anim): install the wheel "
+            "with 'pip install --force-reinstall --only-binary av av', or give --out a .gif."
+        )
+    count = 0
+    # for a name in .webp alone a picture's format is guessed; 0: for ever
+    with av.open(str(path), "w", format="webp", options={"loop": "0"}) as container:
+        stream = None
+        for picture in pictures:
+            opaque = picture.shape[2] == 3
+            if stream is None:
+                rate = Fraction(fps).limit_denominator(1001)
+                stream = container.add_stream("libwebp_anim", rate=rate)
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p" if opaque else "yuva420p"
+                stream.options = {"quality": "90"}
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24" if opaque else "rgba")
+            # libwebp takes BT.601 in limited range
+            frame = frame.reformat(
+                format=stream.pix_fmt, dst_colorspace="ITU601", dst_color_range=_LIMITED_RANGE
+            )
+            frame.pts = count
+            container.mux(stream.encode(frame))
+            count += 1
+        if stream is not None:
+            container.mux(stream.encode())
+    return count
+
+
+def _write_gif(path: Path, pictures: Iterable[UInt8[np.ndarray, "H W C"]], fps: float) -> int:
+    frames = [_with_palette(picture) for picture in pictures]
+    if frames:
+        ends = np.rint(np.arange(len(frames) + 1) * 100 / fps).astype(int)
+        frames[0].save(
+            path,
+            save_all=True,
+            append_images=frames[1:],
+            duration=(10 * np.diff(ends)).tolist(),
+            loop=0,
+            disposal=2 if "transparency" in frames[0].info else 0,
+        )
+    return len(frames)
+
+
+def _with_palette(picture: UInt8[np.ndarray, "H W C"]) -> Image.Image:
+    """255 colours, and a transparent one where the picture has alpha."""
+    image = Image.fromarray(np.ascontiguousarray(picture[..., :3])).quantize(255)
+    if picture.shape[2] == 4:
+        image.paste(255, mask=Image.fromarray(np.uint8(255) * (picture[..., 3] < 128)))
+        image.info["transparency"] = 255
+    return image
+
+
 def write_pictures(
     folder: Path | str,
-    pictures: Iterable[tuple[str, UInt8[np.ndarray, "H W 3"]]],
+    pictures: Iterable[tuple[str, np.ndarray]],
     *,
     replace: bool = False,
 ) -> int:
-    """Write named pictures as ``folder/<name>.png`` and return how many there were.
+    """Write named pictures (RGB, RGBA, 16-bit grey) as ``folder/<name>.png``; gives their count.
 
     The folder appears only when all are written. One that already holds files is refused, unless
     ``replace`` says that it is ours to replace.

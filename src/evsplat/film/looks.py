@@ -1,0 +1,83 @@
+"""What a pixel shows: colour, the person cut out, depth, which part it belongs to, light."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt16
+
+from evsplat.capture import Camera
+from evsplat.errors import ConfigError
+from evsplat.evaluation.pictures import colours
+from evsplat.imaging import decode, encode, luminance
+from evsplat.methods.reconstruction import Parts, Reconstruction, WithDepth
+
+Shown = Literal["rgb", "semantic", "depth", "events"]
+SHOWN: tuple[Shown, ...] = get_args(Shown)
+
+Exposure = np.ndarray
+"""A picture as it is kept: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""
+
+_PERSON, _SCENE = (1.0, 0.46, 0.16), (0.16, 0.50, 0.72)
+# Near to far, from light to dark.
+_NEAR_TO_FAR = ((255, 247, 200), (250, 190, 90), (214, 90, 90), (120, 40, 120), (24, 16, 60))
+
+
+@dataclass(frozen=True)
+class Look:
+    """What of the reconstruction is shown, and of which parts."""
+
+    shown: Shown = "rgb"
+    parts: Parts = "all"
+    transparent: bool = False
+    """RGBA instead of black where nothing is; for ``rgb`` and ``semantic``."""
+
+    def __post_init__(self) -> None:
+        if self.transparent and self.shown not in ("rgb", "semantic"):
+            raise ConfigError(f"--transparent: goes with --show rgb or semantic, not {self.shown}.")
+
+    def expose(
+        self, reconstruction: Reconstruction, camera: Camera, times_us: Sequence[int]
+    ) -> list[Exposure]:
+        """Pictures as they are kept: colours in 8 bit; depth in millimetres and light in 16 bit.
+
+        Light (for events) is linear luminance, coded by the exponent 1/2.2.
+        """
+        if self.shown == "depth":
+            if not isinstance(reconstruction, WithDepth):
+                raise ConfigError(
+                    f"--show depth: method {reconstruction.name} does not know the depth of what "
+                    "it draws."
+                )
+            depth = reconstruction.depth(camera, times_us, parts=self.parts)
+            return list((depth * 1000).round().clamp(0, 65_535).numpy().astype(np.uint16))
+        drawn = reconstruction.render(camera, times_us, parts=self.parts)
+        rgb, alpha = drawn.rgb.cpu().clamp(0, 1), drawn.alpha.cpu().clamp(0, 1)
+        if self.shown == "events":
+            coded = encode(luminance(decode(rgb)))
+            return list((coded * 65_535).round().clamp(0, 65_535).numpy().astype(np.uint16))
+        if self.shown == "semantic":
+            human = drawn.human.cpu().clamp(0, 1)[..., None]
+            tint = human * torch.tensor(_PERSON) + (1 - human) * torch.tensor(_SCENE)
+            grey = rgb.mean(-1, keepdim=True)
+            rgb = (0.3 * alpha[..., None] + 0.7 * grey) * tint
+        if self.transparent:
+            # Over black the colour is multiplied with alpha already.
+            straight = (rgb / alpha[..., None].clamp_min(1e-4)).clamp(0, 1)
+            rgb = torch.cat((straight, alpha[..., None]), -1)
+        return list((rgb * 255).round().to(torch.uint8).numpy())
+
+
+def depth_colours(millimetres: UInt16[np.ndarray, "H W"], nearest_m: float) -> np.ndarray:
+    """Depth as colours, even in 1/z: light at ``nearest_m`` and nearer, dark far away."""
+    far = 1 - nearest_m * 1000 / np.maximum(millimetres, 1)
+    picture = colours(far.astype(np.float32), _NEAR_TO_FAR)
+    picture[millimetres == 0] = 0
+    return picture
+
+
+def linear_luma(exposure: UInt16[np.ndarray, "H W"]) -> Float[torch.Tensor, "H W"]:
+    """Linear light in [0, 1] of an exposure of ``events``."""
+    return decode(torch.from_numpy(exposure.astype(np.float32) / 65_535))

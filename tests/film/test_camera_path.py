@@ -1,0 +1,130 @@
+"""Camera paths: closed forms of the ways around and between, and files that are wrong."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from evsplat.capture import Camera
+from evsplat.errors import DataError
+from evsplat.film import orbit, read_camera_path, swing, through
+
+
+def _camera(seed: int) -> Camera:
+    rng = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    pose[:3, 3] = rng.normal(size=3)
+    focal = rng.uniform(80, 120)
+    K = torch.tensor([[focal, 0, 32.0], [0, focal, 24.0], [0, 0, 1]], dtype=torch.float32)
+    return Camera(64, 48, K, torch.from_numpy(pose).float())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_around_the_person_the_axis_keeps_its_place_in_the_picture(seed):
+    camera = _camera(seed)
+    rng = np.random.default_rng(seed)
+    middle = torch.from_numpy(rng.normal(size=3)).float()
+    up = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=3)).float(), dim=0)
+    axis = middle + torch.tensor([[-0.5], [0.0], [0.7]]) * up
+    expected, depth = camera.project(axis)
+    for path in (orbit(camera, middle, up), swing(camera, middle, up)):
+        for share in rng.uniform(0, 1, 3):
+            pixels, away = path(float(share)).project(axis)
+            assert torch.allclose(pixels, expected, atol=0.05 * float(pixels.abs().max() / 50 + 1))
+            assert torch.allclose(away, depth, atol=1e-4)
+        for share in (0.0, 1.0):
+            pose = path(share).world_to_camera
+            torch.testing.assert_close(pose, camera.world_to_camera, atol=1e-5, rtol=0)
+
+
+def test_half_an_orbit_is_half_a_turn_and_a_swing_ends_at_its_angle():
+    camera, middle, up = _camera(1), torch.tensor([0.3, -0.2, 1.0]), torch.tensor([0.0, 0, 1])
+
+    def turned(path, share):
+        relative = path(share).world_to_camera[:3, :3].T @ camera.world_to_camera[:3, :3]
+        return math.degrees(Rotation.from_matrix(relative.double().numpy()).magnitude())
+
+    assert turned(orbit(camera, middle, up), 0.5) == pytest.approx(180, abs=0.1)
+    assert turned(swing(camera, middle, up), 0.25) == pytest.approx(25, abs=0.1)
+    assert turned(swing(camera, middle, up), 0.75) == pytest.approx(25, abs=0.1)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_a_way_passes_through_its_cameras(count):
+    cameras = [_camera(seed) for seed in range(count)]
+    shares = np.linspace(0, 1, count).tolist()
+    path = through(shares, cameras)
+    for share, camera in zip(shares, cameras, strict=True):
+        at = path(share)
+        torch.testing.assert_close(at.world_to_camera, camera.world_to_camera, atol=1e-5, rtol=0)
+        torch.testing.assert_close(at.K, camera.K, atol=1e-4, rtol=0)
+
+
+def _document() -> dict:
+    return {
+        "format": "evsplat-camera-path",
+        "version": 1,
+        "width": 64,
+        "height": 48,
+        "keys": [
+            {
+                "at": 0,
+                "eye": [0, -3, 1],
+                "target": [0, 0, 1],
+                "up": [0, 0, 1],
+                "fov_y_deg": 90,
+            },
+            {
+                "at": 1,
+                "world_to_camera": np.eye(4).tolist(),
+                "K": [[50, 0, 30], [0, 60, 20], [0, 0, 1]],
+            },
+        ],
+    }
+
+
+def test_a_file_says_where_the_camera_looks(tmp_path):
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(_document()))
+    first, last = (read_camera_path(path)(share) for share in (0.0, 1.0))
+    # A metre up at the target's distance of three is a third of the half height at 90 degrees.
+    pixels, depth = first.project(torch.tensor([[0.0, 0, 1], [0, 0, 2], [1, 0, 1]]))
+    expected = torch.tensor([[32.0, 24], [32, 16], [40, 24]])
+    torch.testing.assert_close(pixels, expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(depth, torch.full((3,), 3.0))
+    torch.testing.assert_close(last.world_to_camera, torch.eye(4), atol=1e-6, rtol=0)
+    assert last.K.tolist() == [[50, 0, 30], [0, 60, 20], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.update(format="other"), "format"),
+        (lambda d: d.update(version=2), "version is 2"),
+        (lambda d: d.update(width=0), "width, height"),
+        (lambda d: d.update(keys=[]), "keys is empty"),
+        (lambda d: d["keys"][0].pop("eye"), r"keys\[0\].eye is missing"),
+        (lambda d: d["keys"][0].update(eye=[0, "x", 1]), r"keys\[0\].eye is"),
+        (lambda d: d["keys"][0].update(up=[0, 1, 0]), "straight along up"),
+        (lambda d: d["keys"][0].update(fov_y_deg=180), "fov_y_deg is 180"),
+        (lambda d: d["keys"][1].update(at=0), "at is"),
+        (lambda d: d["keys"][1].update(at=float("nan")), "at is"),
+        (lambda d: d["keys"][1].update(K=[[1, 1, 0], [0, 1, 0], [0, 0, 1]]), r"keys\[1\].K is"),
+        (
+            lambda d: d["keys"][1].update(world_to_camera=(2 * np.eye(4)).tolist()),
+            "no rigid transform",
+        ),
+    ],
+)
+def test_wrong_files_name_file_and_field(tmp_path, change, message):
+    document = _document()
+    change(document)
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(DataError, match=message) as error:
+        read_camera_path(path)
+    assert str(path) in str(error.value)

@@ -1,0 +1,203 @@
+"""Films from start to end: options that contradict, stopping and going on, light and events."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageSequence
+
+from evsplat.capture import load_capture
+from evsplat.errors import ConfigError, DataError
+from evsplat.events import open_recording
+from evsplat.export import render_run, rendering, write_animation
+from evsplat.film import Film
+from evsplat.methods.reconstruction import Rendering
+
+LAST_US = 9 * 40_000
+
+
+class _Lamp:
+    """Light that rises exponentially in time, the same for all pixels; a person at the left."""
+
+    name = "lamp"
+
+    def __init__(self) -> None:
+        self.drawn: list[int] = []
+        self.stop_after: int | None = None
+
+    def render(self, camera, times_us, *, parts="all"):
+        if self.stop_after is not None and len(self.drawn) >= self.stop_after:
+            raise KeyboardInterrupt
+        self.drawn += times_us
+        linear = 0.05 * torch.exp(torch.tensor(times_us) / LAST_US * 2.0)
+        shape = (len(times_us), camera.height, camera.width)
+        alpha = torch.zeros(shape)
+        alpha[..., : camera.width // 2] = 0.5
+        rgb = (linear ** (1 / 2.2))[:, None, None, None].expand(*shape, 3)
+        if parts == "human":
+            rgb = rgb * alpha[..., None]
+        return Rendering(rgb, alpha, alpha)
+
+
+@pytest.fixture
+def lamp(tiny_capture, tmp_path, monkeypatch):
+    """A run folder, its capture and its reconstruction."""
+    lamp, capture = _Lamp(), load_capture(tiny_capture())
+    loaded = SimpleNamespace(
+        capture=capture, reconstruction=lamp, method="lamp", iteration=1, train_seconds=1.0
+    )
+    monkeypatch.setattr(rendering, "load_run", lambda path, **_: loaded)
+    return SimpleNamespace(run=tmp_path / "run", capture=capture, lamp=lamp, loaded=loaded)
+
+
+def test_a_stopped_film_goes_on_where_it_was_and_equals_an_uninterrupted_one(lamp, tmp_path):
+    whole = render_run(lamp.run, fps=100, out=tmp_path / "whole")
+    count, lamp.lamp.drawn = len(lamp.lamp.drawn), []
+    lamp.lamp.stop_after = count // 2
+    out = tmp_path / "film"
+    with pytest.raises(KeyboardInterrupt, match=rf"of {count} pictures are kept in .*partial"):
+        render_run(lamp.run, fps=100, out=out)
+    assert not out.exists()
+    kept = len(list((tmp_path / "film.partial").glob("*.png")))
+    assert 0 < kept < count
+    lamp.lamp.stop_after, lamp.lamp.drawn = None, []
+    render_run(lamp.run, fps=100, out=out)
+    assert len(lamp.lamp.drawn) == count - kept
+    assert not (tmp_path / "film.partial").exists()
+    for path in whole.iterdir():
+        assert (out / path.name).read_bytes() == path.read_bytes()
+
+
+def test_pictures_of_other_options_or_a_further_trained_run_are_not_taken(lamp, tmp_path):
+    for change in ("options", "training"):
+        lamp.lamp.drawn, lamp.lamp.stop_after = [], 8
+        with pytest.raises(KeyboardInterrupt):
+            render_run(lamp.run, fps=100, out=tmp_path / "film.mp4")
+        lamp.lamp.drawn, lamp.lamp.stop_after = [], None
+        lamp.loaded.iteration += change == "training"
+        fps = 50 if change == "options" else 100
+        render_run(lamp.run, fps=fps, out=tmp_path / "film.mp4")
+        assert len(lamp.lamp.drawn) == 1 + LAST_US * fps // 10**6
+
+
+def test_events_of_exponential_light_come_at_an_even_rate(lamp, tmp_path):
+    out, file = tmp_path / "events", tmp_path / "events.h5"
+    render_run(lamp.run, show="events", fps=25, event_hz=400, out=out, events_out=file)
+    camera = lamp.capture.cameras["main"]
+    events = open_recording(file).read()
+    # ln(0.05 e^(2 t)) with 1e-3 added rises by a little less than 2; thresholds are 0.2.
+    rise = np.log(0.05 * np.exp(2) + 1e-3) - np.log(0.05 + 1e-3)
+    pixels = camera.width * camera.height
+    assert len(events) == pytest.approx(pixels * int(rise / 0.2), abs=pixels)
+    assert (events.p == 1).all()
+    per_pixel = np.diff(events.t[(events.x == 3) & (events.y == 4)])
+    # The first thresholds take longer, for the 1e-3 counts for more in the dark.
+    np.testing.assert_allclose(per_pixel[1:], 0.2 * LAST_US / 2, rtol=0.03)
+    names = sorted(path.name for path in out.iterdir())
+    assert names == [f"{index:05d}.png" for index in range(9)]
+    picture = np.asarray(Image.open(out / names[1]))
+    assert (picture[..., 0] >= picture[..., 2]).all()
+
+
+def test_beside_events_stand_the_recorded_ones(lamp, tmp_path):
+    out = render_run(lamp.run, show="events", beside=True, fps=25, event_hz=50, out=tmp_path / "e")
+    camera = lamp.capture.cameras["main"]
+    first = np.asarray(Image.open(out / "00000.png"))
+    assert first.shape == (camera.height, 2 * camera.width, 3)
+    frames = sorted(lamp.capture.frames, key=lambda frame: frame.mid_us)
+    recorded = lamp.capture.events.between(frames[0].mid_us, frames[0].mid_us + 40_000)
+    signed = np.zeros((camera.height, camera.width))
+    np.add.at(signed, (recorded.y, recorded.x), recorded.p)
+    left = first[:, : camera.width].astype(int)
+    assert ((left[..., 0] > left[..., 2])[signed > 0]).all()
+    assert ((left[..., 0] < left[..., 2])[signed < 0]).all()
+
+
+@pytest.mark.parametrize("ending", ["", ".webp", ".gif"])
+def test_a_cut_out_person_keeps_colour_and_transparency(lamp, tmp_path, ending):
+    out = tmp_path / f"person{ending}"
+    render_run(lamp.run, parts="human", transparent=True, fps=10, out=out)
+    if ending:
+        pictures = [f.convert("RGBA") for f in ImageSequence.Iterator(Image.open(out))]
+    else:
+        pictures = [Image.open(path) for path in sorted(out.iterdir())]
+    picture = np.asarray(pictures[0]).astype(int)
+    half = picture.shape[1] // 2
+    assert (picture[:, half + 2 :, 3] == 0).all()
+    alpha = {"": 128, ".webp": 128, ".gif": 255}[ending]
+    inside = picture[2:-2, 2 : half - 2]
+    assert np.abs(inside[..., 3] - alpha).max() <= 2
+    start = lamp.capture.frames[0].mid_us / LAST_US
+    level = (0.05 * np.exp(2 * start)) ** (1 / 2.2) * 255
+    assert np.abs(inside[..., :3] - level).max() < 4
+
+
+def test_a_held_moment_is_one_time_from_many_places(lamp, tmp_path):
+    out = render_run(lamp.run, at=0.1, seconds=0.5, fps=10, path="swing", out=tmp_path / "held")
+    assert len(list(out.iterdir())) == 6
+    assert set(lamp.lamp.drawn) == {100_000}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"transparent": True, "out": "a.mp4"}, "--transparent: mp4"),
+        ({"transparent": True, "beside": True}, "--beside"),
+        ({"show": "depth", "transparent": True}, "--transparent"),
+        ({"show": "depth"}, "--show depth: method lamp"),
+        ({"motion": "walk"}, "--motion: method lamp draws the recorded motion only"),
+        ({"motion": "walk", "beside": True}, "--beside"),
+        ({"motion_fps": 20.0}, "--motion-fps: goes with --motion"),
+        ({"in_place": True}, "--in-place: goes with --motion"),
+        ({"at": 99.0}, "--at 99"),
+        ({"at": 0.1, "slow": 2.0}, "--slow"),
+        ({"what": "test", "path": "orbit"}, "--path: films the sequence"),
+        ({"what": "test", "show": "events"}, "--show events: films the sequence"),
+        ({"path": "nowhere.json"}, "--path nowhere.json"),
+        ({"events_out": "e.h5"}, "--events: goes with --show events"),
+        ({"fps": 60.0, "out": "a.gif"}, "a GIF plays"),
+        ({"seconds": 0.0}, "--seconds 0"),
+    ],
+)
+def test_contradicting_options_are_refused_before_anything_is_drawn(
+    lamp, tmp_path, monkeypatch, options, message
+):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(ConfigError, match=message):
+        render_run(lamp.run, **options)
+    assert not lamp.lamp.drawn
+    assert sorted(p for p in tmp_path.iterdir() if p.name != "run") == before
+
+
+def test_a_folder_in_the_way_of_kept_pictures_is_left_alone(lamp, tmp_path):
+    mine = tmp_path / "film.mp4.partial"
+    mine.mkdir()
+    (mine / "notes.txt").write_text("keep")
+    with pytest.raises(DataError, match=r"film\.mp4\.partial: is in the way"):
+        render_run(lamp.run, out=tmp_path / "film.mp4")
+    assert (mine / "notes.txt").read_text() == "keep"
+
+
+@pytest.mark.parametrize("ending", [".gif", ".webp"])
+@pytest.mark.parametrize("fps", [12.0, 30.0])
+def test_animations_last_as_long_as_they_should(tmp_path, ending, fps):
+    rng = np.random.default_rng(int(fps))
+    pictures = rng.integers(0, 256, (13, 16, 24, 3), dtype=np.uint8)
+    path = tmp_path / f"a{ending}"
+    assert write_animation(path, pictures, fps=fps) == 13
+    with Image.open(path) as image:
+        durations = [f.copy().info["duration"] for f in ImageSequence.Iterator(image)]
+        assert image.info["loop"] == 0
+    assert len(durations) == 13
+    assert sum(durations) == pytest.approx(13 / fps * 1000, abs=45)
+
+
+def test_file_names_say_what_is_in_them():
+    assert Film().file_name() == "sequence.mp4"
+    assert Film(what="test", parts="human").file_name() == "test-human"
+    assert Film(path="orbit", show="depth").file_name() == "sequence-orbit-depth.mp4"
+    assert Film(motion="poses/walk.npz", transparent=True).file_name() == (
+        "sequence-walk-transparent.webp"
+    )
