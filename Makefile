@@ -1,16 +1,22 @@
-# `make demo` and `make test` set up a virtual environment on the first call and reuse it afterwards.
+# `make demo`, `make view` and `make test` set up a virtual environment on the first call and reuse
+# it afterwards. `make view` shows RUN, by default what `make demo` trained last.
 # Options: PYTHON=python3.12 (which interpreter), VENV=.venv (where the environment lies).
 
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+RUN ?= $(lastword $(sort $(wildcard runs/demo_*/*/*)))
 SET_UP_INPUTS := pyproject.toml constraints.txt CMakeLists.txt \
 	$(shell find native -type f 2>/dev/null | LC_ALL=C sort)
 
-.PHONY: demo test lint types setup clean
+.PHONY: demo view test lint types setup clean
 
 demo: $(STAMP)
 	$(BIN)/evsplat demo $(DEMO_OPTIONS)
+
+view: $(STAMP)
+	@test -n "$(RUN)" || { echo "No demo run yet: make demo first, or make view RUN=FOLDER" >&2; exit 2; }
+	$(BIN)/evsplat view "$(RUN)" $(VIEW_OPTIONS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest $(TEST_OPTIONS)

@@ -8,8 +8,8 @@ The verbs of the command line are functions here, imported on first use:
     ev.write_report(run)
     ev.render_run(run, slow=8)
 
-``evsplat render`` is `render_run` here, ``restore`` is `restore_capture` and ``masks`` is
-`mask_capture`, because these words are names of packages.
+``evsplat render`` is `render_run` here, ``view`` is `view_run`, ``restore`` is `restore_capture`
+and ``masks`` is `mask_capture`, because these words are names of packages.
 """
 
 import os
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from evsplat.synthesis import synthesize
     from evsplat.training.run import load_run
     from evsplat.training.train import train
+    from evsplat.view import view_run
 
 # OpenMP's default is to spin at every barrier. Where another process takes a core, the spinning
 # thread starves the one it waits for (two-thread matrix products: five times slower with one busy
@@ -58,6 +59,7 @@ __all__ = [
     "stage",
     "synthesize",
     "train",
+    "view_run",
     "write_report",
 ]
 
@@ -76,6 +78,7 @@ _LAZY = {
     "stage": "evsplat.staging:stage",
     "synthesize": "evsplat.synthesis:synthesize",
     "train": "evsplat.training:train",
+    "view_run": "evsplat.view:view_run",
     "write_report": "evsplat.evaluation.report:write_report",
 }
 

@@ -162,3 +162,16 @@ def test_ctrl_c_is_answered_with_a_word(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr("evsplat.synthesis.synthesize", interrupted)
     code, _, stderr = _outcome(capsys, "synthesize", "clip.mp4", "--out", str(tmp_path / "out"))
     assert (code, stderr) == (130, "\nevsplat: Stopped.\n")
+
+
+def test_view_without_its_package_says_how_to_get_it(capsys, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(tmp_path)]) == 2
+    message = capsys.readouterr().err
+    assert "pip install 'evsplat[view]'" in message and message.count("\n") == 1
+
+
+def test_view_of_a_folder_that_is_no_run_is_one_sentence(capsys, tmp_path):
+    assert main(["view", str(tmp_path)]) == 2
+    message = capsys.readouterr().err
+    assert str(tmp_path) in message and "config.yaml" in message

@@ -23,13 +23,14 @@ from evsplat.cli.simulate import simulate
 from evsplat.cli.stage import stage
 from evsplat.cli.synthesize import synthesize
 from evsplat.cli.train import train
+from evsplat.cli.view import view
 from evsplat.errors import EvsplatError
 
 _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
     for verb in (
         *(demo, doctor, import_, convert, simulate, synthesize, stage, inspect),
-        *(masks, restore, train, evaluate, report, render),
+        *(masks, restore, train, evaluate, report, render, view),
     )
 }
 _DESCRIPTION = (

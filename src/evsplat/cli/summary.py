@@ -1,5 +1,7 @@
 """The table that is printed when a run has been evaluated."""
 
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -7,9 +9,9 @@ _REGIONS = ("full", "person_crop", "person_mask")
 
 
 def print_summary(metrics: dict[str, Any], *, run: Path, report: Path) -> None:
-    """Print the run's figures above the trivial rows, and where the report is."""
+    """Print the run's figures above the trivial rows, where the report is and how to view it."""
     print(summary_table(metrics))
-    print(f"run:    {run}\nreport: {report}")
+    print(f"run:    {run}\nreport: {report}\nview:   {_command()} view {shlex.quote(str(run))}")
 
 
 def summary_table(metrics: dict[str, Any]) -> str:
@@ -29,3 +31,9 @@ def _cell(values: dict[str, float | None] | None) -> str:
     values = values or {}
     psnr, ssim = values.get("psnr"), values.get("ssim")
     return f"{'-' if psnr is None else f'{psnr:.2f}'} / {'-' if ssim is None else f'{ssim:.3f}'}"
+
+
+def _command() -> str:
+    """What the user types to call evsplat: as it was called, where that is a path to it."""
+    called = Path(sys.argv[0])
+    return str(called) if called.name == "evsplat" and not called.is_absolute() else "evsplat"

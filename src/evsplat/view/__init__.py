@@ -1,0 +1,36 @@
+"""The web viewer: a trained run in the browser, at any time and from anywhere."""
+
+from pathlib import Path
+
+from evsplat.errors import ConfigError
+
+
+def view_run(
+    run: Path | str,
+    other: Path | str | None = None,
+    *,
+    port: int = 8080,
+    host: str = "127.0.0.1",
+    device: str = "auto",
+) -> None:
+    """Show a run in the browser until Ctrl-C, or two runs of one capture to compare.
+
+    Only this machine can reach it unless ``host`` says otherwise. A ``port`` in use gives way to
+    the next free one, which is said with the address.
+
+    Raises:
+        ConfigError: the package viser is missing, or the address cannot be listened at.
+        DataError: no run folder, no checkpoint in it, or runs of two captures.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError:
+        raise ConfigError(
+            "The viewer needs the package viser; get it with: pip install 'evsplat[view]'."
+        ) from None
+    from evsplat.view.server import serve
+
+    serve([path for path in (run, other) if path is not None], host, port, device)
+
+
+__all__ = ["view_run"]

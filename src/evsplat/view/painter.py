@@ -1,0 +1,163 @@
+"""From a look to the picture that the browser shows."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from evsplat.capture import Camera, Capture, Frame
+from evsplat.events.maps import count_map
+from evsplat.film import camera_at
+from evsplat.view import pixels
+from evsplat.view.camera import Box, framed, orbit_camera, resized
+from evsplat.view.look import BLURRY, SHARP, Look
+from evsplat.view.subject import Subject
+
+INSET_SHARE = 0.3
+"""Height of the recorded picture in the corner, as a share of the viewport's."""
+
+
+@dataclass(frozen=True)
+class Pane:
+    """A part of the viewport with a camera of its own."""
+
+    camera: Camera
+    box: Box | None
+    """Where the recorded picture lies; None for a camera that recorded nothing."""
+
+
+class Painter:
+    """Draws looks of one run, or of two runs of one capture."""
+
+    def __init__(self, subject: Subject, others: Mapping[str, Subject]) -> None:
+        """``others`` are what the run can be compared with, by name."""
+        self.subject, self.others = subject, dict(others)
+        self.capture = subject.capture
+
+    def paint(
+        self, look: Look, size: tuple[int, int], *, rough: bool
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """The picture with ``size`` (width, height) pixels, whatever the viewport has."""
+        width, height = size
+        other = look.compare if self._has_place(look) else None
+        beside = look.layout == "side by side" and other is not None
+        share = 0.5 if beside else 1.0
+        pane = self._pane(look, round(share * look.width), look.height)
+        pane = _scaled(pane, round(share * width), height)
+        right = self._drawn(self.subject, pane, look, rough)
+        picture, labels = right, []
+        if other is not None:
+            left = self._compared(other, look, pane, right, rough)
+            if beside:
+                picture = np.concatenate([left, right], 1)
+                picture[:, left.shape[1] - 1 : left.shape[1] + 1] = 1
+                labels = [(0.0, other), (0.5, self.subject.name)]
+            else:
+                picture = pixels.divided(left, right, look.divider)
+                labels = [(0.0, other), (look.divider, self.subject.name)]
+        if pane.box is None and (look.events_us is not None or look.compare != other):
+            self._inset(picture, look)
+        return pixels.with_labels(pixels.to_bytes(picture), labels)
+
+    def frame(self, camera: str | None, time_us: int) -> Frame:
+        """The recorded frame nearest in time, of a camera where it recorded any."""
+        return nearest_frame(self.capture, camera, time_us)
+
+    def _pane(self, look: Look, width: int, height: int) -> Pane:
+        if look.recording is None:
+            return Pane(orbit_camera(look.orbit, width, height), None)
+        camera = camera_at(self.capture, look.recording, look.time_us)
+        return Pane(*framed(camera, width, height))
+
+    def _drawn(
+        self, subject: Subject, pane: Pane, look: Look, rough: bool
+    ) -> Float[np.ndarray, "H W 3"]:
+        """A run's picture with everything laid over it."""
+        layers = subject.layers(pane.camera, look.time_us, parts=look.parts, rough=rough)
+        picture = layers.rgb
+        if look.colouring == "semantic":
+            picture = pixels.by_class(picture, layers.human)
+        picture = np.array(picture)
+        if pane.box is not None:
+            pixels.dim_outside(picture, pane.box)
+            if look.events_us is not None and look.motion.is_recorded:
+                counts = self._events(look)
+                if counts is not None:
+                    pixels.events_on(picture, counts, pane.box)
+        return picture
+
+    def _has_place(self, look: Look) -> bool:
+        """Whether what is compared is known for this view; recordings are for their camera."""
+        if look.compare in self.others:
+            return True
+        frames = [f for f in self.capture.frames if f.camera == look.recording]
+        return look.compare is not None and bool(frames) and look.motion.is_recorded
+
+    def _compared(
+        self, other: str, look: Look, pane: Pane, drawn: Float[np.ndarray, "H W 3"], rough: bool
+    ) -> Float[np.ndarray, "H W 3"]:
+        """What stands beside the run's picture."""
+        if other in self.others:
+            return self._drawn(self.others[other], pane, look, rough)
+        recorded, picture = self._recorded(look), np.zeros_like(drawn)
+        assert pane.box is not None and recorded is not None
+        pixels.paste(picture, recorded, pane.box)
+        return picture
+
+    def _inset(self, picture: Float[np.ndarray, "H W 3"], look: Look) -> None:
+        """Put the recorded picture, with its events, into the lower left corner."""
+        recorded = self._recorded(look)
+        if recorded is None:
+            return
+        recorded = recorded.copy()
+        if look.events_us is not None:
+            counts = self._events(look)
+            if counts is not None:
+                whole = Box(0, 0, recorded.shape[1], recorded.shape[0])
+                pixels.events_on(recorded, counts, whole)
+        height = INSET_SHARE * picture.shape[0]
+        width = height * recorded.shape[1] / recorded.shape[0]
+        margin = 0.02 * picture.shape[0]
+        box = Box(margin, picture.shape[0] - margin - height, width, height)
+        line = max(1.0, 0.003 * picture.shape[0])
+        around = Box(box.left - line, box.top - line, box.width + 2 * line, box.height + 2 * line)
+        pixels.paste(picture, np.ones((2, 2, 3), np.float32), around)
+        pixels.paste(picture, recorded, box)
+
+    def _recorded(self, look: Look) -> Float[np.ndarray, "h w 3"] | None:
+        if not look.motion.is_recorded:
+            return None
+        frame = self.frame(look.recording, look.time_us)
+        if look.compare == SHARP and frame.sharp is not None:
+            return self.capture.sharp(frame).numpy()
+        return self.capture.image(frame).numpy()
+
+    def _events(self, look: Look) -> Float[np.ndarray, "h w"] | None:
+        store = self.capture.events
+        if store is None or look.events_us is None:
+            return None
+        start = look.time_us - look.events_us // 2
+        stream = store.between(start, start + look.events_us)
+        return count_map(stream, store.height, store.width).numpy()
+
+
+def nearest_frame(capture: Capture, camera: str | None, time_us: int) -> Frame:
+    """The frame nearest in time, of a camera where it recorded any."""
+    frames: Sequence[Frame] = [f for f in capture.frames if f.camera == camera]
+    return min(frames or capture.frames, key=lambda frame: abs(frame.mid_us - time_us))
+
+
+def comparisons(capture: Capture, others: Sequence[str]) -> list[str]:
+    """Everything that a run of this capture can be compared with."""
+    truth = [SHARP] if any(frame.sharp for frame in capture.frames) else []
+    return [BLURRY, *truth, *others]
+
+
+def _scaled(pane: Pane, width: int, height: int) -> Pane:
+    """The same view with fewer pixels."""
+    x, y = width / pane.camera.width, height / pane.camera.height
+    box = pane.box
+    if box is not None:
+        box = Box(x * box.left, y * box.top, x * box.width, y * box.height)
+    return Pane(resized(pane.camera, width, height), box)

@@ -1,0 +1,211 @@
+"""The controls that a browser shows."""
+
+import io
+import time
+
+import numpy as np
+import viser
+from PIL import Image
+
+from evsplat.capture import Frame
+from evsplat.film import camera_at
+from evsplat.view.camera import Orbit, forward, framed, vertical_fov
+from evsplat.view.client import Client
+from evsplat.view.painter import comparisons
+from evsplat.view.timeline import Playback
+
+SPEEDS = {
+    "as recorded": 1.0,
+    "1/2": 1 / 2,
+    "1/5": 1 / 5,
+    "1/10": 1 / 10,
+    "1/20": 1 / 20,
+    "1/50": 1 / 50,
+    "1/100": 1 / 100,
+}
+_PARTS = {"person and scene": "all", "person": "human", "scene": "scene"}
+_COLOURING = {"colour": "colour", "person / scene": "semantic"}
+_WHOLE, _EXPOSURE = "the recording", "this exposure"
+_NOTHING = "nothing"
+_SLIDER_S = 0.1
+"""The time slider follows the picture this often."""
+
+
+class Panel:
+    """Builds the controls of one browser and connects them with its client.
+
+    Callbacks are coroutines, which the event loop runs in order; each only writes a wish down.
+    """
+
+    def __init__(self, client: Client, pivot: np.ndarray) -> None:
+        """``pivot`` is the place in the world around which the view turns."""
+        self.client, self.pivot = client, pivot
+        self.capture = client.painter.capture
+        self.gui = client.handle.gui
+        self._slider_at = 0.0
+        self._said = ""
+        self._frames = sorted(self.capture.frames, key=lambda frame: frame.mid_us)
+        self._frames = [f for f in self._frames if f.camera == self._frames[0].camera]
+        self._start_us, self._end_us = self._frames[0].mid_us, self._frames[-1].mid_us
+        with self.gui.add_folder("Time"):
+            self._build_time()
+        with self.gui.add_folder("Camera"):
+            self._build_camera()
+        with self.gui.add_folder("Show"):
+            self._build_show()
+        with self.gui.add_folder("Save"):
+            self._build_save()
+        client.on_time = self._follow
+
+    def _build_time(self) -> None:
+        gui = self.gui
+        length_ms = max((self._end_us - self._start_us) / 1e3, 0.1)
+        self.slider = gui.add_slider("Time, ms", 0.0, length_ms, 0.1, 0.0)
+        self.play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+        self.steps = gui.add_button_group("Frame", ("previous", "next"))
+        self.speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1/5")
+        self.loop = gui.add_dropdown("Loop", (_WHOLE, _EXPOSURE))
+        self.told = gui.add_markdown("")
+
+        async def moved(event: viser.GuiEvent) -> None:
+            if event.client_id is not None:  # else the player moved it
+                self._go(self._start_us + 1e3 * self.slider.value)
+
+        async def pressed(_: viser.GuiEvent) -> None:
+            playback = self.client.play(lambda p, now: p.playing(p.since is None, now))
+            self._show_playing(playback)
+
+        async def stepped(event: viser.GuiEvent) -> None:
+            place = self.client.look.time_us
+            mids = [frame.mid_us for frame in self._frames]
+            later, earlier = [m for m in mids if m > place], [m for m in mids if m < place]
+            forwards = event.target.value == "next"
+            self._show_playing(self.client.play(lambda p, now: p.playing(False, now)))
+            self._go(min(later, default=mids[-1]) if forwards else max(earlier, default=mids[0]))
+            self._move_slider(self.client.look.time_us)
+
+        async def faster(_: viser.GuiEvent) -> None:
+            self.client.play(lambda p, now: p.at_speed(SPEEDS[self.speed.value], now))
+
+        async def looped(_: viser.GuiEvent) -> None:
+            self._loop()
+
+        self.slider.on_update(moved)
+        self.play.on_click(pressed)
+        self.steps.on_click(stepped)
+        self.speed.on_update(faster)
+        self.loop.on_update(looped)
+
+    def _build_camera(self) -> None:
+        names = tuple(self.capture.cameras)
+        self.camera = self.gui.add_dropdown("Recorded by", names, visible=len(names) > 1)
+        snap = self.gui.add_button("See through the recording camera", icon=viser.Icon.CAMERA)
+        self.gui.add_markdown("Drag to turn, right-drag to move, scroll to come nearer.")
+
+        async def see(_: viser.GuiEvent) -> None:
+            self.look_through(self.camera.value)
+
+        self.camera.on_update(see)
+        snap.on_click(see)
+
+    def _build_show(self) -> None:
+        gui, client = self.gui, self.client
+        parts = gui.add_dropdown("Parts", tuple(_PARTS))
+        colouring = gui.add_dropdown("Colours", tuple(_COLOURING))
+        others = comparisons(self.capture, list(client.painter.others))
+        compare = gui.add_dropdown("Compare with", (_NOTHING, *others))
+        layout = gui.add_dropdown("Layout", ("divided", "side by side"))
+        divider = gui.add_slider("Divider", 0.0, 1.0, 0.005, client.look.divider)
+        events = gui.add_checkbox("Events", False, visible=self.capture.events is not None)
+        window = gui.add_slider("Event window, ms", 0.5, 50.0, 0.5, 5.0)
+
+        async def changed(_: viser.GuiEvent) -> None:
+            something = compare.value != _NOTHING
+            layout.visible = something
+            divider.visible = something and layout.value == "divided"
+            window.visible = events.value
+            client.change(
+                parts=_PARTS[parts.value],
+                colouring=_COLOURING[colouring.value],
+                compare=compare.value if something else None,
+                layout=layout.value,
+                divider=divider.value,
+                events_us=round(1e3 * window.value) if events.value else None,
+            )
+
+        layout.visible = divider.visible = window.visible = False
+        for control in (parts, colouring, compare, layout, divider, events, window):
+            control.on_update(changed)
+
+    def _build_save(self) -> None:
+        picture = self.gui.add_button("Picture (PNG)", icon=viser.Icon.DOWNLOAD)
+
+        async def save(_: viser.GuiEvent) -> None:
+            self.client.desk.do(self._send_picture)
+
+        picture.on_click(save)
+
+    def look_through(self, camera: str) -> None:
+        """Put the browser's camera where a recording camera is at this time."""
+        look = self.client.look
+        recording = camera_at(self.capture, camera, look.time_us)
+        view, _ = framed(recording, look.width, look.height)
+        centre, ahead = recording.center().double().numpy(), forward(recording)
+        # The view turns around the place on the optical axis that is as far as the pivot.
+        away = max(0.5, float((self.pivot - centre) @ ahead))
+        orbit = Orbit(look.orbit.wxyz, tuple(centre.tolist()), vertical_fov(view))
+        self.client.look_through(camera, orbit, centre + away * ahead)
+
+    def _go(self, place_us: float) -> None:
+        self.client.play(lambda p, now: p.moved(place_us, now))
+        if self.loop.value == _EXPOSURE:
+            self._loop()
+
+    def _loop(self) -> None:
+        """Loop over what is chosen, around where the time stands."""
+        if self.loop.value == _EXPOSURE:
+            start, end = self._frame_at(self.client.look.time_us).exposure_us
+        else:
+            start, end = self._start_us, self._end_us
+        self.client.play(lambda p, now: p.within(start, end, now))
+
+    def _frame_at(self, time_us: float) -> Frame:
+        return min(self._frames, key=lambda frame: abs(frame.mid_us - time_us))
+
+    def _show_playing(self, playback: Playback) -> None:
+        playing = playback.since is not None
+        self.play.label = "Pause" if playing else "Play"
+        self.play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+
+    def _follow(self, time_us: int) -> None:
+        """Let the slider follow the picture; called by the drawing thread."""
+        now = time.monotonic()
+        if now - self._slider_at < _SLIDER_S:
+            return
+        self._slider_at = now
+        self._move_slider(time_us)
+
+    def _move_slider(self, time_us: int) -> None:
+        place_ms = (time_us - self._start_us) / 1e3
+        if abs(self.slider.value - place_ms) > 0.05:
+            # viser's property has a setter, which type checkers do not see.
+            self.slider.value = min(max(place_ms, 0.0), self.slider.max)  # type: ignore[misc]
+        frame = self._frame_at(time_us)
+        start, end = frame.exposure_us
+        split = {"train": "training", "test": "held out"}[frame.split]
+        if start <= time_us <= end:
+            where = f"{100 * (time_us - start) / max(end - start, 1):.0f} % into its exposure"
+        else:
+            where = "between exposures"
+        said = f"Frame {frame.name} ({split}), {where} of {(end - start) / 1e3:.3g} ms"
+        if said != self._said:
+            self.told.content = self._said = said
+
+    def _send_picture(self) -> None:
+        """Draw the present view with all its pixels and hand it to the browser as a file."""
+        look = self.client.look
+        picture = self.client.painter.paint(look, (look.width, look.height), rough=False)
+        data = io.BytesIO()
+        Image.fromarray(picture).save(data, "PNG")
+        name = f"{self.capture.name}-{look.time_us / 1e3:.1f}ms.png"
+        self.client.handle.send_file_download(name, data.getvalue(), save_immediately=True)

@@ -1,0 +1,204 @@
+"""The web server of the viewer."""
+
+import contextlib
+import errno
+import io
+import logging
+import socket
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from evsplat.body import load_body_track, up_axis
+from evsplat.capture import Capture
+from evsplat.errors import ConfigError, DataError
+from evsplat.film import camera_at
+from evsplat.training.run import Run, load_run
+from evsplat.view.camera import forward, vertical_fov
+from evsplat.view.client import Client, orbit_of
+from evsplat.view.desk import Desk
+from evsplat.view.look import Look, Motion
+from evsplat.view.painter import Painter
+from evsplat.view.panel import SPEEDS, Panel
+from evsplat.view.subject import Subject
+from evsplat.view.timeline import Playback
+
+logger = logging.getLogger(__name__)
+
+_PORTS_TRIED = 20
+_EVERYWHERE = ("", "0.0.0.0", "::")
+_DEFAULT_DISTANCE_M = 3.0
+
+
+class _Server(viser.ViserServer):
+    """viser's, which opens no tunnel to the internet when a browser asks for one."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+class Viewer:
+    """Serves one run, or two to compare, until it is closed."""
+
+    def __init__(self, runs: list[Run], *, host: str, port: int) -> None:
+        self.subjects = [Subject(run, name) for run, name in zip(runs, _names(runs), strict=True)]
+        main, *others = self.subjects
+        self.capture = main.capture
+        self.painter = Painter(main, {other.name: other for other in others})
+        self.pivot, up = _pivot_and_up(self.capture)
+        self.desk = Desk()
+        self.port = _free_port(host, port)
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner
+            self.server = _Server(host, self.port, label="evsplat", verbose=False)
+        self.port = self.server.get_port()
+        self.address = f"http://{'localhost' if host in _EVERYWHERE else host}:{self.port}"
+        self._set_scene(up)
+        self._clients: dict[int, Client] = {}
+        self.server.on_client_connect(self._enter)
+        self.server.on_client_disconnect(self._leave)
+        self.desk.start()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self.desk.close()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def _set_scene(self, up: np.ndarray) -> None:
+        server, first = self.server, self.capture.frames[0]
+        server.scene.set_up_direction(tuple(up.tolist()))
+        camera = camera_at(self.capture, first.camera, first.mid_us)
+        centre = camera.center().double().numpy()
+        start = server.initial_camera
+        start.position = centre
+        start.look_at = centre + forward(camera) * max(0.5, (self.pivot - centre) @ forward(camera))
+        start.up = up
+        start.fov = vertical_fov(camera)
+        server.gui.configure_theme(
+            dark_mode=True,
+            show_logo=False,
+            show_share_button=False,
+            control_width="medium",
+            brand_color=(38, 124, 160),
+        )
+        server.gui.main_panel.dock_right()
+        server.gui.add_markdown(_description(self.subjects))
+
+    async def _enter(self, handle: viser.ClientHandle) -> None:
+        camera, frames = handle.camera, self.capture.frames
+        times = [frame.mid_us for frame in frames if frame.camera == frames[0].camera]
+        look = Look(
+            width=max(16, camera.image_width),
+            height=max(16, camera.image_height),
+            orbit=orbit_of(camera),
+            recording=None,
+            time_us=min(times),
+            motion=Motion(None, ()),
+            parts="all",
+            colouring="colour",
+            compare=None,
+            layout="divided",
+            divider=0.5,
+            events_us=None,
+        )
+        playback = Playback(min(times), max(times), min(times), speed=SPEEDS["1/5"])
+        client = Client(handle, self.painter, self.desk, look, playback)
+        panel = Panel(client, self.pivot)
+        panel.look_through(frames[0].camera)
+        self._clients[handle.client_id] = client
+        self.desk.enter(client)
+
+    async def _leave(self, handle: viser.ClientHandle) -> None:
+        client = self._clients.pop(handle.client_id, None)
+        if client is not None:
+            self.desk.leave(client)
+
+
+def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> None:
+    """Do the work of `evsplat.view.view_run`."""
+    runs = [load_run(path, device=device) for path in paths]
+    captures = [loaded.capture.path.resolve() for loaded in runs]
+    if len(set(captures)) > 1:
+        raise DataError(
+            f"{runs[1].path}: trained on {captures[1]}, but {runs[0].path} on {captures[0]}; "
+            "compare runs of the same capture."
+        )
+    viewer = Viewer(runs, host=host, port=port)
+    if viewer.port != port:
+        print(f"Port {port} is in use; taking {viewer.port}.", flush=True)
+    print(f"view: {viewer.address}  (Ctrl-C stops)", flush=True)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("The viewer is closed.") from None
+    finally:
+        viewer.close()
+
+
+def _names(runs: list[Run]) -> list[str]:
+    """What runs are called: by their method, or by their folder where that is not enough."""
+    names = [run.method for run in runs]
+    if len(set(names)) < len(runs):
+        names = [run.path.resolve().name for run in runs]
+    if len(set(names)) < len(runs):
+        names = [str(run.path) for run in runs]
+    return names
+
+
+def _description(subjects: list[Subject]) -> str:
+    lines = [f"**{subjects[0].capture.name}**"]
+    for subject in subjects:
+        run = subject.run
+        people, scene = run.gaussians["human"], run.gaussians["scene"]
+        lines.append(
+            f"{subject.name}: step {run.iteration:,}, {people:,} Gaussians of the person, "
+            f"{scene:,} of the scene"
+        )
+    return "  \n".join(lines)
+
+
+def _pivot_and_up(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
+    """Around what the view turns, and which way is up in the world."""
+    frames = capture.train_frames or capture.frames
+    if capture.has_body:
+        track = load_body_track(capture)
+        _, transl = track.at([frame.mid_us for frame in frames])
+        root = (track.body.rest_joints[0] + transl).mean(0)
+        return root.double().numpy(), up_axis(track).double().numpy()
+    camera = capture.camera(frames[0])
+    to_world = camera.world_to_camera[:3, :3].T.double().numpy()
+    centre = camera.center().double().numpy()
+    up = np.zeros(3)
+    axis = int(np.abs(to_world[:, 1]).argmax())
+    up[axis] = -np.sign(to_world[axis, 1])
+    return centre + _DEFAULT_DISTANCE_M * to_world[:, 2], up
+
+
+def _free_port(host: str, port: int) -> int:
+    """The first port from ``port`` on that can be listened at."""
+    if not 0 < port < 65536:
+        raise ConfigError(f"--port {port}: expected 1 to 65535.")
+    last = min(port + _PORTS_TRIED, 65536)
+    for candidate in range(port, last):
+        try:
+            family, kind, *_, address = socket.getaddrinfo(
+                host or None, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )[0]
+        except socket.gaierror as error:
+            raise ConfigError(f"--host {host}: no such address ({error.strerror}).") from None
+        with socket.socket(family, kind) as probe:
+            # As the server will: a port that is only waiting to be forgotten is free.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(address)
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    continue
+                raise ConfigError(
+                    f"--host {host} --port {candidate}: cannot listen there ({error.strerror})."
+                ) from None
+            return candidate
+    raise ConfigError(f"--port {port}: this port and the next {_PORTS_TRIED} are all in use.")
