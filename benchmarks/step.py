@@ -34,13 +34,13 @@ from torch import Tensor
 
 from evsplat import _native
 from evsplat.capture import Frame, load_capture
-from evsplat.cli.demo import demo_capture
 from evsplat.deform import drawing, human_scene
 from evsplat.deform.mlp import Precision
 from evsplat.gaussians import ATTRIBUTES, GaussianSet
 from evsplat.methods import PaperConfig, compose
 from evsplat.objectives.base import Stateless, Step
 from evsplat.render import native as native_backend
+from evsplat.shipped import demo_capture
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 

@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from evsplat.benching.run import bench
     from evsplat.capture import load_capture
     from evsplat.capture.importers import import_capture
     from evsplat.capture.inspect_recording import inspect
@@ -45,6 +46,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "__version__",
+    "bench",
     "convert",
     "demo",
     "evaluate",
@@ -64,6 +66,7 @@ __all__ = [
 ]
 
 _LAZY = {
+    "bench": "evsplat.benching.run:bench",
     "convert": "evsplat.events.convert:convert_recording",
     "demo": "evsplat.cli.demo:demo",
     "evaluate": "evsplat.evaluation:evaluate_run",

@@ -139,7 +139,17 @@ def _convert_dataclass(kind: Any, value: Any, where: str, key: str, start: Any) 
             converted[name] = _convert_dataclass(hints[name], item, where, full, inner)
         else:
             converted[name] = _convert(hints[name], item, where, full)
-    return kind(**converted) if start is None else dataclasses.replace(start, **converted)
+    if start is not None:
+        return dataclasses.replace(start, **converted)
+    absent = [n for n, field in fields.items() if n not in converted and not _has_default(field)]
+    if absent:
+        raise ConfigError(f"{where}: {key + ': ' if key else ''}{absent[0]} is missing.")
+    return kind(**converted)
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    missing = dataclasses.MISSING
+    return field.default is not missing or field.default_factory is not missing
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:

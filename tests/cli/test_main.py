@@ -9,7 +9,7 @@ import pytest
 
 import evsplat
 from evsplat.cli import main
-from evsplat.cli.demo import demo_capture
+from evsplat.shipped import demo_capture
 
 VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "masks")
 VERBS += ("restore", "train", "evaluate", "report", "render")

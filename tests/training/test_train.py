@@ -21,14 +21,10 @@ from evsplat.training.clock import Clock
 from evsplat.training.run import RunFolder
 from evsplat.training.trainer import Trainer
 
+from ..small_model import SMALL_MODEL
+
 SMALL = (
-    "human.count=120",
-    "scene.prefit_steps=3",
-    "skinning_prefit_steps=3",
-    "deform.width=16",
-    "deform.colour_width=16",
-    "isometry_samples=64",
-    "densify_human.max_count=150",
+    *SMALL_MODEL,
     # Everything that the schedule switches on is on early, so that few steps meet all of it.
     "deform.non_rigid_start=3000",
     "event.start=1000",

@@ -1,20 +1,10 @@
 """``evsplat demo``: the whole way from a packaged capture to a report, in minutes."""
 
-from importlib.resources import files
-from pathlib import Path
 from typing import Annotated
 
 from evsplat.cli.options import Device, NewRunFolder, Threads, option
 from evsplat.cli.train import train
-from evsplat.errors import DataError
-
-
-def demo_capture() -> Path:
-    """Return the capture that ships with the package."""
-    path = Path(str(files("evsplat") / "data" / "demo_capture"))
-    if not (path / "capture.json").is_file():
-        raise DataError(f"{path}: the demo capture is missing from this installation; reinstall.")
-    return path
+from evsplat.shipped import demo_capture
 
 
 def demo(

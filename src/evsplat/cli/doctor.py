@@ -12,10 +12,10 @@ from importlib.util import find_spec
 from typing import Literal
 
 import evsplat
-from evsplat.cli.demo import demo_capture
 from evsplat.cli.options import Flag
 from evsplat.cuda_support import Need, needs
 from evsplat.errors import DataError, WeightsError
+from evsplat.shipped import demo_capture
 
 _MARKS = {"ok": "ok", "missing": "MISSING", "optional": "-"}
 

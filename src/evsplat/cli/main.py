@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 import evsplat
+from evsplat.cli.bench import bench
 from evsplat.cli.convert import convert
 from evsplat.cli.demo import demo
 from evsplat.cli.doctor import doctor
@@ -30,7 +31,7 @@ _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
     for verb in (
         *(demo, doctor, import_, convert, simulate, synthesize, stage, inspect),
-        *(masks, restore, train, evaluate, report, render, view),
+        *(masks, restore, train, evaluate, report, render, view, bench),
     )
 }
 _DESCRIPTION = (

@@ -54,10 +54,13 @@ def evaluate(
     protocols: Sequence[Protocol] = PROTOCOLS,
     lpips_weights: Path | str | None = None,
     device: torch.device | str = "cpu",
+    alone: bool = False,
 ) -> dict[str, Any]:
     """Measure ``reconstruction`` on the test frames and novel views of ``capture``.
 
     Returns what metrics.json holds, less the facts of a run; pictures go to ``out_dir/pictures``.
+    ``alone`` measures the test frames of the reconstruction and nothing else: no trivial rows, no
+    blurry truth, no novel views, no event maps; these keys are left out.
     Every figure is a mean over test frames of per-frame values. What cannot be measured is None,
     with the reason under "reasons" (a path of keys). Pictures are handled one by one, so that
     memory does not grow with the length of the recording.
@@ -66,7 +69,7 @@ def evaluate(
     networks, weights = _load_networks(lpips_weights, device)
     protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
     people = People(capture)
-    test = _TestFrames(capture, reconstruction, protocols, networks, people, out_dir)
+    test = _TestFrames(capture, reconstruction, protocols, networks, people, out_dir, alone=alone)
     for frame in tqdm(
         capture.test_frames, desc="test frames", unit="frame", leave=False, disable=None
     ):
@@ -78,13 +81,14 @@ def evaluate(
         **test.results(),
     }
     reasons: dict[str, str] = result["reasons"]
-    result["novel_views"] = _novel_views(
-        capture, reconstruction, networks, people, out_dir, reasons
-    )
-    events = evaluate_event_maps(capture, reconstruction, out_dir=out_dir)
-    result["events"] = None if isinstance(events, Absent) else events
-    if isinstance(events, Absent):
-        reasons["events"] = events.reason
+    if not alone:
+        result["novel_views"] = _novel_views(
+            capture, reconstruction, networks, people, out_dir, reasons
+        )
+        events = evaluate_event_maps(capture, reconstruction, out_dir=out_dir)
+        result["events"] = None if isinstance(events, Absent) else events
+        if isinstance(events, Absent):
+            reasons["events"] = events.reason
     result["weights"] = weights
     result["protocol_notes"] = {protocol.name: protocol.summary for protocol in protocols}
     return result
@@ -133,18 +137,23 @@ class _TestFrames:
         networks: Networks,
         people: People,
         out_dir: Path,
+        *,
+        alone: bool = False,
     ) -> None:
+        self._alone = alone
         self._capture = capture
         self._protocols = protocols
         self._networks = networks
         self._people = people
         self._out_dir = out_dir
         self._method: Picture = partial(_render, capture, reconstruction)
-        self._others: dict[str, Picture | Absent] = {
-            "median_background": _trivial(MedianBackground, capture),
-            "nearest_frame": _trivial(NearestFrame, capture),
-            BLURRY_INPUT: capture.image,
-        }
+        self._others: dict[str, Picture | Absent] = {}
+        if not alone:
+            self._others = {
+                "median_background": _trivial(MedianBackground, capture),
+                "nearest_frame": _trivial(NearestFrame, capture),
+                BLURRY_INPUT: capture.image,
+            }
         rows = ("method", *self._others)
         self._tallies = {(row, p.name): Tally() for row in rows for p in protocols}
         self._against_blurry = Tally()
@@ -155,10 +164,6 @@ class _TestFrames:
         ours = self._method(frame)
         mask, person = self._people.in_mask(frame)
         truth = None if frame.sharp is None else self._capture.sharp(frame)
-        blurry = Truth(STANDARD, self._capture.image(frame), mask, person, self._networks)
-        against_blurry = blurry.measure(ours)
-        self._against_blurry.add(against_blurry)
-
         # Standard comes first in self._protocols; the report shows it for every frame and row.
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
@@ -167,20 +172,22 @@ class _TestFrames:
             for row, picture in pictures.items():
                 measured[row][protocol.name] = _compare(judge, picture)
                 self._tallies[row, protocol.name].add(measured[row][protocol.name])
-        self._per_frame.append(
-            {
-                "frame": frame.name,
-                "time_us": frame.mid_us,
-                "protocols": {
-                    name: without_reasons(values) for name, values in measured["method"].items()
-                },
-                "others": {
-                    row: without_reasons(measured[row][STANDARD.name]) for row in self._others
-                },
-                "blurry_ground_truth": without_reasons(against_blurry),
-                "pictures": self._save(frame, ours, truth),
+        entry = {
+            "frame": frame.name,
+            "time_us": frame.mid_us,
+            "protocols": {
+                name: without_reasons(values) for name, values in measured["method"].items()
+            },
+        }
+        if not self._alone:
+            blurry = Truth(STANDARD, self._capture.image(frame), mask, person, self._networks)
+            against_blurry = blurry.measure(ours)
+            self._against_blurry.add(against_blurry)
+            entry["others"] = {
+                row: without_reasons(measured[row][STANDARD.name]) for row in self._others
             }
-        )
+            entry["blurry_ground_truth"] = without_reasons(against_blurry)
+        self._per_frame.append(entry | {"pictures": self._save(frame, ours, truth)})
 
     def results(self) -> dict[str, Any]:
         """Means of everything; "trivial" and "blurry_input" are of the protocol standard."""
@@ -195,8 +202,12 @@ class _TestFrames:
             return means(self._tallies[name, protocol.name], path)
 
         compat = [protocol for protocol in self._protocols if protocol is not STANDARD]
+        method = {p.name: row("method", p, f"protocols.{p.name}") for p in self._protocols}
+        frames = {"per_frame": self._per_frame, "reasons": reasons}
+        if self._alone:
+            return {"protocols": method, **frames}
         return {
-            "protocols": {p.name: row("method", p, f"protocols.{p.name}") for p in self._protocols},
+            "protocols": method,
             "trivial": {name: row(name, STANDARD, f"trivial.{name}") for name in TRIVIAL_ROWS},
             BLURRY_INPUT: row(BLURRY_INPUT, STANDARD, BLURRY_INPUT),
             "compat_rows": {
@@ -206,8 +217,7 @@ class _TestFrames:
                 for p in compat
             },
             "blurry_ground_truth": means(self._against_blurry, "blurry_ground_truth"),
-            "per_frame": self._per_frame,
-            "reasons": reasons,
+            **frames,
         }
 
     def _other_pictures(self, frame: Frame) -> dict[str, Tensor | Absent]:

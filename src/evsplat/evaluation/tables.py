@@ -181,7 +181,7 @@ def latex(metrics: dict[str, Any]) -> str:
                 for c in table.columns
             ]
             cells = [cell.replace("–", "--") for cell in cells]
-            lines.append(" & ".join([_latex_text(table.title(row)), *cells]) + r" \\")
+            lines.append(" & ".join([latex_text(table.title(row)), *cells]) + r" \\")
         lines += [r"\bottomrule", r"\end{tabular}", ""]
     return "\n".join(lines)
 
@@ -198,5 +198,6 @@ _LATEX_SPECIAL = {
 }
 
 
-def _latex_text(text: str) -> str:
+def latex_text(text: str) -> str:
+    """``text`` with everything escaped that LaTeX would take for its own."""
     return "".join(_LATEX_SPECIAL.get(character, character) for character in text)

@@ -1,0 +1,194 @@
+"""One cell: a method on a capture with a seed, trained, measured and recorded, whatever happens."""
+
+import logging
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import evsplat
+from evsplat.benching.folder import BenchFolder, exclusive
+from evsplat.capture import Capture, load_capture
+from evsplat.errors import EvsplatError
+from evsplat.evaluation.evaluator import evaluate
+from evsplat.files import read_json, write_json
+from evsplat.methods.reconstruction import Reconstruction
+from evsplat.methods.trivial import MedianBackground, NearestFrame
+from evsplat.restore import restore_capture
+from evsplat.staging import StageSettings, stage
+
+logger = logging.getLogger(__name__)
+
+UNTRAINED: dict[str, Callable[[Capture], Reconstruction]] = {
+    "median_background": MedianBackground,
+    "nearest_frame": NearestFrame,
+}
+"""Methods that have nothing to train."""
+
+DONE, FAILED = "done", "failed"
+
+
+@dataclass(frozen=True)
+class CaptureSource:
+    """Where a capture comes from."""
+
+    name: str
+    path: Path
+    """Its folder, absolute; of a staged one, where it is made when it is first needed."""
+    fingerprint: str
+    """Changes when the capture does."""
+    stage: StageSettings | None = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What is asked for; nothing else decides the figures but the machine."""
+
+    capture: CaptureSource
+    row: str
+    seed: int
+    method: str
+    restore: str | None
+    settings: tuple[str, ...]
+    iterations: int | None
+    max_minutes: float | None
+
+    @property
+    def id(self) -> str:
+        """``capture/row/seed0``, also the path of its files."""
+        return f"{self.capture.name}/{self.row}/seed{self.seed}"
+
+    @property
+    def trains(self) -> bool:
+        """Whether the method is one that is trained."""
+        return self.method not in UNTRAINED
+
+    def request(self) -> dict[str, Any]:
+        """What decides the figures, as JSON; a cell with another request is another cell."""
+        asked = {key: value for key, value in asdict(self).items() if key != "capture"}
+        return asked | {
+            "capture": self.capture.name,
+            "fingerprint": self.capture.fingerprint,
+            "settings": list(self.settings),
+        }
+
+
+def run_cell(folder: Path, cell: Cell, *, threads: int | None, device: str) -> None:
+    """Do what is left of a cell and write its record, of the failure where it fails.
+
+    Training goes on from the last checkpoint. Only what stops the process from outside (Ctrl-C, a
+    signal) leaves no record.
+    """
+    bench = BenchFolder(folder)
+    started = time.perf_counter()
+    with exclusive(bench.lock_of(cell.id)):
+        try:
+            record = {"status": DONE, **_measured(bench, cell, threads, device)}
+        except EvsplatError as error:
+            record = {"status": FAILED, "reason": str(error)}
+        except Exception as error:
+            # A fault of the program costs this cell only; the log has the traceback.
+            logger.exception("%s failed", cell.id)
+            record = {"status": FAILED, "reason": f"{type(error).__name__}: {error}"}
+        write_json(
+            bench.record_of(cell.id),
+            {
+                "cell": cell.request(),
+                **record,
+                "seconds": time.perf_counter() - started,
+                "peak_memory_mb": _peak_memory_mb(),
+                "evsplat": evsplat.__version__,
+            },
+        )
+
+
+def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) -> dict[str, Any]:
+    """Figures of the cell against the capture as it was recorded, restored or not."""
+    recorded = load_capture(_recorded(bench, cell.capture))
+    trained_on = _restored(bench, recorded, cell)
+    run = bench.run_of(cell.id)
+    facts: dict[str, Any] = {"iteration": None, "train_seconds": None, "gaussians": None}
+    reconstruction: Reconstruction
+    if cell.trains:
+        reconstruction, facts = _trained(run, trained_on, cell, threads, device)
+    else:
+        reconstruction = UNTRAINED[cell.method](load_capture(trained_on))
+    measured = evaluate(recorded, reconstruction, out_dir=run, device=device, alone=True)
+    kept = ("frames", "protocols", "per_frame", "reasons", "weights", "protocol_notes")
+    return {**facts, **{key: measured[key] for key in kept}}
+
+
+def _trained(
+    run: Path, capture: Path, cell: Cell, threads: int | None, device: str
+) -> tuple[Reconstruction, dict[str, Any]]:
+    from evsplat.training import load_run, train
+    from evsplat.training.checkpoint import latest_checkpoint
+    from evsplat.training.run import RunFolder
+
+    folder = RunFolder(run)
+    resume = latest_checkpoint(folder.checkpoints) is not None
+    if resume:
+        # Sums of floats depend on the number of threads, and with it the last bits of a training.
+        threads = read_json(folder.facts)["threads"]
+    else:
+        shutil.rmtree(run, ignore_errors=True)
+    settings = cell.settings
+    iterations = cell.iterations
+    if cell.max_minutes is not None and iterations is not None:
+        # As a setting it is the length of a schedule that the time limit may still shorten.
+        settings, iterations = (*settings, f"optimisation.iterations={iterations}"), None
+    go = partial(
+        train,
+        capture,
+        out=run,
+        device=device,
+        iterations=iterations,
+        max_minutes=cell.max_minutes,
+        threads=threads,
+    )
+    if resume:
+        go(resume=True)
+    else:
+        go(method=cell.method, overrides=settings, seed=cell.seed)
+    trained = load_run(run, device=device)
+    return trained.reconstruction, {
+        "iteration": trained.iteration,
+        "train_seconds": trained.train_seconds,
+        "gaussians": trained.gaussians,
+        "device": trained.device,
+        "threads": torch.get_num_threads(),
+    }
+
+
+def _recorded(bench: BenchFolder, source: CaptureSource) -> Path:
+    """Folder of the capture; a staged one is made by the first cell that needs it."""
+    if source.stage is None:
+        return source.path
+    with exclusive(bench.lock_of(f"captures/{source.path.name}")):
+        if not source.path.exists():
+            stage(source.path, source.stage, progress=False)
+    return source.path
+
+
+def _restored(bench: BenchFolder, recorded: Capture, cell: Cell) -> Path:
+    """Folder of what is trained on: restored once for all rows that want it so."""
+    if cell.restore is None:
+        return recorded.path
+    path = bench.captures / f"{cell.capture.name}-{cell.restore}"
+    with exclusive(bench.lock_of(f"captures/{path.name}")):
+        if not path.exists():
+            restore_capture(recorded.path, path, method=cell.restore)
+    return path
+
+
+def _peak_memory_mb() -> float:
+    """Of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)

@@ -1,0 +1,121 @@
+"""Records of cells put together: means over captures with their spread over seeds."""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from evsplat.benching.cell import DONE
+from evsplat.benching.folder import BenchFolder
+from evsplat.benching.plan import Plan
+from evsplat.files import read_json
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A mean over captures; of each capture over its seeds."""
+
+    mean: float
+    spread: float | None
+    """Standard deviation over seeds of the mean over captures; None with one seed."""
+    captures: int
+    """How many captures it is over."""
+
+
+@dataclass(frozen=True)
+class Records:
+    """Everything that a results folder knows about a plan."""
+
+    plan: Plan
+    by_cell: dict[tuple[str, str, int], Record]
+    """Of (capture, row, seed); cells without a record are not in it."""
+
+    @classmethod
+    def read(cls, plan: Plan, folder: BenchFolder) -> "Records":
+        """Read the record of every cell that has one."""
+        found = {}
+        for cell in plan.cells:
+            path = folder.record_of(cell.id)
+            if path.exists():
+                found[cell.capture.name, cell.row, cell.seed] = read_json(path)
+        return cls(plan, found)
+
+    @property
+    def captures(self) -> list[str]:
+        """Captures that could be run."""
+        return list(self.plan.sources)
+
+    def of(self, capture: str, row: str) -> list[Record]:
+        """Finished records of a place in the table, by seed."""
+        return [
+            record
+            for (one, other, _), record in sorted(self.by_cell.items())
+            if (one, other) == (capture, row) and record["status"] == DONE
+        ]
+
+    def figure(
+        self, row: str, value: Callable[[Record], float | None], captures: Iterable[str]
+    ) -> Figure | None:
+        """The row's mean of ``value`` over those of ``captures`` that have it."""
+        by_capture = []
+        for capture in captures:
+            values = {r["cell"]["seed"]: value(r) for r in self.of(capture, row)}
+            known = {seed: number for seed, number in values.items() if number is not None}
+            if known:
+                by_capture.append(known)
+        if not by_capture:
+            return None
+        mean = _mean(_mean(values.values()) for values in by_capture)
+        seeds = set.intersection(*(set(values) for values in by_capture))
+        per_seed = [_mean(values[seed] for values in by_capture) for seed in seeds]
+        spread = None
+        if len(per_seed) > 1:
+            centre = _mean(per_seed)
+            squares = sum((value - centre) ** 2 for value in per_seed)
+            spread = math.sqrt(squares / (len(per_seed) - 1))
+        return Figure(mean, spread, len(by_capture))
+
+    def why_not(self, capture: str, row: str) -> str:
+        """Why a place in the table is empty."""
+        for (one, other, _), record in self.by_cell.items():
+            if (one, other) == (capture, row) and record["status"] != DONE:
+                return f"failed: {record['reason']}"
+        return "not run"
+
+    def failures(self) -> dict[tuple[str, str], list[str]]:
+        """Captures that a row failed on, by row and reason."""
+        found: dict[tuple[str, str], list[str]] = {}
+        for (capture, row, seed), record in self.by_cell.items():
+            if record["status"] != DONE:
+                where = capture if len(self.plan.suite.seeds) == 1 else f"{capture} seed {seed}"
+                found.setdefault((row, record["reason"]), []).append(where)
+        return found
+
+
+def metric(protocol: str, region: str, name: str) -> Callable[[Record], float | None]:
+    """The value of a metric in a record."""
+    return lambda record: record["protocols"][protocol][region][name]
+
+
+def train_minutes(record: Record) -> float | None:
+    """Minutes of training."""
+    seconds = record["train_seconds"]
+    return None if seconds is None else seconds / 60
+
+
+def steps(record: Record) -> float | None:
+    """Training steps."""
+    return record["iteration"]
+
+
+def gaussians(record: Record) -> float | None:
+    """Gaussians of person and scene together."""
+    counts = record["gaussians"]
+    return None if counts is None else sum(counts.values())
+
+
+def _mean(values: Iterable[float]) -> float:
+    numbers = list(values)
+    return sum(numbers) / len(numbers)

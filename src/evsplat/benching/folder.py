@@ -1,0 +1,65 @@
+"""The results folder of a bench and its locks."""
+
+import fcntl
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from evsplat.errors import ConfigError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class BenchFolder:
+    """Where the parts of a bench lie; ``id`` is a cell's ``capture/row/seed0``."""
+
+    path: Path
+
+    @property
+    def captures(self) -> Path:
+        """Captures that the bench made: staged and restored ones."""
+        return self.path / "captures"
+
+    def record_of(self, id: str) -> Path:  # noqa: A002 - the cell's own word
+        """What came of a cell, JSON; there when the cell is over."""
+        return self.path / "cells" / f"{id}.json"
+
+    def run_of(self, id: str) -> Path:  # noqa: A002
+        """Run folder of a cell: checkpoints and pictures."""
+        return self.path / "runs" / id
+
+    def log_of(self, id: str) -> Path:  # noqa: A002
+        """What the cell's process printed."""
+        return self.path / "logs" / f"{id}.log"
+
+    def lock_of(self, name: str) -> Path:
+        """Held while something of this name is being made."""
+        return self.path / "locks" / f"{name}.lock"
+
+
+@contextmanager
+def exclusive(lock: Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold a lock that ends with this process, however it ends.
+
+    The file holds the process's number. Where the file system has no locks nothing is held: all
+    writing is whole or not at all anyway, so that work may be done twice but not spoilt.
+    """
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with lock.open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            raise ConfigError(
+                f"{lock.parents[1]}: another bench works in this folder; wait for it or choose "
+                "another --out."
+            ) from None
+        except OSError as error:
+            logger.warning("%s: no locks on this file system (%s)", lock, error)
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield

@@ -1,0 +1,115 @@
+"""Cells on this machine, each in a process of its own."""
+
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass, field
+from os import environ
+from pathlib import Path
+from queue import SimpleQueue
+
+from evsplat.benching.cell import Cell
+from evsplat.benching.folder import BenchFolder
+
+ATTEMPTS = 3
+"""How often a cell is started whose process is killed; it goes on from its checkpoint."""
+_LOG_TAIL = 400
+
+
+@dataclass
+class LocalPool:
+    """Runs up to ``jobs`` cells at a time."""
+
+    folder: Path
+    jobs: int
+    threads: int
+    """Of each cell."""
+    device: str
+    gpus: int = 0
+    """On this machine; cells take them in turns."""
+    _running: set["subprocess.Popen[bytes]"] = field(default_factory=set)
+    _stopping: bool = False
+
+    def run(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, str | None]]:
+        """Each cell as it ends, with the reason where its process ended without a record.
+
+        Closing the iterator, and Ctrl-C, stop what runs: training is saved first. A second Ctrl-C
+        waits for nothing.
+        """
+        slots: SimpleQueue[int] = SimpleQueue()
+        for slot in range(self.jobs):
+            slots.put(slot)
+        threads = ThreadPoolExecutor(self.jobs, thread_name_prefix="cell")
+        ends: dict[Future[str | None], Cell] = {}
+        try:
+            for cell in cells:
+                ends[threads.submit(self._one, cell, slots)] = cell
+            for end in as_completed(ends):
+                yield ends[end], end.result()
+        finally:
+            self._stopping = True
+            threads.shutdown(wait=False, cancel_futures=True)
+            try:
+                self._signal(signal.SIGINT)
+                threads.shutdown(wait=True)
+            except KeyboardInterrupt:
+                self._signal(signal.SIGKILL)
+                raise
+
+    def _one(self, cell: Cell, slots: "SimpleQueue[int]") -> str | None:
+        bench = BenchFolder(self.folder)
+        record, log = bench.record_of(cell.id), bench.log_of(cell.id)
+        slot = slots.get()
+        code = 0
+        try:
+            for _ in range(ATTEMPTS):
+                code = self._process(cell, slot, log)
+                if record.exists() or self._stopping:
+                    return None
+                if code >= 0:
+                    break
+        finally:
+            slots.put(slot)
+        end = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
+        tail = log.read_text(encoding="utf-8", errors="replace")[-_LOG_TAIL:].split("\n")[-2:]
+        return f"its process {end}: {' '.join(tail).strip() or 'nothing in its log'}"
+
+    def _process(self, cell: Cell, slot: int, log: Path) -> int:
+        """Run the cell's process to its end; gives the exit code, negative for a signal."""
+        log.parent.mkdir(parents=True, exist_ok=True)
+        threads = str(self.threads)
+        variables = {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
+        if self.gpus > 1:
+            variables["CUDA_VISIBLE_DEVICES"] = str(slot % self.gpus)
+        with log.open("ab") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "evsplat.benching.worker"],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=output,
+                env={**environ, **variables},
+                # Ctrl-C on the terminal is for the bench, which tells its cells.
+                start_new_session=True,
+            )
+        assert process.stdin is not None
+        self._running.add(process)
+        try:
+            if self._stopping:
+                process.kill()
+            # Where it dies at once its exit code tells.
+            with suppress(BrokenPipeError):
+                pickle.dump((self.folder, cell, self.threads, self.device), process.stdin)
+                process.stdin.flush()
+            return process.wait()
+        finally:
+            self._running.discard(process)
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+
+    def _signal(self, number: int) -> None:
+        for process in tuple(self._running):
+            process.send_signal(number)

@@ -1,0 +1,191 @@
+"""One page with the tables and all methods side by side for every test frame; no other file."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import resources
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from evsplat.benching.figures import Record, Records
+from evsplat.benching.folder import BenchFolder
+from evsplat.benching.tables import BenchTable
+from evsplat.benching.writers import LEGEND, html
+from evsplat.capture import Capture, Frame, load_capture
+from evsplat.errors import DataError
+from evsplat.evaluation.people import People
+from evsplat.evaluation.pictures import to_bytes
+from evsplat.evaluation.regions import CROP_MARGIN, Box
+from evsplat.evaluation.report.embed import Embedder
+from evsplat.evaluation.report.html import folded, section, spread
+
+_PIXELS = 60_000_000
+"""Of all pictures of the page together; beyond, captures show fewer frames, evenly spread."""
+_OPEN = 3
+"""Frames of a capture that show at once; the others are folded."""
+
+_STYLE = """
+td.second { text-decoration: underline; text-underline-offset: 3px; }
+tbody th { min-width: 130px; }
+.tiles { display: grid; gap: 10px 8px;
+  grid-template-columns: repeat(auto-fill, minmax(148px, 1fr)); }
+.tile { position: relative; overflow: hidden; border-radius: 5px; background: var(--faint); }
+.tile img { display: block; width: 100%; height: auto; border-radius: 0; }
+#person:checked ~ main .tile[style] { aspect-ratio: var(--a); }
+#person:checked ~ main .tile[style] img { position: absolute; max-width: none; width: var(--w);
+  left: var(--x); top: var(--y); }
+.tile.gap { display: grid; place-items: center; min-height: 120px; padding: 8px; color: var(--soft);
+  font-size: 12px; text-align: center; overflow-wrap: anywhere; }
+figcaption b { color: var(--ink); font-weight: 560; }
+.switch { position: sticky; top: 0; z-index: 2; padding: 10px 0; background: var(--paper); }
+.switch label { cursor: pointer; padding: 7px 14px; border: 1px solid var(--faint);
+  border-radius: 99px; background: var(--panel); }
+#person { position: absolute; opacity: 0; }
+#person:focus-visible ~ main .switch label { outline: 2px solid var(--accent); }
+#person:checked ~ main .whole, #person:not(:checked) ~ main .near { display: none; }
+@media (max-width: 720px) { .tiles { grid-template-columns: repeat(2, 1fr); } }
+"""
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A line of the table as it shows in pictures: of its first seed."""
+
+    title: str
+    record: Record | None
+    run: str
+    why: str
+    """Why there is no record of a result."""
+
+
+def page(records: Records, tables: Sequence[BenchTable], folder: BenchFolder) -> str:
+    """The page as HTML; all that comes from the user's files is escaped."""
+    suite = records.plan.suite
+    style = (resources.files("evsplat") / "data" / "report.css").read_text(encoding="utf-8")
+    title = suite.title or suite.name
+    figures = "".join(
+        section(escape(table.title), escape(table.note), html(table)) for table in tables
+    )
+    captures = {
+        name: load_capture(source.path)
+        for name, source in records.plan.sources.items()
+        if any(records.of(name, row.name) for row in suite.rows)
+    }
+    budget = _PIXELS // max(len(captures), 1)
+    pictures = "".join(
+        _capture(records, name, capture, folder, budget) for name, capture in captures.items()
+    )
+    done = sum(record["status"] == "done" for record in records.by_cell.values())
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{escape(title)}</title><style>{style}{_STYLE}</style></head><body>"
+        '<input type="checkbox" id="person" checked aria-label="person only">'
+        f'<header><p class="kicker">evsplat · bench · {escape(suite.name)}</p>'
+        f'<h1>{escape(title)}</h1><p class="lead">{done} of {len(records.plan.cells)} cells. '
+        f"{escape(LEGEND.format(second='underlined'))}</p></header>"
+        f"<main>{figures}{pictures}</main></body></html>\n"
+    )
+
+
+def _capture(
+    records: Records, name: str, capture: Capture, folder: BenchFolder, budget: int
+) -> str:
+    """All test frames of a capture, each with every row."""
+    rows = []
+    for row in records.plan.suite.rows:
+        found = records.of(name, row.name)
+        record = found[0] if found else None
+        run = "" if record is None else f"{name}/{row.name}/seed{record['cell']['seed']}"
+        rows.append(_Row(row.shown, record, run, records.why_not(name, row.name)))
+    camera = next(iter(capture.cameras.values()))
+    of_frame = camera.width * camera.height * (len(rows) + 2)
+    frames = spread(capture.test_frames, max(2, budget // of_frame))
+    shown = spread(frames, _OPEN)
+    people = People(capture)
+    # Pictures of many methods: light compression is seen by nobody at this size.
+    embed = Embedder(lossless=False)
+    draw = {frame.name: _frame(capture, people, frame, rows, folder, embed) for frame in frames}
+    others = "".join(draw[frame.name] for frame in frames if frame not in shown)
+    left = len(capture.test_frames) - len(frames)
+    intro = f"{left} more test frames are measured but not shown. " if left else ""
+    return section(
+        escape(name),
+        intro + "PSNR of the person crop, protocol standard.",
+        '<div class="switch"><label for="person"><span class="near">show whole pictures</span>'
+        '<span class="whole">show the person only</span></label></div>'
+        + "".join(draw[frame.name] for frame in shown)
+        + folded(f"{len(frames) - len(shown)} more test frames", others),
+    )
+
+
+def _frame(
+    capture: Capture,
+    people: People,
+    frame: Frame,
+    rows: Sequence[_Row],
+    folder: BenchFolder,
+    embed: Embedder,
+) -> str:
+    _, box = people.in_mask(frame)
+    camera = capture.camera(frame)
+    if isinstance(box, Box):
+        box = box.enlarged(CROP_MARGIN, camera.height, camera.width)
+        style = _window(box, camera.height, camera.width)
+    else:
+        style = ""
+    tiles = [_tile(embed.image(to_bytes(capture.image(frame)), "blurry input"), style, "recorded")]
+    if frame.sharp is not None:
+        truth = embed.image(to_bytes(capture.sharp(frame)), "sharp truth")
+        tiles.append(_tile(truth, style, "truth"))
+    for row in rows:
+        entry = None if row.record is None else _entry(row.record, frame.name)
+        if entry is None:
+            tiles.append(
+                f'<figure><div class="tile gap">{escape(row.why)}</div>'
+                f"<figcaption><b>{escape(row.title)}</b></figcaption></figure>"
+            )
+            continue
+        figures = entry["protocols"]["standard"]
+        psnr = figures["person_crop"]["psnr"] or figures["full"]["psnr"]
+        picture = _read(folder, row.run, entry["pictures"]["render"])
+        note = "" if psnr is None else f"{psnr:.2f} dB"
+        tiles.append(_tile(embed.image(picture, row.title), style, row.title, note))
+    return (
+        f'<article class="frame"><h3>Frame {escape(frame.name)}</h3>'
+        f'<div class="tiles">{"".join(tiles)}</div></article>'
+    )
+
+
+def _tile(image: str, style: str, title: str, note: str = "") -> str:
+    return (
+        f'<figure><div class="tile"{style}>{image}</div>'
+        f"<figcaption><b>{escape(title)}</b> {escape(note)}</figcaption></figure>"
+    )
+
+
+def _window(box: Box, height: int, width: int) -> str:
+    """The part of the picture that shows, in shares of the tile's own width and height."""
+    wide, high = box.right - box.left, box.bottom - box.top
+    return (
+        f' style="--a:{wide}/{high};--w:{100 * width / wide:.2f}%;'
+        f'--x:{-100 * box.left / wide:.2f}%;--y:{-100 * box.top / high:.2f}%"'
+    )
+
+
+def _entry(record: Record, frame: str) -> Record | None:
+    return next((entry for entry in record["per_frame"] if entry["frame"] == frame), None)
+
+
+def _read(folder: BenchFolder, run: str, path: str) -> UInt8[np.ndarray, "H W 3"]:
+    file = folder.run_of(run) / path
+    try:
+        with Image.open(file) as image:
+            return np.asarray(image.convert("RGB"))
+    except OSError as error:
+        raise DataError(
+            f"{file}: not readable ({error}); remove {folder.record_of(run)} to measure it again."
+        ) from None

@@ -1,0 +1,158 @@
+"""What a suite asks for on this machine: captures found, cells in the order they are run."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from evsplat.benching.cell import FAILED, UNTRAINED, CaptureSource, Cell
+from evsplat.benching.folder import BenchFolder
+from evsplat.benching.suite import Suite, SuiteCapture, SuiteRow, check_names
+from evsplat.errors import ConfigError
+from evsplat.files import read_json
+from evsplat.shipped import demo_capture
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A suite and what of it can run."""
+
+    suite: Suite
+    sources: dict[str, CaptureSource]
+    """Captures that are there or can be made, by name."""
+    missing: dict[str, str]
+    """Captures that are not, and what to do, by name."""
+    cells: tuple[Cell, ...]
+    """Untrained rows first, since they take seconds and find what is wrong with a capture."""
+
+    def of(self, capture: str, row: str) -> list[Cell]:
+        """The cells of one place in the table, one per seed."""
+        return [cell for cell in self.cells if (cell.capture.name, cell.row) == (capture, row)]
+
+
+def make_plan(
+    suite: Suite,
+    folder: BenchFolder,
+    *,
+    captures: Sequence[Path | str] = (),
+    iterations: int | None = None,
+    max_minutes: float | None = None,
+    seeds: Sequence[int] = (),
+    only: Sequence[str] = (),
+) -> Plan:
+    """Cells of a suite; what is given replaces what the suite says.
+
+    A time limit replaces the suite's number of steps unless a number is given as well.
+
+    Raises:
+        ConfigError: A row does not exist, or a number is out of range.
+    """
+    if captures:
+        named = tuple(SuiteCapture(Path(path).resolve().name, str(path)) for path in captures)
+        check_names("capture", [capture.name for capture in named], "--captures")
+        suite = replace(suite, captures=named)
+    if max_minutes is not None:
+        suite = replace(suite, max_minutes=max_minutes, iterations=iterations)
+    elif iterations is not None:
+        suite = replace(suite, iterations=iterations)
+    if seeds:
+        suite = replace(suite, seeds=tuple(dict.fromkeys(seeds)))
+    if only:
+        suite = replace(suite, rows=tuple(_chosen(suite.rows, only)))
+    if not suite.captures:
+        raise ConfigError(f"suite {suite.name} names no captures; give some with --captures.")
+    if suite.iterations is not None and suite.iterations < 1:
+        raise ConfigError(f"iterations is {suite.iterations}, expected at least 1.")
+    if suite.max_minutes is not None and suite.max_minutes <= 0:
+        raise ConfigError(f"max_minutes is {suite.max_minutes:g}, expected a time above 0.")
+
+    sources: dict[str, CaptureSource] = {}
+    missing: dict[str, str] = {}
+    for capture in suite.captures:
+        source = _source(capture, folder)
+        if isinstance(source, CaptureSource):
+            sources[capture.name] = source
+        else:
+            missing[capture.name] = source
+    return Plan(suite, sources, missing, tuple(_cells(suite, sources.values())))
+
+
+def left_to_do(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]:
+    """Cells without a record; ``retry`` forgets the records of failures.
+
+    Raises:
+        ConfigError: The folder has a cell of the same place that was asked for otherwise.
+    """
+    todo = []
+    for cell in plan.cells:
+        path = folder.record_of(cell.id)
+        if not path.exists():
+            todo.append(cell)
+            continue
+        record = read_json(path)
+        _refuse_another(path, record["cell"], cell.request(), folder)
+        if retry and record["status"] == FAILED:
+            path.unlink()
+            todo.append(cell)
+    return todo
+
+
+def _cells(suite: Suite, sources: Iterable[CaptureSource]) -> list[Cell]:
+    cells = [
+        Cell(
+            source,
+            row.name,
+            seed,
+            row.method,
+            row.restore,
+            row.settings if row.method not in UNTRAINED else (),
+            suite.iterations if row.method not in UNTRAINED else None,
+            suite.max_minutes if row.method not in UNTRAINED else None,
+        )
+        for seed in suite.seeds
+        for source in sources
+        for row in suite.rows
+        # What is not trained has no seed.
+        if row.method not in UNTRAINED or seed == suite.seeds[0]
+    ]
+    return sorted(cells, key=lambda cell: cell.trains)
+
+
+def _chosen(rows: Sequence[SuiteRow], only: Sequence[str]) -> list[SuiteRow]:
+    names = [row.name for row in rows]
+    for name in only:
+        if name not in names:
+            raise ConfigError(f"--only {name}: no such row; rows are {', '.join(names)}.")
+    return [row for row in rows if row.name in only]
+
+
+def _source(capture: SuiteCapture, folder: BenchFolder) -> CaptureSource | str:
+    """The capture, or a sentence that says how to get it."""
+    if capture.stage is not None:
+        settings = json.dumps(asdict(capture.stage), sort_keys=True)
+        made = folder.captures.resolve() / capture.name
+        return CaptureSource(capture.name, made, _digest(settings.encode()), capture.stage)
+    assert capture.path is not None
+    path = demo_capture() if capture.path == "demo" else Path(capture.path)
+    description = path / "capture.json"
+    if not description.is_file():
+        how = f"make it with `{capture.get}`" if capture.get else "check the path"
+        return f"{path}: capture not found; {how}, or name captures with --captures."
+    return CaptureSource(capture.name, path.resolve(), _digest(description.read_bytes()))
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _refuse_another(
+    path: Path, there: dict[str, Any], asked: dict[str, Any], folder: BenchFolder
+) -> None:
+    for key, value in asked.items():
+        if there.get(key) != value:
+            raise ConfigError(
+                f"{path}: was made with {key} {there.get(key)!r}, and {value!r} is asked for; "
+                f"choose another --out, or remove {folder.path} to begin anew."
+            )

@@ -1,0 +1,127 @@
+"""A suite: captures x rows x seeds, read from a YAML file or from those that ship."""
+
+import re
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+from evsplat.config import from_dict, load_yaml
+from evsplat.errors import ConfigError
+from evsplat.staging import StageSettings
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+
+
+@dataclass(frozen=True)
+class SuiteCapture:
+    """A capture of a suite: one on the disk, the packaged one, or one that is staged."""
+
+    name: str
+    """Of the capture in tables and of its folders."""
+    path: str | None = None
+    """Capture folder, relative to the working directory; ``demo`` is the one that ships."""
+    stage: StageSettings | None = None
+    """Settings of `evsplat stage`; the capture is made in the results folder when it is needed."""
+    get: str | None = None
+    """The command that makes the capture, for the message that it is missing."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """Figures of a publication for a row: means over `PublishedTable.captures`."""
+
+    psnr: float
+    """dB."""
+    ssim: float
+    lpips: float
+
+
+@dataclass(frozen=True)
+class SuiteRow:
+    """One line of the table."""
+
+    name: str
+    """In file names and for ``--only``."""
+    method: str
+    """A method that is trained, or ``median_background`` or ``nearest_frame``."""
+    title: str | None = None
+    """In tables; the name where it is not given."""
+    restore: str | None = None
+    """Restoration of the training frames before (`evsplat restore --with`)."""
+    settings: tuple[str, ...] = ()
+    """Settings of the method as for ``--set``: ``event.weight=0``."""
+    published: Published | None = None
+
+    @property
+    def shown(self) -> str:
+        """What a reader sees."""
+        return self.title or self.name
+
+
+@dataclass(frozen=True)
+class PublishedTable:
+    """Where the published figures come from."""
+
+    title: str
+    captures: tuple[str, ...]
+    """Names of the captures that they are means over."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """What is compared with what."""
+
+    name: str
+    rows: tuple[SuiteRow, ...]
+    captures: tuple[SuiteCapture, ...] = ()
+    title: str = ""
+    seeds: tuple[int, ...] = (0,)
+    iterations: int | None = None
+    """Training steps of every row; None: the method's own."""
+    max_minutes: float | None = None
+    """Minutes of training of every cell; the schedule is shortened to be finished by then."""
+    published: PublishedTable | None = field(default=None)
+
+
+def shipped_suites() -> dict[str, Path]:
+    """Suites inside the package, by name."""
+    folder = Path(str(resources.files("evsplat") / "benching" / "suites"))
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def read_suite(suite: Path | str) -> Suite:
+    """A suite by the name of a shipped one or by the path of a YAML file.
+
+    Raises:
+        ConfigError: There is no such suite, a key is unknown (the nearest is named), a name occurs
+            twice or is no file name.
+    """
+    shipped = shipped_suites()
+    path = shipped.get(str(suite), Path(suite))
+    if not path.is_file():
+        raise ConfigError(
+            f"{suite}: no such suite; give the path of a YAML file or one of {', '.join(shipped)}."
+        )
+    read = from_dict(Suite, load_yaml(path), where=str(path))
+    for kind, names in (
+        ("row", [row.name for row in read.rows]),
+        ("capture", [capture.name for capture in read.captures]),
+    ):
+        check_names(kind, names, str(path))
+    for capture in read.captures:
+        if (capture.path is None) == (capture.stage is None):
+            raise ConfigError(f"{path}: capture {capture.name}: expected either path or stage.")
+    if not read.rows:
+        raise ConfigError(f"{path}: rows is empty, expected at least one.")
+    return read
+
+
+def check_names(kind: str, names: list[str], where: str) -> None:
+    """Names become files: refuse those that cannot, and those that occur twice."""
+    for name in names:
+        if not _NAME.fullmatch(name):
+            raise ConfigError(
+                f"{where}: {kind} {name!r}: expected letters, digits, '.', '_', '+' and '-' only."
+            )
+        if names.count(name) > 1:
+            raise ConfigError(f"{where}: two {kind}s are named {name}; give each its own name.")
