@@ -8,8 +8,9 @@ The verbs of the command line are functions here, imported on first use:
     ev.write_report(run)
     ev.render_run(run, slow=8)
 
-``evsplat render`` is `render_run` here, ``view`` is `view_run`, ``restore`` is `restore_capture`
-and ``masks`` is `mask_capture`, because these words are names of packages.
+``evsplat render`` is `render_run` here, ``view`` is `view_run`, ``export`` is `export_run`,
+``restore`` is `restore_capture` and ``masks`` is `mask_capture`, because these words are names of
+packages.
 """
 
 import os
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from evsplat.evaluation import evaluate_run as evaluate
     from evsplat.evaluation.report import write_report
     from evsplat.events.convert import convert_recording as convert
-    from evsplat.export import render_run
+    from evsplat.export import export_run, render_run
     from evsplat.footage.simulate import simulate
     from evsplat.masks import mask_capture
     from evsplat.restore import restore_capture
@@ -50,6 +51,7 @@ __all__ = [
     "convert",
     "demo",
     "evaluate",
+    "export_run",
     "import_capture",
     "inspect",
     "load_capture",
@@ -70,6 +72,7 @@ _LAZY = {
     "convert": "evsplat.events.convert:convert_recording",
     "demo": "evsplat.cli.demo:demo",
     "evaluate": "evsplat.evaluation:evaluate_run",
+    "export_run": "evsplat.export:export_run",
     "import_capture": "evsplat.capture.importers:import_capture",
     "inspect": "evsplat.capture.inspect_recording:inspect",
     "load_capture": "evsplat.capture:load_capture",

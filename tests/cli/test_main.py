@@ -12,7 +12,7 @@ from evsplat.cli import main
 from evsplat.shipped import demo_capture
 
 VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "masks")
-VERBS += ("restore", "train", "evaluate", "report", "render")
+VERBS += ("restore", "train", "evaluate", "report", "render", "export")
 
 
 def _outcome(capsys, *arguments):

@@ -14,6 +14,7 @@ from evsplat.cli.convert import convert
 from evsplat.cli.demo import demo
 from evsplat.cli.doctor import doctor
 from evsplat.cli.evaluate import evaluate
+from evsplat.cli.export import export
 from evsplat.cli.import_ import import_, import_with_kinds
 from evsplat.cli.inspect import inspect
 from evsplat.cli.masks import masks
@@ -31,7 +32,7 @@ _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
     for verb in (
         *(demo, doctor, import_, convert, simulate, synthesize, stage, inspect),
-        *(masks, restore, train, evaluate, report, render, view, bench),
+        *(masks, restore, train, evaluate, report, render, view, export, bench),
     )
 }
 _DESCRIPTION = (

@@ -108,6 +108,21 @@ def _showing_depth(layer: Splats, camera: PinholeCamera) -> Splats:
     return replace(layer, channels=(layer.means @ pose[2, :3] + pose[2, 3])[..., None])
 
 
+def shadowed_scene(model: _Drawable, posed: PosedGaussians) -> Splats:
+    """The scene's Gaussians with the person's shadow in their colours, one set per time.
+
+    For files and viewers of others: the shadow is looked up at the centre of each Gaussian instead
+    of at each pixel. Without shadows it is `PosedGaussians.static`.
+    """
+    scene = posed.static()
+    if model.shadow is None or posed.casters is None:
+        return scene
+    light = model.shadow(posed.casters, scene.means)[:, 0, :, None]
+    rgb, semantic = scene.channels.split((3, 1), -1)
+    channels = [rgb * light, semantic.expand(posed.times, -1, -1)]
+    return replace(scene, channels=torch.cat(channels, -1))
+
+
 def _in_layers(moving: Splats, static: Splats, camera: PinholeCamera) -> tuple[Splats, Splats]:
     """Channels person's RGB, scene's RGB, scene's depth and share, semantic attribute."""
     rgb, semantic = moving.channels.split((3, 1), -1)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.capture.camera import Camera
+from evsplat.render import Splats
 
 Parts = Literal["all", "human", "scene"]
 
@@ -62,4 +63,19 @@ class WithDepth(Protocol):
         self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
     ) -> Float[Tensor, "T H W"]:
         """Mean of z in the camera over what a pixel shows, metres; 0 where it shows nothing."""
+        ...
+
+
+@runtime_checkable
+class SplatReconstruction(Protocol):
+    """A reconstruction that can hand its Gaussians over, for files and viewers of others."""
+
+    def splats(
+        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
+    ) -> list[Splats]:
+        """What `Reconstruction.render` draws, in world metres; the person first, then the scene.
+
+        Channels are R, G, B (sRGB) and the semantic attribute (1 = person). Colours that depend on
+        the direction are those seen from ``camera``.
+        """
         ...

@@ -16,13 +16,13 @@ from torch import Tensor
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, load_capture
 from evsplat.config import load_yaml, to_dict
-from evsplat.deform.drawing import draw, draw_depth
+from evsplat.deform.drawing import draw, draw_depth, shadowed_scene
 from evsplat.deform.model import Model
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
 from evsplat.methods import TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
-from evsplat.render import choose_device, render
+from evsplat.render import Splats, choose_device, render
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, load_model
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
@@ -148,6 +148,17 @@ class GaussianReconstruction:
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
         """The same person doing what ``track`` says; see `Posable`."""
         return GaussianReconstruction(self.name, self.model.following(track))
+
+    @torch.no_grad()
+    def splats(
+        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
+    ) -> list[Splats]:
+        """Gaussians at the given times; see `SplatReconstruction`."""
+        center = camera.to(self.model.device).center()
+        posed = self.model.at(list(times_us), center, hard_semantics=True)
+        if parts == "all":
+            return [posed.moving(), shadowed_scene(self.model, posed)]
+        return [posed.moving() if parts == "human" else posed.static()]
 
 
 @dataclass(frozen=True)

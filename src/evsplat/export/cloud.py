@@ -1,0 +1,126 @@
+"""Gaussians as files hold them: centre, rotation, scale, opacity and one colour each."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from evsplat.body.rotations import (
+    matrix_to_quaternion,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from evsplat.errors import DataError
+from evsplat.render import Splats
+
+CHANNELS = 4
+"""Of exported splats: R, G, B, semantic attribute."""
+
+
+@dataclass(frozen=True, eq=False)
+class SplatCloud:
+    """N Gaussians with one colour each, in the axes of the file."""
+
+    means: Float32[np.ndarray, "N 3"]
+    """Centres, metres."""
+    quaternions: Float32[np.ndarray, "N 4"]
+    """Unit, (w, x, y, z), w >= 0."""
+    scales: Float32[np.ndarray, "N 3"]
+    """Standard deviations along the rotated axes, metres, above 0."""
+    opacities: Float32[np.ndarray, " N"]
+    """In [0, 1]."""
+    rgb: Float32[np.ndarray, "N 3"]
+    """sRGB; mostly in [0, 1], not clamped."""
+    semantic: Float32[np.ndarray, " N"]
+    """1 = person, 0 = scene."""
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return len(self.means)
+
+    def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> "SplatCloud":
+        """The same Gaussians in turned axes: ``rotation`` maps old coordinates to new ones."""
+        turn = torch.from_numpy(np.asarray(rotation, dtype=np.float64))
+        quaternions = quaternion_multiply(
+            matrix_to_quaternion(turn), torch.from_numpy(self.quaternions).double()
+        )
+        means = self.means.astype(np.float64) @ turn.numpy().T
+        return replace(self, means=_float32(means), quaternions=_positive(quaternions))
+
+
+def cloud_of(splats: Splats, time: int = 0) -> SplatCloud:
+    """One time of drawn Gaussians; ``channels`` are R, G, B and the semantic attribute.
+
+    Skinning shears a Gaussian: its covariance is ``(L R S)(L R S)^T`` with any matrix L. The
+    singular value decomposition ``L R S = U s V^T`` gives the rotation U and the scales s of the
+    same covariance, without loss. Gaussians that are not finite are left out, as when drawing.
+    """
+    splats = splats.with_times()
+    if splats.channels.shape[-1] != CHANNELS:
+        raise DataError(
+            f"Gaussians have {splats.channels.shape[-1]} channels, expected R, G, B, semantic."
+        )
+
+    def at(values: Tensor) -> Tensor:
+        return values[min(time, len(values) - 1)].detach().cpu().double()
+
+    quaternions, scales = at(splats.quats), at(splats.scales)
+    if splats.linear is not None:
+        axes = at(splats.linear) @ quaternion_to_matrix(quaternions) * scales[:, None, :]
+        axes = torch.nan_to_num(axes)
+        turned, scales, _ = torch.linalg.svd(axes)
+        # A reflection of the axes leaves the covariance as it is, but is no rotation.
+        turned[..., 2] *= torch.linalg.det(turned)[:, None].sign()
+        quaternions = matrix_to_quaternion(turned)
+    channels = at(splats.channels)
+    cloud = SplatCloud(
+        means=_float32(at(splats.means)),
+        quaternions=_positive(quaternions),
+        scales=_float32(scales),
+        opacities=_float32(at(splats.opacities)),
+        rgb=_float32(channels[:, :3]),
+        semantic=_float32(channels[:, 3]),
+    )
+    values = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities[:, None], cloud.rgb)
+    good = np.isfinite(np.concatenate(values, axis=1)).all(1) & (cloud.scales > 0).all(1)
+    return cloud if good.all() else _rows(cloud, good)
+
+
+def joined(clouds: list[SplatCloud]) -> SplatCloud:
+    """All Gaussians of several clouds, in their order."""
+    names = SplatCloud.__dataclass_fields__
+    return SplatCloud(
+        **{name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in names}
+    )
+
+
+def turn_up(
+    up: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
+) -> Float32[np.ndarray, "3 3"]:
+    """The shortest rotation that carries the unit vector ``up`` to ``target``."""
+    up, target = (np.asarray(v, dtype=np.float64) for v in (up, target))
+    cosine, axis = float(up @ target), np.cross(up, target)
+    if cosine < -1 + 1e-9:
+        side = np.eye(3)[np.abs(up).argmin()]
+        axis = np.cross(up, side)
+        axis /= np.linalg.norm(axis)
+        return _float32(2 * np.outer(axis, axis) - np.eye(3))
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return _float32(np.eye(3) + cross + cross @ cross / (1 + cosine))
+
+
+def _rows(cloud: SplatCloud, rows: np.ndarray) -> SplatCloud:
+    names = SplatCloud.__dataclass_fields__
+    return SplatCloud(**{name: getattr(cloud, name)[rows] for name in names})
+
+
+def _positive(quaternions: Tensor) -> Float32[np.ndarray, "N 4"]:
+    unit = torch.nn.functional.normalize(quaternions, dim=-1)
+    return _float32(torch.where(unit[:, :1] < 0, -unit, unit))
+
+
+def _float32(values: Tensor | np.ndarray) -> Float32[np.ndarray, "..."]:
+    return np.asarray(values, dtype=np.float32)

@@ -1,0 +1,132 @@
+"""``export`` of one instant: the Gaussians of a run as a file that other programs read."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from evsplat.body import up_axis
+from evsplat.body.track import load_body_track
+from evsplat.capture import Camera, Capture
+from evsplat.errors import ConfigError, DataError
+from evsplat.export.cloud import SplatCloud, cloud_of, joined, turn_up
+from evsplat.export.formats import write_gltf, write_ply, write_splat, write_spz
+from evsplat.film import camera_at
+from evsplat.methods.reconstruction import Parts, SplatReconstruction
+from evsplat.training.run import Run
+
+FileKind = Literal["ply", "spz", "splat", "gltf"]
+UpAxis = Literal["y", "z"]
+_AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+ALWAYS_Y_UP = {"spz": "right, up, back (RUB)", "gltf": "+Y up"}
+"""Formats that define their axes."""
+
+
+@dataclass(frozen=True)
+class Instant:
+    """When, and from where the colours are seen."""
+
+    time_us: int
+    camera: Camera
+    camera_name: str
+    label: str
+    """For file names."""
+
+
+def instant_of(
+    capture: Capture, *, time_s: float | None, frame: str | None, camera: str | None
+) -> Instant:
+    """The instant asked for; without any, the mid-exposure in the middle of the recording.
+
+    ``time_s`` counts seconds from the first frame's mid-exposure, ``frame`` names a frame, whose
+    mid-exposure is taken. Colours are seen by ``camera``, or by the camera of the nearest frame.
+    """
+    if time_s is not None and frame is not None:
+        raise ConfigError("--time and --frame both say when; give one of them.")
+    frames = sorted(capture.frames, key=lambda f: f.mid_us)
+    chosen = frames[len(frames) // 2]
+    first, last = frames[0].mid_us, frames[-1].mid_us
+    if frame is not None:
+        by_name = {f.name: f for f in frames}
+        if frame not in by_name:
+            raise ConfigError(
+                f"--frame {frame}: {capture.path} has no such frame; they are "
+                f"{frames[0].name} to {frames[-1].name}."
+            )
+        chosen = by_name[frame]
+    time_us = chosen.mid_us
+    if time_s is not None:
+        time_us = first + round(time_s * 1e6)
+        if not first <= time_us <= last:
+            raise ConfigError(
+                f"--time {time_s:g}: expected 0 to {(last - first) / 1e6:g} s, from the first "
+                "mid-exposure to the last."
+            )
+        chosen = min(frames, key=lambda f: abs(f.mid_us - time_us))
+    name = camera or chosen.camera
+    if name not in capture.cameras:
+        known = ", ".join(capture.cameras)
+        raise ConfigError(f"--camera {name}: the capture has no such camera, only {known}.")
+    label = f"frame-{frame}" if frame is not None else f"{(time_us - first) / 1e6:.3f}s"
+    return Instant(time_us, camera_at(capture, name, time_us), name, label)
+
+
+def splat_source(run: Run) -> SplatReconstruction:
+    """The run's reconstruction, where its method has Gaussians to hand over."""
+    if not isinstance(run.reconstruction, SplatReconstruction):
+        raise DataError(
+            f"{run.path}: method {run.method} draws pictures and hands over no Gaussians; "
+            "nothing can be exported. Use 'evsplat render'."
+        )
+    return run.reconstruction
+
+
+def cloud_at(source: SplatReconstruction, instant: Instant, parts: Parts) -> SplatCloud:
+    """The Gaussians of one instant in the capture's world."""
+    splats = source.splats(instant.camera, [instant.time_us], parts=parts)
+    return joined([cloud_of(layer) for layer in splats])
+
+
+def file_rotation(capture: Capture, kind: str, up: UpAxis | None) -> np.ndarray:
+    """Rotation (3, 3) from the capture's world to the axes of the file."""
+    if kind in ALWAYS_Y_UP:
+        if up == "z":
+            raise ConfigError(
+                f"--up z: the axes of .{kind} files are {ALWAYS_Y_UP[kind]} by definition; "
+                "leave --up out, or write a .ply."
+            )
+        up = "y"
+    if up is None:
+        return np.eye(3, dtype=np.float32)
+    with torch.no_grad():
+        world_up = up_axis(load_body_track(capture)).numpy()
+    return turn_up(world_up, np.array(_AXES[up]))
+
+
+def write_file(
+    path: Path, kind: FileKind, cloud: SplatCloud, rotation: np.ndarray, facts: Mapping[str, Any]
+) -> None:
+    """Write one cloud, turned to the axes of the file; ``facts`` go where a format has room."""
+    if len(cloud) == 0:
+        raise DataError(f"{path}: there is no Gaussian to write.")
+    turned = cloud.rotated(rotation)
+    facts = {**facts, "unit": "metre", "world_to_file_rotation": rotation.tolist()}
+    writers: dict[str, Callable[[], None]] = {
+        "ply": lambda: write_ply(path, turned, comments=_comments(facts)),
+        "spz": lambda: write_spz(path, turned),
+        "splat": lambda: write_splat(path, turned),
+        "gltf": lambda: write_gltf(path, turned, extras=facts),
+    }
+    writers[kind]()
+
+
+def _comments(facts: Mapping[str, Any]) -> list[str]:
+    lines = [f"{name}: {value}" for name, value in facts.items()]
+    return ["written by evsplat", *(" ".join(_ascii(line).split()) for line in lines)]
+
+
+def _ascii(text: str) -> str:
+    return text.encode("ascii", "replace").decode()

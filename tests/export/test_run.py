@@ -1,0 +1,151 @@
+"""Which Gaussians of a run leave it, and what is said where that cannot be."""
+
+from ast import literal_eval
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from evsplat.body import up_axis
+from evsplat.body.track import load_body_track
+from evsplat.capture import load_capture
+from evsplat.config import override
+from evsplat.errors import ConfigError, DataError
+from evsplat.export import export_run
+from evsplat.export import run as exporting
+from evsplat.methods import compose, method_config
+from evsplat.methods.trivial import NearestFrame
+from evsplat.render import render
+from evsplat.training.run import GaussianReconstruction
+
+from .clouds import read_ply
+
+SMALL = (
+    "human.count=150",
+    "deform.width=16",
+    "deform.colour_width=16",
+    "scene.backdrop_stride_px=4",
+)
+
+
+@pytest.fixture
+def reconstruction(tiny_capture):
+    capture = load_capture(tiny_capture())
+    config = method_config("paper", override({}, (*SMALL, "deform.shadow_lights=2")), where="test")
+    return capture, GaussianReconstruction("paper", compose(config, capture, 0, fit=False).model)
+
+
+@pytest.fixture
+def run(reconstruction, tmp_path, monkeypatch):
+    """A folder that `load_run` takes for a run of a small untrained model."""
+    capture, model = reconstruction
+    path = tmp_path / "run"
+    path.mkdir()
+    loaded = SimpleNamespace(
+        path=path, capture=capture, reconstruction=model, method="paper", iteration=7
+    )
+    monkeypatch.setattr(exporting, "load_run", lambda *_, **__: loaded)
+    return loaded
+
+
+@pytest.mark.parametrize("parts", ["all", "human", "scene"])
+def test_splats_draw_what_the_reconstruction_draws(reconstruction, parts):
+    capture, model = reconstruction
+    with torch.no_grad():
+        # No light, no shadow: what is left is exact.
+        model.model.shadow.share_logits.fill_(-50.0)
+    frame = capture.frames[3]
+    camera, times = capture.camera(frame), [frame.mid_us, frame.mid_us + 20_000]
+    want = model.render(camera, times, parts=parts)
+    layers = model.splats(camera, times, parts=parts)
+    assert len(layers) == (2 if parts == "all" else 1)
+    for time in range(2):
+        one = [
+            type(layer)(
+                **{
+                    k: None if v is None else v[min(time, len(v) - 1)][None]
+                    for k, v in vars(layer.with_times()).items()
+                }
+            )
+            for layer in layers
+        ]
+        drawn = render(one[0], camera, static=one[1] if len(one) == 2 else None)
+        torch.testing.assert_close(
+            drawn.image[0, ..., :3].clamp(0, 1), want.rgb[time], atol=1e-5, rtol=0
+        )
+        torch.testing.assert_close(drawn.alpha[0], want.alpha[time], atol=1e-5, rtol=0)
+
+
+def test_a_shadow_darkens_the_colours_of_the_scene(reconstruction, monkeypatch):
+    capture, model = reconstruction
+    frame = capture.frames[3]
+    camera, times = capture.camera(frame), [frame.mid_us, frame.mid_us + 20_000]
+    plain = model.splats(camera, times, parts="scene")[0].channels
+    factors = torch.tensor([0.25, 0.75])[:, None, None]
+    monkeypatch.setattr(
+        model.model.shadow, "forward", lambda body, places: factors.expand(-1, *places.shape[:2])
+    )
+    person, scene = model.splats(camera, times)
+    torch.testing.assert_close(scene.channels[..., :3], plain[..., :3] * factors)
+    assert torch.equal(scene.channels[..., 3], plain[..., 3].expand(2, -1))
+    assert (person.channels[..., 3] == 1).all()
+
+
+def test_ply_of_a_run_is_the_instant_asked_for_in_metres(run, reconstruction):
+    capture, model = reconstruction
+    frame = capture.frames[4]
+    path = export_run(run.path, "ply", frame=frame.name)
+    assert path == run.path / "exports" / f"frame-{frame.name}.ply"
+    comments, columns = read_ply(path)
+    assert f"time_us: {frame.mid_us}" in comments and "unit: metre" in comments
+    person, scene = model.splats(capture.camera(frame), [frame.mid_us])
+    centres = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    want = torch.cat([person.means[0], scene.means[0]]).detach().numpy()
+    np.testing.assert_allclose(centres, want, atol=1e-6)
+    assert (columns["semantic"][:150] == 1).all() and (columns["semantic"][150:] == 0).all()
+
+    later = export_run(run.path, "ply", time_s=0.04, out=run.path / "later.ply", parts="human")
+    comments, columns = read_ply(later)
+    time_us = capture.frames[0].mid_us + 40_000
+    assert f"time_us: {time_us}" in comments
+    (person,) = model.splats(capture.camera(capture.frames[1]), [time_us], parts="human")
+    np.testing.assert_allclose(columns["z"], person.means[0, :, 2].numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize(("up", "axis"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])
+def test_up_turns_the_world_and_says_how(run, up, axis):
+    _, plain = read_ply(export_run(run.path, "ply"))
+    comments, turned = read_ply(export_run(run.path, "ply", up=up, out=run.path / "up.ply"))
+    (line,) = [text for text in comments if text.startswith("world_to_file_rotation: ")]
+    rotation = np.array(literal_eval(line.partition(": ")[2]))
+    world_up = up_axis(load_body_track(run.capture)).numpy()
+    np.testing.assert_allclose(rotation @ world_up, axis, atol=1e-6)
+    before, after = (np.stack([file[a] for a in "xyz"], axis=1) for file in (plain, turned))
+    np.testing.assert_allclose(after, before @ rotation.T, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("obj", {}, "obj: unknown format; choose one of ply"),
+        ("ply", {"out": "a.spz"}, "ends in .ply"),
+        ("ply", {"frame": "nothing"}, "no such frame; they are 0000 to 0009"),
+        ("ply", {"time_s": -0.1}, "expected 0 to 0.36 s"),
+        ("ply", {"time_s": 0.1, "frame": "0000"}, "give one of them"),
+        ("ply", {"camera": "left"}, "only main, side"),
+        ("spz", {"up": "z"}, "RUB"),
+        ("gltf", {"up": "z"}, r"\+Y up"),
+    ],
+)
+def test_bad_options_are_one_sentence_and_write_nothing(run, kind, options, message):
+    with pytest.raises(ConfigError, match=message):
+        export_run(run.path, kind, **options)
+    assert not list(run.path.iterdir())
+
+
+def test_a_method_without_gaussians_says_so(run):
+    run.reconstruction = NearestFrame(run.capture)
+    with pytest.raises(DataError, match="hands over no Gaussians"):
+        export_run(run.path, "ply")
+    assert not list(run.path.iterdir())
