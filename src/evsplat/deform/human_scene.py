@@ -15,6 +15,7 @@ from evsplat.capture import Camera, Frame
 from evsplat.deform.colour import HumanColour, SceneColour, view_jitter
 from evsplat.deform.drawing import Drawing, draw
 from evsplat.deform.encodings import make_encoding
+from evsplat.deform.frame_weights import UnseenFrames, interpolated, seen, seen_or_last
 from evsplat.deform.mlp import PointMLP, Precision
 from evsplat.deform.model import RowCache
 from evsplat.deform.non_rigid import NonRigidNetwork
@@ -67,6 +68,8 @@ class DeformConfig:
     """How often that noise is added in training."""
     view_noise: bool = True
     """Turn all canonical view directions of a training step at random, 45 degrees per axis."""
+    view_noise_symmetric: bool = True
+    """False: about the third axis by 0 to 45 degrees only, as the released 3DGS-Avatar does."""
     scene_view_dependent: bool = True
     """Whether the scene's colour sees the view direction (paper eq. 7, A10)."""
     scene_direction_dropout: float = 0.5
@@ -81,6 +84,8 @@ class DeformConfig:
     pose_correction_start: float | None = None
     """Nominal iteration from which per-frame pose residuals are learned; null = never.
     3DGS-Avatar starts at 5000 (A9). Exact poses get worse by it, noisy ones better."""
+    unseen_frames: UnseenFrames = "interpolated"
+    """Latent and pose residual of instants that are not the middle of a training frame (A22)."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +103,7 @@ class HumanSceneModel(nn.Module):
     """Gaussians, networks and the body track; `at` poses them at given times.
 
     ``frame_times_us`` are the mid-exposures of the training frames, the anchors of the per-frame
-    latents and pose residuals; both are interpolated in time, so held-out frames get their
-    neighbours' values (A22).
+    latents and pose residuals; what other instants get is ``config.unseen_frames`` (A22).
     """
 
     def __init__(
@@ -203,7 +207,8 @@ class HumanSceneModel(nn.Module):
         """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4)."""
         rotations, translation = self.track.at(torch.as_tensor(times_us))
         if self.pose_correction_active:
-            weights = self._time_weights(times_us)
+            share = interpolated if self.config.unseen_frames == "interpolated" else seen
+            weights = share(self.get_buffer("frame_times"), times_us)
             residual = torch.einsum("tf,fjc->tjc", weights, self.rotation_residuals)
             rotations = rotations @ axis_angle_to_matrix(residual)
             translation = translation + weights @ self.translation_residuals
@@ -331,7 +336,9 @@ class HumanSceneModel(nn.Module):
         if float(torch.rand((), generator=generator)) < config.pose_noise_probability:
             rotations = config.pose_noise * torch.randn(1, joints, 3, 3, generator=generator)
             rotations = send(rotations, self.box_low.device).expand(times, -1, -1, -1)
-        turn = view_jitter(generator, symmetric=True) if config.view_noise else torch.eye(3)
+        turn = torch.eye(3)
+        if config.view_noise:
+            turn = view_jitter(generator, symmetric=config.view_noise_symmetric)
         hide = float(torch.rand((), generator=generator)) < config.scene_direction_dropout
         return Noise(rotations, send(turn, self.box_low.device), hide)
 
@@ -416,20 +423,6 @@ class HumanSceneModel(nn.Module):
         if noise is not None:
             canonical_view = canonical_view @ noise.view_turn.T
         canonical_view = nn.functional.normalize(canonical_view, dim=-1)
-        latent = self._time_weights(times_us) @ self.latents
+        share = interpolated if self.config.unseen_frames == "interpolated" else seen_or_last
+        latent = share(self.get_buffer("frame_times"), times_us) @ self.latents
         return self.human_colour(features, canonical_view, feature, latent)
-
-    def _time_weights(self, times_us: Sequence[int]) -> Float[Tensor, "T F"]:
-        """Linear interpolation between the training frames around each time; held at the ends."""
-        anchors = self.get_buffer("frame_times")
-        times = send(torch.tensor(list(times_us), dtype=torch.float64), anchors.device)
-        times = times.clamp(anchors[0], anchors[-1])
-        after = torch.searchsorted(anchors, times).clamp(1, max(len(anchors) - 1, 1))
-        if len(anchors) == 1:
-            return torch.ones(len(times), 1, device=anchors.device)
-        before = after - 1
-        share = (times - anchors[before]) / (anchors[after] - anchors[before])
-        weights = torch.zeros(len(times), len(anchors), dtype=torch.float64, device=anchors.device)
-        weights.scatter_(1, before[:, None], (1 - share)[:, None])
-        weights.scatter_(1, after[:, None], share[:, None])
-        return weights.float()

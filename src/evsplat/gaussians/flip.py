@@ -47,7 +47,7 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
         vertices = frames.body.canonical_vertices()
         vertex = _nearest(vertices, values["means"][leaving])[1]
         transforms = _blend(frames, vertex, torch.full_like(vertex, drawn))
-        _carry(values, leaving, transforms)
+        carry(values, leaving, transforms)
         _take_features(values, leaving, torch.nonzero(~human)[:, 0])
     if len(joining):
         distance, frame, vertex = _nearest_over_frames(frames, values["means"][joining])
@@ -55,7 +55,7 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
         values["semantic_logits"][joining[~near]] = 0.0
         joining = joining[near]
         transforms = torch.linalg.inv(_blend(frames, vertex[near], frame[near]))
-        _carry(values, joining, transforms)
+        carry(values, joining, transforms)
         _take_features(values, joining, torch.nonzero(human)[:, 0])
 
     moved = torch.zeros_like(human)
@@ -66,7 +66,7 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
     return int(moved.sum())
 
 
-def _carry(values: dict[str, Tensor], rows: Tensor, transforms: Float[Tensor, "M 4 4"]) -> None:
+def carry(values: dict[str, Tensor], rows: Tensor, transforms: Float[Tensor, "M 4 4"]) -> None:
     """Apply rigid-like transforms to centres and rotations of some rows, in place."""
     rotation, translation = transforms[:, :3, :3], transforms[:, :3, 3]
     values["means"][rows] = (rotation @ values["means"][rows][..., None])[..., 0] + translation

@@ -6,6 +6,10 @@ from typing import Any
 
 from evsplat.config import from_dict
 from evsplat.errors import ConfigError
+from evsplat.methods.avatar3dgs import AvatarConfig
+from evsplat.methods.avatar3dgs import compose as compose_avatar3dgs
+from evsplat.methods.avatar3dgs_semantic import AvatarSemanticConfig
+from evsplat.methods.avatar3dgs_semantic import compose as compose_avatar3dgs_semantic
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import NOMINAL_ITERATIONS, MethodConfig
 from evsplat.methods.evsplat import EvsplatConfig
@@ -13,6 +17,8 @@ from evsplat.methods.evsplat import compose as compose_evsplat
 from evsplat.methods.paper import PaperConfig, compose
 
 TRAINABLE: dict[str, tuple[type[Any], Callable[..., Composition]]] = {
+    "avatar3dgs": (AvatarConfig, compose_avatar3dgs),
+    "avatar3dgs_semantic": (AvatarSemanticConfig, compose_avatar3dgs_semantic),
     "evsplat": (EvsplatConfig, compose_evsplat),
     "paper": (PaperConfig, compose),
 }

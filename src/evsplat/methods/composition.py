@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
+from evsplat.capture import Capture
 from evsplat.deform.model import Model
 from evsplat.gaussians import BodyFrames, DensifyConfig, Part
 from evsplat.methods.config import Weight
@@ -26,3 +27,5 @@ class Composition:
     """The body at the training frames, for Gaussians that change class; None where none does."""
     generator: torch.Generator
     """All randomness of the training; part of the checkpoint."""
+    capture: Capture | None = None
+    """The recording as the method sees it, where that is not all of it (masked pictures)."""

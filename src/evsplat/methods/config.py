@@ -52,6 +52,8 @@ class LearningRates:
     """Factor that every rate reaches at the end, exponentially."""
     means_final: float = 0.1
     """The same for the centres."""
+    gaussians_final: float = 0.1
+    """The same for the Gaussians' other attributes; 3DGS-Avatar keeps their rates, 1."""
     constant: float = 0.3
     """Share of the training before the decay begins; 3DGS-Avatar: none, over 15,000 steps."""
     latent_weight_decay: float = 0.05

@@ -6,7 +6,7 @@ depends on how the surface is turned and where it stands; the person casts shado
 """
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 
@@ -14,7 +14,8 @@ from evsplat.calibration import estimate_from_capture
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig
 from evsplat.methods.composition import Composition
-from evsplat.methods.paper import Build, EventConfig, PaperConfig
+from evsplat.methods.config import Weight
+from evsplat.methods.paper import EventConfig, PaperConfig, build_model, composition
 from evsplat.objectives import (
     ContrastThresholds,
     EventWindows,
@@ -75,16 +76,17 @@ def compose(
     fit: bool = True,
 ) -> Composition:
     """Put the method together for one capture; see `evsplat.methods.paper.compose`."""
-    build = Build.start(config, capture, seed, device=device, fit=fit)
+    build = build_model(config, capture, seed, device=device, fit=fit)
     renders = {
         frame.name: renders_for(
-            motion_px(capture, build.track, frame),
+            motion_px(capture, build.ground.track, frame),
             config.exposure.px_per_render,
             config.exposure.most_renders,
         )
         for frame in capture.train_frames
     }
-    observed: list[Objective] = [Exposure(capture, renders, build.generator)]
+    observed: list[Objective] = [Exposure(capture, renders, build.ground.generator)]
+    weights: dict[str, Weight] = {}
     if capture.events is not None and config.event.weight != 0.0:
         # A loaded model brings its own.
         known = _thresholds(capture) if fit else (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD)
@@ -95,15 +97,14 @@ def compose(
             EventWindows(
                 capture,
                 thresholds,
-                build.generator,
+                build.ground.generator,
                 start=windows.start,
                 eps=windows.eps,
                 reach=windows.reach,
             )
         )
-    composition = build.composition(observed)
-    weights = {**composition.weights, "contrast": config.windows.contrast_weight}
-    return replace(composition, weights=weights)
+        weights = {"event": config.event.weight, "contrast": windows.contrast_weight}
+    return composition(config, build, observed, weights)
 
 
 def _thresholds(capture: Capture) -> tuple[float, float]:

@@ -66,9 +66,10 @@ def learning_of(model: HumanSceneModel, config: OptimisationConfig) -> Learning:
     def at(start: float, final: float | None = None) -> Rate:
         return Rate(start, rates.final if final is None else final, rates.constant)
 
-    rows = {name: RowRate(at(getattr(rates, name))) for name in ATTRIBUTES}
+    kept = rates.gaussians_final
+    rows = {name: RowRate(at(getattr(rates, name), kept)) for name in ATTRIBUTES}
     rows["means"] = RowRate(at(rates.means, rates.means_final))
-    rows["semantic_logits"] = RowRate(at(rates.semantic_logits), config.semantics_window)
+    rows["semantic_logits"] = RowRate(at(rates.semantic_logits, kept), config.semantics_window)
     clipped: list[tuple[list[nn.Parameter], float, float]] = [
         (list(model.skinning.parameters()), rates.skinning, 0.0),
         ([*model.non_rigid.parameters(), *model.pose_encoder.parameters()], rates.non_rigid, 0.0),

@@ -1,5 +1,6 @@
 """Losses, each a small object: which times it needs, what it compares."""
 
+from evsplat.objectives.alpha import Alpha
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event import EventChange, event_loss
 from evsplat.objectives.event_windows import ContrastThresholds, EventWindows
@@ -10,6 +11,7 @@ from evsplat.objectives.semantic import PackedBounds, RenderedSemantics, silhoue
 from evsplat.objectives.skinning import SkinningPrior
 
 __all__ = [
+    "Alpha",
     "ContrastThresholds",
     "EventChange",
     "EventWindows",

@@ -27,11 +27,16 @@ class Photometric(Stateless):
         *,
         dssim: bool,
         perceptual: PerceptualMetric | None,
+        perceptual_term: str = "perceptual",
     ) -> None:
-        """``boxes``: posed body's pixel box (x0, y0, x1, y1) per training frame that shows it."""
+        """``boxes``: the person's pixel box (x0, y0, x1, y1) per training frame that shows one.
+
+        ``perceptual_term`` is what that term is called.
+        """
         self.capture = capture
         self.frames = {frame.mid_us: frame for frame in capture.train_frames}
         self.boxes, self.dssim, self.perceptual = boxes, dssim, perceptual
+        self.perceptual_term = perceptual_term
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """The middle of the drawn frame's exposure."""
@@ -65,5 +70,5 @@ class Photometric(Stateless):
                 if min(crops[0].shape[:2]) >= self.perceptual.network.min_side:
                     values.append(self.perceptual(2 * crops[0] - 1, 2 * crops[1] - 1))
             if values:
-                terms["perceptual"] = torch.stack(values).mean()
+                terms[self.perceptual_term] = torch.stack(values).mean()
         return terms

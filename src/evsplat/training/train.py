@@ -117,7 +117,7 @@ def train(
         seconds=time.perf_counter() - started,
     )
     cache_bytes = None if device_memory_gb is None else int(1e9 * device_memory_gb)
-    trainer = Trainer(composition, capture, clock, cache_bytes=cache_bytes)
+    trainer = Trainer(composition, composition.capture or capture, clock, cache_bytes=cache_bytes)
     if checkpoint is not None:
         tensors, state = load_checkpoint(checkpoint)
         trainer.load_state(tensors, state)

@@ -1,0 +1,153 @@
+"""Where the Gaussians of a method start: the person's on the body, the scene's behind it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from evsplat.body import BodyTrack, up_axis
+from evsplat.capture import Capture
+from evsplat.errors import ConfigError
+from evsplat.gaussians.flip import carry
+from evsplat.gaussians.initialise import (
+    backdrop_depth,
+    gaussians_at,
+    median_backdrop,
+    nearest_spacing,
+    random_cube,
+)
+
+
+@dataclass(frozen=True)
+class HumanStartConfig:
+    """How the person's Gaussians start (reference 1.2)."""
+
+    count: int | None = None
+    """Number of surface samples. 3DGS-Avatar takes 50,000; null = as many as ``spacing_px`` asks
+    for, since a person of 4,000 pixels needs no 50,000 Gaussians."""
+    spacing_px: float = 1.5
+    """Mean distance of neighbouring samples on the screen when ``count`` is null."""
+    max_count: int = 20_000
+    """Upper bound of the automatic count."""
+    opacity: float = 0.1
+    """Opacity of every sample."""
+
+
+@dataclass(frozen=True)
+class SceneStartConfig:
+    """How the scene's Gaussians start (A21: unsaid in the paper)."""
+
+    kind: Literal["median_backdrop", "random_cube"] = "median_backdrop"
+    """``random_cube``: as HUGS in the paper (2.9), needs far more steps. ``median_backdrop``: the
+    temporal median of the training frames on a floor and a wall; static cameras only."""
+    cube_count: int = 100_000
+    """Points of the random cube."""
+    cube_half_side_m: float | None = None
+    """Half side of the cube; null = the larger of 2 m and 1.5 times the camera's distance."""
+    cube_opacity: float = 0.1
+    backdrop_stride_px: int = 2
+    """The sheet has one Gaussian per square of this side."""
+    backdrop_edge_share: float = 0.18
+    """Share of all pixels, those of strongest gradient, that get a Gaussian of their own."""
+    backdrop_opacity: float = 0.9
+    backdrop_margin: float = 0.15
+    """How far behind the deepest body point the wall stands, as a fraction of its depth."""
+    prefit_steps: int = 300
+    """Steps of fitting the sheet to the median before training proper."""
+
+
+def human_start(
+    config: HumanStartConfig,
+    capture: Capture,
+    track: BodyTrack,
+    generator: torch.Generator,
+    semantic_logit: float,
+) -> dict[str, Tensor]:
+    """Start values of the person's Gaussians: samples of the canonical body's surface."""
+    count = config.count or _automatic_count(config, capture, track)
+    points = track.body.sample_surface(count, generator).points
+    scales = nearest_spacing(points)[:, None].repeat(1, 3)
+    return gaussians_at(
+        points,
+        scales,
+        opacity=config.opacity,
+        semantic_logit=semantic_logit,
+    )
+
+
+def _automatic_count(config: HumanStartConfig, capture: Capture, track: BodyTrack) -> int:
+    """Surface samples so that neighbours lie ``spacing_px`` apart at the person's distance."""
+    vertices = track.body.canonical_vertices()
+    corners = vertices[track.body.faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area_m2 = float(area.norm(dim=-1).sum() / 2)
+    frame = capture.train_frames[len(capture.train_frames) // 2]
+    camera = capture.camera(frame)
+    _, depth = camera.project(track.vertices(frame.mid_us))
+    pixels_per_metre = float(camera.K[0, 0] / depth.median().clamp_min(0.1))
+    count = area_m2 * (pixels_per_metre / config.spacing_px) ** 2
+    return int(min(max(count, 2_000), config.max_count))
+
+
+def scene_start(
+    start: SceneStartConfig,
+    capture: Capture,
+    track: BodyTrack,
+    generator: torch.Generator,
+    semantic_logit: float,
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Start values of the scene's Gaussians, and the colours they shall show."""
+    frames = capture.train_frames
+    camera = capture.camera(frames[0])
+    _, translation = track.at(torch.tensor([frame.mid_us for frame in frames]))
+    if start.kind == "random_cube":
+        roots = track.body.rest_joints[0] + translation
+        center = roots.mean(0)
+        distance = float((center - camera.center()).norm())
+        half_side = start.cube_half_side_m or max(2.0, 1.5 * distance)
+        points, colours = random_cube(center, half_side, start.cube_count, generator)
+        scales = nearest_spacing(points)[:, None].repeat(1, 3)
+        opacity = start.cube_opacity
+    else:
+        if not capture.is_static_camera:
+            raise ConfigError(
+                f"{capture.path}: scene.kind is median_backdrop, which needs one static camera; "
+                "this capture's camera moves. Pass --set scene.kind=random_cube."
+            )
+        body = torch.cat([track.vertices(frame.mid_us)[::7] for frame in frames])
+        depth = backdrop_depth(camera, body, up=up_axis(track), margin=start.backdrop_margin)
+        points, scales, colours = median_backdrop(
+            camera,
+            capture.median_background(),
+            depth,
+            stride=start.backdrop_stride_px,
+            edge_points=int(start.backdrop_edge_share * camera.width * camera.height),
+        )
+        opacity = start.backdrop_opacity
+    values = gaussians_at(
+        points,
+        scales,
+        opacity=opacity,
+        semantic_logit=semantic_logit,
+        rgb_srgb=colours,
+    )
+    return values, colours
+
+
+def as_person(scene: dict[str, Tensor], track: BodyTrack, time_us: int) -> dict[str, Tensor]:
+    """A scene's start as if it were part of the person: it follows the root bone.
+
+    At ``time_us`` it then lies where the scene was.
+    """
+    root = int((track.body.parents < 0).nonzero()[0, 0])
+    to_canonical = torch.linalg.inv(track.bones([time_us])[0, root])
+    values = {name: value.clone() for name, value in scene.items()}
+    rows = torch.arange(len(values["means"]))
+    carry(values, rows, to_canonical.expand(len(rows), 4, 4))
+    return values
+
+
+def no_gaussians() -> dict[str, Tensor]:
+    """The start of a class that is empty."""
+    return gaussians_at(torch.zeros(0, 3), torch.ones(0, 3), opacity=0.5, semantic_logit=0.0)
