@@ -1,8 +1,11 @@
-"""Tensors on a device: sending them without waiting, and keeping recorded data there."""
+"""Tensors on a device: sending them without waiting, keeping recorded data there; what it is."""
 
+import os
+import platform
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -95,3 +98,30 @@ class DeviceCache:
             copied = torch.cuda.Event()
             copied.record(self._stream)
         return tensor, copied
+
+
+def hardware() -> dict[str, str | int | float]:
+    """What this machine computes with, for the record: CPU, cores, memory, GPU where there is one.
+
+    What the system does not tell is left out.
+    """
+    found: dict[str, str | int | float] = {"cpu_cores": os.cpu_count() or 1}
+    processor = platform.processor()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = next(
+            (line.split(":")[1].strip() for line in lines if line.startswith("model name")),
+            processor,
+        )
+    except OSError:
+        pass
+    if processor:
+        found["cpu"] = processor
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        found["memory_gb"] = round(memory / 1e9, 1)
+    except (ValueError, OSError):
+        pass
+    if torch.cuda.is_available():
+        found["gpu"] = torch.cuda.get_device_name()
+    return found

@@ -113,7 +113,11 @@ def test_page_shows_every_test_frame_pair_and_view(tiny_capture, tmp_path):
     text = " ".join(parsed.text)
     for shown in ("median background", "12\u202f345", "1 h 02 min", "4\u202f321", "2.13", "weight"):
         assert shown in text
-    assert parsed.count("polyline") == 5
+    # loss and two terms' sum, PSNR, two counts; PSNR by frame of two rows, and the speed
+    assert parsed.count("polyline") == 8
+    assert sum(attributes.get("type") == "range" for _, attributes in parsed.elements) == 2 * len(
+        source.capture.test_frames
+    )
 
 
 def test_embedded_pictures_are_the_pictures(tiny_capture, tmp_path):

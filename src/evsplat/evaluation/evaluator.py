@@ -1,6 +1,7 @@
 """One evaluator for all methods: figures, pictures and tables of a reconstruction's test frames."""
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -103,6 +104,7 @@ def evaluate_run(
     """
     from evsplat.training.run import load_run
 
+    start = time.monotonic()
     device = choose_device(device)
     run = load_run(Path(run_dir), device=device)
     measured = evaluate(
@@ -119,6 +121,7 @@ def evaluate_run(
         "train_seconds": run.train_seconds,
         "device": run.device,
         "gaussians": run.gaussians,
+        "evaluate_seconds": round(time.monotonic() - start, 1),
         **measured,
     }
     write_json(Path(run.path) / "metrics.json", metrics)

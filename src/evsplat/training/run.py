@@ -18,6 +18,7 @@ from evsplat.capture import Camera, Capture, load_capture
 from evsplat.config import load_yaml, to_dict
 from evsplat.deform.drawing import draw, draw_depth, shadowed_scene
 from evsplat.deform.model import Model
+from evsplat.devices import hardware
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
 from evsplat.methods import TRAINABLE, MethodConfig, method_config
@@ -90,6 +91,7 @@ def write_facts(folder: RunFolder, capture: Capture, method: str, device: str, s
             "method": method,
             "device": device,
             "threads": torch.get_num_threads(),
+            **hardware(),
             "seed": seed,
             "python": platform.python_version(),
             "machine": platform.machine(),

@@ -23,13 +23,21 @@ class Series:
     y: Sequence[float]
 
 
-def line_chart(series: Sequence[Series], *, x_title: str, y_title: str, log: bool = False) -> str:
+def line_chart(
+    series: Sequence[Series],
+    *,
+    x_title: str,
+    y_title: str,
+    log: bool = False,
+    dots: bool = False,
+    lines: bool = True,
+) -> str:
     """An SVG element with axes and lines, and a legend where there are several.
 
-    Long series are averaged over bins. On a logarithmic axis values that are not positive leave a
-    gap.
+    Long series are averaged over bins, unless each value has its dot. On a logarithmic axis values
+    that are not positive leave a gap.
     """
-    prepared = [(line.name, *_prepared(line, log)) for line in series]
+    prepared = [(line.name, *_prepared(line, log, whole=dots)) for line in series]
     prepared = [(name, x, y) for name, x, y in prepared if len(x)]
     if not prepared:
         return ""
@@ -66,13 +74,19 @@ def line_chart(series: Sequence[Series], *, x_title: str, y_title: str, log: boo
     # A single line takes the accent colour; the first of several is the sum, in the text colour.
     first = 1 if len(prepared) == 1 else 0
     for number, (name, xs, ys) in enumerate(prepared, start=first):
-        points = " ".join(
-            f"{place_x(float(a)):.1f},{place_y(float(b)):.1f}" for a, b in zip(xs, ys, strict=True)
-        )
-        parts.append(
-            f'<polyline class="line c{number % SERIES_COLOURS}" points="{points}">'
-            f"<title>{escape(name)}</title></polyline>"
-        )
+        places = [
+            (f"{place_x(float(a)):.1f}", f"{place_y(float(b)):.1f}")
+            for a, b in zip(xs, ys, strict=True)
+        ]
+        colour = f"c{number % SERIES_COLOURS}"
+        if lines:
+            points = " ".join(f"{x},{y}" for x, y in places)
+            parts.append(
+                f'<polyline class="line {colour}" points="{points}">'
+                f"<title>{escape(name)}</title></polyline>"
+            )
+        if dots:
+            parts += [f'<circle class="dot {colour}" cx="{x}" cy="{y}" r="3"/>' for x, y in places]
     parts.append(
         f'<text class="tick" x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 2}" text-anchor="end">'
         f"{escape(x_title)}</text>"
@@ -90,12 +104,12 @@ def line_chart(series: Sequence[Series], *, x_title: str, y_title: str, log: boo
     )
 
 
-def _prepared(line: Series, log: bool) -> tuple[np.ndarray, np.ndarray]:
+def _prepared(line: Series, log: bool, *, whole: bool) -> tuple[np.ndarray, np.ndarray]:
     """Finite points, binned; on a logarithmic axis the ordinate is the decimal logarithm."""
     x, y = np.asarray(line.x, dtype=np.float64), np.asarray(line.y, dtype=np.float64)
     keep = np.isfinite(x) & np.isfinite(y) & ((y > 0) if log else True)
     x, y = x[keep], y[keep]
-    if len(x) > _MOST_POINTS:
+    if len(x) > _MOST_POINTS and not whole:
         groups = np.array_split(np.arange(len(x)), _MOST_POINTS)
         x = np.array([x[group].mean() for group in groups])
         y = np.array([y[group].mean() for group in groups])

@@ -20,6 +20,22 @@ def folded(title: str, body: str) -> str:
     return f"<details><summary>{escape(title)}</summary>{body}</details>" if body else ""
 
 
+def more(shown: int, there: int, what: str) -> str:
+    """What is behind a click: all of the rest, or so many of it."""
+    return f"{shown} more {what}" if shown == there else f"{shown} of {there} more {what}"
+
+
+def compare(left: str, right: str, caption: str) -> str:
+    """Two image elements of one size behind a slider; side by side in print."""
+    return (
+        f'<figure class="both"><div class="compare">{left}<div class="over">{right}</div>'
+        '<input type="range" min="0" max="100" value="50" step="any" '
+        f'aria-label="{escape(caption)}" '
+        "oninput=\"this.parentNode.style.setProperty('--x',this.value+'%')\"></div>"
+        f'<figcaption><span class="screen">drag: </span>{escape(caption)}</figcaption></figure>'
+    )
+
+
 def figure(image: str, caption: str = "") -> str:
     """An image element with a line of text below."""
     text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""

@@ -8,15 +8,26 @@ from typing import Any
 from evsplat.evaluation.pictures import css_gradient, to_bytes
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
-from evsplat.evaluation.report.configuration import configuration
+from evsplat.evaluation.report.configuration import configuration, duration, made_with
 from evsplat.evaluation.report.embed import Embedder, data_uri
 from evsplat.evaluation.report.figures import figures
-from evsplat.evaluation.report.html import figure, folded, frame_figures, legend, section, spread
+from evsplat.evaluation.report.frames import frame_by_frame
+from evsplat.evaluation.report.html import (
+    figure,
+    folded,
+    frame_figures,
+    legend,
+    more,
+    section,
+    spread,
+)
 from evsplat.evaluation.report.shots import test_frames
 from evsplat.evaluation.report.source import Source
 
 _PAIRS_OPEN = {"test": 4, "train": 2}
 """Event map pairs shown at once per split; the others are folded."""
+_PAIRS_MOST = 24
+"""Event map pairs on the page in all, evenly spread."""
 _NOVEL_SHOWN = 4
 """Novel views shown per camera, evenly spread over time."""
 
@@ -27,10 +38,12 @@ def page(source: Source) -> str:
         _clip(source),
         figures(source),
         test_frames(source),
+        frame_by_frame(source),
         _event_maps(source),
         _novel_views(source),
         _curves(source),
         configuration(source),
+        made_with(source),
     ]
     title = f"{source.metrics['capture']} · {source.metrics['method']}"
     style = (resources.files("evsplat") / "data" / "report.css").read_text(encoding="utf-8")
@@ -46,9 +59,10 @@ def page(source: Source) -> str:
 def _header(source: Source) -> str:
     metrics = source.metrics
     gaussians = metrics.get("gaussians") or {}
+    seconds = metrics.get("train_seconds")
     facts = [
         ("method", metrics["method"]),
-        ("trained for", _duration(metrics.get("train_seconds"))),
+        ("trained for", None if seconds is None else duration(seconds)),
         ("iterations", _count(metrics.get("iteration"))),
         ("device", metrics.get("device")),
         ("Gaussians, person", _count(gaussians.get("human"))),
@@ -113,7 +127,8 @@ def _event_maps(source: Source) -> str:
         for split, count in _PAIRS_OPEN.items()
         for pair in spread([p for p in events["pairs"] if p["split"] == split], count)
     ]
-    others = [pair for pair in events["pairs"] if pair not in shown]
+    rest = [pair for pair in events["pairs"] if pair not in shown]
+    others = spread(rest, _PAIRS_MOST - len(shown))
     scale = (
         "the rendered change of log brightness over the sensor’s contrast threshold"
         if events["threshold_known"]
@@ -132,7 +147,7 @@ def _event_maps(source: Source) -> str:
         f"{means}.",
         legend(css_gradient(signed=True), "darker", "brighter", "events")
         + _event_pairs(source, shown, embed)
-        + folded(f"{len(others)} more pairs", _event_pairs(source, others, embed)),
+        + folded(more(len(others), len(rest), "pairs"), _event_pairs(source, others, embed)),
     )
 
 
@@ -242,13 +257,3 @@ def _provenance(source: Source) -> str:
 def _count(value: Any) -> str | None:
     """A count with narrow spaces between thousands."""
     return None if value is None else f"{value:,}".replace(",", "\u202f")
-
-
-def _duration(seconds: float | None) -> str | None:
-    if seconds is None:
-        return None
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"

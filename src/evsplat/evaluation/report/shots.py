@@ -11,13 +11,28 @@ from evsplat.capture import Frame
 from evsplat.evaluation.pictures import ERROR_FULL_SCALE, css_gradient, to_bytes
 from evsplat.evaluation.regions import Box
 from evsplat.evaluation.report.embed import Embedder
-from evsplat.evaluation.report.html import figure, folded, frame_figures, legend, section, spread
+from evsplat.evaluation.report.html import (
+    compare,
+    figure,
+    folded,
+    frame_figures,
+    legend,
+    more,
+    section,
+    spread,
+)
 from evsplat.evaluation.report.source import Source
 
 _WORTH_ENLARGING = 0.8
 """Crops wider than this share of the picture show nothing new."""
 _FRAMES_OPEN = 4
 """Test frames shown at once, evenly spread; the others are folded."""
+_MOST_PIXELS = 24_000_000
+"""Pixels of all pictures of test frames on a page; of a longer recording fewer frames are shown."""
+_INPUT, _RENDER = "blurry input", "our render"
+
+Pictures = dict[str, UInt8[np.ndarray, "H W 3"]]
+"""By title; without truth there is neither truth nor error."""
 
 
 def test_frames(source: Source) -> str:
@@ -25,24 +40,40 @@ def test_frames(source: Source) -> str:
     entries = source.metrics["per_frame"]
     if not entries:
         return section("Test frames", "", '<p class="note">No frame has split “test”.</p>')
-    shots = [Shot.of(source, entry) for entry in entries]
-    # Per frame the pictures themselves and crops of about a third of the area.
-    pixels = sum(picture.size // 3 for shot in shots for picture in shot.pictures.values())
-    embed = Embedder.for_pixels(pixels * 4 // 3)
-    shown = spread(shots, _FRAMES_OPEN)
-    others = [shot for shot in shots if shot not in shown]
-    more = "".join(_test_frame(shot, embed) for shot in others)
+    # Per frame four pictures and crops of about a third of their area.
+    camera = source.capture.camera(entries[0]["frame"])
+    pixels_each = camera.width * camera.height * 16 // 3
+    most = max(2 * _FRAMES_OPEN, _MOST_PIXELS // pixels_each)
+    shots = [Shot.of(source, entry) for entry in _worth_showing(entries, most)]
+    embed = Embedder.for_pixels(pixels_each * len(shots))
+    shown = shots[:_FRAMES_OPEN]
+    others = sorted(shots[_FRAMES_OPEN:], key=lambda shot: shot.frame.mid_us)
+    folds = "".join(_test_frame(shot, embed) for shot in others)
     scale = legend(
         css_gradient(signed=False), "0", f"{ERROR_FULL_SCALE} levels of 255 and more", "error"
     )
     return section(
         "Test frames",
         "Held out: the training saw the body's pose at these times, but neither picture nor mask.",
-        _slider(shots, embed)
-        + (scale if any("error" in shot.pictures for shot in shots) else "")
+        (scale if any("error" in shot.pictures for shot in shots) else "")
         + "".join(_test_frame(shot, embed) for shot in shown)
-        + folded(f"{len(others)} more test frames", more),
+        + folded(more(len(others), len(entries) - len(shown), "test frames"), folds),
     )
+
+
+def _worth_showing(entries: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
+    """The most blurred frame, then some evenly spread ones, then others, evenly spread."""
+    hardest = min(entries, key=lambda entry: _known_psnr(entry, 1e9))
+    first = [hardest, *(e for e in spread(entries, _FRAMES_OPEN - 1) if e is not hardest)]
+    rest = [entry for entry in entries if entry not in first]
+    return [*first, *spread(rest, max(2, most - len(first)))]
+
+
+def _known_psnr(entry: dict[str, Any], otherwise: float) -> float:
+    """PSNR of the blurry input on the person, or on the full frame: how hard the frame is."""
+    blurry = entry["others"]["blurry_input"]
+    known = [blurry[region]["psnr"] for region in ("person_mask", "person_crop", "full")]
+    return next((value for value in known if value is not None), otherwise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +83,7 @@ class Shot:
     frame: Frame
     figures: dict[str, dict[str, float | None]]
     """Of protocol standard, by region and metric."""
-    input_psnr: float | None
-    """PSNR of the blurry input on the person (or the full frame): how hard the frame is."""
-    pictures: dict[str, UInt8[np.ndarray, "H W 3"]]
-    """By title; without truth there is neither truth nor error."""
+    pictures: Pictures
     person: Box | None
 
     @classmethod
@@ -63,30 +91,27 @@ class Shot:
         """Collect what the evaluation wrote and what the capture has."""
         frame = source.capture.frame(entry["frame"])
         pictures = {
-            "blurry input": to_bytes(source.capture.image(frame)),
-            "our render": source.picture(entry["pictures"]["render"]),
+            _INPUT: to_bytes(source.capture.image(frame)),
+            _RENDER: source.picture(entry["pictures"]["render"]),
         }
         if frame.sharp is not None:
             pictures["sharp truth"] = to_bytes(source.capture.sharp(frame))
             pictures["error"] = source.picture(entry["pictures"]["error"])
-        blurry = entry["others"]["blurry_input"]
-        known = [blurry[region]["psnr"] for region in ("person_mask", "person_crop", "full")]
         return cls(
             frame,
             entry["protocols"]["standard"],
-            next((value for value in known if value is not None), None),
             pictures,
             source.person(frame.name),
         )
 
-    def crops(self, aspect: float) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+    def crops(self, aspect: float) -> Pictures:
         """The pictures around the person, at least ``aspect`` times as wide as high.
 
         Empty where nobody is seen or where the person fills the picture anyway.
         """
         if self.person is None:
             return {}
-        height, width = self.pictures["our render"].shape[:2]
+        height, width = self.pictures[_RENDER].shape[:2]
         box = self.person.at_least(aspect, height, width)
         if box.right - box.left > _WORTH_ENLARGING * width:
             return {}
@@ -96,42 +121,24 @@ class Shot:
         }
 
 
-def _slider(shots: list[Shot], embed: Embedder) -> str:
-    """The most blurred frame: input and render behind a slider, the truth beside them."""
-    shot = min(shots, key=lambda shot: shot.input_psnr if shot.input_psnr is not None else 1e9)
-    pictures = shot.crops(1.0) or shot.pictures
-    name = shot.frame.name
-    blurry = embed.image(pictures["blurry input"], f"blurry input, frame {name}")
-    render = embed.image(pictures["our render"], f"our render, frame {name}")
-    compare = (
-        f'<figure><div class="compare">{blurry}<div class="over">{render}</div>'
-        '<input type="range" min="0" max="100" value="50" step="any" '
-        'aria-label="share of the blurry input" '
-        "oninput=\"this.parentNode.style.setProperty('--x',this.value+'%')\"></div>"
-        f"<figcaption>frame {escape(name)}, drag: blurry input | our render</figcaption></figure>"
-    )
-    truth = ""
-    if "sharp truth" in pictures:
-        truth = figure(embed.image(pictures["sharp truth"], f"truth, frame {name}"), "sharp truth")
-    return f'<div class="grid n2 wide">{compare}{truth}</div>'
-
-
 def _test_frame(shot: Shot, embed: Embedder) -> str:
     frame = shot.frame
-    full = "".join(
-        figure(embed.image(picture, f"{title}, frame {frame.name}"), title)
-        for title, picture in shot.pictures.items()
-    )
-    crops = "".join(
-        figure(embed.image(picture, f"{title}, person in frame {frame.name}"))
-        for title, picture in shot.crops(2 / 3).items()
-    )
-    count = len(shot.pictures)
     exposure_ms = (frame.exposure_us[1] - frame.exposure_us[0]) / 1000
     return (
         f'<article class="frame"><h3>Frame {escape(frame.name)} '
         f"<small>{frame.mid_us / 1e6:.3f} s · exposure {exposure_ms:g} ms"
         f"{frame_figures(shot.figures)}</small></h3>"
-        f'<div class="grid n{count}">{full}</div><div class="grid n{count} crops">{crops}</div>'
-        "</article>"
+        + _row(shot.pictures, f"frame {frame.name}", embed)
+        + _row(shot.crops(2 / 3), f"person in frame {frame.name}", embed)
+        + "</article>"
     )
+
+
+def _row(pictures: Pictures, place: str, embed: Embedder) -> str:
+    """Input and render behind a slider, truth and error beside them."""
+    if not pictures:
+        return ""
+    images = {title: embed.image(p, f"{title}, {place}") for title, p in pictures.items()}
+    first = compare(images.pop(_INPUT), images.pop(_RENDER), "blurry input | our render")
+    rest = "".join(figure(image, title) for title, image in images.items())
+    return f'<div class="grid shots n{1 + len(images)}">{first}{rest}</div>'
