@@ -189,7 +189,11 @@ class MoreTimes(Stateless):
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """Mean of all that was drawn."""
-        return {"more_times": torch.stack([picture.mean() for picture in step.rgb]).mean()}
+        return {
+            "more_times": torch.stack(
+                [picture.movedim(-1, 0).mean() for picture in step.rgb]
+            ).mean()
+        }
 
 
 def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], dict[str, float]]:

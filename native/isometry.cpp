@@ -1,6 +1,11 @@
 #include "isometry.h"
 
+#include <algorithm>
 #include <cmath>
+#include <vector>
+
+#include "buffer.h"
+#include "thread_pool.h"
 
 namespace evsplat {
 namespace {
@@ -175,16 +180,71 @@ struct Sample {
     }
 };
 
+// Places of the seven arrays of one sample in its own copy, and how many of each there are.
+struct Layout {
+    static constexpr size_t kWidth[7] = {3, 4, 3, 3, 4, 3, 16};
+    size_t begin[8];
+
+    explicit Layout(size_t times) {
+        begin[0] = 0;
+        for (int a = 0; a < 7; ++a) begin[a + 1] = begin[a] + kWidth[a] * kRows * (a < 3 ? 1 : times);
+    }
+
+    // work(floats of an array, at which row, place in the copy) for all rows of a sample.
+    template <class Work>
+    void rows(const int64_t* rows, size_t times, size_t points, const Work& work) const {
+        for (int a = 0; a < 7; ++a)
+            for (size_t t = 0; t < (a < 3 ? 1 : times); ++t)
+                for (int k = 0; k < kRows; ++k)
+                    work(a, (t * points + rows[k]) * kWidth[a], begin[a] + (t * kRows + k) * kWidth[a]);
+    }
+};
+
 }  // namespace
 
-IsometryMeans isometry(const IsometryInputs& in, const IsometryGrads& grads) {
-    const double share = 1.0 / (double(in.samples) * kNeighbours * in.times);
+size_t isometry_floats(size_t times) { return Layout(times).begin[7]; }
+
+IsometryMeans isometry(const IsometryInputs& in, int threads, float* gradients) {
+    const Layout layout(in.times);
+    const size_t floats = layout.begin[7];
+    const float share = float(1.0 / (double(in.samples) * kNeighbours * in.times));
+    const float* arrays[7] = {in.means,       in.quats,        in.scales_log, in.posed_means,
+                              in.posed_quats, in.posed_scales, in.transforms};
+    std::vector<IsometryMeans> sums(in.samples);
+    constexpr size_t kPiece = 32;
+    parallel_for(threads, (in.samples + kPiece - 1) / kPiece, [&](size_t piece) {
+        Buffer<float> copy(floats);
+        float* c = copy.data();
+        const int64_t own[kRows] = {0, 1, 2, 3, 4};
+        for (size_t s = piece * kPiece; s < std::min(in.samples, (piece + 1) * kPiece); ++s) {
+            layout.rows(in.rows + s * kRows, in.times, in.points, [&](int a, size_t from, size_t to) {
+                std::copy_n(arrays[a] + from, Layout::kWidth[a], c + to);
+            });
+            float* g = gradients + s * floats;
+            std::fill_n(g, floats, 0.f);
+            const size_t* at = layout.begin;
+            const IsometryInputs one = {1,         in.times,  kRows,     own,       c + at[0], c + at[1],
+                                        c + at[2], c + at[3], c + at[4], c + at[5], c + at[6]};
+            const IsometryGrads grads = {g + at[0], g + at[1], g + at[2], g + at[3], g + at[4], g + at[5], g + at[6]};
+            const Sample sample = {one, grads, own, share};
+            sums[s] = {sample.centers(), sample.covariances()};
+        }
+    });
     IsometryMeans means = {};
-    for (size_t s = 0; s < in.samples; ++s) {
-        const Sample sample = {in, grads, in.rows + s * kRows, float(share)};
-        means.centers += sample.centers() * share, means.covariances += sample.covariances() * share;
-    }
-    return means;
+    for (const IsometryMeans& sum : sums) means.centers += sum.centers, means.covariances += sum.covariances;
+    return {means.centers * share, means.covariances * share};
+}
+
+void isometry_add(const IsometryInputs& in, const float* gradients, float by_centers, float by_covariances,
+                  const IsometryGrads& grads) {
+    const Layout layout(in.times);
+    float* arrays[7] = {grads.means,       grads.quats,        grads.scales_log, grads.posed_means,
+                        grads.posed_quats, grads.posed_scales, grads.transforms};
+    for (size_t s = 0; s < in.samples; ++s, gradients += layout.begin[7])
+        layout.rows(in.rows + s * kRows, in.times, in.points, [&](int a, size_t to, size_t from) {
+            const float by = a % 3 == 0 && a < 6 ? by_centers : by_covariances;
+            for (size_t i = 0; i < Layout::kWidth[a]; ++i) arrays[a][to + i] += by * gradients[from + i];
+        });
 }
 
 }  // namespace evsplat

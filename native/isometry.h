@@ -17,7 +17,7 @@ struct IsometryInputs {
     const float *posed_means, *posed_quats, *posed_scales, *transforms;  // transforms: (T, N, 16)
 };
 
-// Gradients of the two means, added to: `means` of the first, the others of the second.
+// Gradients of the two means: `means` of the first, the others of the second.
 struct IsometryGrads {
     float *means, *quats, *scales_log;
     float *posed_means, *posed_quats, *posed_scales, *transforms;
@@ -27,7 +27,15 @@ struct IsometryMeans {
     double centers, covariances;
 };
 
-// Means over samples, neighbours and times of the absolute change. Serial: it is short.
-IsometryMeans isometry(const IsometryInputs&, const IsometryGrads&);
+// Floats of the gradients of one sample's rows.
+size_t isometry_floats(size_t times);
+
+// Means over samples, neighbours and times of the absolute change. Writes the gradients by the rows of each
+// sample, (samples, isometry_floats).
+IsometryMeans isometry(const IsometryInputs&, int threads, float* gradients);
+
+// Adds them, times those of the two means, to the rows they belong to; of the inputs only `rows` are read.
+void isometry_add(const IsometryInputs&, const float* gradients, float by_centers, float by_covariances,
+                  const IsometryGrads&);
 
 }  // namespace evsplat

@@ -736,7 +736,9 @@ double multiply_add(int64_t rounds, float* sink) {
 
 const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,         project, forward,
                          backward,     project_backward, multiply_add, &mlp_kernels,
-                         ssim_band,    log_brightness, power, add_sign, skin, skin_backward,
+                         ssim_band,    log_brightness, power, add_sign,
+                         membership,   square_sums,    difference_sums, difference_slope,
+                         view_directions, sh_rows, tree_softmax, skin, skin_backward,
                          hash_forward, hash_backward,  sensor_step};
 
 }  // namespace EVSPLAT_LEVEL

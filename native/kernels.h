@@ -7,6 +7,7 @@
 #include "hash_grid.h"
 #include "mlp_kernels.h"
 #include "picture.h"
+#include "posing.h"
 #include "sensor_kernels.h"
 #include "skinning.h"
 #include "ssim.h"
@@ -97,6 +98,10 @@ struct BackwardJob {
     bool background_is_image;
 };
 
+struct PairOfSums {
+    double first, second;
+};
+
 // Gradients that are added to; each may be null.
 struct GaussianGrads {
     float *means, *quats, *scales, *opacities, *values, *linear, *offset;
@@ -125,6 +130,14 @@ struct Kernels {
     void (*log_brightness)(const LogBrightness&, size_t begin, size_t end);
     void (*power)(const Power&, size_t begin, size_t end);
     void (*add_sign)(const float*, const float*, float, float, size_t, float*);
+    double (*membership)(const Membership&, size_t begin, size_t end);  // begin: a multiple of 16
+    // Of two maps: squares; absolute differences and their signs times the first; the gradient of those.
+    PairOfSums (*square_sums)(const float*, const float*, size_t);
+    PairOfSums (*difference_sums)(const float*, const float*, float, float, size_t);
+    void (*difference_slope)(const float*, const float*, float, float, float, float, size_t, float*);
+    void (*view_directions)(const ViewDirections&, size_t begin, size_t end);
+    void (*sh_rows)(const ShRows&, size_t begin, size_t end);
+    void (*tree_softmax)(const TreeSoftmax&, size_t begin, size_t end, float* scratch);
     // Points [begin, end).
     void (*skin)(const Skinning&, size_t begin, size_t end, float* moved, float* blended);
     void (*skin_backward)(const Skinning&, const SkinningGrads&, const float* blended, size_t begin, size_t end);
@@ -140,6 +153,13 @@ struct Kernels {
     void log_brightness(const LogBrightness&, size_t, size_t);                      \
     void power(const Power&, size_t, size_t);                                       \
     void add_sign(const float*, const float*, float, float, size_t, float*);        \
+    double membership(const Membership&, size_t, size_t);                           \
+    PairOfSums square_sums(const float*, const float*, size_t);                     \
+    PairOfSums difference_sums(const float*, const float*, float, float, size_t);   \
+    void difference_slope(const float*, const float*, float, float, float, float, size_t, float*);  \
+    void view_directions(const ViewDirections&, size_t, size_t);                    \
+    void sh_rows(const ShRows&, size_t, size_t);                                    \
+    void tree_softmax(const TreeSoftmax&, size_t, size_t, float*);                  \
     void skin(const Skinning&, size_t, size_t, float*, float*);                                  \
     void skin_backward(const Skinning&, const SkinningGrads&, const float*, size_t, size_t);     \
     void hash_forward(const HashLevel&);         \

@@ -43,13 +43,23 @@ struct Pairs {
     }
 
     // Without `rows` only to `columns`.
+    static void keep_rows(const Hidden<uint32_t>& to, int p, int row, F a, F b) {
+        const __m512i both = to_columns(to.columns, p, row, a, b);
+        if (to.rows) stream((float*)(to.rows + p * kPanelPairs + row / 2 * W), (F)in_rows(both));
+    }
     static void store_rows(const Hidden<uint32_t>& to, int p, int row, F a, F b) {
+        const __m512i both = to_columns(to.columns, p, row, a, b);
+        _mm512_storeu_si512(to.rows + p * kPanelPairs + row / 2 * W, in_rows(both));
+    }
+    static __m512i to_columns(uint32_t* columns, int p, int row, F a, F b) {
         const __m512i both = (__m512i)_mm512_cvtne2ps_pbh((__m512)b, (__m512)a);
-        _mm512_storeu_si512(to.columns + p * kPanelPairs + row * (W / 2), both);  // one row behind the other
-        if (!to.rows) return;
+        _mm512_storeu_si512(columns + p * kPanelPairs + row * (W / 2), both);  // one row behind the other
+        return both;
+    }
+    static __m512i in_rows(__m512i both) {
         const __m512i order = _mm512_set_epi16(31, 15, 30, 14, 29, 13, 28, 12, 27, 11, 26, 10, 25, 9, 24, 8, 23, 7,
                                                22, 6, 21, 5, 20, 4, 19, 3, 18, 2, 17, 1, 16, 0);
-        _mm512_storeu_si512(to.rows + p * kPanelPairs + row / 2 * W, _mm512_permutexvar_epi16(order, both));
+        return _mm512_permutexvar_epi16(order, both);
     }
     static void load_rows(const uint32_t* rows, int p, int row, F& a, F& b) {
         const U pairs = load(rows + p * kPanelPairs + row / 2 * W);

@@ -27,17 +27,22 @@ struct Single {
     static F add(F sum, float a, F b) { return sum + splat(a) * b; }
     static F add_values(F sum, F b) { return sum + b; }
 
-    // Where a layer's values go: to `kept`, or without it to `own`.
-    static Hidden<float> place(float* own, float* kept) { return {kept ? kept : own, kept ? kept : own}; }
+    // Where a layer's values go: to `own`, and on to `kept` if it is there.
+    static Hidden<float> place(float* own, float* kept) { return {own, kept ? kept : own}; }
     // A matrix in `memory`.
     static Hidden<float> matrix(float* memory, int) { return {memory, memory}; }
     // The same of panels that are there already.
     static Hidden<float> from_panels(float* panels, float*, int) { return {panels, panels}; }
 
-    // Rows (row, row + 1) of panel p, to a matrix and from its `rows`.
+    // Rows (row, row + 1) of panel p, to a matrix and from its `rows`; `keep_rows` to what forward keeps.
+    static void keep_rows(const Hidden<float>& to, int p, int row, F a, F b) {
+        const size_t at = p * kPanel + row * W;
+        store(to.columns + at, a), store(to.columns + at + W, b);
+        if (to.rows != to.columns) stream(to.rows + at, a), stream(to.rows + at + W, b);
+    }
     static void store_rows(const Hidden<float>& to, int p, int row, F a, F b) {
         float* at = to.rows + p * kPanel + row * W;
-        __builtin_memcpy(at, &a, sizeof a), __builtin_memcpy(at + W, &b, sizeof b);
+        store(at, a), store(at + W, b);
     }
     static void load_rows(const float* rows, int p, int row, F& a, F& b) {
         const float* at = rows + p * kPanel + row * W;
@@ -221,7 +226,7 @@ void forward(const MlpShape& s, const MlpForward& job, size_t block, float* scra
         };
         const auto into = [&](int layer) {
             return [to = place(layer), slope](int p, int r, F a, F b) {
-                Kind::store_rows(to, p, r, leaky(a, slope), leaky(b, slope));
+                Kind::keep_rows(to, p, r, leaky(a, slope), leaky(b, slope));
             };
         };
         const float* bias = job.bias + t * s.width_panels * W;

@@ -14,7 +14,6 @@
 
 #include "event_module.h"
 #include "hash_grid.h"
-#include "isometry.h"
 #include "levels.h"
 #include "mlp.h"
 #include "neighbours.h"
@@ -23,6 +22,7 @@
 #include "sensor_module.h"
 #include "skinning.h"
 #include "ssim.h"
+#include "step_module.h"
 #include "zbuffer_module.h"
 
 namespace nb = nanobind;
@@ -322,7 +322,6 @@ void hash_encode_backward(In positions, In table, std::vector<int64_t> cells, st
 }
 
 using OutIndex = nb::ndarray<int64_t, nb::c_contig, nb::device::cpu>;
-using InRows = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
 
 Skinning skinning(const In& position, const In& weight, const In& bones) {
     require(bones.ndim() == 4 && bones.shape(2) == 4 && bones.shape(3) == 4, "the bones");
@@ -361,28 +360,6 @@ void blend_skin_backward(In position, In weight, In bones, In blended, std::opti
                                  asked(bones_grad), nullptr, 0};
     nb::gil_scoped_release release;
     skin_backward(job, blended.data(), grads, threads);
-}
-
-// `arrays` and `grads`: means, quats, scales_log, posed means, posed quats, posed scales, transforms.
-std::pair<double, double> isometry_change(InRows rows, const std::vector<In>& arrays, const std::vector<Out>& grads) {
-    require(arrays.size() == 7 && grads.size() == 7, "the arrays");
-    require(rows.ndim() == 2 && rows.shape(1) == 1 + kNeighbours, "the rows");
-    require(arrays[3].ndim() == 3, "the posed means");
-    const size_t times = arrays[3].shape(0), points = arrays[3].shape(1);
-    const size_t width[7] = {3, 4, 3, 3, 4, 3, 16};
-    for (int i = 0; i < 7; ++i) {
-        require(grads[i].size() == arrays[i].size(), "a gradient");
-        require(i < 3 ? arrays[i].size() >= points * width[i] : arrays[i].size() == times * points * width[i], "an array");
-    }
-    for (size_t i = 0; i < rows.size(); ++i)
-        require(rows.data()[i] >= 0 && size_t(rows.data()[i]) < points, "the rows: outside of the points");
-    const IsometryInputs in = {rows.shape(0), times, points, rows.data(), arrays[0].data(), arrays[1].data(),
-                               arrays[2].data(), arrays[3].data(), arrays[4].data(), arrays[5].data(), arrays[6].data()};
-    const IsometryGrads out = {grads[0].data(), grads[1].data(), grads[2].data(), grads[3].data(), grads[4].data(),
-                               grads[5].data(), grads[6].data()};
-    nb::gil_scoped_release release;
-    const IsometryMeans means = isometry(in, out);
-    return {means.centers, means.covariances};
 }
 
 void nearest(In points, std::optional<In> queries, OutIndex index, Out square, int threads) {
@@ -445,8 +422,6 @@ NB_MODULE(_native, m) {
           nb::arg("blended"), nb::arg("moved_grad").none(), nb::arg("blended_grad").none(),
           nb::arg("position_grad").none(), nb::arg("weight_grad").none(), nb::arg("bones_grad").none(),
           nb::arg("threads"), "Writes the gradients of skin.");
-    m.def("isometry", &isometry_change, nb::arg("rows"), nb::arg("arrays"), nb::arg("grads"),
-          "Mean change of neighbours' distances and covariances; adds the gradients of each.");
     m.def("hash_encode", &hash_encode, nb::arg("positions"), nb::arg("table"), nb::arg("cells"), nb::arg("begin"),
           nb::arg("mask"), nb::arg("encoded"), nb::arg("threads"), "Hash grid encoding (levels * features, N).");
     m.def("hash_encode_backward", &hash_encode_backward, nb::arg("positions"), nb::arg("table"), nb::arg("cells"),
@@ -454,6 +429,7 @@ NB_MODULE(_native, m) {
           nb::arg("position_grad").none(), nb::arg("threads"),
           "Adds to the table's gradient and writes that of the positions.");
     bind_sensor(m);
+    bind_step(m);
     bind_events(m);
     m.def("nearest", &nearest, nb::arg("points"), nb::arg("queries").none(), nb::arg("index"), nb::arg("square"),
           nb::arg("threads"), "Nearest points of queries, or of the points themselves; squared distances.");

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <stddef.h>
+#include <stdint.h>
 
 namespace evsplat {
 
@@ -31,5 +32,31 @@ void power(const Power&, size_t count, int threads);
 // grad = by_difference * sign(image - reference) + scale * grad, over `count` values.
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count,
               int threads, float* grad);
+
+// How well `count` pixels' share of the person fits to what each surely is: the natural logarithm of the
+// share, held within [lowest, 1 - lowest], where `inside` has its bit, of 1 - share where `outside` has
+// it, and nothing elsewhere. Masks have their first pixel in a byte's highest bit. `slope` is null or
+// takes the derivative of the sum.
+struct Membership {
+    const float* share;
+    const uint8_t *inside, *outside;
+    float lowest;
+    float* slope;
+};
+
+double membership(const Membership&, size_t count, int threads);
+
+// Two maps of `count` pixels, each divided by sqrt(sum of squares + count floor^2).
+struct MapDifference {
+    double scale[2];     // one over the divisors
+    double difference;   // sum of absolute differences
+    double along;        // sum of their signs times the first map
+};
+
+MapDifference map_difference(const float* map, const float* reference, float floor, size_t count, int threads);
+
+// Gradient of `weight * difference` by the first map.
+void map_difference_backward(const float* map, const float* reference, const MapDifference&, float weight,
+                             size_t count, int threads, float* grad);
 
 }  // namespace evsplat

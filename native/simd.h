@@ -26,6 +26,19 @@ typedef int32_t I4 __attribute__((vector_size(16), may_alias));
 INLINE F splat(float value) { return value - F{}; }
 INLINE F load(const float* p) { F v; __builtin_memcpy(&v, p, sizeof v); return v; }
 INLINE void store(float* p, F v) { __builtin_memcpy(p, &v, sizeof v); }
+// To an aligned place that is not read soon: past the cache, so that its line is not fetched first.
+INLINE void stream(float* p, F v) {
+#if defined(__AVX512F__) && EVSPLAT_LANES == 16
+    _mm512_stream_ps(p, (__m512)v);
+#elif defined(__AVX__) && EVSPLAT_LANES == 8
+    _mm256_stream_ps(p, (__m256)v);
+#elif defined(__SSE2__) && EVSPLAT_LANES == 4
+    _mm_stream_ps(p, (__m128)v);
+#else
+    store(p, v);
+#endif
+}
+
 INLINE F min(F a, F b) { return a < b ? a : b; }
 INLINE F max(F a, F b) { return a > b ? a : b; }
 INLINE F select(I mask, F a, F b) { return mask ? a : b; }

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from evsplat.deform import HumanColour, SceneColour, sh_basis, view_jitter
+from evsplat.deform.colour import beside_basis, view_directions
 
 
 def unit(*shape, seed=0, dtype=torch.float32):
@@ -96,3 +97,34 @@ def test_view_jitter_is_a_rotation_with_the_released_codes_third_angle():
     assert (third(literal)[inside] > -1e-4).all()
     assert (third(literal)[inside] < math.pi / 4 + 1e-4).all()
     assert (third(symmetric) < 0).float().mean() > 0.3
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("values_first", [False, True])
+def test_compiled_basis_beside_values_equals_plain_torch_in_float64(seed, values_first):
+    directions = unit(2, 37, 3, seed=seed)
+    values = torch.randn(2, 37, 5, generator=torch.Generator().manual_seed(seed))
+    weights = torch.randn(2, 37, 20, generator=torch.Generator().manual_seed(seed + 9))
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = values.detach().to(dtype).requires_grad_()
+        joined = beside_basis(directions.to(dtype), leaf, values_first=values_first)
+        (joined * weights.to(dtype)).sum().backward()
+        results.append((joined.detach().double(), leaf.grad.double()))
+    for compiled, plain in zip(*results, strict=True):
+        torch.testing.assert_close(compiled, plain, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("turned", [False, True])
+def test_compiled_view_directions_equal_plain_torch_in_float64(seed, turned):
+    generator = torch.Generator().manual_seed(seed)
+    positions, center = torch.randn(2, 41, 3, generator=generator), torch.randn(3)
+    positions[1, 7] = center  # no direction at all
+    more = ()
+    if turned:
+        more = torch.randn(2, 41, 4, 4, generator=generator), view_jitter(generator)
+    compiled = view_directions(positions, center, *more)
+    plain = view_directions(positions.double(), center.double(), *(m.double() for m in more))
+    torch.testing.assert_close(compiled.double(), plain, rtol=1e-4, atol=1e-5)
+    assert not compiled.requires_grad and (compiled[1, 7] == 0).all()

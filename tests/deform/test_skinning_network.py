@@ -1,5 +1,7 @@
 """The hierarchical softmax against a literal transcription of SMPL's rule, and on any tree."""
 
+import math
+
 import pytest
 import torch
 
@@ -143,3 +145,29 @@ def test_network_learns_the_weights_of_a_body():
         optimiser.step()
         losses.append(loss.item())
     assert losses[-1] < 0.15 * losses[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("joints", [1, 2, 7, 31])
+def test_compiled_softmax_and_its_gradient_equal_plain_torch_in_float64(seed, joints):
+    generator = torch.Generator().manual_seed(seed)
+    parents = [-1] + [int(torch.randint(j, (), generator=generator)) for j in range(1, joints)]
+    softmax = HierarchicalSoftmax(parents)
+    logits = 5 * torch.randn(3, 13, softmax.logits, generator=generator)
+    upstream = torch.randn(3, 13, joints, generator=generator)
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = logits.detach().to(dtype).requires_grad_()
+        weights = softmax(leaf)
+        (gradient,) = torch.autograd.grad(weights, leaf, upstream.to(dtype))
+        results.append((weights.detach().double(), gradient.double()))
+    for compiled, plain in zip(*results, strict=True):
+        assert (compiled - plain).norm() <= 2e-6 * plain.norm()
+
+
+def test_compiled_softmax_of_no_number_is_none():
+    softmax = HierarchicalSoftmax((-1, 0, 0, 1))
+    logits = torch.zeros(5, softmax.logits)
+    logits[2] = math.nan
+    weights = softmax(logits)
+    assert weights[2].isnan().any() and not weights[[0, 1, 3, 4]].isnan().any()

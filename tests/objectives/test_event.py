@@ -79,3 +79,27 @@ def test_gradient_of_the_loss_agrees_with_finite_differences():
     assert torch.autograd.gradcheck(
         lambda image: event_loss(log_brightness_change(before, image), events), (after,)
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("floor", [0.0, 0.03])
+def test_compiled_loss_and_its_gradient_equal_plain_torch_in_float64(seed, floor):
+    generator = torch.Generator().manual_seed(seed)
+    shape = ((20, 30), (37, 29), (1, 3), (150, 220))[seed]
+    change = torch.randn(shape, generator=generator)
+    events = torch.randint(-3, 4, shape, generator=generator).float()
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = change.detach().to(dtype).requires_grad_()
+        loss = event_loss(leaf, events.to(dtype), floor=floor)
+        (3 * loss).backward()
+        results.append((loss.detach().double(), leaf.grad.double()))
+    (loss, gradient), (expected, expected_gradient) = results
+    assert float(loss) == pytest.approx(float(expected), rel=2e-6)
+    assert (gradient - expected_gradient).norm() < 5e-6 * expected_gradient.norm()
+
+
+def test_compiled_loss_of_no_number_is_none():
+    change = torch.ones(20, 30)
+    change[3, 4] = math.nan
+    assert bool(event_loss(change, torch.ones(20, 30)).isnan())

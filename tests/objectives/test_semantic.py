@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from evsplat.devices import DeviceCache
 from evsplat.objectives import PackedBounds, RenderedSemantics, silhouette_bounds
+from evsplat.objectives.semantic import membership_loss
 
 
 def disc(radius: float) -> np.ndarray:
@@ -57,3 +58,34 @@ def test_frames_without_bounds_say_nothing():
         model=SimpleNamespace(gaussians=SimpleNamespace(semantics=lambda: torch.tensor([0.5]))),
     )
     assert set(RenderedSemantics({}).loss(step)) == {"binarise"}
+
+
+@pytest.mark.parametrize("seed,shape", [(0, (40, 50)), (1, (37, 29)), (2, (181, 203)), (3, (1, 3))])
+def test_compiled_loss_and_its_gradient_equal_plain_torch_in_float64(seed, shape):
+    rng = np.random.default_rng(seed)
+    kind = rng.integers(3, size=shape)  # inside, outside, between
+    packed = PackedBounds(np.packbits(np.stack([kind == 0, kind == 1]).reshape(2, -1), 1), *shape)
+    share = rng.uniform(-0.1, 1.1, shape).astype(np.float32)
+    share.flat[:2] = 1e-4, 1.0  # a bound of the range, and beyond it
+    results = []
+    for given, masks in (
+        (torch.tensor(share), packed),
+        (torch.tensor(share, dtype=torch.float64), packed.masks()),
+    ):
+        given = given.detach().requires_grad_()
+        loss = membership_loss(given, masks)
+        (3 * loss).backward()
+        results.append((loss.detach().double(), given.grad.double()))
+    (loss, gradient), (expected, expected_gradient) = results
+    # One less the upper bound has four digits less in float32.
+    assert float(loss) == pytest.approx(float(expected), rel=2e-5, abs=1e-7)
+    # The bounds are not the same numbers in both precisions.
+    inner = torch.from_numpy((np.abs(share - 1e-4) > 1e-6) & (np.abs(share - 1 + 1e-4) > 1e-6))
+    torch.testing.assert_close(gradient[inner], expected_gradient[inner], rtol=1e-4, atol=1e-9)
+
+
+def test_compiled_loss_of_no_number_is_none():
+    packed = PackedBounds.of(disc(8), 5)
+    share = torch.full((40, 50), 0.5)
+    share[20, 25] = math.nan
+    assert bool(membership_loss(share, packed).isnan())

@@ -33,7 +33,13 @@ def quick(capture_path, **options):
 
 def without_native(monkeypatch):
     for module in (
+        "evsplat.deform.colour",
         "evsplat.deform.mlp",
+        "evsplat.deform.non_rigid",
+        "evsplat.deform.skinning_network",
+        "evsplat.objectives.event",
+        "evsplat.objectives.isometry",
+        "evsplat.objectives.semantic",
         "evsplat.deform.encodings",
         "evsplat.similarity.psnr_ssim",
     ):

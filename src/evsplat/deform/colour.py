@@ -1,12 +1,15 @@
 """Colour networks of human and scene Gaussians."""
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import axis_angle_to_matrix
+from evsplat.compiled import native, runs_native
 from evsplat.deform.mlp import PointMLP
 from evsplat.deform.spherical_harmonics import sh_basis
 
@@ -45,8 +48,7 @@ class HumanColour(nn.Module):
         ``directions`` are unit vectors from the camera to the Gaussian, turned back to canonical
         space; ``latent`` is the frame's.
         """
-        both = torch.cat((sh_basis(directions), nonrigid), -1)
-        return self.mlp(features, latent, both).sigmoid()
+        return self.mlp(features, latent, beside_basis(directions, nonrigid)).sigmoid()
 
 
 class SceneColour(nn.Module):
@@ -78,12 +80,78 @@ class SceneColour(nn.Module):
         """SRGB in [0, 1]; ``directions`` are unit vectors from the camera in the world."""
         inputs = features
         if self.view_dependent:
-            basis = sh_basis(directions)
             if self.training and self.direction_dropout > 0:
-                kept = torch.rand(len(basis), 1, device=basis.device) >= self.direction_dropout
-                basis = basis * kept
-            inputs = torch.cat((features, basis), -1)
+                # All of the basis is zero at the zero vector.
+                count, device = len(directions), directions.device
+                kept = torch.rand(count, 1, device=device) >= self.direction_dropout
+                directions = directions * kept
+            inputs = beside_basis(directions, features, values_first=True)
         return self.mlp(inputs)[0].sigmoid()
+
+
+def beside_basis(
+    directions: Float[Tensor, "*batch 3"],
+    values: Float[Tensor, "*batch V"],
+    *,
+    values_first: bool = False,
+) -> Float[Tensor, "*batch V+15"]:
+    """The basis of unit vectors up to degree 3, without its constant, beside other values."""
+    if runs_native(directions) and runs_native(values) and not directions.requires_grad:
+        joined: Tensor = _NativeBesideBasis.apply(directions, values, values_first)
+        return joined
+    basis = sh_basis(directions)
+    return torch.cat((values, basis) if values_first else (basis, values), -1)
+
+
+class _NativeBesideBasis(torch.autograd.Function):
+    """`beside_basis` for directions without a gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, directions: Tensor, values: Tensor, values_first: bool) -> Tensor:
+        count = values.shape[-1]
+        first = 0 if values_first else _DIRECTION_DIM
+        ctx.columns = slice(first, first + count)
+        joined = values.new_empty(*values.shape[:-1], count + _DIRECTION_DIM)
+        joined[..., ctx.columns] = values
+        at = count if values_first else 0
+        native.sh_rows(directions.contiguous(), joined, at, torch.get_num_threads())
+        return joined
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[None, Tensor, None]:
+        return None, upstream[0][..., ctx.columns], None
+
+
+def view_directions(
+    positions: Float[Tensor, "T N 3"],
+    center: Float[Tensor, "3"],
+    transforms: Float[Tensor, "T N 4 4"] | None = None,
+    turn: Float[Tensor, "3 3"] | None = None,
+) -> Float[Tensor, "T N 3"]:
+    """Unit vectors from ``center`` to positions, without a gradient.
+
+    Each is turned back by the transposed 3x3 part of its transform, then all by ``turn``.
+    """
+    positions = positions.detach()
+    transforms = None if transforms is None else transforms.detach()
+    if runs_native(positions):
+        directions = torch.empty(positions.shape)
+        native.view_directions(
+            positions.contiguous(),
+            None if transforms is None else transforms.contiguous(),
+            center.tolist(),
+            (torch.eye(3) if turn is None else turn).flatten().tolist(),
+            directions,
+            torch.get_num_threads(),
+        )
+        return directions
+    view = positions - center
+    if transforms is not None:
+        view = (view[..., None, :] @ transforms[..., :3, :3])[..., 0, :]
+    if turn is not None:
+        view = view @ turn.T
+    return nn.functional.normalize(view, dim=-1)
 
 
 def view_jitter(

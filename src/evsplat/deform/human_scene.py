@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack, bounding_box, skin, up_axis
-from evsplat.body.rotations import axis_angle_to_matrix, quaternion_multiply
+from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.capture import Camera, Frame
-from evsplat.deform.colour import HumanColour, SceneColour, view_jitter
+from evsplat.deform.colour import HumanColour, SceneColour, view_directions, view_jitter
 from evsplat.deform.drawing import Drawing, draw
 from evsplat.deform.encodings import make_encoding
 from evsplat.deform.frame_weights import UnseenFrames, interpolated, seen, seen_or_last
@@ -243,7 +243,7 @@ class HumanSceneModel(nn.Module):
         seen_times, seen = list(times_us), rotations
         if networks_at_us is not None:
             seen_times, seen = [networks_at_us], self.pose([networks_at_us])[0]
-        deformed, log_scales, quaternions, feature = self._non_rigid(moving, seen, noise)
+        deformed, scales, quaternions, feature = self._non_rigid(moving, seen, noise)
         if share_skinning:
             shared = self.normalise(deformed.mean(0))
             weights = self.skinning_turns.weights(self.skinning, shared)[None]
@@ -272,7 +272,9 @@ class HumanSceneModel(nn.Module):
         if self.shading is not None:
             rgb = rgb * self._shade(parts["means"][0], human_means, transforms[:, people])
         hidden = noise is not None and noise.hide_scene_direction
-        directions = nn.functional.normalize(scene_means.detach() - camera_center, dim=-1)
+        directions = view_directions(scene_means[None], camera_center)[0]
+        if hidden:
+            directions = torch.zeros_like(directions)
         soft = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
         opacities = gaussians.of_parts(gaussians.opacities())
         semantics = gaussians.of_parts(soft)
@@ -281,7 +283,7 @@ class HumanSceneModel(nn.Module):
             human=PosedHuman(
                 human_means,
                 quaternions[:, people].expand(times, -1, -1),
-                log_scales[:, people].exp().expand(times, -1, -1),
+                scales[:, people].expand(times, -1, -1),
                 rgb.expand(times, -1, -1),
                 transforms[:, people],
             ),
@@ -289,7 +291,9 @@ class HumanSceneModel(nn.Module):
                 scene_means,
                 parts["quaternions"][1],
                 parts["scales_log"][1].exp(),
-                self.scene_colour(scene_features, directions * (0.0 if hidden else 1.0)),
+                self.scene_colour(
+                    scene_features, torch.zeros_like(directions) if hidden else directions
+                ),
             ),
             human_opacities=opacities[0],
             scene_opacities=opacities[1],
@@ -375,27 +379,21 @@ class HumanSceneModel(nn.Module):
     def _non_rigid(
         self, moving: dict[str, Tensor], rotations: Tensor, noise: Noise | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Deformed centres, log-scales, quaternions and colour feature (eq. 1), time leading.
+        """Deformed centres, scales, quaternions and colour feature (eq. 1), time leading.
 
         Before the network is switched on all but the feature have a leading axis of 1.
         """
-        canonical = moving["means"]
-        log_scales, quaternions = moving["scales_log"][None], moving["quaternions"][None]
+        canonical, quaternions = moving["means"], moving["quaternions"]
         if not self.non_rigid_active:
             feature = canonical.new_zeros(
                 len(rotations), len(canonical), self.non_rigid.feature_dim
             )
-            return canonical[None], log_scales, quaternions, feature
+            return canonical[None], moving["scales_log"].exp()[None], quaternions[None], feature
         seen = (
             rotations if noise is None or noise.rotations is None else rotations + noise.rotations
         )
         delta = self.non_rigid(self.normalise(canonical), self.pose_encoder(seen))
-        return (
-            canonical + delta.offset,
-            log_scales + delta.log_scale,
-            quaternion_multiply(delta.rotation, nn.functional.normalize(quaternions, dim=-1)),
-            delta.feature,
-        )
+        return delta.shape(canonical, moving["scales_log"], quaternions)
 
     def _shade(
         self, canonical: Tensor, world: Tensor, transforms: Tensor
@@ -418,11 +416,8 @@ class HumanSceneModel(nn.Module):
     ) -> Float[Tensor, "T H 3"]:
         """Colours of the person, from the view direction turned back into canonical space."""
         # Detached as in 3DGS-Avatar: colour must not be bought by moving the body.
-        view = (world - camera_center).detach()[..., None, :]
-        canonical_view = (view @ transforms[..., :3, :3].detach())[..., 0, :]
-        if noise is not None:
-            canonical_view = canonical_view @ noise.view_turn.T
-        canonical_view = nn.functional.normalize(canonical_view, dim=-1)
+        turn = None if noise is None else noise.view_turn
+        canonical_view = view_directions(world, camera_center, transforms, turn)
         share = interpolated if self.config.unseen_frames == "interpolated" else seen_or_last
         latent = share(self.get_buffer("frame_times"), times_us) @ self.latents
         return self.human_colour(features, canonical_view, feature, latent)

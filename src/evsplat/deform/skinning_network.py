@@ -1,12 +1,15 @@
 """Skinning weights from canonical position: an MLP and a hierarchical softmax over the skeleton."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from evsplat.body.tree import joint_depths
+from evsplat.compiled import native, runs_native
 from evsplat.deform.mlp import PointMLP
 
 
@@ -74,9 +77,21 @@ class HierarchicalSoftmax(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
+        depths = joint_depths(parents)
+        kept = (gates.get(j, children[j][0] if children[j] else -1) for j in range(joints))
+        self.tree = (
+            sorted(range(joints), key=lambda joint: depths[joint]),
+            [int(parent) for parent in parents],
+            list(kept),
+            [int(joint in gates) for joint in range(joints)],
+        )
+        """Order with parents first, parents, gates and whether a joint's children share."""
 
     def forward(self, logits: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch J"]:
         """Weights that sum to one."""
+        if runs_native(logits):
+            weights: Tensor = _NativeSoftmax.apply(logits.reshape(-1, self.logits), self.tree)
+            return weights.unflatten(0, logits.shape[:-1])
         log_weights = nn.functional.logsigmoid(logits) @ self.gate_paths.to(logits)
         log_weights = log_weights + logits @ self.logit_paths.to(logits)
         if len(self.siblings):
@@ -85,6 +100,28 @@ class HierarchicalSoftmax(nn.Module):
             shares = shares.index_select(-1, self.sibling_places)
             log_weights = log_weights + shares @ self.child_paths.to(logits)
         return log_weights.exp()
+
+
+class _NativeSoftmax(torch.autograd.Function):
+    """`HierarchicalSoftmax` in the compiled module."""
+
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor, tree: tuple[list[int], ...]) -> Tensor:
+        given = logits.detach().contiguous()
+        weights = torch.empty(len(given), len(tree[0]))
+        native.tree_softmax(given, tree, None, weights, torch.get_num_threads())
+        ctx.tree = tree
+        ctx.save_for_backward(given)
+        return weights
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (given,) = ctx.saved_tensors
+        gradient = torch.empty_like(given)
+        above = upstream[0].contiguous()
+        native.tree_softmax(given, ctx.tree, above, gradient, torch.get_num_threads())
+        return gradient, None
 
 
 class SkinningNetwork(nn.Module):

@@ -65,7 +65,13 @@ class Step(Generic[ModelType]):
 
     def observed(self, frame: Frame) -> Float[Tensor, "H W 3"]:
         """The recorded picture of a frame, on the model's device."""
-        return self.data.get(*picture(self.capture, frame))
+        if frame.name not in self._observed:
+            self._observed[frame.name] = self.data.get(*picture(self.capture, frame))
+        return self._observed[frame.name]
+
+    @cached_property
+    def _observed(self) -> dict[str, Tensor]:
+        return {}
 
 
 def picture(capture: Capture, frame: Frame) -> tuple[Hashable, Callable[[], Tensor]]:

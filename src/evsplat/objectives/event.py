@@ -3,12 +3,15 @@
 from collections import OrderedDict
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from evsplat.capture import Capture, Frame
+from evsplat.compiled import native, runs_native
 from evsplat.devices import DeviceCache
 from evsplat.events import count_map
 from evsplat.imaging import log_brightness_change
@@ -35,8 +38,32 @@ def event_loss(
     ``change`` is the rendered log-brightness change, ``events`` the signed event count; the
     contrast threshold cancels. Sum of absolute differences divided by ``sqrt(N)``.
     """
+    if runs_native(change) and runs_native(events) and not events.requires_grad:
+        distance: Tensor = _NativeEventLoss.apply(change, events, floor)
+        return distance
     difference = normalised(change, floor) - normalised(events, floor)
     return difference.abs().sum() / difference.numel() ** 0.5
+
+
+class _NativeEventLoss(torch.autograd.Function):
+    """`event_loss` in the compiled module."""
+
+    @staticmethod
+    def forward(ctx: Any, change: Tensor, events: Tensor, floor: float) -> Tensor:
+        maps = change.detach().contiguous(), events.contiguous()
+        ctx.known = native.map_difference(*maps, floor, torch.get_num_threads())
+        ctx.save_for_backward(*maps)
+        return change.new_tensor(ctx.known[2] / change.numel() ** 0.5)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
+        change, events = ctx.saved_tensors
+        gradient = torch.empty_like(change)
+        weight = float(upstream[0]) / change.numel() ** 0.5
+        threads = torch.get_num_threads()
+        native.map_difference_backward(change, events, ctx.known, weight, gradient, threads)
+        return gradient, None, None
 
 
 class EventChange(Stateless):

@@ -61,24 +61,25 @@ def isometry_change(
 
 
 class _NativeIsometry(torch.autograd.Function):
-    """`isometry_change` in the compiled module; the gradients are found on the way forward."""
+    """`isometry_change` in the compiled module; gradients are found on the way forward."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, *arrays: Tensor) -> tuple[Tensor, Tensor]:
         given = [array.detach().contiguous() for array in arrays]
-        grads = [torch.zeros_like(array) for array in given]
-        centers, covariances = native.isometry(rows.contiguous(), given, grads)
-        ctx.save_for_backward(*grads)
+        rows = rows.contiguous()
+        times = len(given[3])
+        gradients = torch.empty(len(rows), native.isometry_floats(times))
+        centers, covariances = native.isometry(rows, given, gradients, torch.get_num_threads())
+        ctx.shapes = [array.shape for array in arrays]
+        ctx.save_for_backward(rows, gradients)
         return arrays[0].new_tensor(centers), arrays[0].new_tensor(covariances)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        of_centers = (True, False, False, True, False, False, False)
-        return None, *(
-            grad * upstream[0 if centers else 1]
-            for grad, centers in zip(ctx.saved_tensors, of_centers, strict=True)
-        )
+        grads = [torch.zeros(shape) for shape in ctx.shapes]
+        native.isometry_add(*ctx.saved_tensors, *map(float, upstream), grads)
+        return None, *grads
 
 
 def _rows(values: Tensor, rows: Tensor, axis: int) -> Tensor:

@@ -2,17 +2,23 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from evsplat.capture import Frame
+from evsplat.compiled import native, runs_native
 from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.devices import DeviceCache
 from evsplat.objectives.base import Stateless, Step
+
+LEAST_SHARE = 1e-4
+"""A share of the person is held so far from 0 and 1, where the logarithm has no end."""
 
 
 def silhouette_bounds(
@@ -34,6 +40,7 @@ class PackedBounds:
     """`silhouette_bounds` at one bit a mask and pixel: training keeps those of every frame."""
 
     bits: np.ndarray
+    """A row of bytes per mask, the first pixel in a byte's highest bit."""
     height: int
     width: int
 
@@ -41,13 +48,49 @@ class PackedBounds:
     def of(cls, silhouette: Bool[np.ndarray, "H W"], band_px: int) -> "PackedBounds":
         """Find and pack them."""
         masks = torch.stack(silhouette_bounds(silhouette, band_px)).numpy()
-        return cls(np.packbits(masks), *silhouette.shape)
+        return cls(np.packbits(masks.reshape(2, -1), axis=1), *silhouette.shape)
 
     def masks(self) -> Bool[Tensor, "2 H W"]:
         """Inside and outside, as `silhouette_bounds` gave them."""
         pixels = self.height * self.width
-        masks = torch.from_numpy(np.unpackbits(self.bits, count=2 * pixels).view(bool))
+        masks = torch.from_numpy(np.unpackbits(self.bits, axis=1, count=pixels).view(bool))
         return masks.view(2, self.height, self.width)
+
+
+def membership_loss(
+    share: Float[Tensor, "H W"], masks: Bool[Tensor, "2 H W"] | PackedBounds
+) -> Float[Tensor, ""]:
+    """Cross-entropy, mean over pixels, of the share of the person against what a pixel surely is.
+
+    Pixels between ``inside`` and ``outside`` count as right. Packed masks are for the compiled
+    module, which takes float32 on the CPU.
+    """
+    if isinstance(masks, PackedBounds):
+        packed: Tensor = _NativeMembership.apply(share, masks.bits)
+        return packed
+    inside, outside = masks.to(share.dtype)
+    # The probability of what the pixel surely is: p inside, 1 - p outside, 1 between.
+    held = share.clamp(LEAST_SHARE, 1 - LEAST_SHARE)
+    return -torch.addcmul(1 - inside, inside - outside, held).log().mean()
+
+
+class _NativeMembership(torch.autograd.Function):
+    """`membership_loss` in the compiled module; the gradient is found on the way forward."""
+
+    @staticmethod
+    def forward(ctx: Any, share: Tensor, bits: np.ndarray) -> Tensor:
+        given = share.detach().contiguous()
+        slope = torch.empty_like(given) if ctx.needs_input_grad[0] else None
+        total = native.membership(given, bits, LEAST_SHARE, slope, torch.get_num_threads())
+        if slope is not None:
+            ctx.save_for_backward(slope)
+        return share.new_tensor(-total / share.numel())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (slope,) = ctx.saved_tensors
+        return slope * (-upstream[0] / slope.numel()), None
 
 
 class RenderedSemantics(Stateless):
@@ -75,11 +118,9 @@ class RenderedSemantics(Stateless):
         for time, drawn in zip(step.times_us, step.semantic, strict=True):
             if time not in self.bounds:
                 continue
-            masks = step.data.get(("bounds", time), self.bounds[time].masks)
-            inside, outside = masks.to(drawn.dtype)
-            # The probability of what the pixel surely is: p inside, 1 - p outside, 1 between.
-            right = torch.addcmul(1 - inside, inside - outside, drawn.clamp(1e-4, 1 - 1e-4))
-            values.append(-right.log().mean())
+            packed = self.bounds[time]
+            masks = packed if runs_native(drawn) else step.data.get(("bounds", time), packed.masks)
+            values.append(membership_loss(drawn, masks))
         soft = step.model.gaussians.semantics()
         terms = {"binarise": (soft * (1 - soft)).mean()}
         if values:

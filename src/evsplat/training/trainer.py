@@ -30,10 +30,20 @@ PARTS: tuple[Part, Part] = ("human", "scene")
 class StepReport:
     """What one step measured. Reading a number waits for the device that computes it."""
 
-    measured: Float[Tensor, " K"]
-    """Loss, PSNR and the terms."""
+    losses: tuple[Float[Tensor, ""], ...]
+    """What was minimised, and its terms, unweighted."""
     names: tuple[str, ...]
     """Of the terms."""
+    drawn: Float[Tensor, "H W 3"]
+    recorded: Float[Tensor, "H W 3"]
+    """The drawn frame's render and its blurry picture, compared only if somebody asks."""
+
+    @cached_property
+    def measured(self) -> Float[Tensor, " K"]:
+        """Loss, PSNR and the terms."""
+        error = (self.drawn.clamp(0, 1) - self.recorded).square().mean()
+        loss, *terms = self.losses
+        return torch.stack([loss, -10 * torch.log10(error), *terms])
 
     @cached_property
     def _numbers(self) -> list[float]:
@@ -126,9 +136,8 @@ class Trainer:
         self._count(drawing, unsure)
         self._edit(frame, nominal)
         drawn = drawing.rgb[step.index(frame.mid_us)].detach()
-        error = (drawn.clamp(0, 1) - step.observed(frame)).square().mean()
-        numbers = [loss, -10 * torch.log10(error), *terms.values()]
-        return StepReport(torch.stack([n.detach() for n in numbers]), tuple(terms))
+        losses = tuple(number.detach() for number in (loss, *terms.values()))
+        return StepReport(losses, tuple(terms), drawn, step.observed(frame))
 
     def counts(self) -> dict[str, int]:
         """Number of Gaussians per class."""

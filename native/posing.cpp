@@ -1,0 +1,115 @@
+#include "posing.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "buffer.h"
+#include "levels.h"
+#include "thread_pool.h"
+
+namespace evsplat {
+namespace {
+
+constexpr size_t kPiece = 1024;  // points of one piece of work; a multiple of every level's lanes
+
+template <class Work>
+void in_pieces(size_t count, int threads, const Work& work) {
+    parallel_for(threads, (count + kPiece - 1) / kPiece, [&](size_t piece) {
+        work(piece * kPiece, std::min(count, (piece + 1) * kPiece));
+    });
+}
+
+// A quaternion over its length.
+struct Unit {
+    float w, x, y, z, inverse_length;
+
+    explicit Unit(const float* q) {
+        const float length = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        inverse_length = 1.f / std::max(length, 1e-12f);
+        w = q[0] * inverse_length, x = q[1] * inverse_length, y = q[2] * inverse_length, z = q[3] * inverse_length;
+    }
+};
+
+}  // namespace
+
+void view_directions(const ViewDirections& job, int threads) {
+    const auto kernel = select_kernels().view_directions;
+    in_pieces(job.points, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+}
+
+void sh_rows(const ShRows& job, int threads) {
+    const auto kernel = select_kernels().sh_rows;
+    in_pieces(job.points, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+}
+
+void tree_softmax(const TreeSoftmax& job, int threads) {
+    const auto kernel = select_kernels().tree_softmax;
+    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+        Buffer<float> scratch(tree_softmax_floats(job.joints, job.logits));
+        kernel(job, begin, end, scratch.data());
+    });
+}
+
+void change_shape(const ShapeChange& job, int threads, float* moved, float* scales, float* rotations, float* feature) {
+    const size_t rest = job.columns - kShapeChanges;
+    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+        for (size_t t = 0; t < job.times; ++t)
+            for (size_t i = begin; i < end; ++i) {
+                const size_t row = t * job.points + i;
+                const float* by = job.changes + row * job.columns;
+                for (int c = 0; c < 3; ++c) {
+                    moved[row * 3 + c] = job.means[i * 3 + c] + by[c];
+                    scales[row * 3 + c] = std::exp(job.scales_log[i * 3 + c] + by[3 + c]);
+                }
+                const Unit q(job.quats + i * 4);
+                const float x = by[6], y = by[7], z = by[8];
+                float* r = rotations + row * 4;
+                r[0] = q.w - x * q.x - y * q.y - z * q.z;
+                r[1] = q.x + x * q.w + y * q.z - z * q.y;
+                r[2] = q.y - x * q.z + y * q.w + z * q.x;
+                r[3] = q.z + x * q.y - y * q.x + z * q.w;
+                std::copy_n(by + kShapeChanges, rest, feature + row * rest);
+            }
+    });
+}
+
+void change_shape_backward(const ShapeChange& job, const float* scales, const ShapeGrad (&above)[4], int threads,
+                           float* changes, float* means, float* scales_log, float* quats) {
+    const size_t rest = job.columns - kShapeChanges;
+    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+        for (size_t i = begin; i < end; ++i) {
+            const Unit q(job.quats + i * 4);
+            float mean[3] = {}, scale_log[3] = {}, unit[4] = {};
+            for (size_t t = 0; t < job.times; ++t) {
+                const size_t row = t * job.points + i;
+                const float* by = job.changes + row * job.columns;
+                float* to = changes + row * job.columns;
+                const auto grad = [&](int which, int c) {
+                    return above[which].data ? above[which].data[row * above[which].step + c] : 0.f;
+                };
+                for (int c = 0; c < 3; ++c) {
+                    to[c] = grad(0, c), to[3 + c] = grad(1, c) * scales[row * 3 + c];
+                    mean[c] += to[c], scale_log[c] += to[3 + c];
+                }
+                const float w = grad(2, 0), x = grad(2, 1), y = grad(2, 2), z = grad(2, 3);
+                to[6] = -w * q.x + x * q.w - y * q.z + z * q.y;
+                to[7] = -w * q.y + x * q.z + y * q.w - z * q.x;
+                to[8] = -w * q.z - x * q.y + y * q.x + z * q.w;
+                unit[0] += w + x * by[6] + y * by[7] + z * by[8];
+                unit[1] += x - w * by[6] - z * by[7] + y * by[8];
+                unit[2] += y - w * by[7] + z * by[6] - x * by[8];
+                unit[3] += z - w * by[8] - y * by[6] + x * by[7];
+                if (above[3].data)
+                    std::copy_n(above[3].data + row * above[3].step, rest, to + kShapeChanges);
+                else
+                    std::fill_n(to + kShapeChanges, rest, 0.f);
+            }
+            const float along = unit[0] * q.w + unit[1] * q.x + unit[2] * q.y + unit[3] * q.z;
+            const float direction[4] = {q.w, q.x, q.y, q.z};
+            for (int c = 0; c < 3; ++c) means[i * 3 + c] = mean[c], scales_log[i * 3 + c] = scale_log[c];
+            for (int c = 0; c < 4; ++c) quats[i * 4 + c] = (unit[c] - along * direction[c]) * q.inverse_length;
+        }
+    });
+}
+
+}  // namespace evsplat

@@ -1,0 +1,220 @@
+#include "step_module.h"
+
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <optional>
+#include <stdexcept>
+
+#include "isometry.h"
+#include "picture.h"
+#include "posing.h"
+
+namespace nb = nanobind;
+using namespace evsplat;
+
+namespace {
+
+using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using Rows = nb::ndarray<const float, nb::device::cpu>;  // (T, N, columns): columns together, rows evenly apart
+using Index = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+using Bits = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+void require(bool ok, const char* what) {
+    if (!ok) throw std::invalid_argument(std::string("evsplat._native: bad shape of ") + what);
+}
+
+const float* given(const std::optional<In>& array) { return array ? array->data() : nullptr; }
+float* asked(const std::optional<Out>& array) { return array ? array->data() : nullptr; }
+
+double py_membership(In share, Bits bits, float lowest, std::optional<Out> slope, int threads) {
+    const size_t count = share.size(), bytes = (count + 7) / 8;
+    require(bits.shape(0) == 2 && bits.shape(1) == bytes, "the masks");
+    require(!slope || slope->size() == count, "the slope");
+    nb::gil_scoped_release release;
+    return membership({share.data(), bits.data(), bits.data() + bytes, lowest, asked(slope)}, count, threads);
+}
+
+std::array<double, 4> py_map_difference(In map, In reference, float floor, int threads) {
+    require(map.size() == reference.size(), "the maps");
+    nb::gil_scoped_release release;
+    const MapDifference d = map_difference(map.data(), reference.data(), floor, map.size(), threads);
+    return {d.scale[0], d.scale[1], d.difference, d.along};
+}
+
+void py_map_difference_backward(In map, In reference, const std::array<double, 4>& known, float weight, Out grad,
+                                int threads) {
+    require(map.size() == reference.size() && grad.size() == map.size(), "the maps");
+    nb::gil_scoped_release release;
+    map_difference_backward(map.data(), reference.data(), {{known[0], known[1]}, known[2], known[3]}, weight,
+                            map.size(), threads, grad.data());
+}
+
+constexpr size_t kIsometryWidth[7] = {3, 4, 3, 3, 4, 3, 16};
+
+IsometryInputs isometry_inputs(const Index& rows, size_t times, size_t points) {
+    require(rows.ndim() == 2 && rows.shape(1) == 1 + kNeighbours, "the rows");
+    for (size_t i = 0; i < rows.size(); ++i)
+        require(rows.data()[i] >= 0 && size_t(rows.data()[i]) < points, "the rows: outside of the points");
+    IsometryInputs in = {};
+    in.samples = rows.shape(0), in.times = times, in.points = points, in.rows = rows.data();
+    return in;
+}
+
+// `arrays`: means, quats, scales_log, posed means, posed quats, posed scales, transforms.
+template <class Array>
+void check_isometry(const std::vector<Array>& arrays, size_t times, size_t points) {
+    require(arrays.size() == 7, "the arrays");
+    for (int i = 0; i < 7; ++i)
+        require(i < 3 ? arrays[i].size() >= points * kIsometryWidth[i]
+                      : arrays[i].size() == times * points * kIsometryWidth[i],
+                "an array");
+}
+
+std::pair<double, double> py_isometry(Index rows, const std::vector<In>& arrays, Out gradients, int threads) {
+    require(arrays.size() == 7 && arrays[3].ndim() == 3, "the arrays");
+    const size_t times = arrays[3].shape(0), points = arrays[3].shape(1);
+    check_isometry(arrays, times, points);
+    IsometryInputs in = isometry_inputs(rows, times, points);
+    require(gradients.size() == in.samples * isometry_floats(times), "the gradients");
+    in.means = arrays[0].data(), in.quats = arrays[1].data(), in.scales_log = arrays[2].data();
+    in.posed_means = arrays[3].data(), in.posed_quats = arrays[4].data(), in.posed_scales = arrays[5].data();
+    in.transforms = arrays[6].data();
+    nb::gil_scoped_release release;
+    const IsometryMeans means = isometry(in, threads, gradients.data());
+    return {means.centers, means.covariances};
+}
+
+void py_isometry_add(Index rows, In gradients, float by_centers, float by_covariances, const std::vector<Out>& grads) {
+    require(grads.size() == 7 && grads[3].ndim() == 3, "the gradients");
+    const size_t times = grads[3].shape(0), points = grads[3].shape(1);
+    check_isometry(grads, times, points);
+    const IsometryInputs in = isometry_inputs(rows, times, points);
+    require(gradients.size() == in.samples * isometry_floats(times), "the gradients");
+    const IsometryGrads out = {grads[0].data(), grads[1].data(), grads[2].data(), grads[3].data(),
+                               grads[4].data(), grads[5].data(), grads[6].data()};
+    nb::gil_scoped_release release;
+    isometry_add(in, gradients.data(), by_centers, by_covariances, out);
+}
+
+void py_view_directions(In positions, std::optional<In> transforms, const std::array<float, 3>& center,
+                        const std::array<float, 9>& turn, Out directions, int threads) {
+    const size_t points = positions.size() / 3;
+    require(positions.size() == points * 3 && directions.size() == positions.size(), "the positions");
+    require(!transforms || transforms->size() == points * 16, "the transforms");
+    ViewDirections job = {points, positions.data(), given(transforms), {}, {}, directions.data()};
+    for (int i = 0; i < 3; ++i) job.center[i] = center[i];
+    for (int i = 0; i < 9; ++i) job.turn[i] = turn[i];
+    nb::gil_scoped_release release;
+    view_directions(job, threads);
+}
+
+// Into columns [first, first + 15) of `to`.
+void py_sh_rows(In directions, Out to, size_t first, int threads) {
+    const size_t points = directions.size() / 3;
+    require(to.ndim() >= 1 && directions.size() == points * 3, "the directions");
+    const size_t stride = to.shape(to.ndim() - 1);
+    require(first + kShValues <= stride && to.size() == points * stride, "the values");
+    nb::gil_scoped_release release;
+    sh_rows({points, directions.data(), to.data() + first, stride}, threads);
+}
+
+using Joints = std::vector<int32_t>;
+
+// Writes `result`: the weights or, with their gradient `above`, that of the logits.
+void py_tree_softmax(In given, const std::array<Joints, 4>& tree, std::optional<In> above, Out result, int threads) {
+    require(given.ndim() == 2, "the logits");
+    const size_t points = given.shape(0), logits = given.shape(1), joints = tree[0].size();
+    const auto& [order, parents, gate, divides] = tree;
+    require(parents.size() == joints && gate.size() == joints && divides.size() == joints && joints <= logits, "the tree");
+    for (size_t j = 0; j < joints; ++j)
+        require(order[j] >= 0 && size_t(order[j]) < joints && parents[j] < int(joints) && gate[j] < int(logits) &&
+                    (parents[j] < 0 || gate[parents[j]] >= 0),
+                "the tree");
+    require(!above || above->size() == points * joints, "the gradient");
+    require(result.size() == points * (above ? logits : joints), "the result");
+    TreeSoftmax job = {points,       int(joints),   int(logits), order.data(), parents.data(), gate.data(),
+                       divides.data(), given.data(), nullptr,    given.data(), nullptr};
+    job.above = ::given(above);
+    (above ? job.grad : job.weights) = result.data();
+    nb::gil_scoped_release release;
+    tree_softmax(job, threads);
+}
+
+ShapeChange shape_change(const In& changes, const In& means, const In& scales_log, const In& quats) {
+    require(changes.ndim() == 3 && changes.shape(2) >= size_t(kShapeChanges), "the changes");
+    const size_t points = changes.shape(1);
+    require(means.size() == points * 3 && scales_log.size() == points * 3 && quats.size() == points * 4, "the points");
+    return {changes.shape(0), points,            int(changes.shape(2)), changes.data(),
+            means.data(),     scales_log.data(), quats.data()};
+}
+
+void py_change_shape(In changes, In means, In scales_log, In quats, Out moved, Out scales, Out rotations, Out feature,
+                     int threads) {
+    const ShapeChange job = shape_change(changes, means, scales_log, quats);
+    const size_t rows = job.times * job.points;
+    require(moved.size() == rows * 3 && scales.size() == rows * 3 && rotations.size() == rows * 4 &&
+                feature.size() == rows * (job.columns - kShapeChanges),
+            "the results");
+    nb::gil_scoped_release release;
+    change_shape(job, threads, moved.data(), scales.data(), rotations.data(), feature.data());
+}
+
+void py_change_shape_backward(In changes, In means, In scales_log, In quats, In scales,
+                              const std::vector<std::optional<Rows>>& above, Out changes_grad, Out means_grad,
+                              Out scales_grad, Out quats_grad, int threads) {
+    const ShapeChange job = shape_change(changes, means, scales_log, quats);
+    const size_t width[4] = {3, 3, 4, size_t(job.columns - kShapeChanges)};
+    require(scales.size() == job.times * job.points * 3, "the scales");
+    require(changes_grad.size() == changes.size() && means_grad.size() == means.size() &&
+                scales_grad.size() == scales_log.size() && quats_grad.size() == quats.size(),
+            "the gradients");
+    require(above.size() == 4, "the results' gradients");
+    ShapeGrad grads[4] = {};
+    for (int i = 0; i < 4; ++i) {
+        if (!above[i]) continue;
+        const Rows& a = *above[i];
+        require(a.ndim() == 3 && a.shape(0) == job.times && a.shape(1) == job.points && a.shape(2) == width[i] &&
+                    (a.shape(2) <= 1 || a.stride(2) == 1) && a.stride(1) >= 0 &&
+                    (a.shape(0) == 1 || a.stride(0) == a.stride(1) * int64_t(job.points)),
+                "a result's gradient");
+        grads[i] = {a.data(), size_t(a.stride(1))};
+    }
+    nb::gil_scoped_release release;
+    change_shape_backward(job, scales.data(), grads, threads, changes_grad.data(), means_grad.data(),
+                          scales_grad.data(), quats_grad.data());
+}
+
+}  // namespace
+
+void bind_step(nb::module_& m) {
+    m.def("membership", &py_membership, nb::arg("share"), nb::arg("bits"), nb::arg("lowest"), nb::arg("slope").none(),
+          nb::arg("threads"), "Sum of the logarithms of what pixels surely are, by two bit masks, and its slope.");
+    m.def("map_difference", &py_map_difference, nb::arg("map"), nb::arg("reference"), nb::arg("floor"),
+          nb::arg("threads"), "What map_difference_backward wants of two normalised maps; the third is their distance.");
+    m.def("map_difference_backward", &py_map_difference_backward, nb::arg("map"), nb::arg("reference"),
+          nb::arg("known"), nb::arg("weight"), nb::arg("grad"), nb::arg("threads"));
+    m.def("isometry_floats", &isometry_floats, nb::arg("times"), "Of the gradients of one sample.");
+    m.def("isometry", &py_isometry, nb::arg("rows"), nb::arg("arrays"), nb::arg("gradients"), nb::arg("threads"),
+          "Mean change of neighbours' distances and covariances; writes the gradients by sample.");
+    m.def("isometry_add", &py_isometry_add, nb::arg("rows"), nb::arg("gradients"), nb::arg("by_centers"),
+          nb::arg("by_covariances"), nb::arg("grads"), "Adds the samples' gradients to those of the arrays.");
+    m.def("view_directions", &py_view_directions, nb::arg("positions"), nb::arg("transforms").none(),
+          nb::arg("center"), nb::arg("turn"), nb::arg("directions"), nb::arg("threads"),
+          "Unit vectors from a centre, turned back by transforms and then by one matrix.");
+    m.def("sh_rows", &py_sh_rows, nb::arg("directions"), nb::arg("to"), nb::arg("first"), nb::arg("threads"),
+          "Spherical harmonics of degrees 1 to 3 into columns of a matrix.");
+    m.def("tree_softmax", &py_tree_softmax, nb::arg("logits"), nb::arg("tree"), nb::arg("above").none(),
+          nb::arg("result"), nb::arg("threads"), "Weights over the joints of a tree, or the gradient of its logits.");
+    m.def("change_shape", &py_change_shape, nb::arg("changes"), nb::arg("means"), nb::arg("scales_log"),
+          nb::arg("quats"), nb::arg("moved"), nb::arg("scales"), nb::arg("rotations"), nb::arg("feature"),
+          nb::arg("threads"), "Moves, scales and turns Gaussians by what a network says.");
+    m.def("change_shape_backward", &py_change_shape_backward, nb::arg("changes"), nb::arg("means"),
+          nb::arg("scales_log"), nb::arg("quats"), nb::arg("scales"), nb::arg("above"), nb::arg("changes_grad"),
+          nb::arg("means_grad"), nb::arg("scales_grad"), nb::arg("quats_grad"), nb::arg("threads"));
+}
