@@ -73,3 +73,21 @@ def quaternion_multiply(
         ),
         -1,
     )
+
+
+def six_to_matrix(six: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices whose first two rows are ``six`` made orthonormal (Zhou et al. 2019).
+
+    The first three numbers give the first row up to length; of the next three what is orthogonal
+    to it counts.
+    """
+    normalize = torch.nn.functional.normalize
+    first = normalize(six[..., :3], dim=-1)
+    rest = six[..., 3:]
+    second = normalize(rest - (first * rest).sum(-1, keepdim=True) * first, dim=-1)
+    return torch.stack((first, second, torch.linalg.cross(first, second)), -2)
+
+
+def matrix_to_six(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 6"]:
+    """The first two rows, which `six_to_matrix` takes back."""
+    return matrix[..., :2, :].flatten(-2)

@@ -2,7 +2,15 @@
 
 from evsplat.gaussians.densify import DensifyConfig, Edit, ScreenStatistics, densify
 from evsplat.gaussians.flip import BodyFrames, flip_labels
-from evsplat.gaussians.gaussian_set import ATTRIBUTES, FEATURE_DIM, GaussianSet, Part, Rows, Shape
+from evsplat.gaussians.gaussian_set import (
+    ATTRIBUTES,
+    FEATURE_DIM,
+    GaussianSet,
+    OneClassRows,
+    Part,
+    Rows,
+    Shape,
+)
 from evsplat.gaussians.posed import PosedGaussians, PosedHuman, StaticScene
 from evsplat.gaussians.row_adam import RowAdam
 
@@ -13,6 +21,7 @@ __all__ = [
     "DensifyConfig",
     "Edit",
     "GaussianSet",
+    "OneClassRows",
     "Part",
     "PosedGaussians",
     "PosedHuman",

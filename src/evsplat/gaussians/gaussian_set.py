@@ -96,6 +96,23 @@ class Rows(nn.Module):
         raise NotImplementedError
 
 
+class OneClassRows(Rows):
+    """A set whose Gaussians are all of one class, for ever."""
+
+    def __init__(self, values: Mapping[str, Tensor], part: Part) -> None:
+        """``values`` name the attributes, each with a leading axis of rows."""
+        super().__init__(values, len(values["means"]) if part == "human" else 0)
+        self.part: Part = part
+
+    def holds(self, part: Part) -> bool:
+        """Whether it is the set's class."""
+        return part == self.part
+
+    def set_rows(self, values: Mapping[str, Tensor], human_count: int) -> None:
+        """Replace all rows; the class tells how many of them are the person's."""
+        super().set_rows(values, len(values["means"]) if self.part == "human" else 0)
+
+
 class GaussianSet(Rows):
     """Person and scene in one set.
 

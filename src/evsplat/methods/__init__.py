@@ -14,12 +14,15 @@ from evsplat.methods.composition import Composition
 from evsplat.methods.config import NOMINAL_ITERATIONS, MethodConfig
 from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.evsplat import compose as compose_evsplat
+from evsplat.methods.hugs import HugsConfig
+from evsplat.methods.hugs import compose as compose_hugs
 from evsplat.methods.paper import PaperConfig, compose
 
 TRAINABLE: dict[str, tuple[type[Any], Callable[..., Composition]]] = {
     "avatar3dgs": (AvatarConfig, compose_avatar3dgs),
     "avatar3dgs_semantic": (AvatarSemanticConfig, compose_avatar3dgs_semantic),
     "evsplat": (EvsplatConfig, compose_evsplat),
+    "hugs": (HugsConfig, compose_hugs),
     "paper": (PaperConfig, compose),
 }
 """Configuration and composition of every method that is trained."""

@@ -1,0 +1,87 @@
+"""The person: centres that are learned, everything else read from a triplane at them."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.body.rotations import matrix_to_quaternion, six_to_matrix
+from evsplat.gaussians import OneClassRows, Shape
+from evsplat.hugs.decoders import AppearanceDecoder, GeometryDecoder, SkinningDecoder
+from evsplat.hugs.triplane import Triplane
+
+SH_CONSTANT = 0.28209479177387814
+"""The constant spherical harmonic; colour is 0.5 more than its multiple, as 3DGS."""
+START_MULTIPLIER = 0.5
+"""Of every Gaussian's size."""
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """The person's ``N`` Gaussians in canonical space."""
+
+    offsets: Float[Tensor, "N 3"]
+    """From the learned centre, metres."""
+    six: Float[Tensor, "N 6"]
+    """Rotation, see `six_to_matrix`."""
+    scales: Float[Tensor, "N 3"]
+    """Standard deviations before the multiplier, metres."""
+    colours: Float[Tensor, "N 3"]
+    """Coefficients of the constant spherical harmonic."""
+    opacities: Float[Tensor, " N"]
+    weights: Float[Tensor, "N J"]
+    """Skinning weights; rows sum to one."""
+
+    @property
+    def rgb(self) -> Float[Tensor, "N 3"]:
+        """SRGB, not below 0."""
+        return (0.5 + SH_CONSTANT * self.colours).clamp_min(0)
+
+    def quaternions(self) -> Float[Tensor, "N 4"]:
+        """Unit quaternions (w, x, y, z) of the rotations."""
+        return matrix_to_quaternion(six_to_matrix(self.six))
+
+
+class TriplaneHuman(OneClassRows):
+    """Canonical centres, their size multipliers, the triplane and its decoders.
+
+    ``scales_log`` is the logarithm of the multiplier, (N, 1): it is not learned but falls where
+    densification splits. A new Gaussian has its looks from where it is.
+    """
+
+    def __init__(
+        self,
+        means: Float[Tensor, "N 3"],
+        joints: int,
+        *,
+        channels: int,
+        resolution: int,
+        center: Float[Tensor, "3"],
+        half_side: float,
+    ) -> None:
+        """``means`` are the start, canonical metres; the rest is the triplane's."""
+        multipliers = torch.full((len(means), 1), START_MULTIPLIER)
+        super().__init__({"means": means, "scales_log": multipliers.log()}, "human")
+        self.triplane = Triplane(channels, resolution, center, half_side)
+        features = 3 * channels
+        self.appearance = AppearanceDecoder(features)
+        self.geometry = GeometryDecoder(features)
+        self.skinning = SkinningDecoder(features, joints)
+
+    def look_up(self, positions: Float[Tensor, "M 3"]) -> Decoded:
+        """What the decoders say of any canonical places."""
+        features = self.triplane(positions)
+        offsets, six, scales = self.geometry(features)
+        return Decoded(offsets, six, scales, *self.appearance(features), self.skinning(features))
+
+    def multipliers(self) -> Float[Tensor, "N 1"]:
+        """Factor of each Gaussian's standard deviations."""
+        return self.scales_log.detach().exp()
+
+    @torch.no_grad()
+    def shape(self) -> Shape:
+        """Decoded where the Gaussians are now."""
+        decoded = self.look_up(self.means)
+        scales = (decoded.scales * self.multipliers()).abs()
+        return Shape(scales, decoded.quaternions(), decoded.opacities)

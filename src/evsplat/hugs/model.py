@@ -1,0 +1,175 @@
+"""HUGS: a triplane person and a scene of its own, drawn together (reference 2.1 to 2.3)."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from evsplat.body import BodyTrack, skin
+from evsplat.body.rotations import six_to_matrix
+from evsplat.capture import Camera, Frame
+from evsplat.deform.drawing import Drawing, draw
+from evsplat.deform.model import RowCache
+from evsplat.deform.shadow import BodyShadow
+from evsplat.devices import send
+from evsplat.gaussians import OneClassRows, PosedGaussians, PosedHuman, StaticScene
+from evsplat.hugs.human import Decoded, TriplaneHuman
+from evsplat.hugs.scene import SphericalScene
+
+DEGREE_EVERY = 1_000
+"""Nominal iterations after which the scene's colour gets one more degree of harmonics."""
+_NO_TURN = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class HugsDrawing(Drawing):
+    """A drawing that remembers what the person was decoded to."""
+
+    decoded: Decoded
+    shifted: bool
+    """Whether the scene is told other Gaussians' gradients, as the released code does."""
+
+    def center_gradients(self) -> tuple[Float[Tensor, "T H 2"], Float[Tensor, "1 S 2"]]:
+        """Gradients of the projected centres of person and scene, pixels.
+
+        The released code draws one array, the person's Gaussians first, and takes the gradients of
+        its first rows for the scene's.
+        """
+        human, scene = super().center_gradients()
+        if not self.shifted:
+            return human, scene
+        return human, torch.cat([human, scene], 1)[:, : scene.shape[1]]
+
+
+class HugsModel(nn.Module):
+    """Both sets, and the body track with a correction of the pose per training frame."""
+
+    row_caches: dict[str, RowCache] = {}
+    shadow: BodyShadow | None = None
+
+    def __init__(
+        self,
+        human: TriplaneHuman,
+        scene: SphericalScene,
+        track: BodyTrack,
+        frame_times_us: Sequence[int],
+        *,
+        release_compatible: bool,
+    ) -> None:
+        """``frame_times_us`` are the mid-exposures of the training frames."""
+        super().__init__()
+        self.human, self.scene, self.track = human, scene, track
+        self.release_compatible = release_compatible
+        frames, joints = len(frame_times_us), len(track.body.parents)
+        self.turns = nn.Parameter(torch.tensor(_NO_TURN).repeat(frames, joints, 1))
+        """Rotation after each joint's own, six numbers, see `six_to_matrix`."""
+        self.shifts = nn.Parameter(torch.zeros(frames, 3))
+        """Added to the body's translation, metres."""
+        self.frame_times: Tensor
+        self.nominal: Tensor
+        times = torch.tensor(list(frame_times_us), dtype=torch.float64)
+        self.register_buffer("frame_times", times)
+        self.register_buffer("nominal", torch.zeros((), dtype=torch.float64))
+
+    def _apply(self, fn: Any, recurse: bool = True) -> "HugsModel":
+        nominal = self.nominal
+        super()._apply(fn, recurse)
+        self.nominal = nominal  # read by the host
+        self.track = self.track.to(self.device)
+        return self
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        return self.frame_times.device
+
+    @property
+    def sets(self) -> dict[str, OneClassRows]:
+        """Person and scene."""
+        return {"human": self.human, "scene": self.scene}
+
+    @property
+    def active_degree(self) -> int:
+        """Degree of the scene's harmonics that are drawn.
+
+        The released code draws both sets with the person's, which is 0.
+        """
+        return 0 if self.release_compatible else min(3, int(self.nominal) // DEGREE_EVERY)
+
+    def pose(self, times_us: Sequence[int]) -> Float[Tensor, "T J 4 4"]:
+        """Bone transforms canonical to world.
+
+        A training frame's middle has that frame's correction; any other time the recorded pose.
+        """
+        rotations, translation = self.track.at(torch.as_tensor(list(times_us)))
+        times = send(torch.tensor(list(times_us), dtype=torch.float64), self.device)
+        frames = (times[:, None] == self.frame_times).float()
+        kept = self.turns.new_tensor(_NO_TURN) * (1 - frames.sum(1))[:, None, None]
+        turns = kept + torch.einsum("tf,fjc->tjc", frames, self.turns)
+        rotations = rotations @ six_to_matrix(turns)
+        return self.track.body.canonical_to_world(rotations, translation + frames @ self.shifts)
+
+    def at(
+        self,
+        times_us: Sequence[int],
+        camera_center: Float[Tensor, "3"],
+        *,
+        hard_semantics: bool = True,
+    ) -> PosedGaussians:
+        """All Gaussians in the world; the classes are hard whatever is asked for."""
+        return self._posed(self.human.look_up(self.human.means), times_us, camera_center)
+
+    def training_drawing(
+        self,
+        times_us: Sequence[int],
+        frame: Frame,
+        camera: Camera,
+        generator: torch.Generator,
+    ) -> Drawing:
+        """Person and scene over a random colour; see `Model`."""
+        background = send(torch.rand(3, generator=generator), self.device)
+        decoded = self.human.look_up(self.human.means)
+        posed = self._posed(decoded, times_us, camera.center())
+        drawing = draw(self, posed, camera, center_gradients=True, background=background)
+        return HugsDrawing(**vars(drawing), decoded=decoded, shifted=self.release_compatible)
+
+    def following(self, track: BodyTrack) -> "HugsModel":
+        """The same person doing what ``track`` says, without the corrections; see `Model`."""
+        model = copy.deepcopy(self)
+        model.track = track.to(self.device)
+        with torch.no_grad():
+            model.turns.copy_(model.turns.new_tensor(_NO_TURN))
+            model.shifts.zero_()
+        return model
+
+    def _posed(
+        self, decoded: Decoded, times_us: Sequence[int], camera_center: Tensor
+    ) -> PosedGaussians:
+        human, scene = self.human, self.scene
+        world, transforms = skin(
+            human.means + decoded.offsets, decoded.weights, self.pose(times_us)
+        )
+        times = (len(times_us), -1, -1)
+        return PosedGaussians(
+            human=PosedHuman(
+                world,
+                decoded.quaternions().expand(times),
+                (decoded.scales * human.multipliers()).expand(times),
+                decoded.rgb.expand(times),
+                transforms,
+            ),
+            scene=StaticScene(
+                scene.means,
+                scene.quaternions,
+                scene.scales_log.exp(),
+                scene.rgb(camera_center, self.active_degree),
+            ),
+            human_opacities=decoded.opacities,
+            scene_opacities=scene.opacities(),
+            human_semantics=torch.ones_like(decoded.opacities),
+            scene_semantics=torch.zeros_like(scene.opacity_logits),
+        )
