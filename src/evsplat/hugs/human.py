@@ -73,7 +73,8 @@ class TriplaneHuman(OneClassRows):
         """What the decoders say of any canonical places."""
         features = self.triplane(positions)
         offsets, six, scales = self.geometry(features)
-        return Decoded(offsets, six, scales, *self.appearance(features), self.skinning(features))
+        colours, opacities = self.appearance(features)
+        return Decoded(offsets, six, scales, colours, opacities, self.skinning(features))
 
     def multipliers(self) -> Float[Tensor, "N 1"]:
         """Factor of each Gaussian's standard deviations."""

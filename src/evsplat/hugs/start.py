@@ -12,6 +12,8 @@ from evsplat.neighbours import nearest
 
 START_COLOUR, START_OPACITY = 0.5, 0.1
 NEIGHBOURS = 6
+TEXEL_RATE, DECODER_RATE = 5e-2, 5e-3
+"""Learning rates of the fit."""
 _SAME_LIMB, _SHARPNESS = 0.9, 0.02
 
 
@@ -51,7 +53,6 @@ def fit_to_body(
     *,
     steps: int,
     batch: int,
-    rate: float,
     generator: torch.Generator,
 ) -> None:
     """Make triplane and decoders say what the body is, at random points of its surface.
@@ -61,14 +62,15 @@ def fit_to_body(
     Gaussians, with the multiplier that they start with.
     """
     size = spacing_m * 0.5 / float(human.multipliers().median())
-    slow = list(human.skinning.parameters())
-    fast = [
-        *human.triplane.parameters(),
-        *human.geometry.parameters(),
-        *human.appearance.parameters(),
-    ]
+    decoders = [*human.geometry.parameters(), *human.appearance.parameters()]
     adam = torch.optim.Adam(
-        [{"params": fast, "rate": rate}, {"params": slow, "rate": 0.5 * rate}], lr=rate, fused=True
+        [
+            {"params": list(human.triplane.parameters()), "rate": TEXEL_RATE},
+            {"params": decoders, "rate": DECODER_RATE},
+            {"params": list(human.skinning.parameters()), "rate": DECODER_RATE},
+        ],
+        lr=DECODER_RATE,
+        fused=True,
     )
     targets = matrix_to_six(facing(surface.normals))
     for step in range(steps):

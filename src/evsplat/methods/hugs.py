@@ -42,8 +42,8 @@ class TriplaneConfig:
     channels: int = 32
     """Of each of the three planes."""
     resolution: int | None = None
-    """Texels along a side. Null: as many as make a texel no larger than a pixel at the person's
-    distance, a power of two of at most 256, which is the released number."""
+    """Texels along a side. Null: the power of two that brings a texel nearest to the size of a
+    pixel at the person's distance, at most 256, which is the released number."""
     half_side_m: float | None = None
     """Of the cube that it covers, about the middle of the canonical body. Null: 1 m as released,
     more for a body that is larger."""
@@ -53,11 +53,9 @@ class TriplaneConfig:
 class FitConfig:
     """Fit of triplane and decoders to the body before training. Released: 7,000 steps of all."""
 
-    steps: int = 2_000
+    steps: int = 1_000
     batch: int = 1_024
     """Surface points per step."""
-    rate: float = 3e-3
-    """Learning rate at the start; half of it for skinning."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +181,6 @@ def compose(
             spacing,
             steps=config.fit.steps,
             batch=config.fit.batch,
-            rate=config.fit.rate,
             generator=generator,
         )
     metric = make_perceptual(config.loss.perceptual, device=device)
@@ -251,7 +248,7 @@ def _resolution(capture: Capture, track: BodyTrack, half_side_m: float) -> int:
     camera = capture.camera(frame)
     depth = float(camera.project(track.vertices(frame.mid_us))[1].median().clamp_min(0.1))
     pixel_m = depth / float(camera.K[0, 0])
-    return min(FINEST, 2 ** max(4, math.ceil(math.log2(2 * half_side_m / pixel_m))))
+    return min(FINEST, 2 ** max(4, round(math.log2(2 * half_side_m / pixel_m))))
 
 
 def _extent(config: HugsConfig, capture: Capture, track: BodyTrack) -> float:

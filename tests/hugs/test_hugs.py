@@ -1,0 +1,238 @@
+"""Method `hugs` as a whole: its losses, the released code's slips, a run saved and read back."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from evsplat.capture import load_capture
+from evsplat.errors import DataError
+from evsplat.hugs.losses import PATCH_PX, Perceptual, draw_squares
+from evsplat.hugs.model import HugsDrawing
+from evsplat.methods import TRAINABLE, method_config
+from evsplat.render import render
+from evsplat.similarity.psnr_ssim import ssim
+from evsplat.training import load_run, train
+from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
+from evsplat.training.clock import Clock
+from evsplat.training.trainer import Trainer
+
+SMALL = {
+    "human": {"count": 80},
+    "triplane": {"resolution": 16, "channels": 8},
+    "fit": {"steps": 2, "batch": 32},
+    "scene": {"cube_count": 600},
+}
+
+
+def composed(path, **settings):
+    config = method_config("hugs", SMALL | settings, where="test")
+    return TRAINABLE["hugs"][1](config, load_capture(path), 0, fit=False)
+
+
+def step_of(composition, capture, frame):
+    """What the losses see of one step, and the pieces that they are made from."""
+    trainer = Trainer(composition, capture, Clock(10))
+    seen = []
+
+    def keep(objective):
+        loss = objective.loss
+        return lambda step: seen.append((step, terms := loss(step))) or terms
+
+    for objective in composition.objectives:
+        objective.loss = keep(objective)
+    trainer.queue = [capture.train_frames.index(frame)]
+    trainer.step()
+    return seen[0][0], {name: value.detach() for _, terms in seen for name, value in terms.items()}
+
+
+def test_terms_are_those_of_the_description(tiny_capture):
+    capture = load_capture(tiny_capture(frames=10))
+    frame = capture.train_frames[3]
+    composition = composed(capture.path)
+    step, terms = step_of(composition, capture, frame)
+    observed, mask = capture.image(frame), (capture.mask(frame) > 0.5)[..., None]
+    drawn = step.rgb[0].detach().clamp(0, 1)
+    torch.testing.assert_close(terms["l1"], (drawn - observed).abs().mean())
+    torch.testing.assert_close(terms["dssim"], 1 - ssim(drawn, observed))
+
+    # The same random numbers again: order of the frames, background, colour behind the person.
+    generator = torch.Generator().manual_seed(0)
+    generator.set_state(composed(capture.path).generator.get_state())
+    background, colour = (torch.rand(3, generator=generator) for _ in range(2))
+    assert not torch.equal(background, colour)
+    person = step.posed.moving()
+    alone = render(person, capture.camera(frame), background=torch.cat([colour, torch.zeros(1)]))
+    alone = alone.image[0, ..., :3].detach().clamp(0, 1)
+    expected = torch.where(mask, observed, colour)
+    share = mask.float().mean()
+    l1 = (alone - expected).abs().sum() / mask.sum()
+    torch.testing.assert_close(terms["human_l1"], l1, rtol=1e-3, atol=1e-5)
+    dssim = (1 - ssim(alone, expected)) * share
+    torch.testing.assert_close(terms["human_dssim"], dssim, rtol=1e-3, atol=1e-5)
+    weights = step.drawing.decoded.weights.detach()
+    assert weights.shape[1] == len(step.model.track.body.parents)
+    target = composition.objectives[2].target
+    torch.testing.assert_close(terms["skinning"], (weights - target).square().mean())
+
+
+def test_every_set_of_parameters_learns(tiny_capture):
+    capture = load_capture(tiny_capture(frames=10))
+    composition = composed(capture.path, scene=SMALL["scene"] | {"sh_degree": 1})
+    model = composition.model
+    model.scene.directional.data += 0.01
+    before = {n: p.detach().clone() for n, p in model.named_parameters()}
+    trainer = Trainer(composition, capture, Clock(100, fraction=0.101))
+    trainer.previous_nominal = trainer.clock.nominal
+    trainer.step()
+    kept = {n for n, p in model.named_parameters() if torch.equal(p, before[n])}
+    assert kept == {"human.scales_log"}
+
+
+def test_squares_lie_in_the_picture_and_mostly_on_the_person():
+    mask = torch.zeros(200, 300, dtype=torch.bool)
+    mask[20:60, 250:290] = True
+    generator = torch.Generator().manual_seed(0)
+    squares = [square for _ in range(100) for square in draw_squares(mask, generator)]
+    for rows, columns in squares:
+        assert rows.stop - rows.start == columns.stop - columns.start == PATCH_PX
+        assert 0 <= rows.start and rows.stop <= 200
+        assert 0 <= columns.start and columns.stop <= 300
+    hits = sum(bool(mask[square].any()) for square in squares)
+    assert 0.85 < hits / len(squares) < 1.0
+    assert draw_squares(torch.zeros(40, 30, dtype=torch.bool), generator)[0][1] == slice(0, 30)
+
+
+@pytest.mark.parametrize("rescaled", [True, False])
+def test_released_code_gives_the_perceptual_distance_unscaled_pictures(rescaled):
+    seen = []
+
+    def metric(image, reference):
+        seen.extend([float(image.min()), float(image.max())])
+        return (image - reference).abs().mean()
+
+    pictures = torch.rand(2, 40, 40, 3).round()
+    generator = torch.Generator().manual_seed(0)
+    Perceptual(metric, rescaled=rescaled)(*pictures, torch.ones(40, 40), generator)
+    assert (min(seen), max(seen)) == ((-1.0, 1.0) if rescaled else (0.0, 1.0))
+
+
+@pytest.mark.parametrize("shifted", [True, False])
+def test_released_code_gives_the_scene_gradients_of_rows_shifted_by_the_person(shifted):
+    def layer(values):
+        offset = torch.zeros(1, len(values), 2, requires_grad=True)
+        offset.grad = torch.tensor(values)[None, :, None].expand(1, -1, 2)
+        return SimpleNamespace(centers2d_offset=offset)
+
+    drawing = HugsDrawing(
+        rgb=(), semantic=(), output=None, posed=None, moving=layer([1.0, 2.0]),
+        static=layer([3.0, 4.0, 5.0]), decoded=None, shifted=shifted,
+    )  # fmt: skip
+    human, scene = drawing.center_gradients()
+    assert human[0, :, 0].tolist() == [1.0, 2.0]
+    assert scene[0, :, 0].tolist() == ([1.0, 2.0, 3.0] if shifted else [3.0, 4.0, 5.0])
+
+
+def test_release_compatible_repeats_the_other_slips(tiny_capture):
+    path = tiny_capture(frames=10)
+    repaired, released = composed(path), composed(path, release_compatible=True)
+    for composition, slip in ((repaired, False), (released, True)):
+        model, learning = composition.model, composition.learning
+        model.nominal.fill_(2_500)
+        assert model.active_degree == (0 if slip else 2)
+        learned = {id(p) for network in learning.networks for p in network.parameters}
+        assert id(model.turns) in learned
+        assert (id(model.shifts) in learned) == (not slip)
+        # A static camera is no distance away from itself: nothing moves, everything is split.
+        scene = composition.densify["scene"]
+        assert (learning.rows["scene"]["means"].rate.start == 0) == slip
+        assert (scene.split_above_m == 0) == slip
+        assert scene.opacity_reset == ((500,) if slip else ())
+
+
+def test_a_scene_colour_has_the_harmonics_that_are_asked_for(tiny_capture):
+    path = tiny_capture()
+    assert composed(path).model.scene.directional.shape[1] == 0  # one static camera
+    scene = composed(path, scene=SMALL["scene"] | {"sh_degree": 3}).model.scene
+    center = torch.tensor([0.1, 0.2, -3.0])
+    constant = scene.rgb(center, 3)
+    torch.nn.init.normal_(scene.directional)
+    assert torch.equal(scene.rgb(center, 0), constant)
+    assert not torch.allclose(scene.rgb(center, 3), scene.rgb(center, 1))
+
+
+def test_points_that_no_camera_sees_are_left_out(tiny_capture):
+    path = tiny_capture()
+    scene = composed(path).model.scene
+    capture = load_capture(path)
+    camera = capture.camera(capture.frames[0])
+    pixels, depth = camera.project(scene.means.detach())
+    assert 0 < len(scene) < SMALL["scene"]["cube_count"]
+    assert (depth > 0).all()
+    assert (pixels[:, 0].abs() < 1.2 * camera.width).all()
+
+
+def test_training_frames_have_their_correction_and_others_the_recorded_pose(tiny_capture):
+    capture = load_capture(tiny_capture(frames=10))
+    model = composed(capture.path).model
+    recorded, unseen = capture.train_frames[2].mid_us, capture.train_frames[2].mid_us + 1
+    before = model.pose([recorded, unseen]).detach()
+    torch.testing.assert_close(before, model.track.bones([recorded, unseen]))
+    with torch.no_grad():
+        model.shifts[2] += torch.tensor([0.0, 0.5, 0.0])
+        model.turns[2] += 0.1 * torch.randn_like(model.turns[2])
+    after = model.pose([recorded, unseen]).detach()
+    assert not torch.allclose(after[0, :, :3, :3], before[0, :, :3, :3])
+    assert float(after[0, 0, 1, 3] - before[0, 0, 1, 3]) != 0
+    torch.testing.assert_close(after[1], before[1])
+
+
+def test_a_resumed_run_goes_on_as_the_uninterrupted_one(tiny_capture):
+    capture = load_capture(tiny_capture(frames=10))
+
+    def trainer():
+        return Trainer(composed(capture.path), capture, Clock(40))
+
+    def steps(trainer, count):
+        for _ in range(count):
+            trainer.step()
+            trainer.clock.advance(0.01)
+        return trainer
+
+    # Densification takes place in between, of both sets.
+    whole, first, second = steps(trainer(), 12), steps(trainer(), 7), trainer()
+    second.load_state(*first.state())
+    expected, found = whole.state()[0], steps(second, 5).state()[0]
+    assert expected.keys() == found.keys()
+    assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
+
+
+def test_a_run_is_drawn_after_loading_and_its_sets_densify(tiny_capture, tmp_path):
+    path = tiny_capture(frames=10)
+    settings = ("human.count=80", "triplane.resolution=16", "triplane.channels=8", "fit.steps=5")
+    out = train(
+        path, method="hugs", out=tmp_path / "run", iterations=30,
+        overrides=(*settings, "scene.cube_count=600", "densify_human.gradient=1e-7"),
+    )  # fmt: skip
+    run = load_run(out)
+    assert run.gaussians["human"] > 80
+    tensors, _ = load_checkpoint(latest_checkpoint(out / "checkpoints"))
+    assert len(tensors["model.scene.means"]) == run.gaussians["scene"]
+    frame = run.capture.test_frames[0]
+    camera = run.capture.camera(frame)
+    pictures = run.reconstruction.render(camera, [frame.mid_us, frame.mid_us + 500])
+    assert pictures.rgb.shape == (2, camera.height, camera.width, 3)
+    assert bool(pictures.rgb.isfinite().all()) and float(pictures.rgb.std()) > 0
+    human = run.reconstruction.render(camera, [frame.mid_us], parts="human")
+    assert 0 < float(human.human.mean()) < 1
+
+
+def test_without_masks_it_says_what_to_run(tiny_capture):
+    path = tiny_capture(frames=10)
+    document = json.loads((path / "capture.json").read_text())
+    for entry in document["frames"]:
+        entry.pop("mask", None)
+    (path / "capture.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match=r"no mask .* evsplat masks"):
+        composed(path)
