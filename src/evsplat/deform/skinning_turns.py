@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-Network = Callable[[Float[Tensor, "M 3"]], Float[Tensor, "M J"]]
+Network = Callable[[Float[Tensor, "M C"]], Float[Tensor, "M J"]]
 
 
 class SkinningTurns:
@@ -24,8 +24,9 @@ class SkinningTurns:
         self.turn = 0
         self.kept = torch.zeros(0, 0)
 
-    def weights(self, network: Network, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
-        """Weights at ``positions``; all are looked up after rows were changed."""
+    def weights(self, network: Network, positions: Float[Tensor, "N C"]) -> Float[Tensor, "N J"]:
+        """Weights at ``positions``, or what the network takes for them; after rows were changed
+        all are looked up."""
         if self.turns == 1:
             return network(positions)
         if len(self.kept) != len(positions):

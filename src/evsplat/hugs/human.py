@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body.rotations import matrix_to_quaternion, six_to_matrix
+from evsplat.deform.skinning_turns import SkinningTurns
 from evsplat.gaussians import OneClassRows, Shape
 from evsplat.hugs.decoders import AppearanceDecoder, GeometryDecoder, SkinningDecoder
 from evsplat.hugs.triplane import Triplane
@@ -59,8 +60,9 @@ class TriplaneHuman(OneClassRows):
         resolution: int,
         center: Float[Tensor, "3"],
         half_side: float,
+        skinning_turns: int = 1,
     ) -> None:
-        """``means`` are the start, canonical metres; the rest is the triplane's."""
+        """``means`` are the start, canonical metres; of the rest most is the triplane's."""
         multipliers = torch.full((len(means), 1), START_MULTIPLIER)
         super().__init__({"means": means, "scales_log": multipliers.log()}, "human")
         self.triplane = Triplane(channels, resolution, center, half_side)
@@ -68,13 +70,25 @@ class TriplaneHuman(OneClassRows):
         self.appearance = AppearanceDecoder(features)
         self.geometry = GeometryDecoder(features)
         self.skinning = SkinningDecoder(features, joints)
+        self.skinning_turns = SkinningTurns(skinning_turns)
 
     def look_up(self, positions: Float[Tensor, "M 3"]) -> Decoded:
         """What the decoders say of any canonical places."""
         features = self.triplane(positions)
+        return self._decode(features, self.skinning(features))
+
+    def for_training(self) -> Decoded:
+        """The person's Gaussians, a part of them with skinning weights a few steps old.
+
+        See `SkinningTurns`; of all networks that of the skinning costs most and learns slowest.
+        """
+        features = self.triplane(self.means)
+        return self._decode(features, self.skinning_turns.weights(self.skinning, features))
+
+    def _decode(self, features: Tensor, weights: Tensor) -> Decoded:
         offsets, six, scales = self.geometry(features)
         colours, opacities = self.appearance(features)
-        return Decoded(offsets, six, scales, colours, opacities, self.skinning(features))
+        return Decoded(offsets, six, scales, colours, opacities, weights)
 
     def multipliers(self) -> Float[Tensor, "N 1"]:
         """Factor of each Gaussian's standard deviations."""

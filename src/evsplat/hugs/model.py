@@ -48,7 +48,6 @@ class HugsDrawing(Drawing):
 class HugsModel(nn.Module):
     """Both sets, and the body track with a correction of the pose per training frame."""
 
-    row_caches: dict[str, RowCache] = {}
     shadow: BodyShadow | None = None
 
     def __init__(
@@ -64,6 +63,7 @@ class HugsModel(nn.Module):
         super().__init__()
         self.human, self.scene, self.track = human, scene, track
         self.release_compatible = release_compatible
+        self.row_caches: dict[str, RowCache] = {"skinning_turns": human.skinning_turns}
         frames, joints = len(frame_times_us), len(track.body.parents)
         self.turns = nn.Parameter(torch.tensor(_NO_TURN).repeat(frames, joints, 1))
         """Rotation after each joint's own, six numbers, see `six_to_matrix`."""
@@ -132,7 +132,7 @@ class HugsModel(nn.Module):
     ) -> Drawing:
         """Person and scene over a random colour; see `Model`."""
         background = send(torch.rand(3, generator=generator), self.device)
-        decoded = self.human.look_up(self.human.means)
+        decoded = self.human.for_training()
         posed = self._posed(decoded, times_us, camera.center())
         drawing = draw(self, posed, camera, center_gradients=True, background=background)
         return HugsDrawing(**vars(drawing), decoded=decoded, shifted=self.release_compatible)

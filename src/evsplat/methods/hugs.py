@@ -133,6 +133,9 @@ class HugsConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     scene: HugsSceneConfig = field(default_factory=HugsSceneConfig)
     loss: HugsLossConfig = field(default_factory=HugsLossConfig)
+    skinning_turns: int = 4
+    """A training step decodes the skinning weights of one Gaussian in so many, in turns; 1 = of
+    all, as released."""
     skinning_refresh: int = 50
     """Steps between look-ups of the body's weights; the released code does it at every step."""
     optimisation: HugsOptimisation = field(default_factory=HugsOptimisation)
@@ -239,6 +242,7 @@ def _human(
         resolution=config.triplane.resolution or _resolution(capture, track, half_side),
         center=(low + high) / 2,
         half_side=half_side,
+        skinning_turns=config.skinning_turns,
     )
     return human, float(nearest_spacing(points).mean())
 
