@@ -25,8 +25,10 @@ class SkinningTurns:
         self.kept = torch.zeros(0, 0)
 
     def weights(self, network: Network, positions: Float[Tensor, "N C"]) -> Float[Tensor, "N J"]:
-        """Weights at ``positions``, or what the network takes for them; after rows were changed
-        all are looked up."""
+        """Weights at ``positions``, or at what the network takes for them.
+
+        All are looked up after rows were changed.
+        """
         if self.turns == 1:
             return network(positions)
         if len(self.kept) != len(positions):
