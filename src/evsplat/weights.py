@@ -1,11 +1,15 @@
 """Weight files of pretrained networks: found, never downloaded; read, never unpickled."""
 
 import hashlib
+import os
 import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor, nn
 
 from evsplat.errors import WeightsError
 
@@ -42,3 +46,66 @@ def home_as_tilde(path: Path) -> str:
     """The path as people write it."""
     home = Path.home()
     return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
+
+
+@dataclass(frozen=True)
+class WeightFile:
+    """A published weight file: what it is called, how large it is and where people get it."""
+
+    network: str
+    """What needs it, as the sentence about its absence begins."""
+    name: str
+    size: str
+    source: str
+    """Where to get it, to be read after "get it"."""
+    variable: str
+    """Environment variable with its place."""
+
+    def find(self, given: Path | str | None = None) -> Path:
+        """The file as given, from the environment variable or in torch's hub folder.
+
+        Raises `MissingWeights`, with where to get it, where it is not there.
+        """
+        named = given or os.environ.get(self.variable)
+        path = Path(named or hub_folder() / self.name).expanduser()
+        if path.is_file():
+            return path
+        raise MissingWeights(
+            f"{home_as_tilde(path)}: file not found. {self.network} needs {self.name} "
+            f"({self.size}): get it {self.source} and put it there, or give its place with "
+            f"--weights or {self.variable}."
+        )
+
+
+def state_under(path: Path, keys: tuple[str, ...]) -> dict[str, Tensor]:
+    """The tensors of a checkpoint that keeps them under one of ``keys``, or bare.
+
+    The prefix that training on several GPUs puts before every name is taken off.
+    """
+    state = read_state(path)
+    for key in keys:
+        if isinstance(state.get(key), Mapping):
+            state = state[key]
+            break
+    tensors = {key: value for key, value in state.items() if isinstance(value, Tensor)}
+    return {key.removeprefix("module."): value for key, value in tensors.items()}
+
+
+def fill(
+    network: nn.Module, state: Mapping[str, Tensor], path: Path, *, what: str, part: str = ""
+) -> nn.Module:
+    """Put all of ``state`` into a network, ready for inference; no name or shape may differ.
+
+    ``part`` is what the file puts before the names, ``what`` it should be in the message of the
+    `WeightsError`.
+    """
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    found = {name: tuple(value.shape) for name, value in state.items()}
+    for name in sorted(expected.keys() | found.keys()):
+        if expected.get(name) != found.get(name):
+            raise WeightsError(
+                f"{path}: {part}{name}: expected {expected.get(name, 'nothing')}, found "
+                f"{found.get(name, 'nothing')}; this is not {what}."
+            )
+    network.load_state_dict(state)
+    return network.eval().requires_grad_(False)

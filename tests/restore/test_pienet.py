@@ -64,7 +64,7 @@ def test_the_command_writes_a_capture_that_says_what_made_it(tiny_capture, tmp_p
     assert made["with"] == "pienet" and made["package"] == "event-pienet 1.1.3"
     assert made["sha256"] == sha256_of(pienet.find_weights())
     assert main(["restore", str(path), "--with", "pienet", "--contrast-threshold", "1", "1"]) == 2
-    assert "belongs to --with edi" in capsys.readouterr().err
+    assert "means nothing to --with pienet" in capsys.readouterr().err
 
 
 @needs_package

@@ -15,6 +15,7 @@ import evsplat
 from evsplat.cli.options import Flag
 from evsplat.cuda_support import Need, needs
 from evsplat.errors import DataError, WeightsError
+from evsplat.restore import WEIGHT_FILES
 from evsplat.shipped import demo_capture
 
 _MARKS = {"ok": "ok", "missing": "MISSING", "optional": "-"}
@@ -63,6 +64,7 @@ def run_checks() -> Iterator[Check]:
         _body_models,
         _opencv,
         _super_slomo,
+        *(partial(_restorer, name) for name in WEIGHT_FILES),
         _pienet,
         _recordings,
         _st_lpips,
@@ -143,6 +145,14 @@ def _super_slomo() -> Check:
         return Check("Super SloMo", "ok", f"weights {find_checkpoint()}")
     except WeightsError as error:
         return Check("Super SloMo", "optional", str(error))
+
+
+def _restorer(name: str) -> Check:
+    file = WEIGHT_FILES[name]
+    try:
+        return Check(file.network, "ok", f"weights {file.find()}")
+    except WeightsError as error:
+        return Check(file.network, "optional", str(error))
 
 
 def _pienet() -> Check:

@@ -6,17 +6,20 @@ from typing import Annotated, Any, Literal
 from evsplat.cli.options import CaptureFolder, Device, option
 from evsplat.errors import ConfigError
 
+Method = Literal["edi", "nafnet", "mprnet", "efnet", "d2net", "e2vid", "pienet"]
+
 
 def restore(
     capture: CaptureFolder,
     /,
     *,
-    out: Annotated[Path | None, option("FOLDER", default="CAPTURE-edi")] = None,
-    method: Annotated[
-        Literal["edi", "pienet"], option("{edi,pienet}", default="edi", name="with")
-    ] = "edi",
+    out: Annotated[Path | None, option("FOLDER", default="CAPTURE-NAME")] = None,
+    method: Annotated[Method, option("NAME", default="edi", name="with")] = "edi",
     contrast_threshold: Annotated[
         tuple[float, float] | None, option("C+ C-", default="the capture's, or estimated")
+    ] = None,
+    weights: Annotated[
+        Path | None, option("FILE", default="EVSPLAT_NAME, or torch's cache")
     ] = None,
     device: Device = "auto",
 ) -> None:
@@ -27,20 +30,24 @@ def restore(
     Args:
         capture: Capture folder (docs/capture-format.md).
         out: The new capture.
-        method: edi: event double integral, from each frame and its events; pienet: a network.
+        method: edi (event double integral), or a network: nafnet, mprnet (no events), efnet,
+            d2net (both), e2vid, pienet (brightness from events); docs/restore.md.
         contrast_threshold: For edi: log-intensity change per brighter and darker event.
+        weights: For networks but pienet: the published checkpoint, which you bring.
         device: For networks: where they run.
     """
     from evsplat.restore import restore_capture
 
-    options: dict[str, Any] = {}
-    if method == "edi":
-        options["contrast_threshold"] = contrast_threshold
-    else:
-        if contrast_threshold is not None:
+    given: dict[str, tuple[bool, Any]] = {
+        "contrast_threshold": (method == "edi", contrast_threshold),
+        "weights": (method not in ("edi", "pienet"), weights),
+        "device": (method != "edi", None if method == "edi" and device == "auto" else device),
+    }
+    for name, (fits, value) in given.items():
+        if value is not None and not fits:
             raise ConfigError(
-                f"--contrast-threshold belongs to --with edi, not to {method}; leave it out."
+                f"--{name.replace('_', '-')} means nothing to --with {method}; leave it out."
             )
-        options["device"] = device
+    options = {name: value for name, (_, value) in given.items() if value is not None}
     target = out or capture.resolve().with_name(f"{capture.resolve().name}-{method}")
     print(f"written: {restore_capture(capture, target, method=method, **options)}")

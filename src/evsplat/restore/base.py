@@ -7,8 +7,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
+from evsplat.restore.d2net import D2Net
+from evsplat.restore.e2vid import FILE, E2Vid
 from evsplat.restore.edi import Edi
+from evsplat.restore.efnet import EfNet
+from evsplat.restore.mprnet import MprNet
+from evsplat.restore.nafnet import NafNet
 from evsplat.restore.pienet import PieNet
+from evsplat.weights import WeightFile
 
 
 class Restorer(Protocol):
@@ -25,5 +31,22 @@ class Restorer(Protocol):
         ...
 
 
-RESTORERS: dict[str, Callable[..., Restorer]] = {"edi": Edi, "pienet": PieNet}
+RESTORERS: dict[str, Callable[..., Restorer]] = {
+    Edi.name: Edi,
+    NafNet.name: NafNet,
+    MprNet.name: MprNet,
+    EfNet.name: EfNet,
+    D2Net.name: D2Net,
+    E2Vid.name: E2Vid,
+    PieNet.name: PieNet,
+}
 """By name; called with the capture and the restorer's own options as keywords."""
+
+WEIGHT_FILES: dict[str, WeightFile] = {
+    NafNet.name: NafNet.file,
+    MprNet.name: MprNet.file,
+    EfNet.name: EfNet.file,
+    D2Net.name: D2Net.file,
+    E2Vid.name: FILE,
+}
+"""What users bring for the restorers whose weights come with no package."""

@@ -20,7 +20,14 @@ from torch.nn import functional as F
 from evsplat.errors import WeightsError
 from evsplat.imaging.srgb import Transfer, decode
 from evsplat.synthesis.interpolate import Picture
-from evsplat.weights import MissingWeights, home_as_tilde, hub_folder, read_state, sha256_of
+from evsplat.weights import (
+    MissingWeights,
+    fill,
+    home_as_tilde,
+    hub_folder,
+    read_state,
+    sha256_of,
+)
 
 WEIGHTS_VARIABLE = "EVSPLAT_SUPER_SLOMO"
 """Environment variable with the path of the checkpoint."""
@@ -187,14 +194,7 @@ def _network(path: Path, state: dict[str, Any], key: str, inputs: int, outputs: 
             f"{path}: holds no {key!r}, expected {FILE_NAME} with {' and '.join(_NETWORKS)}; fetch "
             "it again."
         )
+    what = f"{FILE_NAME} of colour pictures"
     network = UNet(inputs, outputs)
-    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in state[key].items()}
-    for name in sorted(expected.keys() | found.keys()):
-        if expected.get(name) != found.get(name):
-            raise WeightsError(
-                f"{path}: {key}.{name}: expected {expected.get(name, 'nothing')}, found "
-                f"{found.get(name, 'nothing')}; this is not {FILE_NAME} of colour pictures."
-            )
-    network.load_state_dict(state[key])
-    return network.eval()
+    fill(network, state[key], path, what=what, part=f"{key}.")
+    return network
