@@ -139,7 +139,7 @@ def rest_from_zero(
     Trunks differ by a few degrees of lean that are anatomy and not direction, and skeletons are
     drawn along their axes: the nearest rotation that takes axes to axes is meant.
     """
-    rotation = _facing(taker, rest) @ _facing(mover, zero).T
+    rotation = trunk_axes(taker, rest) @ trunk_axes(mover, zero).T
     snapped = np.zeros((3, 3))
     for _ in range(3):
         size = np.abs(snapped)
@@ -151,7 +151,7 @@ def rest_from_zero(
     return snapped if np.linalg.det(snapped) > 0 and angle < 25 else rotation
 
 
-def _facing(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:
+def trunk_axes(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:
     """Columns: towards the left, up along the trunk, forward."""
     limbs = skeleton.limbs
     left = joints[limbs["left_thigh"]] - joints[limbs["right_thigh"]]

@@ -26,6 +26,8 @@ def train(
     device_memory_gb: Annotated[float | None, option("GB", default="a quarter of the free")] = None,
     seed: Annotated[int | None, option("S", default="the method's")] = None,
     evaluate: Flag = True,
+    view: Flag = False,
+    port: Annotated[int, option("PORT", default="8080, or the next free one")] = 8080,
 ) -> None:
     """Train a method on a capture, then evaluate it and write report.html.
 
@@ -45,10 +47,14 @@ def train(
         device_memory_gb: GPU memory for recorded pictures and event maps.
         seed: Seed of every random number.
         evaluate: Skip the evaluation and the report at the end.
+        view: Show the run in the browser while it is trained, and afterwards until Ctrl-C.
+        port: Where --view listens.
     """
+    from evsplat.cli.viewer_process import ViewerProcess
     from evsplat.training import train as train_run
     from evsplat.training.train import Stopped
 
+    viewer = ViewerProcess(port) if view else None
     try:
         run = train_run(
             capture,
@@ -63,13 +69,23 @@ def train(
             threads=threads,
             seed=seed,
             device_memory_gb=device_memory_gb,
+            on_start=viewer.start if viewer else None,
         )
+        if evaluate:
+            _evaluate(run, device)
+        else:
+            print(f"run: {run}")
+        if viewer:
+            viewer.wait()
     except Stopped as stop:
         command = shlex.join(["evsplat", "train", str(capture), "--out", str(stop.run), "--resume"])
         raise KeyboardInterrupt(f"Stopped and saved. Go on with: {command}") from None
-    if not evaluate:
-        print(f"run: {run}")
-        return
+    finally:
+        if viewer:
+            viewer.close()
+
+
+def _evaluate(run: Path, device: Device) -> None:
     try:
         evaluate_and_report(run, device=device)
     except KeyboardInterrupt:

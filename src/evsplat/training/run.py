@@ -3,7 +3,7 @@
 import json
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -193,31 +193,50 @@ def config_values(method: str, config: MethodConfig) -> dict[str, Any]:
     return {"method": method, **to_dict(config)}
 
 
-def load_run(run_dir: Path | str, *, device: str = "auto") -> Run:
-    """Read a run at its last checkpoint; a folder without one is a `DataError`."""
+def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = None) -> Run:
+    """Read a run at its last checkpoint; a folder without one is a `DataError`.
+
+    ``state`` is another checkpoint or snapshot of it.
+    """
     device = choose_device(device)
     folder = RunFolder(Path(run_dir))
     method, config, facts = read_config(folder)
-    path = latest_checkpoint(folder.checkpoints)
+    path = state or latest_checkpoint(folder.checkpoints)
     if path is None:
         raise DataError(f"{folder.checkpoints}: no checkpoint; train the run first.")
-    tensors, state = load_checkpoint(path)
+    tensors, progress = load_checkpoint(path)
     capture = load_capture(Path(facts["capture"]))
     compose = TRAINABLE[method][1]
     composition = compose(config, capture, facts["seed"], device=device, fit=False)
-    load_model(composition.model, tensors, state["human_count"])
-    sets = composition.model.sets.values()
+    load_model(composition.model, tensors, progress["human_count"])
     return Run(
         path=folder.path,
         config=config,
         method=method,
         capture=capture,
         reconstruction=GaussianReconstruction(method, composition.model),
-        iteration=state["clock"]["iteration"],
-        train_seconds=state["clock"]["seconds"],
         device=facts["device"],
-        gaussians={
+        **_progress(composition.model, progress),
+    )
+
+
+def reload_run(run: Run, state: Path) -> Run:
+    """The run at another checkpoint or snapshot of it; its model gets other parameters in place."""
+    assert isinstance(run.reconstruction, GaussianReconstruction)
+    model = run.reconstruction.model
+    tensors, progress = load_checkpoint(state)
+    load_model(model, tensors, progress["human_count"])
+    return replace(run, **_progress(model, progress))
+
+
+def _progress(model: Model, progress: dict[str, Any]) -> dict[str, Any]:
+    """The fields of `Run` that change while it is trained."""
+    sets = model.sets.values()
+    return {
+        "iteration": progress["clock"]["iteration"],
+        "train_seconds": progress["clock"]["seconds"],
+        "gaussians": {
             "human": sum(rows.human_count for rows in sets),
             "scene": sum(rows.scene_count for rows in sets),
         },
-    )
+    }

@@ -5,7 +5,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -30,6 +30,7 @@ from evsplat.training.run import (
     write_facts,
 )
 from evsplat.training.trainer import StepReport, Trainer
+from evsplat.training.watching import Showcase
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +61,7 @@ def train(
     threads: int | None = None,
     seed: int | None = None,
     device_memory_gb: float | None = None,
+    on_start: Callable[[Path], None] | None = None,
 ) -> Path:
     """Train ``method`` on a capture and return the run folder.
 
@@ -68,8 +70,8 @@ def train(
     step count as training. ``resume`` goes on from the last
     checkpoint in ``out``. ``config`` is a run's config.yaml; ``overrides`` are ``key=value``
     settings over it. ``device_memory_gb`` bounds the pictures and event maps kept on a GPU (a
-    quarter of its free memory by default); the rest is copied ahead of its use. Raises `Stopped` on
-    Ctrl-C after saving.
+    quarter of its free memory by default); the rest is copied ahead of its use. ``on_start`` is
+    called with the run folder before the first step. Raises `Stopped` on Ctrl-C after saving.
     """
     device = choose_device(device)
     if iterations is not None and iterations < 1:
@@ -129,6 +131,8 @@ def train(
         save_yaml(folder.config, config_values(method, settings))
         write_facts(folder, capture, method, device, seed)
         logger.info("%s", schedule_table(settings, composition.weights))
+    if on_start is not None:
+        on_start(folder.path)
     _loop(trainer, folder)
     return folder.path
 
@@ -158,6 +162,7 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
         _interrupt_flag() as interrupted,
         folder.log.open("a", encoding="utf-8", buffering=1) as log,
         _progress_bar() as bar,
+        Showcase(folder.path).open() as showcase,
     ):
         while not clock.done and not clock.out_of_time:
             started = time.perf_counter()
@@ -175,7 +180,8 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
             if time.perf_counter() - saved_at > CHECKPOINT_SECONDS:
                 save()
                 saved_at = time.perf_counter()
-    save()
+            showcase.show(trainer.snapshot)
+        save()
     if clock.iteration == 0:
         raise DataError(f"{folder.path}: no step was made.")
 

@@ -149,7 +149,7 @@ class Trainer:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """All tensors and all numbers that a resume needs."""
-        tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
+        tensors, state = self.snapshot()
         tensors |= flatten("optimiser", self.optimiser.state())
         for name, statistics in self.statistics.items():
             tensors |= flatten(f"statistics.{name}", vars(statistics))
@@ -158,14 +158,17 @@ class Trainer:
         for name, cache in self.model.row_caches.items():
             tensors |= flatten(name, cache.state())
         tensors["generator"] = self.composition.generator.get_state()
-        state = {
-            "clock": asdict(self.clock),
+        state |= {
             "queue": self.queue,
             "skipped": self.bad.settle(),
             "previous_nominal": self.previous_nominal,
-            "human_count": self.counts()["human"],
         }
         return tensors, state
+
+    def snapshot(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """What of `state` is needed to draw the model."""
+        tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
+        return tensors, {"clock": asdict(self.clock), "human_count": self.counts()["human"]}
 
     def load_state(self, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:
         """Go back to the moment of `state`; the clock's limits stay those of this run."""

@@ -22,15 +22,20 @@ def view_run(
         ConfigError: the package viser is missing, or the address cannot be listened at.
         DataError: no run folder, no checkpoint in it, or runs of two captures.
     """
+    check_viewer()
+    from evsplat.view.server import serve
+
+    serve([path for path in (run, other) if path is not None], host, port, device)
+
+
+def check_viewer() -> None:
+    """Raise a `ConfigError` that says how to get the viewer where it is not installed."""
     try:
         import viser  # noqa: F401
     except ImportError:
         raise ConfigError(
             "The viewer needs the package viser; get it with: pip install 'evsplat[view]'."
         ) from None
-    from evsplat.view.server import serve
-
-    serve([path for path in (run, other) if path is not None], host, port, device)
 
 
-__all__ = ["view_run"]
+__all__ = ["check_viewer", "view_run"]

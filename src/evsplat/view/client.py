@@ -11,10 +11,10 @@ import viser
 
 from evsplat.view.camera import Orbit
 from evsplat.view.desk import Desk
-from evsplat.view.look import Look
 from evsplat.view.painter import Painter
 from evsplat.view.resolution import Resolution
 from evsplat.view.timeline import Playback
+from evsplat.view.wish import Wish
 
 LONGEST_PX = 1600
 """Pictures are drawn no larger; the browser enlarges them to its window."""
@@ -48,12 +48,12 @@ class Client:
         handle: viser.ClientHandle,
         painter: Painter,
         desk: Desk,
-        look: Look,
+        wish: Wish,
         playback: Playback,
     ) -> None:
         self.handle, self.painter, self.desk = handle, painter, desk
         self._lock = threading.Lock()
-        self._look = look
+        self._wish = wish
         self._playback = playback
         self._snap: Snap | None = None
         self._resolution = Resolution()
@@ -62,9 +62,15 @@ class Client:
         handle.camera.on_update(self._camera_moved)
 
     def change(self, **fields: Any) -> None:
-        """Wish for a look with other fields."""
+        """Wish for other fields."""
         with self._lock:
-            self._look = replace(self._look, **fields)
+            self._wish = replace(self._wish, **fields)
+        self.desk.wake()
+
+    def move(self, **fields: Any) -> None:
+        """Wish for a motion with other fields."""
+        with self._lock:
+            self._wish = replace(self._wish, motion=replace(self._wish.motion, **fields))
         self.desk.wake()
 
     def play(self, change: Callable[[Playback, float], Playback]) -> Playback:
@@ -80,7 +86,7 @@ class Client:
         ahead = look_at - np.asarray(orbit.position)
         with self._lock:
             self._snap = Snap(np.asarray(orbit.position), ahead / np.linalg.norm(ahead))
-            self._look = replace(self._look, recording=camera, orbit=orbit)
+            self._wish = replace(self._wish, recording=camera, orbit=orbit)
         with self.handle.atomic():
             self.handle.camera.position = orbit.position
             self.handle.camera.look_at = look_at
@@ -88,16 +94,16 @@ class Client:
         self.desk.wake()
 
     @property
-    def look(self) -> Look:
+    def standing(self) -> Wish:
         """The present wish, at the time where it stands."""
         with self._lock:
             place = round(self._playback.at(time.monotonic()))
-            return replace(self._look, time_us=place)
+            return replace(self._wish, time_us=place)
 
-    def wish(self, now: float) -> Look:
+    def wish(self, now: float) -> Wish:
         """The picture to show at a second of the wall clock."""
         with self._lock:
-            return replace(self._look, time_us=round(self._playback.at(now)))
+            return replace(self._wish, time_us=round(self._playback.at(now)))
 
     def serve(self, wish: Any, *, draft: bool) -> None:
         """Draw and send."""
@@ -122,8 +128,8 @@ class Client:
         with self._lock:
             if self._snap is not None and self._snap.left(camera):
                 self._snap = None
-                self._look = replace(self._look, recording=None)
-            self._look = replace(self._look, orbit=orbit, width=width, height=height)
+                self._wish = replace(self._wish, recording=None)
+            self._wish = replace(self._wish, orbit=orbit, width=width, height=height)
         self.desk.wake()
 
 

@@ -1,4 +1,4 @@
-"""From a look to the picture that the browser shows."""
+"""From a wish to the picture that the browser shows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from evsplat.events.maps import count_map
 from evsplat.film import camera_at
 from evsplat.view import pixels
 from evsplat.view.camera import Box, framed, orbit_camera, resized
-from evsplat.view.look import BLURRY, SHARP, Look
 from evsplat.view.subject import Subject
+from evsplat.view.wish import BLURRY, SHARP, Wish
 
 INSET_SHARE = 0.3
 """Height of the recorded picture in the corner, as a share of the viewport's."""
@@ -28,91 +28,96 @@ class Pane:
 
 
 class Painter:
-    """Draws looks of one run, or of two runs of one capture."""
+    """Draws wishes of one run, or of two runs of one capture."""
 
     def __init__(self, subject: Subject, others: Mapping[str, Subject]) -> None:
         """``others`` are what the run can be compared with, by name."""
         self.subject, self.others = subject, dict(others)
         self.capture = subject.capture
 
+    @property
+    def knows_depth(self) -> bool:
+        """Whether every run that is shown can show its depth."""
+        return all(s.knows_depth for s in (self.subject, *self.others.values()))
+
     def paint(
-        self, look: Look, size: tuple[int, int], *, rough: bool
+        self, wish: Wish, size: tuple[int, int], *, rough: bool
     ) -> UInt8[np.ndarray, "H W 3"]:
         """The picture with ``size`` (width, height) pixels, whatever the viewport has."""
         width, height = size
-        other = look.compare if self._has_place(look) else None
-        beside = look.layout == "side by side" and other is not None
+        other = wish.compare if self._has_place(wish) else None
+        beside = wish.layout == "side by side" and other is not None
         share = 0.5 if beside else 1.0
-        pane = self._pane(look, round(share * look.width), look.height)
+        pane = self._pane(wish, round(share * wish.width), wish.height)
         pane = _scaled(pane, round(share * width), height)
-        right = self._drawn(self.subject, pane, look, rough)
+        right = self._drawn(self.subject, pane, wish, rough)
         picture, labels = right, []
         if other is not None:
-            left = self._compared(other, look, pane, right, rough)
+            left = self._compared(other, wish, pane, right, rough)
             if beside:
                 picture = np.concatenate([left, right], 1)
                 picture[:, left.shape[1] - 1 : left.shape[1] + 1] = 1
                 labels = [(0.0, other), (0.5, self.subject.name)]
             else:
-                picture = pixels.divided(left, right, look.divider)
-                labels = [(0.0, other), (look.divider, self.subject.name)]
-        if pane.box is None and (look.events_us is not None or look.compare != other):
-            self._inset(picture, look)
+                picture = pixels.divided(left, right, wish.divider)
+                labels = [(0.0, other), (wish.divider, self.subject.name)]
+        if pane.box is None and (wish.events_us is not None or wish.compare != other):
+            self._inset(picture, wish)
         return pixels.with_labels(pixels.to_bytes(picture), labels)
 
     def frame(self, camera: str | None, time_us: int) -> Frame:
         """The recorded frame nearest in time, of a camera where it recorded any."""
         return nearest_frame(self.capture, camera, time_us)
 
-    def _pane(self, look: Look, width: int, height: int) -> Pane:
-        if look.recording is None:
-            return Pane(orbit_camera(look.orbit, width, height), None)
-        camera = camera_at(self.capture, look.recording, look.time_us)
+    def _pane(self, wish: Wish, width: int, height: int) -> Pane:
+        if wish.recording is None:
+            return Pane(orbit_camera(wish.orbit, width, height), None)
+        # Another motion has times of its own; the camera then stands where it stood first.
+        time_us = wish.time_us if wish.motion.name is None else self.capture.frames[0].mid_us
+        camera = camera_at(self.capture, wish.recording, time_us)
         return Pane(*framed(camera, width, height))
 
     def _drawn(
-        self, subject: Subject, pane: Pane, look: Look, rough: bool
+        self, subject: Subject, pane: Pane, wish: Wish, rough: bool
     ) -> Float[np.ndarray, "H W 3"]:
         """A run's picture with everything laid over it."""
-        layers = subject.layers(pane.camera, look.time_us, parts=look.parts, rough=rough)
-        picture = layers.rgb
-        if look.colouring == "semantic":
-            picture = pixels.by_class(picture, layers.human)
-        picture = np.array(picture)
+        picture = np.array(
+            subject.picture(pane.camera, wish.time_us, wish.motion, wish.look, rough=rough)
+        )
         if pane.box is not None:
             pixels.dim_outside(picture, pane.box)
-            if look.events_us is not None and look.motion.is_recorded:
-                counts = self._events(look)
+            if wish.events_us is not None and wish.motion.is_recorded:
+                counts = self._events(wish)
                 if counts is not None:
                     pixels.events_on(picture, counts, pane.box)
         return picture
 
-    def _has_place(self, look: Look) -> bool:
+    def _has_place(self, wish: Wish) -> bool:
         """Whether what is compared is known for this view; recordings are for their camera."""
-        if look.compare in self.others:
+        if wish.compare in self.others:
             return True
-        frames = [f for f in self.capture.frames if f.camera == look.recording]
-        return look.compare is not None and bool(frames) and look.motion.is_recorded
+        frames = [f for f in self.capture.frames if f.camera == wish.recording]
+        return wish.compare is not None and bool(frames) and wish.motion.is_recorded
 
     def _compared(
-        self, other: str, look: Look, pane: Pane, drawn: Float[np.ndarray, "H W 3"], rough: bool
+        self, other: str, wish: Wish, pane: Pane, drawn: Float[np.ndarray, "H W 3"], rough: bool
     ) -> Float[np.ndarray, "H W 3"]:
         """What stands beside the run's picture."""
         if other in self.others:
-            return self._drawn(self.others[other], pane, look, rough)
-        recorded, picture = self._recorded(look), np.zeros_like(drawn)
+            return self._drawn(self.others[other], pane, wish, rough)
+        recorded, picture = self._recorded(wish), np.zeros_like(drawn)
         assert pane.box is not None and recorded is not None
         pixels.paste(picture, recorded, pane.box)
         return picture
 
-    def _inset(self, picture: Float[np.ndarray, "H W 3"], look: Look) -> None:
+    def _inset(self, picture: Float[np.ndarray, "H W 3"], wish: Wish) -> None:
         """Put the recorded picture, with its events, into the lower left corner."""
-        recorded = self._recorded(look)
+        recorded = self._recorded(wish)
         if recorded is None:
             return
         recorded = recorded.copy()
-        if look.events_us is not None:
-            counts = self._events(look)
+        if wish.events_us is not None:
+            counts = self._events(wish)
             if counts is not None:
                 whole = Box(0, 0, recorded.shape[1], recorded.shape[0])
                 pixels.events_on(recorded, counts, whole)
@@ -125,20 +130,20 @@ class Painter:
         pixels.paste(picture, np.ones((2, 2, 3), np.float32), around)
         pixels.paste(picture, recorded, box)
 
-    def _recorded(self, look: Look) -> Float[np.ndarray, "h w 3"] | None:
-        if not look.motion.is_recorded:
+    def _recorded(self, wish: Wish) -> Float[np.ndarray, "h w 3"] | None:
+        if not wish.motion.is_recorded:
             return None
-        frame = self.frame(look.recording, look.time_us)
-        if look.compare == SHARP and frame.sharp is not None:
+        frame = self.frame(wish.recording, wish.time_us)
+        if wish.compare == SHARP and frame.sharp is not None:
             return self.capture.sharp(frame).numpy()
         return self.capture.image(frame).numpy()
 
-    def _events(self, look: Look) -> Float[np.ndarray, "h w"] | None:
+    def _events(self, wish: Wish) -> Float[np.ndarray, "h w"] | None:
         store = self.capture.events
-        if store is None or look.events_us is None:
+        if store is None or wish.events_us is None:
             return None
-        start = look.time_us - look.events_us // 2
-        stream = store.between(start, start + look.events_us)
+        start = wish.time_us - wish.events_us // 2
+        stream = store.between(start, start + wish.events_us)
         return count_map(stream, store.height, store.width).numpy()
 
 

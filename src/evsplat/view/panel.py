@@ -8,10 +8,13 @@ import viser
 from PIL import Image
 
 from evsplat.capture import Frame
-from evsplat.film import camera_at
+from evsplat.film import Look, camera_at
+from evsplat.film.looks import Shown
+from evsplat.methods.reconstruction import Parts
 from evsplat.view.camera import Orbit, forward, framed, vertical_fov
 from evsplat.view.client import Client
 from evsplat.view.painter import comparisons
+from evsplat.view.pose_panel import PosePanel
 from evsplat.view.timeline import Playback
 
 SPEEDS = {
@@ -23,8 +26,8 @@ SPEEDS = {
     "1/50": 1 / 50,
     "1/100": 1 / 100,
 }
-_PARTS = {"person and scene": "all", "person": "human", "scene": "scene"}
-_COLOURING = {"colour": "colour", "person / scene": "semantic"}
+_PARTS: dict[str, Parts] = {"person and scene": "all", "person": "human", "scene": "scene"}
+_SHOWN: dict[str, Shown] = {"colour": "rgb", "person / scene": "semantic", "depth": "depth"}
 _WHOLE, _EXPOSURE = "the recording", "this exposure"
 _NOTHING = "nothing"
 _SLIDER_S = 0.1
@@ -46,13 +49,18 @@ class Panel:
         self._said = ""
         self._frames = sorted(self.capture.frames, key=lambda frame: frame.mid_us)
         self._frames = [f for f in self._frames if f.camera == self._frames[0].camera]
-        self._start_us, self._end_us = self._frames[0].mid_us, self._frames[-1].mid_us
+        self._recording_us = self._frames[0].mid_us, self._frames[-1].mid_us
+        self._start_us, self._end_us = self._recording_us
+        self._motion: str | None = None
         with self.gui.add_folder("Time"):
             self._build_time()
         with self.gui.add_folder("Camera"):
             self._build_camera()
         with self.gui.add_folder("Show"):
             self._build_show()
+        if client.painter.subject.is_posable:
+            with self.gui.add_folder("Motion and pose"):
+                PosePanel(self)
         with self.gui.add_folder("Save"):
             self._build_save()
         client.on_time = self._follow
@@ -76,13 +84,13 @@ class Panel:
             self._show_playing(playback)
 
         async def stepped(event: viser.GuiEvent) -> None:
-            place = self.client.look.time_us
+            place = self.client.standing.time_us
             mids = [frame.mid_us for frame in self._frames]
             later, earlier = [m for m in mids if m > place], [m for m in mids if m < place]
             forwards = event.target.value == "next"
             self._show_playing(self.client.play(lambda p, now: p.playing(False, now)))
             self._go(min(later, default=mids[-1]) if forwards else max(earlier, default=mids[0]))
-            self._move_slider(self.client.look.time_us)
+            self._move_slider(self.client.standing.time_us)
 
         async def faster(_: viser.GuiEvent) -> None:
             self.client.play(lambda p, now: p.at_speed(SPEEDS[self.speed.value], now))
@@ -111,11 +119,12 @@ class Panel:
     def _build_show(self) -> None:
         gui, client = self.gui, self.client
         parts = gui.add_dropdown("Parts", tuple(_PARTS))
-        colouring = gui.add_dropdown("Colours", tuple(_COLOURING))
+        known = [name for name in _SHOWN if name != "depth" or client.painter.knows_depth]
+        shown = gui.add_dropdown("Colours", tuple(known))
         others = comparisons(self.capture, list(client.painter.others))
         compare = gui.add_dropdown("Compare with", (_NOTHING, *others))
         layout = gui.add_dropdown("Layout", ("divided", "side by side"))
-        divider = gui.add_slider("Divider", 0.0, 1.0, 0.005, client.look.divider)
+        divider = gui.add_slider("Divider", 0.0, 1.0, 0.005, client.standing.divider)
         events = gui.add_checkbox("Events", False, visible=self.capture.events is not None)
         window = gui.add_slider("Event window, ms", 0.5, 50.0, 0.5, 5.0)
 
@@ -125,8 +134,7 @@ class Panel:
             divider.visible = something and layout.value == "divided"
             window.visible = events.value
             client.change(
-                parts=_PARTS[parts.value],
-                colouring=_COLOURING[colouring.value],
+                look=Look(_SHOWN[shown.value], _PARTS[parts.value]),
                 compare=compare.value if something else None,
                 layout=layout.value,
                 divider=divider.value,
@@ -134,7 +142,7 @@ class Panel:
             )
 
         layout.visible = divider.visible = window.visible = False
-        for control in (parts, colouring, compare, layout, divider, events, window):
+        for control in (parts, shown, compare, layout, divider, events, window):
             control.on_update(changed)
 
     def _build_save(self) -> None:
@@ -147,24 +155,42 @@ class Panel:
 
     def look_through(self, camera: str) -> None:
         """Put the browser's camera where a recording camera is at this time."""
-        look = self.client.look
-        recording = camera_at(self.capture, camera, look.time_us)
-        view, _ = framed(recording, look.width, look.height)
+        wish = self.client.standing
+        recording = camera_at(self.capture, camera, wish.time_us)
+        view, _ = framed(recording, wish.width, wish.height)
         centre, ahead = recording.center().double().numpy(), forward(recording)
         # The view turns around the place on the optical axis that is as far as the pivot.
         away = max(0.5, float((self.pivot - centre) @ ahead))
-        orbit = Orbit(look.orbit.wxyz, tuple(centre.tolist()), vertical_fov(view))
+        orbit = Orbit(wish.orbit.wxyz, tuple(centre.tolist()), vertical_fov(view))
         self.client.look_through(camera, orbit, centre + away * ahead)
+
+    def show_motion(self, name: str | None) -> None:
+        """Let the time go through a motion of the package, or the recording (None).
+
+        Called by the drawing thread, since reading a motion takes a while.
+        """
+        if name is None:
+            self._start_us, self._end_us = self._recording_us
+        else:
+            times = self.client.painter.subject.track(name).times_us
+            self._start_us, self._end_us = int(times[0]), int(times[-1])
+        self._motion = name
+        self.loop.visible = self.steps.visible = name is None
+        self.slider.max = round((self._end_us - self._start_us) / 1e3, 1)
+        self.client.move(name=name)
+        self.client.play(
+            lambda p, now: p.within(self._start_us, self._end_us, now).moved(self._start_us, now)
+        )
 
     def _go(self, place_us: float) -> None:
         self.client.play(lambda p, now: p.moved(place_us, now))
-        if self.loop.value == _EXPOSURE:
+        if self._motion is None and self.loop.value == _EXPOSURE:
             self._loop()
 
     def _loop(self) -> None:
         """Loop over what is chosen, around where the time stands."""
-        if self.loop.value == _EXPOSURE:
-            start, end = self._frame_at(self.client.look.time_us).exposure_us
+        if self.loop.value == _EXPOSURE and self._motion is None:
+            start, end = self._frame_at(self.client.standing.time_us).exposure_us
         else:
             start, end = self._start_us, self._end_us
         self.client.play(lambda p, now: p.within(start, end, now))
@@ -190,6 +216,14 @@ class Panel:
         if abs(self.slider.value - place_ms) > 0.05:
             # viser's property has a setter, which type checkers do not see.
             self.slider.value = min(max(place_ms, 0.0), self.slider.max)  # type: ignore[misc]
+        if self._motion is None:
+            said = self._of_frame(time_us)
+        else:
+            said = f"Motion {self._motion.replace('_', ' ')}, which was not recorded"
+        if said != self._said:
+            self.told.content = self._said = said
+
+    def _of_frame(self, time_us: int) -> str:
         frame = self._frame_at(time_us)
         start, end = frame.exposure_us
         split = {"train": "training", "test": "held out"}[frame.split]
@@ -197,15 +231,13 @@ class Panel:
             where = f"{100 * (time_us - start) / max(end - start, 1):.0f} % into its exposure"
         else:
             where = "between exposures"
-        said = f"Frame {frame.name} ({split}), {where} of {(end - start) / 1e3:.3g} ms"
-        if said != self._said:
-            self.told.content = self._said = said
+        return f"Frame {frame.name} ({split}), {where} of {(end - start) / 1e3:.3g} ms"
 
     def _send_picture(self) -> None:
         """Draw the present view with all its pixels and hand it to the browser as a file."""
-        look = self.client.look
-        picture = self.client.painter.paint(look, (look.width, look.height), rough=False)
+        wish = self.client.standing
+        picture = self.client.painter.paint(wish, (wish.width, wish.height), rough=False)
         data = io.BytesIO()
         Image.fromarray(picture).save(data, "PNG")
-        name = f"{self.capture.name}-{look.time_us / 1e3:.1f}ms.png"
+        name = f"{self.capture.name}-{wish.time_us / 1e3:.1f}ms.png"
         self.client.handle.send_file_download(name, data.getvalue(), save_immediately=True)

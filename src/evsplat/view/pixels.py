@@ -1,4 +1,4 @@
-"""Arithmetic on pictures: colour scales, divided views, what is laid over them.
+"""Arithmetic on pictures: divided views, what is laid over them.
 
 Pictures are float32 (H, W, 3), sRGB in [0, 1].
 """
@@ -7,41 +7,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
-from evsplat.capture.drawing import BRIGHTER, DARKER, TEST, TRAIN, font
+from evsplat.capture.drawing import BRIGHTER, DARKER, font
 from evsplat.view.camera import Box
 
-_LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _FULL_STRENGTH = 3
 """Events at one pixel that hide what is below them."""
-_SPECTRAL = np.array(
-    [
-        [158, 1, 66], [213, 62, 79], [244, 109, 67], [253, 174, 97], [254, 224, 139],
-        [230, 245, 152], [171, 221, 164], [102, 194, 165], [50, 136, 189], [94, 79, 162],
-    ],
-    np.float32,
-) / 255  # fmt: skip
-"""ColorBrewer's "Spectral": near is red, far is violet."""
-
 Picture = Float[np.ndarray, "H W 3"]
-
-
-def by_class(rgb: Picture, human: Float[np.ndarray, "H W"]) -> Picture:
-    """Person and scene in a colour each, over the picture's brightness."""
-    person, scene = (np.array(colour, np.float32) / 255 for colour in (TEST, TRAIN))
-    share = human[..., None].clip(0, 1)
-    brightness = 0.35 + 0.9 * (rgb @ _LUMA)[..., None]
-    return (brightness * (share * person + (1 - share) * scene)).clip(0, 1)
-
-
-def by_depth(depth: Float[np.ndarray, "H W"], near: float, far: float) -> Picture:
-    """Colours from near (red) to far (violet), even steps of 1 / depth; black where depth is 0."""
-    seen = depth > 0
-    nearness = 1 / np.where(seen, depth, 1).clip(near, far)
-    place = (1 / near - nearness) / max(1 / near - 1 / far, 1e-9) * (len(_SPECTRAL) - 1)
-    below = place.astype(int).clip(0, len(_SPECTRAL) - 2)
-    share = (place - below)[..., None].astype(np.float32)
-    colours = _SPECTRAL[below] * (1 - share) + _SPECTRAL[below + 1] * share
-    return colours * seen[..., None]
 
 
 def events_on(picture: Picture, counts: Float[np.ndarray, "h w"], box: Box) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import io
 import logging
+import signal
 import socket
 import threading
 from collections.abc import Sequence
@@ -16,15 +17,17 @@ from evsplat.body import load_body_track, up_axis
 from evsplat.capture import Capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.film import camera_at
-from evsplat.training.run import Run, load_run
+from evsplat.training.run import Run
+from evsplat.training.watching import is_training
 from evsplat.view.camera import forward, vertical_fov
 from evsplat.view.client import Client, orbit_of
 from evsplat.view.desk import Desk
-from evsplat.view.look import Look, Motion
+from evsplat.view.follow import Follower, load_newest, yield_to_training
 from evsplat.view.painter import Painter
 from evsplat.view.panel import SPEEDS, Panel
 from evsplat.view.subject import Subject
 from evsplat.view.timeline import Playback
+from evsplat.view.wish import Wish
 
 logger = logging.getLogger(__name__)
 
@@ -60,12 +63,23 @@ class Viewer:
         self.server.on_client_connect(self._enter)
         self.server.on_client_disconnect(self._leave)
         self.desk.start()
+        self._followers = [
+            Follower(subject, self.desk.do, lambda: bool(self._clients), self._reloaded)
+            for subject in self.subjects
+            if is_training(subject.run.path)
+        ]
 
     def close(self) -> None:
         """Stop serving."""
+        for follower in self._followers:
+            follower.stop()
         self.desk.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
+
+    def _reloaded(self) -> None:
+        self._told.content = _description(self.subjects)
+        self.desk.redraw()
 
     def _set_scene(self, up: np.ndarray) -> None:
         server, first = self.server, self.capture.frames[0]
@@ -85,27 +99,19 @@ class Viewer:
             brand_color=(38, 124, 160),
         )
         server.gui.main_panel.dock_right()
-        server.gui.add_markdown(_description(self.subjects))
+        self._told = server.gui.add_markdown(_description(self.subjects))
 
     async def _enter(self, handle: viser.ClientHandle) -> None:
         camera, frames = handle.camera, self.capture.frames
         times = [frame.mid_us for frame in frames if frame.camera == frames[0].camera]
-        look = Look(
+        wish = Wish(
             width=max(16, camera.image_width),
             height=max(16, camera.image_height),
             orbit=orbit_of(camera),
-            recording=None,
             time_us=min(times),
-            motion=Motion(None, ()),
-            parts="all",
-            colouring="colour",
-            compare=None,
-            layout="divided",
-            divider=0.5,
-            events_us=None,
         )
         playback = Playback(min(times), max(times), min(times), speed=SPEEDS["1/5"])
-        client = Client(handle, self.painter, self.desk, look, playback)
+        client = Client(handle, self.painter, self.desk, wish, playback)
         panel = Panel(client, self.pivot)
         panel.look_through(frames[0].camera)
         self._clients[handle.client_id] = client
@@ -119,7 +125,13 @@ class Viewer:
 
 def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> None:
     """Do the work of `evsplat.view.view_run`."""
-    runs = [load_run(path, device=device) for path in paths]
+    folders = [Path(path) for path in paths]
+    if any(map(is_training, folders)):
+        yield_to_training()
+        # The training's GPU, if it has one, is not to be shared.
+        device = "cpu" if device == "auto" else device
+        print("The run is being trained; the view follows it.", flush=True)
+    runs = [load_newest(path, device) for path in folders]
     captures = [loaded.capture.path.resolve() for loaded in runs]
     if len(set(captures)) > 1:
         raise DataError(
@@ -130,6 +142,8 @@ def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> Non
     if viewer.port != port:
         print(f"Port {port} is in use; taking {viewer.port}.", flush=True)
     print(f"view: {viewer.address}  (Ctrl-C stops)", flush=True)
+    # Closed by whoever started it as by Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

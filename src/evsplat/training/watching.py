@@ -1,0 +1,91 @@
+"""How a run that is being trained shows itself: snapshots of its model, while someone watches.
+
+The only thing that trainer and watcher share is the run folder. While it trains there is a file
+``.watch`` in it. A watcher changes that file's time every second or so; the trainer, seeing this,
+writes the model to ``snapshot.safetensors`` every few seconds. It never waits for a watcher.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import save_file
+from torch import Tensor
+
+from evsplat.files import atomic_path
+from evsplat.training.checkpoint import latest_checkpoint
+
+SNAPSHOT_SECONDS = 3.0
+"""Time between snapshots."""
+LARGEST_SHARE = 0.01
+"""Of the training's time that goes into snapshots; slow disks see them less often."""
+_WATCHED_SECONDS = 10.0
+"""A watcher that was not seen for so long has gone."""
+_LOOK_SECONDS = 1.0
+
+
+class Showcase:
+    """The trainer's side."""
+
+    def __init__(self, run: Path, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.sign, self.file = run / ".watch", run / "snapshot.safetensors"
+        self._clock = clock
+        self._looked = self._shown = -1e9
+        self._seen = 0
+        self._watched_until = -1e9
+        self._pause = SNAPSHOT_SECONDS
+
+    @contextmanager
+    def open(self) -> Iterator["Showcase"]:
+        """Be there to be watched; afterwards neither file is left."""
+        self.sign.touch()
+        self._seen = self.sign.stat().st_mtime_ns
+        try:
+            yield self
+        finally:
+            self.sign.unlink(missing_ok=True)
+            self.file.unlink(missing_ok=True)
+
+    def show(self, snapshot: Callable[[], tuple[dict[str, Tensor], dict[str, Any]]]) -> None:
+        """Write a snapshot if someone watches and the last one is old; else nothing."""
+        now = self._clock()
+        if now - self._looked < _LOOK_SECONDS:
+            return
+        self._looked = now
+        try:
+            seen = self.sign.stat().st_mtime_ns
+        except OSError:
+            return
+        if seen != self._seen:
+            # Only that the time changed counts: the watcher's clock may be another machine's.
+            self._seen, self._watched_until = seen, now + _WATCHED_SECONDS
+        if now >= self._watched_until or now - self._shown < self._pause:
+            return
+        tensors, state = snapshot()
+        with atomic_path(self.file) as temporary:
+            kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+            save_file(kept, temporary, metadata={"state": json.dumps(state)})
+        self._shown = self._clock()
+        self._pause = max(SNAPSHOT_SECONDS, (self._shown - now) / LARGEST_SHARE)
+
+
+def is_training(run: Path) -> bool:
+    """Whether a run is being trained, as far as its folder says."""
+    return (run / ".watch").exists()
+
+
+def watch(run: Path) -> None:
+    """Ask the trainer for snapshots; where that is not allowed its checkpoints have to do."""
+    with suppress(OSError):
+        os.utime(run / ".watch")
+
+
+def newest_state(run: Path) -> Path | None:
+    """The snapshot or checkpoint that was written last; None where there is none."""
+    found = [run / "snapshot.safetensors", latest_checkpoint(run / "checkpoints")]
+    written = [(path.stat().st_mtime_ns, path) for path in found if path and path.exists()]
+    return max(written)[1] if written else None
