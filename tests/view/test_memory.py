@@ -1,5 +1,7 @@
 """Networks that remember give the pictures of those that do not."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -68,6 +70,16 @@ def test_a_remembering_model_poses_and_colours_as_the_model_does(model):
                 assert torch.equal(found.means, expected.means)
                 assert torch.equal(found.channels, expected.channels)
     assert not any(isinstance(module, Remembering) for module in model.modules())
+
+
+@torch.no_grad()
+def test_a_model_in_its_first_steps_can_be_shown(model):
+    model, capture = model
+    model.config = dataclasses.replace(model.config, non_rigid_start=1_000)
+    camera, time_us = next(iter(capture.cameras.values())), capture.frames[0].mid_us
+    found = remembering(model).at([time_us], camera.center())
+    expected = model.at([time_us], camera.center())
+    assert torch.equal(found.moving().means, expected.moving().means)
 
 
 @torch.no_grad()

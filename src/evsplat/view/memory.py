@@ -29,6 +29,13 @@ class Remembering(nn.Module):
         self._asked: tuple[Any, ...] | None = None
         self._answer: Any = None
 
+    def __getattr__(self, name: str) -> Any:
+        """What is asked of the network itself, such as its sizes."""
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            return getattr(super().__getattr__("network"), name)
+
     def forward(self, *question: Any) -> Any:
         """The network's answer, new or remembered."""
         if self._asked is not None:
