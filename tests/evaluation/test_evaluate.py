@@ -191,6 +191,7 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
         reconstruction=TruthWithNoise(capture, 0.05),
         iteration=1200,
         train_seconds=61.5,
+        human_only=False,
         device="cpu",
         gaussians={"human": 10, "scene": 20},
     )

@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from evsplat.capture import load_capture
+from evsplat.cli.summary import summary_table
 from evsplat.config import override
 from evsplat.deform.drawing import draw
 from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation.evaluator import evaluate_run
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.avatar3dgs import AvatarConfig
+from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.config import weight_at
 from evsplat.objectives import perceptual
 from evsplat.training import load_run, train
@@ -208,6 +210,8 @@ def test_a_resumed_run_equals_the_uninterrupted_one(tiny_capture):
 
 
 def test_the_perceptual_term_has_the_name_of_what_ran(tiny_capture, monkeypatch, caplog):
+    caplog.set_level("INFO")
+
     class Distance:
         network = SimpleNamespace(min_side=2)
 
@@ -235,6 +239,7 @@ def test_a_run_is_trained_read_back_measured_and_drawn(tiny_capture, tmp_path):
     metrics = evaluate_run(out, device="cpu")
     assert metrics["method"] == "avatar3dgs" and metrics["gaussians"]["scene"] == 0
     run = load_run(out)
+    assert run.human_only
     frame = run.capture.test_frames[0]
     camera = run.capture.camera(frame)
     both = run.reconstruction.render(camera, [frame.mid_us])
@@ -243,3 +248,19 @@ def test_a_run_is_trained_read_back_measured_and_drawn(tiny_capture, tmp_path):
     assert torch.equal(both.rgb, alone.rgb) and bool((both.rgb > 0).any())
     assert not nothing.rgb.any() and not nothing.alpha.any()
     assert torch.allclose(both.human, both.alpha, atol=1e-6)
+
+    # Black is no background: the person is measured before the median of the frames as well.
+    median = run.capture.median_background()
+    composited = OnMedianBackground(run.reconstruction, run.capture)
+    picture = composited.render(camera, [frame.mid_us])
+    expected = both.rgb + (1 - both.alpha[..., None]) * median
+    assert torch.allclose(picture.rgb, expected, atol=1e-6)
+    assert torch.equal(picture.human, both.human) and bool((picture.alpha == 1).all())
+    scene = composited.render(camera, [frame.mid_us], parts="scene")
+    assert torch.equal(scene.rgb[0], median)
+    for protocol, regions in metrics["composited"].items():
+        black = metrics["protocols"][protocol]
+        assert regions["full"]["psnr"] > black["full"]["psnr"] + 3
+    table = (out / "metrics.md").read_text()
+    assert table.count("the same person on the median background") == 3
+    assert "on_median_background" in summary_table(metrics)

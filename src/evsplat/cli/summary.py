@@ -16,7 +16,13 @@ def print_summary(metrics: dict[str, Any], *, run: Path, report: Path) -> None:
 
 def summary_table(metrics: dict[str, Any]) -> str:
     """Format PSNR (dB) / SSIM of protocol 'standard' per region: the run and the trivial rows."""
-    rows = {metrics["method"]: metrics["protocols"]["standard"], **metrics["trivial"]}
+    from evsplat.evaluation.tables import composited
+
+    rows = {
+        metrics["method"]: metrics["protocols"]["standard"],
+        **composited(metrics),
+        **metrics["trivial"],
+    }
     width = max(map(len, rows))
     head = "".join(f"{region.replace('_', ' '):>18}" for region in _REGIONS)
     lines = [f"PSNR dB / SSIM on the test frames, protocol 'standard'\n{'':{width}}{head}"]

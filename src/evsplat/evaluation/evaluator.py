@@ -30,6 +30,7 @@ from evsplat.evaluation.protocols import (
 from evsplat.evaluation.tables import write_tables
 from evsplat.evaluation.tally import Tally, all_absent, without_reasons
 from evsplat.files import write_json
+from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
 from evsplat.render import choose_device
@@ -43,6 +44,8 @@ logger = logging.getLogger(__name__)
 TRIVIAL_ROWS = ("median_background", "nearest_frame")
 BLURRY_INPUT = "blurry_input"
 """The picture that the camera took at the test time: no method, for no method sees it."""
+COMPOSITED = "on_median_background"
+"""The person of a method without scene, before the median of the training frames."""
 
 Picture = Callable[[Frame], Float[Tensor, "H W 3"]]
 
@@ -56,12 +59,15 @@ def evaluate(
     lpips_weights: Path | str | None = None,
     device: torch.device | str = "cpu",
     alone: bool = False,
+    human_only: bool = False,
 ) -> dict[str, Any]:
     """Measure ``reconstruction`` on the test frames and novel views of ``capture``.
 
     Returns what metrics.json holds, less the facts of a run; pictures go to ``out_dir/pictures``.
     ``alone`` measures the test frames of the reconstruction and nothing else: no trivial rows, no
-    blurry truth, no novel views, no event maps; these keys are left out.
+    blurry truth, no novel views, no event maps; these keys are left out. ``human_only`` says that
+    it draws a person on black: it is measured once more before the median background ("composited",
+    by protocol), since against a full frame the black alone decides.
     Every figure is a mean over test frames of per-frame values. What cannot be measured is None,
     with the reason under "reasons" (a path of keys). Pictures are handled one by one, so that
     memory does not grow with the length of the recording.
@@ -70,7 +76,16 @@ def evaluate(
     networks, weights = _load_networks(lpips_weights, device)
     protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
     people = People(capture)
-    test = _TestFrames(capture, reconstruction, protocols, networks, people, out_dir, alone=alone)
+    test = _TestFrames(
+        capture,
+        reconstruction,
+        protocols,
+        networks,
+        people,
+        out_dir,
+        alone=alone,
+        human_only=human_only,
+    )
     for frame in tqdm(
         capture.test_frames, desc="test frames", unit="frame", leave=False, disable=None
     ):
@@ -113,6 +128,7 @@ def evaluate_run(
         out_dir=run.path,
         lpips_weights=lpips_weights,
         device=device,
+        human_only=run.human_only,
     )
     metrics = {
         "capture": measured.pop("capture"),
@@ -142,6 +158,7 @@ class _TestFrames:
         out_dir: Path,
         *,
         alone: bool = False,
+        human_only: bool = False,
     ) -> None:
         self._alone = alone
         self._capture = capture
@@ -150,11 +167,16 @@ class _TestFrames:
         self._people = people
         self._out_dir = out_dir
         self._method: Picture = partial(_render, capture, reconstruction)
+        self._human_only = human_only
         self._others: dict[str, Picture | Absent] = {}
+        if human_only:
+            self._others[COMPOSITED] = _picture_of(
+                partial(OnMedianBackground, reconstruction), capture
+            )
         if not alone:
-            self._others = {
-                "median_background": _trivial(MedianBackground, capture),
-                "nearest_frame": _trivial(NearestFrame, capture),
+            self._others |= {
+                "median_background": _picture_of(MedianBackground, capture),
+                "nearest_frame": _picture_of(NearestFrame, capture),
                 BLURRY_INPUT: capture.image,
             }
         rows = ("method", *self._others)
@@ -205,12 +227,18 @@ class _TestFrames:
             return means(self._tallies[name, protocol.name], path)
 
         compat = [protocol for protocol in self._protocols if protocol is not STANDARD]
-        method = {p.name: row("method", p, f"protocols.{p.name}") for p in self._protocols}
+        rows = {"protocols": "method"}
+        if self._human_only:
+            rows["composited"] = COMPOSITED
+        method = {
+            key: {p.name: row(name, p, f"{key}.{p.name}") for p in self._protocols}
+            for key, name in rows.items()
+        }
         frames = {"per_frame": self._per_frame, "reasons": reasons}
         if self._alone:
-            return {"protocols": method, **frames}
+            return {**method, **frames}
         return {
-            "protocols": method,
+            **method,
             "trivial": {name: row(name, STANDARD, f"trivial.{name}") for name in TRIVIAL_ROWS},
             BLURRY_INPUT: row(BLURRY_INPUT, STANDARD, BLURRY_INPUT),
             "compat_rows": {
@@ -306,9 +334,7 @@ def _render_view(
         return Absent(str(error))
 
 
-def _trivial(
-    kind: type[MedianBackground] | type[NearestFrame], capture: Capture
-) -> Picture | Absent:
+def _picture_of(kind: Callable[[Capture], Reconstruction], capture: Capture) -> Picture | Absent:
     try:
         return partial(_render, capture, kind(capture))
     except DataError as error:

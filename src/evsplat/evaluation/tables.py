@@ -8,6 +8,7 @@ from typing import Any
 from evsplat.files import write_text
 
 ROW_TITLES = {
+    "on_median_background": "the same person on the median background",
     "median_background": "median background (trivial)",
     "nearest_frame": "nearest training frame (trivial)",
     "blurry_input": "blurry input itself (no method sees it)",
@@ -88,7 +89,11 @@ def tables_of(metrics: dict[str, Any]) -> Iterator[Table]:
     """One table per protocol, `standard` first."""
     for protocol, ours in metrics["protocols"].items():
         if protocol == "standard":
-            others = {**metrics["trivial"], "blurry_input": metrics["blurry_input"]}
+            others = {
+                **composited(metrics),
+                **metrics["trivial"],
+                "blurry_input": metrics["blurry_input"],
+            }
         else:
             others = metrics["compat_rows"][protocol]
         rows = {metrics["method"]: ours, **others}
@@ -100,6 +105,13 @@ def tables_of(metrics: dict[str, Any]) -> Iterator[Table]:
         )
         note = metrics["protocol_notes"][protocol]
         yield Table(protocol, note, columns, rows, metrics["method"])
+
+
+def composited(metrics: dict[str, Any]) -> dict[str, Any]:
+    """The extra row of a method without scene under protocol standard; empty for all others."""
+    if "composited" not in metrics:
+        return {}
+    return {"on_median_background": metrics["composited"]["standard"]}
 
 
 def missing_networks(metrics: dict[str, Any]) -> list[str]:

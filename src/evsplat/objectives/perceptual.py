@@ -29,7 +29,7 @@ def choose_perceptual(
         try:
             return name, make_perceptual(name, device=device)
         except MissingWeights as error:
-            logger.warning("No perceptual term %s: %s", name, error)
+            logger.info("No perceptual term %s: %s", name, error)
     return "none", None
 
 

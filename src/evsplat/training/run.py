@@ -15,6 +15,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, load_capture
+from evsplat.capture.masked import MaskedCapture
 from evsplat.config import load_yaml, to_dict
 from evsplat.deform.drawing import draw, draw_depth, shadowed_scene
 from evsplat.deform.model import Model
@@ -177,6 +178,8 @@ class Run:
     device: str
     gaussians: dict[str, int]
     """Number of Gaussians, ``human`` and ``scene``."""
+    human_only: bool
+    """Whether the method learned nothing but the person and draws it on black."""
 
 
 def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
@@ -216,6 +219,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         capture=capture,
         reconstruction=GaussianReconstruction(method, composition.model),
         device=facts["device"],
+        human_only=isinstance(composition.capture, MaskedCapture),
         **_progress(composition.model, progress),
     )
 

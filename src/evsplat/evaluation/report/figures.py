@@ -43,7 +43,7 @@ def _cards(table: Table) -> str:
         trivial = [
             other
             for row in table.rows
-            if row not in (table.method, "blurry_input")
+            if row not in (table.method, "on_median_background", "blurry_input")
             and (other := table.value(row, column)) is not None
         ]
         gain = ""
