@@ -9,7 +9,7 @@ RUN ?= $(lastword $(sort $(wildcard runs/demo_*/*/*)))
 SET_UP_INPUTS := pyproject.toml constraints.txt CMakeLists.txt \
 	$(shell find native -type f 2>/dev/null | LC_ALL=C sort)
 
-.PHONY: demo view test lint types setup clean
+.PHONY: demo view test lint types docs setup clean
 
 demo: $(STAMP)
 	$(BIN)/evsplat demo $(DEMO_OPTIONS)
@@ -27,6 +27,10 @@ lint: $(STAMP)
 
 types: $(STAMP)
 	$(BIN)/mypy src
+
+# Warnings, such as a link that leads nowhere, are errors.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 setup: $(STAMP)
 
