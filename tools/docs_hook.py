@@ -1,18 +1,28 @@
-"""What the documentation takes from the program while it is built: the help of every command."""
+"""What the documentation takes from the repository as it is built: every command, examples."""
 
 import contextlib
 import io
 import os
+import re
+from pathlib import Path
 from typing import Any
 
 os.environ.update(COLUMNS="92", NO_COLOR="1", TERM="dumb")
 
-_MARKER = "<!-- every command -->"
+_ROOT = Path(__file__).parents[1]
+_COMMANDS = "<!-- every command -->"
+_FILE = re.compile(r"<!-- file (\S+) -->")
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put the commands where a page asks for them."""
-    return markdown.replace(_MARKER, _commands()) if _MARKER in markdown else markdown
+    """Put the commands and files where a page asks for them."""
+    if _COMMANDS in markdown:
+        markdown = markdown.replace(_COMMANDS, _commands())
+    return _FILE.sub(lambda found: _code(_ROOT / found.group(1)), markdown)
+
+
+def _code(path: Path) -> str:
+    return f"```python\n{path.read_text(encoding='utf-8').rstrip()}\n```"
 
 
 def _commands() -> str:
