@@ -17,13 +17,21 @@ _LOOK_SECONDS = 1.0
 def yield_to_training() -> None:
     """Let this process have only what processors have left, from now on.
 
-    Call it before there are threads, which inherit it.
+    Reading the run is better done before: it takes seconds once, and without end on what is left.
     """
-    if hasattr(os, "SCHED_IDLE"):
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-            return
-    os.nice(19)
+    if not hasattr(os, "SCHED_IDLE"):
+        os.nice(19)
+        return
+    for thread in threading.enumerate():
+        _leave_first(thread.native_id or 0)
+    with contextlib.suppress(OSError):  # the pools of threads that Python does not know
+        for entry in Path("/proc/self/task").iterdir():
+            _leave_first(int(entry.name))
+
+
+def _leave_first(thread: int) -> None:
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
 
 
 def load_newest(path: Path, device: str) -> Run:

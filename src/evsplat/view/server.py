@@ -126,8 +126,8 @@ class Viewer:
 def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> None:
     """Do the work of `evsplat.view.view_run`."""
     folders = [Path(path) for path in paths]
-    if any(map(is_training, folders)):
-        yield_to_training()
+    following = any(map(is_training, folders))
+    if following:
         # The training's GPU, if it has one, is not to be shared.
         device = "cpu" if device == "auto" else device
         print("The run is being trained; the view follows it.", flush=True)
@@ -139,6 +139,8 @@ def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> Non
             "compare runs of the same capture."
         )
     viewer = Viewer(runs, host=host, port=port)
+    if following:
+        yield_to_training()
     if viewer.port != port:
         print(f"Port {port} is in use; taking {viewer.port}.", flush=True)
     print(f"view: {viewer.address}  (Ctrl-C stops)", flush=True)
