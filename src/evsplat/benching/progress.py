@@ -28,7 +28,7 @@ class Progress:
         _say(
             f"suite {suite.name}: {_count(len(plan.sources), 'capture')} x "
             f"{_count(len(suite.rows), 'row')} x {_count(len(suite.seeds), 'seed')}; "
-            f"{len(todo)} cells to do, {done} done before; logs in {folder.path / 'logs'}"
+            f"{_count(len(todo), 'cell')} to do, {done} done before; logs in {folder.path / 'logs'}"
         )
         for sentence in plan.missing.values():
             _say(sentence)

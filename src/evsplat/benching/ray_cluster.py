@@ -39,8 +39,8 @@ class RayCluster:
         if started:
             self._connect(ray)
         # A worker that has run a cell ends, so that no cell inherits memory or threads of another.
-        task = ray.remote(max_calls=1, max_retries=RETRIES)(_cell_on_node).options(
-            num_cpus=self.cpus, num_gpus=self.gpus
+        task = ray.remote(num_cpus=self.cpus, num_gpus=self.gpus, max_calls=1, max_retries=RETRIES)(
+            _cell_on_node
         )
         running = {
             task.options(name=cell.id).remote(self.folder, cell, self.cpus, self.device): cell

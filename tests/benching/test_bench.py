@@ -1,0 +1,119 @@
+"""A bench that is killed, fails in places or is asked again ends with the same table."""
+
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from .helpers import MEDIAN, PAPER, records, write_suite
+
+
+def command(suite: Path, out: Path, *options: str) -> list[str]:
+    return [sys.executable, "-m", "evsplat", "bench", str(suite), "--out", str(out), *options]
+
+
+def test_killed_at_random_moments_and_started_again_it_ends_with_the_same_records(
+    tiny_capture, tmp_path
+):
+    rows = (PAPER | {"restore": "edi"},)
+    suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, *rows)
+    started = time.monotonic()
+    subprocess.run(command(suite, tmp_path / "whole", "--jobs", "1"), check=True)
+    took = time.monotonic() - started
+    seed = random.randrange(1 << 30)
+    moments = random.Random(seed)
+    for _ in range(2):
+        process = subprocess.Popen(command(suite, tmp_path / "killed", "--jobs", "1"))
+        try:
+            process.wait(moments.uniform(0.3, 0.9) * took)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    subprocess.run(command(suite, tmp_path / "killed", "--jobs", "1"), check=True)
+    assert records(tmp_path / "killed") == records(tmp_path / "whole"), f"seed {seed}"
+    hidden = [path.name for path in (tmp_path / "killed" / "captures").iterdir()]
+    assert hidden == ["one-edi"]
+
+
+def test_a_cell_that_died_goes_on_from_its_checkpoint(tiny_capture, tmp_path, monkeypatch):
+    suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, PAPER)
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    step, seen = Trainer.step, []
+
+    def counted(trainer, stop_at=None):
+        seen.append(trainer.clock.iteration)
+        if trainer.clock.iteration == stop_at:
+            raise SystemExit("as if the process was killed")
+        return step(trainer)
+
+    def run(out: str) -> Path:
+        folder = BenchFolder(tmp_path / out)
+        (cell,) = make_plan(read_suite(suite), folder).cells
+        run_cell(folder.path, cell, threads=1, device="cpu")
+        return folder.path
+
+    monkeypatch.setattr(Trainer, "step", counted)
+    whole = run("whole")
+    monkeypatch.setattr(Trainer, "step", lambda trainer: counted(trainer, stop_at=7))
+    with pytest.raises(SystemExit):
+        run("broken")
+    assert not (tmp_path / "broken" / "cells").exists()
+    seen.clear()
+    monkeypatch.setattr(Trainer, "step", counted)
+    assert records(run("broken")) == records(whole)
+    assert seen == list(range(7, 12))
+
+
+def test_failures_are_recorded_kept_and_tried_again_only_when_asked(tiny_capture, tmp_path, capsys):
+    rows = (MEDIAN, {"name": "new", "method": "of_tomorrow"})
+    suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, *rows)
+    out = tmp_path / "out"
+    assert main(["bench", str(suite), "--out", str(out), "--jobs", "1"]) == 0
+    assert "0 done before" in capsys.readouterr().err
+    first = records(out)
+    assert first["one/median/seed0.json"]["status"] == "done"
+    failed = first["one/new/seed0.json"]
+    assert failed["status"] == "failed" and "of_tomorrow: unknown" in failed["reason"]
+    for name in ("tables.md", "tables.tex", "index.html"):
+        assert "unknown; methods are" in (out / name).read_text()
+
+    assert main(["bench", str(suite), "--out", str(out)]) == 0
+    assert "0 cells to do, 2 done before" in capsys.readouterr().err
+    assert main(["bench", str(suite), "--out", str(out), "--retry"]) == 0
+    assert "1 cell to do, 1 done before" in capsys.readouterr().err
+    assert records(out) == first
+
+    write_suite(suite, {"one": tiny_capture("two")}, MEDIAN | {"method": "nearest_frame"})
+    assert main(["bench", str(suite), "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert "was made with method 'median_background', and 'nearest_frame' is asked for" in message
+    assert records(out) == first
+
+
+def test_two_benches_do_not_share_a_folder(tiny_capture, tmp_path):
+    suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, MEDIAN)
+    with (
+        exclusive(BenchFolder(tmp_path / "out").lock_of("bench")),
+        pytest.raises(ConfigError, match="another bench works in this folder"),
+    ):
+        ev.bench(suite, out=tmp_path / "out")
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tiny_capture, tmp_path):
+    suite = write_suite(
+        tmp_path / "suite.yaml", {"one": tiny_capture("one")}, PAPER, iterations=1_000_000
+    )
+    out = tmp_path / "out"
+    process = subprocess.Popen(command(suite, out), stderr=subprocess.PIPE, text=True)
+    log = out / "runs" / "one" / "paper" / "seed0" / "log.jsonl"
+    deadline = time.monotonic() + 120
+    while not (log.exists() and log.stat().st_size):
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "0 of 1 cells are done" in errors and f"evsplat bench {suite}" in errors
+    assert latest_checkpoint(log.parent / "checkpoints") is not None
+    assert "1 of 1 cells have not been run yet" in (out / "tables.md").read_text()
