@@ -53,11 +53,12 @@ class Progress:
     def ended(self, cell: Cell, record: dict[str, Any]) -> None:
         """Tell what came of a cell."""
         self._ended += 1
-        self._trained += cell.trains
         if record["status"] == FAILED:
             self._failed += 1
+            self._to_train -= cell.trains  # it took no time that tells of the others'
             what = f"failed: {record['reason'][:_REASON_LENGTH]}"
         else:
+            self._trained += cell.trains
             figures = record["protocols"]["standard"]
             psnr = [figures[region]["psnr"] for region in ("full", "person_crop", "person_mask")]
             shown = " / ".join("–" if value is None else f"{value:.2f}" for value in psnr)

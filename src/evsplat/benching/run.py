@@ -110,7 +110,7 @@ def bench(
 
 def _run(plan: Plan, todo: Sequence[Cell], folder: BenchFolder, executor: Executor) -> None:
     with (
-        _terminate_as_interrupt(),
+        _stopped_by_signals(),
         Progress(plan, todo, folder) as progress,
         closing(executor.run(todo)) as ends,  # type: ignore[type-var]
     ):
@@ -161,18 +161,20 @@ def _cores() -> int:
 
 
 @contextmanager
-def _terminate_as_interrupt() -> Iterator[None]:
-    """A batch system's SIGTERM saves and stops as Ctrl-C does."""
+def _stopped_by_signals() -> Iterator[None]:
+    """A batch system's SIGTERM saves and stops as Ctrl-C does, in the background too."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
+    numbers = (signal.SIGINT, signal.SIGTERM)
     try:
-        previous = signal.signal(signal.SIGTERM, interrupt)
+        previous = [signal.signal(number, interrupt) for number in numbers]
     except ValueError:  # not in the main thread
         yield
         return
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in zip(numbers, previous, strict=True):
+            signal.signal(number, handler)
