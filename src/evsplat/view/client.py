@@ -57,6 +57,8 @@ class Client:
         self._playback = playback
         self._snap: Snap | None = None
         self._resolution = Resolution()
+        self.gone = False
+        """Whether the browser has left, perhaps while its picture was drawn."""
         self.on_time: Callable[[int], None] = lambda time_us: None
         """Called by the drawing thread with the time that is shown."""
         handle.camera.on_update(self._camera_moved)
@@ -113,6 +115,8 @@ class Client:
             size = self._resolution.size(*size)
         started = time.perf_counter()
         picture = self.painter.paint(wish, size, rough=draft)
+        if self.gone:
+            return
         self.handle.scene.set_background_image(
             picture, format="jpeg", jpeg_quality=_DRAFT_QUALITY if draft else _SHARP_QUALITY
         )

@@ -120,6 +120,7 @@ class Viewer:
     async def _leave(self, handle: viser.ClientHandle) -> None:
         client = self._clients.pop(handle.client_id, None)
         if client is not None:
+            client.gone = True
             self.desk.leave(client)
 
 
