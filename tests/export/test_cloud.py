@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.capture import Camera
 from evsplat.errors import DataError
-from evsplat.export.cloud import cloud_of, joined, turn_up
+from evsplat.export.cloud import cloud_of, joined
 from evsplat.render import Splats, render
 
 from .clouds import covariances, random_cloud, random_splats
@@ -66,15 +66,6 @@ def test_turned_axes_turn_covariances_and_centres(seed):
     got = covariances(turned.quaternions, turned.scales)
     np.testing.assert_allclose(got, want, atol=2e-6)
     np.testing.assert_array_equal(turned.rgb, cloud.rgb)
-
-
-@pytest.mark.parametrize("up", [*np.eye(3), *-np.eye(3), [0.6, 0.0, 0.8]])
-@pytest.mark.parametrize("target", [(0, 1, 0), (0, 0, 1)])
-def test_up_becomes_up_by_a_rotation(up, target):
-    turn = turn_up(np.array(up), np.array(target, dtype=float))
-    np.testing.assert_allclose(turn @ up, target, atol=1e-6)
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
-    assert np.linalg.det(turn) == pytest.approx(1, abs=1e-6)
 
 
 def test_gaussians_that_are_not_drawn_are_left_out():

@@ -1,7 +1,6 @@
 """Which Gaussians of a run leave it, and what is said where that cannot be."""
 
 from ast import literal_eval
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,44 +8,12 @@ import torch
 
 from evsplat.body import up_axis
 from evsplat.body.track import load_body_track
-from evsplat.capture import load_capture
-from evsplat.config import override
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import export_run
-from evsplat.export import run as exporting
-from evsplat.methods import compose, method_config
 from evsplat.methods.trivial import NearestFrame
 from evsplat.render import render
-from evsplat.training.run import GaussianReconstruction
 
 from .clouds import read_ply
-
-SMALL = (
-    "human.count=150",
-    "deform.width=16",
-    "deform.colour_width=16",
-    "scene.backdrop_stride_px=4",
-)
-
-
-@pytest.fixture
-def reconstruction(tiny_capture):
-    capture = load_capture(tiny_capture())
-    config = method_config("paper", override({}, (*SMALL, "deform.shadow_lights=2")), where="test")
-    return capture, GaussianReconstruction("paper", compose(config, capture, 0, fit=False).model)
-
-
-@pytest.fixture
-def run(reconstruction, tmp_path, monkeypatch):
-    """A folder that `load_run` takes for a run of a small untrained model."""
-    capture, model = reconstruction
-    path = tmp_path / "run"
-    path.mkdir()
-    loaded = SimpleNamespace(
-        path=path, capture=capture, reconstruction=model, method="paper", iteration=7
-    )
-    monkeypatch.setattr(exporting, "load_run", lambda *_, **__: loaded)
-    return loaded
 
 
 @pytest.mark.parametrize("parts", ["all", "human", "scene"])
@@ -136,10 +103,20 @@ def test_up_turns_the_world_and_says_how(run, up, axis):
         ("ply", {"camera": "left"}, "only main, side"),
         ("spz", {"up": "z"}, "RUB"),
         ("gltf", {"up": "z"}, r"\+Y up"),
+        ("html", {"frame": "0000"}, "--time and --frame: format html has no use"),
+        ("avatar", {"up": "y"}, "--up: format avatar has no use"),
+        ("avatar", {"canonical": True}, "--canonical: format avatar has no use"),
+        ("ply", {"motion": "walk"}, "--motion: format ply has no use"),
+        ("ply", {"canonical": True, "time_s": 0.1}, "at no time"),
+        ("avatar", {"parts": "scene"}, "no skeleton"),
+        ("avatar", {"out": "a.ply"}, "ends in .html or is a folder"),
+        ("avatar", {"motion": "swimming"}, "neither a file nor one of"),
+        ("avatar", {"camera": "left"}, "only main, side"),
+        ("html", {"fps": 0.1}, "expected 1 to 120"),
     ],
 )
 def test_bad_options_are_one_sentence_and_write_nothing(run, kind, options, message):
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises((ConfigError, DataError), match=message):
         export_run(run.path, kind, **options)
     assert not list(run.path.iterdir())
 
@@ -148,4 +125,6 @@ def test_a_method_without_gaussians_says_so(run):
     run.reconstruction = NearestFrame(run.capture)
     with pytest.raises(DataError, match="hands over no Gaussians"):
         export_run(run.path, "ply")
+    with pytest.raises(DataError, match="no avatar to export"):
+        export_run(run.path, "avatar")
     assert not list(run.path.iterdir())

@@ -214,6 +214,10 @@ class HumanSceneModel(nn.Module):
             translation = translation + weights @ self.translation_residuals
         return rotations, self.track.body.canonical_to_world(rotations, translation)
 
+    def skinning_weights(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Weights of the bones at canonical points (metres)."""
+        return self.skinning(self.normalise(points))
+
     def at(
         self,
         times_us: Sequence[int],

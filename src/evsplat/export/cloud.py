@@ -96,22 +96,6 @@ def joined(clouds: list[SplatCloud]) -> SplatCloud:
     )
 
 
-def turn_up(
-    up: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
-) -> Float32[np.ndarray, "3 3"]:
-    """The shortest rotation that carries the unit vector ``up`` to ``target``."""
-    up, target = (np.asarray(v, dtype=np.float64) for v in (up, target))
-    cosine, axis = float(up @ target), np.cross(up, target)
-    if cosine < -1 + 1e-9:
-        side = np.eye(3)[np.abs(up).argmin()]
-        axis = np.cross(up, side)
-        axis /= np.linalg.norm(axis)
-        return _float32(2 * np.outer(axis, axis) - np.eye(3))
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return _float32(np.eye(3) + cross + cross @ cross / (1 + cosine))
-
-
 def _rows(cloud: SplatCloud, rows: np.ndarray) -> SplatCloud:
     names = SplatCloud.__dataclass_fields__
     return SplatCloud(**{name: getattr(cloud, name)[rows] for name in names})

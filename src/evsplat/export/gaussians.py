@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
-from evsplat.body import up_axis
-from evsplat.body.track import load_body_track
+from evsplat.body import Body, BodyTrack, up_axis
+from evsplat.body.retarget import smallest_rotation
 from evsplat.capture import Camera, Capture
 from evsplat.errors import ConfigError, DataError
-from evsplat.export.cloud import SplatCloud, cloud_of, joined, turn_up
+from evsplat.export.cloud import SplatCloud, cloud_of, joined
 from evsplat.export.formats import write_gltf, write_ply, write_splat, write_spz
 from evsplat.film import camera_at
 from evsplat.methods.reconstruction import Parts, SplatReconstruction
@@ -90,8 +89,19 @@ def cloud_at(source: SplatReconstruction, instant: Instant, parts: Parts) -> Spl
     return joined([cloud_of(layer) for layer in splats])
 
 
-def file_rotation(capture: Capture, kind: str, up: UpAxis | None) -> np.ndarray:
-    """Rotation (3, 3) from the capture's world to the axes of the file."""
+def facts_of(run: Run) -> dict[str, Any]:
+    """Where Gaussians come from, for formats that have room to say so."""
+    return {"capture": run.capture.name, "method": run.method, "iteration": run.iteration}
+
+
+def rest_track(body: Body) -> BodyTrack:
+    """The body in its rest pose, where the world is that of the rest pose."""
+    joints = len(body.parents)
+    return BodyTrack(body, np.zeros(1, np.int64), np.zeros((1, joints, 3)), np.zeros((1, 3)))
+
+
+def file_rotation(track: BodyTrack, kind: str, up: UpAxis | None) -> np.ndarray:
+    """Rotation (3, 3) from the world of ``track`` to the axes of the file."""
     if kind in ALWAYS_Y_UP:
         if up == "z":
             raise ConfigError(
@@ -100,10 +110,8 @@ def file_rotation(capture: Capture, kind: str, up: UpAxis | None) -> np.ndarray:
             )
         up = "y"
     if up is None:
-        return np.eye(3, dtype=np.float32)
-    with torch.no_grad():
-        world_up = up_axis(load_body_track(capture)).numpy()
-    return turn_up(world_up, np.array(_AXES[up]))
+        return np.eye(3)
+    return smallest_rotation(up_axis(track).double().numpy(), np.array(_AXES[up]))
 
 
 def write_file(

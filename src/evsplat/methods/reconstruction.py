@@ -9,6 +9,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.capture.camera import Camera
+from evsplat.gaussians.skinned import SkinnedGaussians
 from evsplat.render import Splats
 
 Parts = Literal["all", "human", "scene"]
@@ -77,5 +78,23 @@ class SplatReconstruction(Protocol):
 
         Channels are R, G, B (sRGB) and the semantic attribute (1 = person). Colours that depend on
         the direction are those seen from ``camera``.
+        """
+        ...
+
+
+@runtime_checkable
+class Bakeable(SplatReconstruction, Posable, Protocol):
+    """A reconstruction whose person can be had as Gaussians that follow a skeleton by weights."""
+
+    def at_rest(self, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
+        """The person's mean over ``views`` (times in us and their cameras), in canonical space."""
+        ...
+
+    def pose(
+        self, times_us: Sequence[int]
+    ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T J 4 4"]]:
+        """The recorded motion with what the method corrected of it.
+
+        Rotations of joints against their parents, and bone transforms canonical to world.
         """
         ...

@@ -17,11 +17,13 @@ from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, load_capture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.config import load_yaml, to_dict
+from evsplat.deform.at_rest import Skinned, mean_at_rest
 from evsplat.deform.drawing import draw, draw_depth, shadowed_scene
 from evsplat.deform.model import Model
 from evsplat.devices import hardware
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
+from evsplat.gaussians.skinned import SkinnedGaussians
 from evsplat.methods import TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
 from evsplat.render import Splats, choose_device, render
@@ -162,6 +164,24 @@ class GaussianReconstruction:
         if parts == "all":
             return [posed.moving(), shadowed_scene(self.model, posed)]
         return [posed.moving() if parts == "human" else posed.static()]
+
+    def at_rest(self, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
+        """The person's mean in canonical space; see `Bakeable`."""
+        return mean_at_rest(self._skinned(), views)
+
+    @torch.no_grad()
+    def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """The recorded motion as it was corrected; see `Bakeable`."""
+        rotations, bones = self._skinned().pose(list(times_us))
+        return rotations.cpu(), bones.cpu()
+
+    def _skinned(self) -> Skinned:
+        if isinstance(self.model, Skinned):
+            return self.model
+        raise DataError(
+            f"Method {self.name} does not tell the skinning weights of its Gaussians, so that its "
+            "person cannot be taken apart from its poses; export an instant or an html clip."
+        )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,151 @@
+// The page: what it holds, what the reader does.
+
+const find = (id) => document.getElementById(id);
+const avatar = JSON.parse(find("data").textContent);
+const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+const floats = (text) => new Float32Array(bytes(text).buffer);
+
+const skeleton = new Skeleton(avatar.skeleton);
+const clips = avatar.clips.map((clip) => ({
+  ...clip, rotations: floats(clip.rotations), transl: floats(clip.transl),
+  length: (clip.count - 1) / clip.rate_hz,
+}));
+const joints = skeleton.names.length;
+const state = { clip: 0, time: 0, playing: true, speed: 1, rest: false, scene: true, exact: null };
+
+const canvas = find("picture");
+const chosen = bytes(avatar.skin.bones), weights = bytes(avatar.skin.weights);
+const clouds = [{
+  count: avatar.person.count, values: floats(avatar.person.values),
+  bones: (row, k) => chosen[4 * row + k], weights: (row, k) => weights[4 * row + k] / 255,
+}];
+if (avatar.scene) {
+  clouds.push({
+    count: avatar.scene.count, values: floats(avatar.scene.values),
+    bones: () => joints, weights: (_, k) => (k ? 0 : 1),
+  });
+}
+
+let renderer = null;
+try {
+  renderer = new SplatRenderer(canvas, clouds, joints + 1);
+  find("message").remove();
+} catch (error) {
+  find("message").textContent = error.message;
+  throw error;
+}
+const orbit = new Orbit(canvas, avatar.up);
+
+function pose() {
+  const moving = skeleton.at(clips[state.clip], state.time);
+  if (!state.rest) return moving;
+  return { rotations: moving.rotations.map((turn, joint) => (joint ? [1, 0, 0, 0] : turn)), transl: moving.transl };
+}
+
+// Stand where the recording camera stood and look at the person's depth.
+function goHome() {
+  const rows = avatar.camera.world_to_camera.slice(0, 3);
+  const place = [0, 1, 2].map((c) => -rows.reduce((sum, row) => sum + row[c] * row[3], 0));
+  const forward = rows[2].slice(0, 3);
+  const root = V.plus(skeleton.rest[0], skeleton.at(clips[0], 0).transl);
+  orbit.stand(place, forward, Math.max(V.dot(forward, root) + rows[2][3], 0.5));
+}
+
+function draw() {
+  let { K, width, height, world_to_camera: view } = state.exact ?? avatar.camera;
+  let lens = [K[0][0], K[1][1], K[0][2], K[1][2]];
+  if (!state.exact) {
+    const ratio = Math.min(devicePixelRatio, 2);
+    // As much in height as the recording camera saw, whatever the width.
+    const focal = (K[1][1] * innerHeight * ratio) / height;
+    [width, height] = [Math.round(innerWidth * ratio), Math.round(innerHeight * ratio)];
+    lens = [focal, focal, width / 2, height / 2];
+    view = orbit.pose();
+  }
+  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  const columns = new Float32Array([0, 1, 2, 3].flatMap((c) => view.map((row) => row[c])));
+  const count = state.scene ? renderer.count : avatar.person.count;
+  const background = state.exact || (avatar.scene && state.scene) ? [0, 0, 0] : [0.08, 0.086, 0.1];
+  renderer.draw(skeleton.bones(pose()), columns, lens, background, count);
+}
+
+function seek(seconds) {
+  state.time = seconds;
+  find("time").value = seconds;
+  find("clock").textContent = `${seconds.toFixed(2)} s`;
+}
+
+function play(on) {
+  state.playing = on;
+  find("play").textContent = on ? "❚❚" : "▶";
+}
+
+function chooseClip(number) {
+  state.clip = number;
+  find("time").max = clips[number].length;
+  find("clip").value = number;
+  seek(0);
+}
+
+function showJoint() {
+  const angles = skeleton.offsets[find("joint").value];
+  for (const slider of document.querySelectorAll("[data-axis]")) {
+    slider.value = angles[slider.dataset.axis];
+    slider.nextElementSibling.textContent = `${angles[slider.dataset.axis]}°`;
+  }
+}
+
+function setOffset(joint, degrees) {
+  skeleton.offsets[joint] = [...degrees];
+  showJoint();
+}
+
+skeleton.names.forEach((name, joint) => find("joint").add(new Option(name, joint)));
+clips.forEach((clip, number) => find("clip").add(new Option(clip.name, number)));
+find("clip").hidden = clips.length < 2;
+find("scene-row").hidden = !avatar.scene;
+find("note").textContent = avatar.note ?? "";
+document.title = avatar.capture ? `${avatar.capture} – avatar` : "Avatar";
+find("play").onclick = () => play(!state.playing);
+find("time").oninput = (event) => { play(false); seek(Number(event.target.value)); };
+find("clip").onchange = (event) => chooseClip(Number(event.target.value));
+find("speed").onchange = (event) => { state.speed = Number(event.target.value); };
+find("home").onclick = goHome;
+find("joint").onchange = showJoint;
+find("reset-joint").onclick = () => setOffset(find("joint").value, [0, 0, 0]);
+find("reset-all").onclick = () => { skeleton.offsets.forEach((angles) => angles.fill(0)); showJoint(); };
+find("rest").onchange = (event) => { state.rest = event.target.checked; };
+find("scene").onchange = (event) => { state.scene = event.target.checked; };
+find("fold").onclick = (event) => {
+  const open = event.target.getAttribute("aria-expanded") === "true";
+  event.target.setAttribute("aria-expanded", String(!open));
+};
+for (const slider of document.querySelectorAll("[data-axis]")) {
+  slider.oninput = () => {
+    skeleton.offsets[find("joint").value][slider.dataset.axis] = Number(slider.value);
+    slider.nextElementSibling.textContent = `${slider.value}°`;
+  };
+}
+
+let before = performance.now();
+function frame(now) {
+  const passed = Math.min(Math.max(now - before, 0) / 1000, 0.1);
+  before = now;
+  if (state.playing) seek((state.time + passed * state.speed) % Math.max(clips[state.clip].length, 1e-3));
+  draw();
+  requestAnimationFrame(frame);
+}
+
+chooseClip(0);
+goHome();
+play(true);
+requestAnimationFrame(frame);
+
+// For scripts: drive the page, and draw at once exactly what a calibrated camera sees.
+globalThis.avatarPlayer = {
+  names: skeleton.names, clips: clips.map(({ name, length }) => ({ name, length })),
+  seek: (seconds) => { play(false); seek(seconds); },
+  play, setOffset, chooseClip, orbit, draw,
+  showScene: (on) => { state.scene = on; },
+  look: (camera) => { state.exact = camera; draw(); },
+};

@@ -1,0 +1,250 @@
+// Draws skinned Gaussians with WebGL 2 by the rules of evsplat's rasteriser: EWA projection with a
+// low-pass of 0.3 px², contributions from 1/255 on, back to front by depth.
+
+const TEXELS = 6; // of a Gaussian: centre and opacity, covariance (2), colour, weights, bones
+const WIDTH = 1020; // of its texture, a multiple of TEXELS
+const MIN_ALPHA = 1 / 255;
+
+const VERTEX = `#version 300 es
+precision highp float;
+precision highp int;
+uniform highp sampler2D gaussians, bones;
+uniform mat4 view;         // world to camera: x right, y down, z forward
+uniform vec4 lens;         // focal lengths and principal point, pixels
+uniform vec2 size;         // of the picture, pixels
+in uint index;
+out vec2 offset;           // pixels from the centre
+flat out vec3 conic;
+flat out vec4 colour;
+
+vec4 texel(int k) {
+  int at = int(index) * ${TEXELS} + k;
+  return texelFetch(gaussians, ivec2(at % ${WIDTH}, at / ${WIDTH}), 0);
+}
+
+void main() {
+  gl_Position = vec4(0, 0, 2, 1);
+  vec4 a = texel(0), b = texel(1), c = texel(2), weights = texel(4), chosen = texel(5);
+  mat3x4 blend = mat3x4(0);
+  for (int k = 0; k < 4; k++) {
+    int bone = int(chosen[k]);
+    blend += weights[k] * mat3x4(
+      texelFetch(bones, ivec2(0, bone), 0), texelFetch(bones, ivec2(1, bone), 0),
+      texelFetch(bones, ivec2(2, bone), 0));
+  }
+  vec3 world = vec4(a.xyz, 1) * blend;
+  vec3 local = (view * vec4(world, 1)).xyz;
+  if (local.z < 0.01 || a.w < ${MIN_ALPHA}) return;
+
+  vec2 focal = lens.xy, middle = lens.zw, tangent = local.xy / local.z;
+  vec2 center = focal * tangent + middle;
+  // The Jacobian is taken inside the field of view, enlarged by 30 % of its half width.
+  vec2 margin = 0.15 * size / focal;
+  tangent = clamp(tangent, -middle / focal - margin, (size - middle) / focal + margin);
+  mat3 linear = mat3(view) * transpose(mat3(blend[0].xyz, blend[1].xyz, blend[2].xyz));
+  mat3 covariance = mat3(b.x, b.y, b.z, b.y, b.w, c.x, b.z, c.x, c.y);
+  mat3 seen = linear * covariance * transpose(linear);
+  vec3 right = vec3(focal.x, 0, -focal.x * tangent.x) / local.z;
+  vec3 down = vec3(0, focal.y, -focal.y * tangent.y) / local.z;
+  float xx = dot(right, seen * right) + 0.3, xy = dot(right, seen * down);
+  float yy = dot(down, seen * down) + 0.3, determinant = xx * yy - xy * xy;
+  if (determinant <= 0.0) return;
+
+  conic = vec3(yy, -xy, xx) / determinant;
+  colour = vec4(texel(3).rgb, a.w);
+  float extent = sqrt(2.0 * log(a.w / ${MIN_ALPHA}));
+  vec2 reach = ceil(extent * sqrt(vec2(xx, yy)));
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  offset = corner * reach;
+  vec2 place = (center + offset) / size * 2.0 - 1.0;
+  gl_Position = vec4(place.x, -place.y, 0, 1);
+}`;
+
+const FRAGMENT = `#version 300 es
+precision highp float;
+in vec2 offset;
+flat in vec3 conic;
+flat in vec4 colour;
+out vec4 result;
+void main() {
+  float distance = dot(conic * vec3(1, 2, 1), vec3(offset.x * offset.x, offset.x * offset.y, offset.y * offset.y));
+  float alpha = min(0.999, colour.a * exp(-0.5 * distance));
+  if (alpha < ${MIN_ALPHA}) discard;
+  result = vec4(colour.rgb * alpha, alpha);
+}`;
+
+const COPY_VERTEX = `#version 300 es
+void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0, 1); }`;
+const COPY_FRAGMENT = `#version 300 es
+precision highp float;
+uniform highp sampler2D picture;
+out vec4 result;
+void main() { result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1); }`;
+
+class SplatRenderer {
+  // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with bones and weights.
+  constructor(canvas, clouds, boneCount) {
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
+    if (!gl) throw new Error("This browser has no WebGL 2, which drawing Gaussians needs.");
+    this.gl = gl;
+    this.canvas = canvas;
+    this.boneCount = boneCount;
+    // Sixteen bits per channel where the device can blend them: eight add a rounding per Gaussian.
+    this.fine = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    this.count = clouds.reduce((sum, cloud) => sum + cloud.count, 0);
+    this.program = program(gl, VERTEX, FRAGMENT);
+    this.copy = program(gl, COPY_VERTEX, COPY_FRAGMENT);
+    this.gaussians = this.pack(clouds);
+    this.bones = texture(gl);
+    this.order = new Uint32Array(this.count);
+    this.depths = new Float32Array(this.count);
+    this.buffer = gl.createBuffer();
+    this.array = gl.createVertexArray();
+    gl.bindVertexArray(this.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.buffer);
+    const index = gl.getAttribLocation(this.program, "index");
+    gl.enableVertexAttribArray(index);
+    gl.vertexAttribIPointer(index, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(index, 1);
+    gl.bindVertexArray(null);
+    this.target = null;
+  }
+
+  pack(clouds) {
+    const gl = this.gl, rows = Math.ceil((this.count * TEXELS) / WIDTH);
+    const texels = new Float32Array(4 * WIDTH * rows);
+    this.centers = new Float32Array(3 * this.count);
+    this.skin = { bones: new Uint16Array(4 * this.count), weights: new Float32Array(4 * this.count) };
+    let k = 0;
+    for (const { count, values, bones, weights } of clouds) {
+      for (let row = 0; row < count; row++, k++) {
+        const v = values.subarray(14 * row, 14 * row + 14), at = 4 * TEXELS * k;
+        const c = covarianceOf(v.subarray(3, 7), v.subarray(7, 10));
+        texels.set([v[0], v[1], v[2], v[10], ...c, 0, 0, v[11], v[12], v[13], 0], at);
+        for (let j = 0; j < 4; j++) {
+          texels[at + 16 + j] = this.skin.weights[4 * k + j] = weights(row, j);
+          texels[at + 20 + j] = this.skin.bones[4 * k + j] = bones(row, j);
+        }
+        this.centers.set([v[0], v[1], v[2]], 3 * k);
+      }
+    }
+    const made = texture(gl);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, WIDTH, rows, 0, gl.RGBA, gl.FLOAT, texels);
+    return made;
+  }
+
+  // Far to near, by a counting sort of 16 bits of depth.
+  sort(bones, view, count) {
+    const depthOf = new Float32Array(4 * this.boneCount);
+    for (let bone = 0; bone < this.boneCount; bone++) {
+      for (let column = 0; column < 4; column++) {
+        let sum = column === 3 ? view[14] : 0;
+        for (let row = 0; row < 3; row++) sum += view[4 * row + 2] * bones[12 * bone + 4 * row + column];
+        depthOf[4 * bone + column] = sum;
+      }
+    }
+    const { centers, depths, order } = this, { bones: chosen, weights } = this.skin;
+    let low = Infinity, high = -Infinity;
+    for (let k = 0; k < count; k++) {
+      let depth = 0;
+      for (let j = 4 * k; j < 4 * k + 4; j++) {
+        if (!weights[j]) continue;
+        const d = 4 * chosen[j];
+        depth += weights[j] * (depthOf[d] * centers[3 * k] + depthOf[d + 1] * centers[3 * k + 1]
+          + depthOf[d + 2] * centers[3 * k + 2] + depthOf[d + 3]);
+      }
+      depths[k] = depth;
+      if (depth < low) low = depth;
+      if (depth > high) high = depth;
+    }
+    const scale = 65535 / Math.max(high - low, 1e-9), starts = new Uint32Array(65537);
+    const bucket = (k) => 65535 - Math.round((depths[k] - low) * scale);
+    for (let k = 0; k < count; k++) starts[bucket(k) + 1]++;
+    for (let b = 1; b < 65537; b++) starts[b] += starts[b - 1];
+    for (let k = 0; k < count; k++) order[starts[bucket(k)]++] = k;
+  }
+
+  // bones: rows of 3x4 matrices; view: 4x4 by columns; lens: fx, fy, cx, cy in pixels; count: how
+  // many Gaussians from the start.
+  draw(bones, view, lens, background, count = this.count) {
+    const gl = this.gl, { width, height } = this.canvas;
+    this.sort(bones, view, count);
+    gl.bindTexture(gl.TEXTURE_2D, this.bones);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 3, this.boneCount, 0, gl.RGBA, gl.FLOAT, bones);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.fine ? this.framebuffer(width, height) : null);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(...background, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.useProgram(this.program);
+    bind(gl, this.program, "gaussians", 0, this.gaussians);
+    bind(gl, this.program, "bones", 1, this.bones);
+    gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "view"), false, view);
+    gl.uniform4fv(gl.getUniformLocation(this.program, "lens"), lens);
+    gl.uniform2f(gl.getUniformLocation(this.program, "size"), width, height);
+    gl.bindVertexArray(this.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, this.order.subarray(0, count), gl.DYNAMIC_DRAW);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+    gl.bindVertexArray(null);
+    if (!this.fine) return;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.disable(gl.BLEND);
+    gl.useProgram(this.copy);
+    bind(gl, this.copy, "picture", 0, this.target.picture);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  framebuffer(width, height) {
+    const gl = this.gl, { target } = this;
+    if (target && target.width === width && target.height === height) return target.buffer;
+    if (target) { gl.deleteTexture(target.picture); gl.deleteFramebuffer(target.buffer); }
+    const picture = texture(gl), buffer = gl.createFramebuffer();
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
+    this.target = { width, height, picture, buffer };
+    return buffer;
+  }
+}
+
+// xx, xy, xz, yy, yz, zz of R S S R^T.
+function covarianceOf([w, x, y, z], scales) {
+  const rows = [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+  const product = (a, b) => rows[a].reduce((sum, v, k) => sum + v * rows[b][k] * scales[k] ** 2, 0);
+  return [product(0, 0), product(0, 1), product(0, 2), product(1, 1), product(1, 2), product(2, 2)];
+}
+
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(made, shader);
+  }
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
+  return made;
+}
+
+function texture(gl) {
+  const made = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+  for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+  return made;
+}
+
+function bind(gl, used, name, unit, bound) {
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  gl.bindTexture(gl.TEXTURE_2D, bound);
+  gl.uniform1i(gl.getUniformLocation(used, name), unit);
+  gl.activeTexture(gl.TEXTURE0);
+}

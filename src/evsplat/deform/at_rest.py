@@ -1,0 +1,73 @@
+"""The mean of a person over recorded times, in canonical space, moved by bones alone."""
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from evsplat.body import BodyTrack
+from evsplat.capture import Camera
+from evsplat.gaussians import PosedGaussians
+from evsplat.gaussians.skinned import SkinnedGaussians
+
+
+@runtime_checkable
+class Skinned(Protocol):
+    """A model whose person follows bones by weights that it can tell."""
+
+    track: BodyTrack
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+
+    def at(
+        self, times_us: Sequence[int], camera_center: Float[Tensor, "3"], *, hard_semantics: bool
+    ) -> PosedGaussians:
+        """All Gaussians in world space; see `evsplat.deform.model.Model`."""
+        ...
+
+    def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4)."""
+        ...
+
+    def skinning_weights(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Weights of the bones at canonical points (metres); rows sum to 1."""
+        ...
+
+
+@torch.no_grad()
+def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
+    """What skinning can show of a model: its mean over ``views``, instants (us) and their cameras.
+
+    Centre, log-scales, rotation and colour are the means of what the model shows at those instants
+    with the skinning undone. That drops less than switching the pose-dependent part off: what all
+    poses have in common stays. Weights are those at the mean centre.
+    """
+    sums: list[Tensor] = []
+    first: Tensor | None = None
+    for time_us, camera in views:
+        posed = model.at([time_us], camera.center().to(model.device), hard_semantics=True)
+        person = posed.human
+        transforms = person.transforms[0].double()
+        offset = person.means[0].double() - transforms[:, :3, 3]
+        centers = torch.linalg.solve(transforms[:, :3, :3], offset)
+        quaternions = normalize(person.quaternions[0].double(), dim=-1)
+        first = quaternions if first is None else first
+        # q and -q are one rotation: only those on one side have a mean.
+        quaternions = quaternions * torch.where((quaternions * first).sum(-1) < 0, -1, 1)[:, None]
+        values = [centers, person.scales[0].double().log(), quaternions, person.rgb[0].double()]
+        sums = [a + b for a, b in zip(sums, values, strict=True)] if sums else values
+    centers, log_scales, quaternions, rgb = ((total / len(views)).float().cpu() for total in sums)
+    return SkinnedGaussians(
+        body=model.track.body.to("cpu"),
+        means=centers,
+        quaternions=normalize(quaternions, dim=-1),
+        scales=log_scales.exp(),
+        opacities=posed.human_opacities.cpu(),
+        rgb=rgb,
+        weights=model.skinning_weights(centers.to(model.device)).cpu(),
+    )

@@ -1,0 +1,146 @@
+"""The avatar as a folder or one page: Gaussians, skin weights, skeleton, motions, player."""
+
+import base64
+import json
+import re
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from evsplat.body import BodyTrack, up_axis
+from evsplat.capture import Camera
+from evsplat.errors import DataError
+from evsplat.export.avatar.figure import Clip, Figure, identity_bones
+from evsplat.export.cloud import SplatCloud, cloud_of
+from evsplat.export.formats import write_ply
+from evsplat.files import new_folder, write_json, write_text
+
+FORMAT, VERSION = "evsplat-avatar", 1
+_PLAYER = files("evsplat") / "data" / "player"
+_SCRIPTS = ("splats.js", "skeleton.js", "orbit.js", "player.js")
+_README = """An avatar made by evsplat.
+
+index.html     opens in any browser with WebGL 2, without a network: plays, orbits, poses
+avatar.json    skeleton, motions and skin weights; the format is in evsplat's docs/export.md
+gaussians.ply  the person at rest (canonical pose), 3D Gaussian splatting layout, metres
+scene.ply      what stands around, in the axes of the capture (where it was asked for)
+"""
+
+
+def write_avatar(
+    path: Path | str,
+    figure: Figure,
+    clips: Sequence[Clip],
+    *,
+    track: BodyTrack,
+    camera: Camera,
+    scene: SplatCloud | None,
+    facts: Mapping[str, Any],
+) -> Path:
+    """Write one self-contained page where ``path`` ends in .html, else a folder around it.
+
+    ``camera`` is where the page starts to look from; ``scene`` stands around the person if given;
+    ``facts`` are shown (``note``) and kept. Returns the page.
+    """
+    path = Path(path)
+    document = avatar_document(figure, clips, track=track, camera=camera, facts=facts)
+    cloud = rest_cloud(figure)
+    page = _page(document, cloud, scene)
+    if path.suffix.lower() in (".html", ".htm"):
+        write_text(path, page)
+        return path
+    with new_folder(path) as folder:
+        write_text(folder / "index.html", page)
+        write_json(folder / "avatar.json", document)
+        comments = ["written by evsplat", "unit: metre"]
+        write_ply(folder / "gaussians.ply", cloud, comments=comments)
+        if scene is not None:
+            write_ply(folder / "scene.ply", scene, comments=comments)
+        write_text(folder / "README.txt", _README)
+    return path / "index.html"
+
+
+def rest_cloud(figure: Figure) -> SplatCloud:
+    """The person in the canonical pose."""
+    return cloud_of(figure.gaussians.posed(identity_bones(figure.gaussians)))
+
+
+def avatar_document(
+    figure: Figure,
+    clips: Sequence[Clip],
+    *,
+    track: BodyTrack,
+    camera: Camera,
+    facts: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What avatar.json holds; arrays are base64 of little-endian numbers, rows after rows."""
+    body = figure.gaussians.body
+    inverse = torch.linalg.inv(body.canonical_bone_transforms().double())
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        **facts,
+        "unit": "metre",
+        "up": [float(v) for v in up_axis(track)],
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            "K": camera.K.tolist(),
+            "world_to_camera": camera.world_to_camera.tolist(),
+        },
+        "skeleton": {
+            "names": list(body.joint_names),
+            "parents": body.parents.tolist(),
+            "rest": body.rest_joints.tolist(),
+            "rest_from_canonical": [row.tolist() for row in inverse.float()],
+        },
+        "skin": {
+            "count": len(figure.bones),
+            "bones": _base64(figure.bones, "u1"),
+            "weights": _base64(figure.weights, "u1"),
+        },
+        "clips": [
+            {
+                "name": clip.name,
+                "rate_hz": clip.rate_hz,
+                "count": len(clip.rotations),
+                "rotations": _base64(clip.rotations, "<f4"),
+                "transl": _base64(clip.transl, "<f4"),
+            }
+            for clip in clips
+        ],
+    }
+
+
+def _page(document: Mapping[str, Any], person: SplatCloud, scene: SplatCloud | None) -> str:
+    """Player and data in one page."""
+    data = {**document, "person": _cloud(person), "scene": None if scene is None else _cloud(scene)}
+    if len(person) != document["skin"]["count"]:
+        raise DataError("Some Gaussians of the person are not finite; train the run longer.")
+    page = _asset("page.html")
+    # A closing tag inside a script would end it.
+    parts = {
+        "STYLE": _asset("player.css"),
+        # A closing tag inside a script would end it.
+        "DATA": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"),
+        "SCRIPT": "\n".join(_asset(name) for name in _SCRIPTS),
+    }
+    return re.sub(r"/\*(STYLE|DATA|SCRIPT)\*/", lambda match: parts[match[1]], page)
+
+
+def _asset(name: str) -> str:
+    return (_PLAYER / name).read_text(encoding="utf-8")
+
+
+def _cloud(cloud: SplatCloud) -> dict[str, Any]:
+    """14 float32 per Gaussian: centre, rotation (w, x, y, z), scales, opacity, RGB."""
+    columns = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities[:, None], cloud.rgb)
+    return {"count": len(cloud), "values": _base64(np.concatenate(columns, axis=1), "<f4")}
+
+
+def _base64(values: np.ndarray, kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")

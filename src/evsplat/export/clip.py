@@ -1,0 +1,99 @@
+"""``export html``: the recording as a page of moving Gaussians, played by viser offline."""
+
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from evsplat.body import BodyTrack, load_body_track, up_axis
+from evsplat.body.rotations import quaternion_to_matrix
+from evsplat.capture import Camera
+from evsplat.errors import ConfigError
+from evsplat.export.cloud import SplatCloud, cloud_of
+from evsplat.export.gaussians import instant_of, splat_source
+from evsplat.files import write_text
+from evsplat.methods.reconstruction import Parts
+from evsplat.training.run import Run
+
+logger = logging.getLogger(__name__)
+
+_ENLARGED = 32.0
+"""viser keeps covariances in 16 bits, too few for square metres of millimetre-sized Gaussians: they
+are stored 32 times as large, and the scene is shrunk."""
+
+
+def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: float) -> Path:
+    """Write the whole recording as a page that plays from disk, and return it.
+
+    Colours are those that the camera of ``instant_of`` sees. The scene is stored once, with the
+    shadow that it has in the middle of the recording.
+    """
+    if not 1 <= fps <= 120:
+        raise ConfigError(f"--fps {fps:g}: expected 1 to 120 pictures per second.")
+    try:
+        import viser
+    except ImportError:
+        raise ConfigError(
+            "An html clip needs the package viser; get it with: pip install 'evsplat[view]'."
+        ) from None
+    capture, source = run.capture, splat_source(run)
+    track = load_body_track(capture)
+    middle = instant_of(capture, time_s=None, frame=None, camera=camera)
+    mids = sorted(frame.mid_us for frame in capture.frames)
+    count = 1 + int((mids[-1] - mids[0]) * fps / 1e6)
+    times = [mids[0] + round(k * 1e6 / fps) for k in range(count)]
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        server.gui.configure_theme(control_layout="collapsible", dark_mode=True)
+        server.scene.set_up_direction(tuple(up_axis(track).tolist()))
+        view = middle.camera
+        ahead = view.center() + view.world_to_camera[2, :3] * _distance(track, view, middle.time_us)
+        server.initial_camera.position = tuple(view.center().tolist())
+        server.initial_camera.look_at = tuple(ahead.tolist())
+        server.initial_camera.fov = 2 * math.atan(view.height / 2 / float(view.K[1, 1]))
+        if parts != "human":
+            layers = source.splats(middle.camera, [middle.time_us], parts=parts)
+            _show(server, "/scene", cloud_of(layers[-1]))
+        serializer = server.get_scene_serializer()
+        handle = None
+        for time in tqdm(times if parts != "scene" else times[:1], desc="clip", unit="picture"):
+            if parts != "scene":
+                layers = source.splats(middle.camera, [time], parts="human")
+                handle = _show(server, "/person", cloud_of(layers[0]), handle)
+            serializer.insert_sleep(1 / fps)
+        page = serializer.as_html(dark_mode=True)
+    finally:
+        server.stop()
+    write_text(path, page)
+    logger.info(
+        "%d pictures, %g per second, colours as camera %s sees them; metres, axes of the capture.",
+        len(times),
+        fps,
+        middle.camera_name,
+    )
+    return path
+
+
+def _distance(track: BodyTrack, camera: Camera, time_us: int) -> float:
+    """Depth of the person in the camera, metres: what the reader orbits about."""
+    return float(camera.project(track.vertices(time_us))[1].mean())
+
+
+def _show(server: Any, name: str, cloud: SplatCloud, handle: Any = None) -> Any:
+    """Put a cloud into the scene, or in the place of the one that ``handle`` shows."""
+    quaternions = torch.from_numpy(cloud.quaternions)
+    axes = (quaternion_to_matrix(quaternions) * torch.from_numpy(cloud.scales)[:, None]).numpy()
+    axes *= _ENLARGED
+    values = {
+        "centers": cloud.means * _ENLARGED,
+        "covariances": axes @ axes.transpose(0, 2, 1),
+        "rgbs": cloud.rgb.clip(0, 1),
+        "opacities": cloud.opacities[:, None],
+    }
+    if handle is None:
+        return server.scene.add_gaussian_splats(name, **values, scale=1 / _ENLARGED)
+    handle.set_gaussians(**values)
+    return handle

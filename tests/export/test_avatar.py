@@ -1,0 +1,274 @@
+"""The avatar moves as the model does, up to what it says that it drops."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from importlib.resources import files
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from evsplat.body import load_body_track
+from evsplat.deform.at_rest import mean_at_rest
+from evsplat.errors import DataError
+from evsplat.export import export_run
+from evsplat.export.avatar.figure import clip_of, figure_of, recorded_clip
+from evsplat.export.avatar.loss import measure_loss
+from evsplat.export.avatar.package import avatar_document
+from evsplat.export.cloud import cloud_of
+from evsplat.gaussians import PosedHuman
+from evsplat.gaussians.skinned import SkinnedGaussians
+from evsplat.methods.reconstruction import Bakeable
+
+from ..body.helpers import reference_bones
+from .clouds import covariances, read_ply
+
+SEEDS = pytest.mark.parametrize("seed", [0, 1, 2])
+
+
+def _views(capture):
+    return [(frame.mid_us, capture.camera(frame)) for frame in capture.train_frames]
+
+
+def _skinned(track, count: int, seed: int) -> SkinnedGaussians:
+    rng = np.random.default_rng(seed)
+    joints = len(track.body.parents)
+    weights = rng.random((count, joints)) ** 3
+    weights /= weights.sum(1, keepdims=True)
+
+    def tensor(values) -> torch.Tensor:
+        return torch.from_numpy(np.float32(values))
+
+    return SkinnedGaussians(
+        track.body,
+        tensor(rng.normal(size=(count, 3))),
+        torch.nn.functional.normalize(tensor(rng.normal(size=(count, 4))), dim=-1),
+        tensor(np.exp(rng.uniform(-6, -3, (count, 3)))),
+        tensor(rng.random(count)),
+        tensor(rng.random((count, 3))),
+        tensor(weights),
+    )
+
+
+@SEEDS
+def test_mean_at_rest_undoes_any_skinning(seed):
+    """Closed form: one rest person under random affine maps comes back as it was."""
+    rng = np.random.default_rng(seed)
+    count, times = 40, 5
+    rest, scales = rng.normal(size=(count, 3)), np.exp(rng.uniform(-6, -3, (count, 3)))
+    quaternions = rng.normal(size=(count, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    colours = rng.random((times, count, 3))
+
+    def at(times_us, center, *, hard_semantics):
+        assert hard_semantics
+        maps = np.tile(np.eye(4), (count, 1, 1))
+        maps[:, :3] += 0.3 * rng.normal(size=(count, 3, 4))
+        world = np.einsum("nij,nj->ni", maps[:, :3, :3], rest) + maps[:, :3, 3]
+        signs = rng.choice([-1.0, 1.0], size=(count, 1))
+        given = (world, signs * quaternions, scales, colours[times_us[0]], maps)
+        human = PosedHuman(*(torch.from_numpy(values)[None] for values in given))
+        return SimpleNamespace(human=human, human_opacities=torch.ones(count))
+
+    seen = []
+    model = SimpleNamespace(
+        track=SimpleNamespace(body=SimpleNamespace(to=lambda device: None)),
+        device=torch.device("cpu"),
+        at=at,
+        skinning_weights=lambda points: seen.append(points) or torch.ones(count, 1),
+    )
+    camera = SimpleNamespace(center=lambda: torch.zeros(3))
+    mean = mean_at_rest(model, [(time, camera) for time in range(times)])
+    np.testing.assert_allclose(mean.means, rest, atol=1e-5)
+    np.testing.assert_allclose(mean.scales, scales, rtol=1e-5)
+    np.testing.assert_allclose(np.abs((mean.quaternions * quaternions).sum(1)), 1, atol=1e-6)
+    np.testing.assert_allclose(mean.rgb, colours.mean(0), atol=1e-6)
+    assert torch.equal(seen[0], mean.means)
+
+
+def test_a_model_without_non_rigid_motion_is_its_avatar(reconstruction):
+    capture, source = reconstruction
+    assert isinstance(source, Bakeable) and not source.model.non_rigid_active
+    mean = source.at_rest(_views(capture))
+    frame = capture.frames[8]
+    (person,) = source.splats(capture.camera(frame), [frame.mid_us], parts="human")
+    avatar = mean.posed(source.pose([frame.mid_us])[1])
+    torch.testing.assert_close(avatar.means, person.means, atol=1e-5, rtol=0)
+    torch.testing.assert_close(avatar.linear, person.linear, atol=1e-5, rtol=0)
+    torch.testing.assert_close(avatar.scales, person.scales[0], atol=0, rtol=1e-5)
+    torch.testing.assert_close(avatar.opacities, person.opacities)
+
+
+@SEEDS
+def test_four_bones_in_255ths_are_the_heaviest_and_sum_to_one(reconstruction, seed):
+    track = load_body_track(reconstruction[0])
+    rng = np.random.default_rng(seed)
+    weights = rng.random((300, 9)) ** 4
+    weights /= weights.sum(1, keepdims=True)
+    gaussians = _skinned(track, 300, seed)
+    figure = figure_of(replace(gaussians, weights=torch.from_numpy(np.float32(weights))))
+    assert (figure.weights.astype(int).sum(1) == 255).all()
+    want = np.sort(weights, axis=1)[:, -4:]
+    got = np.sort(np.take_along_axis(weights, figure.bones.astype(int), axis=1), axis=1)
+    np.testing.assert_allclose(got, want, rtol=1e-6)
+    exact = weights[np.arange(300)[:, None], figure.bones] / want.sum(1, keepdims=True)
+    assert np.abs(figure.weights / 255 - exact).max() < 1 / 255
+    dense = np.zeros((300, 9))
+    np.put_along_axis(dense, figure.bones.astype(int), figure.weights / 255, axis=1)
+    np.testing.assert_allclose(figure.gaussians.weights, dense, atol=1e-7)
+
+
+def test_a_body_of_too_many_joints_is_told(reconstruction):
+    gaussians = _skinned(load_body_track(reconstruction[0]), 5, 0)
+    with pytest.raises(DataError, match="300 joints"):
+        figure_of(replace(gaussians, weights=torch.full((5, 300), 1 / 300)))
+
+
+def test_the_recorded_clip_is_the_motion_that_the_method_has(reconstruction):
+    capture, source = reconstruction
+    mids = [frame.mid_us for frame in capture.frames]
+    gaussians = source.at_rest(_views(capture)[:1])
+    clip = recorded_clip(source, gaussians, (mids[0], mids[-1]))
+    body = gaussians.body
+    assert len(clip.rotations) == 1 + int((mids[-1] - mids[0]) * 60 / 1e6)
+    for key in (0, 5, len(clip.rotations) - 1):
+        turns = Rotation.from_quat(clip.rotations[key][:, [1, 2, 3, 0]]).as_matrix()
+        rotations = torch.from_numpy(np.float32(turns))
+        bones = body.canonical_to_world(rotations, torch.from_numpy(clip.transl[key]))
+        want = source.pose([mids[0] + round(key * 1e6 / 60)])[1][0]
+        torch.testing.assert_close(bones, want, atol=2e-6, rtol=0)
+    # Neighbours on one side: a player may interpolate them as they are.
+    assert ((clip.rotations[1:] * clip.rotations[:-1]).sum(-1) > 0).all()
+
+
+def _decoded(document: dict, key: int) -> np.ndarray:
+    """Bones canonical to world of the first clip's key, as docs/export.md says, in float64."""
+    skeleton, clip = document["skeleton"], document["clips"][0]
+
+    def numbers(text: str, *shape: int) -> np.ndarray:
+        return np.frombuffer(base64.b64decode(text), "<f4").reshape(clip["count"], *shape)
+
+    quaternions = numbers(clip["rotations"], len(skeleton["names"]), 4)[key]
+    poses = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_rotvec()
+    transl = numbers(clip["transl"], 3)[key]
+    bones = reference_bones(skeleton["parents"], skeleton["rest"], poses, transl)
+    return bones @ np.array(skeleton["rest_from_canonical"])
+
+
+def test_the_document_says_how_the_skeleton_moves(reconstruction):
+    capture, source = reconstruction
+    track = source.track
+    document = _document(capture, source)
+    for key in (0, 7):
+        want = track.bones([round(key * 1e6 / 60) + int(track.times_us[0])])[0]
+        np.testing.assert_allclose(_decoded(document, key), want, atol=2e-6)
+    assert document["unit"] == "metre" and sum(np.abs(document["up"])) == 1
+
+
+def _document(capture, source) -> dict:
+    figure = figure_of(_skinned(source.track, 20, 3))
+    clips = [clip_of("again", source.track)]
+    camera = capture.camera(capture.frames[0])
+    return avatar_document(figure, clips, track=source.track, camera=camera, facts={"a": 1})
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's script")
+def test_the_page_moves_the_skeleton_as_the_document_says(reconstruction, tmp_path):
+    """skeleton.js between two keys: slerp of the joints, then forward kinematics."""
+    document = _document(*reconstruction)
+    turn = [20.0, -40.0, 75.0]
+    (tmp_path / "document.json").write_text(json.dumps(document))
+    script = (files("evsplat") / "data" / "player" / "skeleton.js").read_text(encoding="utf-8")
+    script += """
+    const { readFileSync } = require("fs");
+    const given = JSON.parse(readFileSync(process.argv[2]));
+    const floats = (text) => new Float32Array(new Uint8Array(Buffer.from(text, "base64")).buffer);
+    const clip = given.clips[0];
+    Object.assign(clip, { rotations: floats(clip.rotations), transl: floats(clip.transl) });
+    const skeleton = new Skeleton(given.skeleton);
+    const plain = skeleton.bones(skeleton.at(clip, 3.25 / clip.rate_hz));
+    skeleton.offsets[1] = TURN;
+    const turned = skeleton.bones(skeleton.at(clip, 3.25 / clip.rate_hz));
+    console.log(JSON.stringify([[...plain], [...turned]]));
+    """.replace("TURN", json.dumps(turn))
+    (tmp_path / "run.cjs").write_text(script)
+    command = ["node", "run.cjs", "document.json"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    got = np.array(json.loads(done.stdout)).reshape(2, -1, 3, 4)
+
+    skeleton, clip = document["skeleton"], document["clips"][0]
+    joints = len(skeleton["names"])
+    rotations = np.frombuffer(base64.b64decode(clip["rotations"]), "<f4").reshape(-1, joints, 4)
+    transl = np.frombuffer(base64.b64decode(clip["transl"]), "<f4").reshape(-1, 3)
+    ends = [Rotation.from_quat(rotations[k][:, [1, 2, 3, 0]]) for k in (3, 4)]
+    between = ends[0] * Rotation.from_rotvec(0.25 * (ends[0].inv() * ends[1]).as_rotvec())
+    place = 0.75 * transl[3] + 0.25 * transl[4]
+    for moved, extra in zip(got, ([0, 0, 0], turn), strict=True):
+        offsets = np.zeros((joints, 3))
+        offsets[1] = extra
+        poses = (between * Rotation.from_rotvec(np.radians(offsets))).as_rotvec()
+        bones = reference_bones(skeleton["parents"], skeleton["rest"], poses, place)
+        want = bones @ np.array(skeleton["rest_from_canonical"])
+        np.testing.assert_allclose(moved[:-1], want[:, :3], atol=1e-5)
+        # What follows no bone stays.
+        np.testing.assert_array_equal(moved[-1], np.eye(4)[:3])
+
+
+def test_loss_is_that_of_the_avatar_and_nothing_else(reconstruction):
+    capture, source = reconstruction
+    figure = figure_of(source.at_rest(_views(capture)))
+    loss = measure_loss(source, figure, capture)
+    assert loss.frames == len([f for f in capture.frames if f.split == "test"])
+    assert loss.model_to_truth is not None and loss.avatar_to_truth is not None
+    assert f"{loss.avatar_to_model.person:.2f} dB" in loss.sentence()
+    # Colours far off must show, on the person more than on the frame.
+    wrong = replace(figure, gaussians=replace(figure.gaussians, rgb=1 - figure.gaussians.rgb))
+    worse = measure_loss(source, wrong, capture)
+    assert worse.avatar_to_model.person < loss.avatar_to_model.person - 3
+    assert worse.avatar_to_model.person < worse.avatar_to_model.full
+    assert worse.model_to_truth == loss.model_to_truth
+
+
+def test_the_package_is_complete_and_needs_no_network(run):
+    run.capture.name = "two </script> ends"
+    page = export_run(run.path, "avatar", parts="all", out=run.path / "dancer")
+    assert page == run.path / "dancer" / "index.html"
+    names = {path.name for path in page.parent.iterdir()}
+    assert names == {"index.html", "avatar.json", "gaussians.ply", "scene.ply", "README.txt"}
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"""https?:|\bsrc=|\bhref=|\bimport\b|url\(""", text)
+    assert text.count("<script") == text.count("</script>") == 2
+    (data,) = re.findall(r'id="data">(.*?)</script>', text, re.DOTALL)
+    embedded = json.loads(data)
+    document = json.loads((page.parent / "avatar.json").read_text(encoding="utf-8"))
+    assert {key: embedded[key] for key in document} == document
+    assert document["capture"] == run.capture.name
+    assert [clip["name"] for clip in document["clips"]] == ["recorded"]
+    assert "Dropped" in document["note"] and document["loss_db"]["frames"] == 3
+    rows = np.frombuffer(base64.b64decode(embedded["person"]["values"]), "<f4").reshape(-1, 14)
+    assert len(rows) == embedded["person"]["count"] == document["skin"]["count"] == 150
+    frame = run.capture.frames[0]
+    (scene,) = run.reconstruction.splats(run.capture.camera(frame), [frame.mid_us], parts="scene")
+    around = np.frombuffer(base64.b64decode(embedded["scene"]["values"]), "<f4").reshape(-1, 14)
+    np.testing.assert_allclose(around[:, :3], cloud_of(scene).means, atol=1e-6)
+    with pytest.raises(DataError, match="already"):
+        export_run(run.path, "avatar", out=run.path / "dancer")
+
+
+def test_the_person_at_rest_is_a_file_too(run):
+    path = export_run(run.path, "ply", canonical=True)
+    assert path.name == "canonical.ply"
+    _, columns = read_ply(path)
+    mean = run.reconstruction.at_rest(_views(run.capture))
+    centres = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(centres, mean.means, atol=1e-6)
+    scales = np.exp(np.stack([columns[f"scale_{k}"] for k in range(3)], 1))
+    got = covariances(np.stack([columns[f"rot_{k}"] for k in range(4)], 1), scales)
+    want = covariances(mean.quaternions.numpy(), mean.scales.numpy())
+    np.testing.assert_allclose(got, want, atol=1e-7)
