@@ -21,6 +21,7 @@ from evsplat.evaluation.evaluator import evaluate
 from evsplat.files import read_json, write_json
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
+from evsplat.render import choose_device
 from evsplat.restore import restore_capture
 from evsplat.staging import StageSettings, stage
 
@@ -111,6 +112,7 @@ def run_cell(folder: Path, cell: Cell, *, threads: int | None, device: str) -> N
 
 def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) -> dict[str, Any]:
     """Figures of the cell against the capture as it was recorded, restored or not."""
+    device = choose_device(device)
     recorded = load_capture(_recorded(bench, cell.capture))
     trained_on = _restored(bench, recorded, cell)
     run = bench.run_of(cell.id)

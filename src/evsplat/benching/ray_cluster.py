@@ -14,6 +14,7 @@ from evsplat.errors import BackendError, DataError
 RETRIES = 3
 """How often a cell is started again whose worker or machine died; from its checkpoint."""
 _STOP_SECONDS = 120.0
+_ANSWER_SECONDS = 10.0
 
 
 @dataclass
@@ -66,12 +67,20 @@ class RayCluster:
             )
             return
         try:
+            _knock(self.address)
             ray.init(address=self.address, log_to_driver=False, logging_level="error")
-        except (ConnectionError, ValueError) as error:
+        except (OSError, ValueError) as error:
             raise BackendError(
                 f"--ray {self.address}: no Ray cluster answers ({error}); start one with "
                 "`ray start --head`, or pass --ray local."
             ) from None
+
+
+def _knock(address: str) -> None:
+    """Fail at once where nobody listens at HOST:PORT; Ray itself would try for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=_ANSWER_SECONDS).close()
 
 
 def _cell_on_node(folder: Path, cell: Cell, threads: int, device: str) -> None:
