@@ -34,8 +34,11 @@ def export(
 ) -> None:
     """Write a run as a file for other programs, in metres: docs/export.md.
 
-    ply, spz, splat, gltf: the Gaussians of one instant. html: a page that plays the recording.
-    avatar: the person as a page that plays and can be posed.
+    ply, spz, splat and gltf hold the Gaussians of one instant.
+
+    html is a page that plays the recording in 3D.
+
+    avatar is a page with a person to play and to pose.
 
     Args:
         run: Run folder written by 'evsplat train'.
