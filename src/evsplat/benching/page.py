@@ -29,6 +29,7 @@ _OPEN = 3
 _STYLE = """
 td.second { text-decoration: underline; text-underline-offset: 3px; }
 tbody th { min-width: 130px; }
+table th:first-child { position: sticky; left: 0; background: var(--panel); }
 .tiles { display: grid; gap: 10px 8px;
   grid-template-columns: repeat(auto-fill, minmax(148px, 1fr)); }
 .tile { position: relative; overflow: hidden; border-radius: 5px; background: var(--faint); }
@@ -152,7 +153,7 @@ def _frame(
         figures = entry["protocols"]["standard"]
         psnr = figures["person_crop"]["psnr"] or figures["full"]["psnr"]
         picture = _read(folder, row.run, entry["pictures"]["render"])
-        note = "" if psnr is None else f"{psnr:.2f} dB"
+        note = "" if psnr is None else f"{psnr:.2f}\u00a0dB"
         tiles.append(_tile(embed.image(picture, row.title), style, row.title, note))
     return (
         f'<article class="frame"><h3>Frame {escape(frame.name)}</h3>'
