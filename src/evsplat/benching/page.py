@@ -30,7 +30,7 @@ _STYLE = """
 td.second { text-decoration: underline; text-underline-offset: 3px; }
 tbody th { min-width: 130px; }
 table { border-collapse: separate; border-spacing: 0; }
-table th:first-child { position: sticky; left: 0; background: var(--panel); }
+thead .corner, tbody th { position: sticky; left: 0; background: var(--panel); }
 .tiles { display: grid; gap: 10px 8px;
   grid-template-columns: repeat(auto-fill, minmax(148px, 1fr)); }
 .tile { position: relative; overflow: hidden; border-radius: 5px; background: var(--faint); }
