@@ -15,9 +15,9 @@ import evsplat
 from evsplat.cli.options import Flag
 from evsplat.cuda_support import Need, needs
 from evsplat.errors import DataError, WeightsError
-from evsplat.restore import WEIGHT_FILES
 from evsplat.shipped import demo_capture
 
+_RESTORERS_WITH_WEIGHTS = ("nafnet", "mprnet", "efnet", "d2net", "e2vid")
 _MARKS = {"ok": "ok", "missing": "MISSING", "optional": "-"}
 
 
@@ -64,7 +64,7 @@ def run_checks() -> Iterator[Check]:
         _body_models,
         _opencv,
         _super_slomo,
-        *(partial(_restorer, name) for name in WEIGHT_FILES),
+        *(partial(_restorer, name) for name in _RESTORERS_WITH_WEIGHTS),
         _pienet,
         _recordings,
         _st_lpips,
@@ -148,6 +148,8 @@ def _super_slomo() -> Check:
 
 
 def _restorer(name: str) -> Check:
+    from evsplat.restore import WEIGHT_FILES
+
     file = WEIGHT_FILES[name]
     try:
         return Check(file.network, "ok", f"weights {file.find()}")
