@@ -6,6 +6,8 @@ import torch
 from evsplat.body import skin
 from evsplat.capture import load_capture
 from evsplat.config import override
+from evsplat.errors import ConfigError
+from evsplat.gaussians import ATTRIBUTES
 from evsplat.methods import PaperConfig, compose, method_config
 
 SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16")
@@ -109,3 +111,34 @@ def test_every_network_and_attribute_gets_a_gradient(tiny_capture):
     ]
     # Residuals of the pose are learned only on demand.
     assert [name for name in silent if not name.endswith("residuals")] == []
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_own_colours_on_the_body_surface_need_no_network(tiny_capture, seed):
+    settings = ("deform.skinning=surface", "deform.human_colour=own")
+    model, times, center = model_of(tiny_capture(), *settings)
+    torch.manual_seed(seed)
+    activate(model)
+    posed = model.at(times, center)
+    canonical = model.gaussians.means[model.gaussians.human].detach()
+    samples = model.surface.surface
+    weights = samples.weights[torch.cdist(canonical, samples.points).argmin(1)]
+    rotations, bones = model.pose(times)
+    deformed, *_ = model._non_rigid(model._moving(_parts(model)), rotations, None)
+    expected, _ = skin(deformed, weights, bones)
+    assert torch.allclose(posed.human.means, expected, atol=1e-5)
+    assert torch.equal(model.skinning_weights(canonical.flip(0)), weights.flip(0))
+    colours = model.gaussians.features[model.gaussians.human][:, :3].sigmoid()
+    assert torch.equal(posed.human.rgb, colours.expand(len(times), -1, -1))
+    names = {name.partition(".")[0] for name, _ in model.named_parameters()}
+    assert not {"skinning", "human_colour"} & names
+
+
+def test_weights_of_the_surface_and_points_far_from_it_exclude_each_other(tiny_capture):
+    with pytest.raises(ConfigError, match="deform.skinning=network"):
+        model_of(tiny_capture(), "semantics=ste", "deform.skinning=surface")
+
+
+def _parts(model):
+    gaussians = model.gaussians
+    return {name: gaussians.of_parts(getattr(gaussians, name)) for name in ATTRIBUTES}

@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from evsplat.body import SurfaceSamples
-from evsplat.deform.shading import Shading, SurfaceNormals
+from evsplat.deform.shading import NearestSurface, Shading
 
 
 def sphere(count: int, generator: torch.Generator) -> SurfaceSamples:
     normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    return SurfaceSamples(2 * normals, normals, torch.ones(count, 1))
+    return SurfaceSamples(2 * normals, normals, torch.rand(count, 3, generator=generator))
 
 
 def test_nothing_is_shaded_at_the_start():
@@ -47,15 +47,17 @@ def test_gradcheck():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_normals_are_those_of_the_nearest_surface_and_follow_changed_rows(seed):
+def test_what_the_nearest_surface_gives_follows_changed_rows(seed):
     generator = torch.Generator().manual_seed(seed)
-    normals = SurfaceNormals(sphere(20_000, generator))
+    surface = NearestSurface(sphere(20_000, generator))
     radial = sphere(300, generator).normals
     points = radial * (1 + 2 * torch.rand(300, 1, generator=generator))
-    assert ((normals.of(points) * radial).sum(-1) > 0.995).all()
-    assert torch.equal(normals.of(-points), normals.of(points))  # kept until rows change
-    resumed = SurfaceNormals(normals.surface)
-    resumed.load_state(normals.state())
-    assert torch.equal(resumed.of(-points), normals.of(points))
-    normals.rows_changed()
-    assert ((normals.of(-points) * -radial).sum(-1) > 0.995).all()
+    place = torch.cdist(points, surface.surface.points).argmin(1)
+    assert torch.equal(surface.normals(points), surface.surface.normals[place])
+    assert torch.equal(surface.weights(points), surface.surface.weights[place])
+    assert torch.equal(surface.normals(-points), surface.normals(points))  # until rows change
+    resumed = NearestSurface(surface.surface)
+    resumed.load_state(surface.state())
+    assert torch.equal(resumed.normals(-points), surface.normals(points))
+    surface.rows_changed()
+    assert ((surface.normals(-points) * -radial).sum(-1) > 0.995).all()

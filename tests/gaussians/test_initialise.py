@@ -3,10 +3,12 @@
 import pytest
 import torch
 
+from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Camera
 from evsplat.gaussians.initialise import (
     COLOUR_LOGITS,
     backdrop_depth,
+    facing,
     gaussians_at,
     median_backdrop,
     nearest_spacing,
@@ -73,3 +75,16 @@ def test_cube_is_uniform_and_spacing_is_that_of_a_lattice():
     assert 0 <= float(colours.min()) and float(colours.max()) <= 1
     lattice = torch.cartesian_prod(*(torch.arange(6.0) * 0.1 for _ in range(3)))
     assert torch.allclose(nearest_spacing(lattice), torch.full((216,), 0.1), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_facing_turns_the_third_axis_to_the_normal_the_short_way(seed):
+    generator = torch.Generator().manual_seed(seed)
+    normals = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=-1)
+    poles = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    normals = torch.cat([normals, poles])
+    rotations = quaternion_to_matrix(facing(normals))
+    assert torch.allclose(rotations[..., 2], normals, atol=1e-5)
+    # By no more than the angle between both: the trace is 1 + 2 cos of the angle turned.
+    turned = (rotations.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2
+    assert torch.allclose(turned, normals[:, 2], atol=1e-4)

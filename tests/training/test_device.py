@@ -189,7 +189,10 @@ def test_a_step_stays_on_its_device_and_never_waits(settings, foreign, tiny_capt
     trainer.step()  # what is made once, such as the levels of the skeleton
     device.may_wait = False
     report = trainer.step()
-    assert {"l1", "dssim", "event", "semantic", "skinning", "isometry_centers"} <= {*report.names}
+    named = {"l1", "dssim", "event", "semantic", "isometry_centers"}
+    if settings.get("method") != "evsplat":  # its weights are the body's
+        named.add("skinning")
+    assert named <= {*report.names}
     assert report.measured.device.type == NAME
     for parameter in trainer.model.parameters():
         assert parameter.device.type == NAME

@@ -20,12 +20,14 @@ from evsplat.deform.mlp import PointMLP, Precision
 from evsplat.deform.model import RowCache
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
-from evsplat.deform.shading import Shading, SurfaceNormals
+from evsplat.deform.shading import NearestSurface, Shading
 from evsplat.deform.shadow import BodyShadow
 from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.deform.skinning_turns import SkinningTurns
 from evsplat.devices import send
+from evsplat.errors import ConfigError
 from evsplat.gaussians import ATTRIBUTES, GaussianSet, PosedGaussians, PosedHuman, StaticScene
+from evsplat.gaussians.initialise import COLOUR_LOGITS
 
 NORMAL_SAMPLES = 20_000
 """Points of the body's surface among which a Gaussian finds its normal."""
@@ -51,8 +53,13 @@ class DeformConfig:
     point jump when the network is switched on."""
     skinning_depth: int = 4
     """Hidden layers of the skinning network."""
+    skinning: Literal["network", "surface"] = "network"
+    """Where a Gaussian's skinning weights come from: the network (eq. 2), or the nearest point of
+    the body's surface, which costs nothing and is what the network's prior asks for."""
     skinning_turns: int = 4
     """A training step looks up the skinning weights of one row in so many, in turns; 1 = of all."""
+    human_colour: Literal["network", "own"] = "network"
+    """The person's canonical colours: by the network, or a colour of each Gaussian's own."""
     colour_width: int = 64
     """Hidden width of the colour networks (A10)."""
     latent_dim: int = 16
@@ -130,9 +137,22 @@ class HumanSceneModel(nn.Module):
             depth=config.non_rigid_depth,
             last_layer_std=config.non_rigid_last_std,
         )
-        self.skinning = SkinningNetwork(parents, width=config.width, depth=config.skinning_depth)
+        self.skinning: SkinningNetwork | None = None
+        """None where weights are those of the nearest surface."""
+        if config.skinning == "network":
+            self.skinning = SkinningNetwork(
+                parents, width=config.width, depth=config.skinning_depth
+            )
+        elif semantics == "ste":
+            raise ConfigError(
+                "semantics is ste, which deforms points far from the body, and deform.skinning is "
+                "surface, which knows weights on it only; set deform.skinning=network."
+            )
         self.skinning_turns = SkinningTurns(config.skinning_turns)
-        self.human_colour = HumanColour(latent_dim=config.latent_dim, width=config.colour_width)
+        self.human_colour: HumanColour | None = None
+        """None where each Gaussian has a colour of its own."""
+        if config.human_colour == "network":
+            self.human_colour = HumanColour(latent_dim=config.latent_dim, width=config.colour_width)
         self.scene_colour = SceneColour(
             view_dependent=config.scene_view_dependent, width=config.colour_width
         )
@@ -146,10 +166,11 @@ class HumanSceneModel(nn.Module):
         self.shadow: BodyShadow | None = None
         self.row_caches: dict[str, RowCache] = {"skinning_turns": self.skinning_turns}
         generator = torch.Generator().manual_seed(0)
-        if config.shading:
+        if config.shading or config.skinning == "surface":
             surface = body.sample_surface(NORMAL_SAMPLES, generator)
-            self.surface_normals = SurfaceNormals(surface)
-            self.row_caches["surface_normals"] = self.surface_normals
+            self.surface = NearestSurface(surface)
+            self.row_caches["surface"] = self.surface
+        if config.shading:
             roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
             middle = roots.mean(0)
             radius = max(1.0, float((roots - middle).norm(dim=-1).max()))
@@ -216,6 +237,8 @@ class HumanSceneModel(nn.Module):
 
     def skinning_weights(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Weights of the bones at canonical points (metres)."""
+        if self.skinning is None:
+            return self.surface.weights_at(points)
         return self.skinning(self.normalise(points))
 
     def at(
@@ -248,7 +271,9 @@ class HumanSceneModel(nn.Module):
         if networks_at_us is not None:
             seen_times, seen = [networks_at_us], self.pose([networks_at_us])[0]
         deformed, scales, quaternions, feature = self._non_rigid(moving, seen, noise)
-        if share_skinning:
+        if self.skinning is None:
+            weights = self.surface.weights(moving["means"])[None]
+        elif share_skinning:
             shared = self.normalise(deformed.mean(0))
             weights = self.skinning_turns.weights(self.skinning, shared)[None]
         else:
@@ -404,7 +429,7 @@ class HumanSceneModel(nn.Module):
     ) -> Float[Tensor, "T H 3"]:
         """Factor of the light on the person's colours; geometry gets no gradient by it."""
         assert self.shading is not None
-        normals = self.surface_normals.of(canonical)[None, ..., None]
+        normals = self.surface.normals(canonical)[None, ..., None]
         turned = (transforms[..., :3, :3].detach() @ normals)[..., 0]
         return self.shading(nn.functional.normalize(turned, dim=-1), world.detach())
 
@@ -419,6 +444,8 @@ class HumanSceneModel(nn.Module):
         noise: Noise | None,
     ) -> Float[Tensor, "T H 3"]:
         """Colours of the person, from the view direction turned back into canonical space."""
+        if self.human_colour is None:
+            return features[None, :, COLOUR_LOGITS].sigmoid()
         # Detached as in 3DGS-Avatar: colour must not be bought by moving the body.
         turn = None if noise is None else noise.view_turn
         canonical_view = view_directions(world, camera_center, transforms, turn)

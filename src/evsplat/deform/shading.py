@@ -1,7 +1,7 @@
 """How bright the person's surface is, by where it stands and how it is turned."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from evsplat.body.surface import SurfaceSamples
@@ -44,35 +44,54 @@ class Shading(nn.Module):
         return (1 + bent).clamp(_DARKEST, _BRIGHTEST)
 
 
-class SurfaceNormals:
-    """Canonical normals of Gaussians: those of the nearest point of the body's surface.
+class NearestSurface:
+    """What Gaussians take from the nearest point of the canonical body's surface.
 
     Looked up again only after rows have changed: between two densifications a Gaussian moves by
-    less than what turns the surface.
+    less than what turns the surface or changes the bones it hangs on.
     """
 
     def __init__(self, surface: SurfaceSamples) -> None:
         """``surface``: samples of the canonical body."""
         self.surface = surface
-        self.normals = torch.zeros(0, 3)
+        self.index = torch.zeros(0, dtype=torch.long)
 
-    def of(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Unit normals at canonical centres."""
-        if len(self.normals) != len(means):
-            self.surface = self.surface.to(means.device)
-            _, index = nearest(self.surface.points, 1, means.detach())
-            self.normals = self.surface.normals[index[:, 0]]
-        self.normals = self.normals.to(means.device)
-        return self.normals
+    def normals(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Unit normals at the canonical centres of all Gaussians."""
+        index = self._of(means)
+        return self._on(means.device).normals[index]
+
+    def weights(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Skinning weights at the canonical centres of all Gaussians."""
+        index = self._of(means)
+        return self._on(means.device).weights[index]
+
+    def weights_at(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Skinning weights at any canonical points, looked up now."""
+        return self._on(points.device).weights[self._nearest(points)]
+
+    def _of(self, means: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
+        if len(self.index) != len(means):
+            self.index = self._nearest(means)
+        self.index = self.index.to(means.device)  # after a resume it is on the CPU
+        return self.index
+
+    def _nearest(self, points: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
+        return nearest(self._on(points.device).points, 1, points.detach())[1][:, 0]
+
+    def _on(self, device: torch.device) -> SurfaceSamples:
+        if self.surface.points.device != device:
+            self.surface = self.surface.to(device)
+        return self.surface
 
     def rows_changed(self) -> None:
         """Row numbers mean other Gaussians now."""
-        self.normals = self.normals[:0]
+        self.index = self.index[:0]
 
     def state(self) -> dict[str, Tensor]:
         """What a resume needs."""
-        return {"normals": self.normals}
+        return {"index": self.index}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Take back what `state` gave."""
-        self.normals = state["normals"]
+        self.index = state["index"]

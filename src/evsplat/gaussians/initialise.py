@@ -52,6 +52,15 @@ def gaussians_at(
     }
 
 
+def facing(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
+    """Rotations, (w, x, y, z), that turn the third axis to the unit ``normals`` the short way."""
+    x, y, z = normals.float().unbind(-1)
+    # Half-way quaternion of z = (0, 0, 1) and the normal; straight down, any half turn will do.
+    half = torch.stack([1 + z, -y, x, torch.zeros_like(z)], -1)
+    half[z < -0.9999] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    return torch.nn.functional.normalize(half, dim=-1)
+
+
 def random_cube(
     center: Float[Tensor, "3"], half_side: float, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:

@@ -110,7 +110,7 @@ class Build:
         if config.deform.precision == "bfloat16" and not bfloat16_runs(model.box_low.device):
             logger.warning("This machine multiplies no bfloat16: the networks run in float32.")
         prior = SkinningPrior(ground.surface.to(device), config.skinning_points)
-        if fit:
+        if fit and model.skinning is not None:
             fit_skinning(model, prior, config.skinning_prefit_steps, ground.generator)
         return cls(ground, model, prior)
 
@@ -135,7 +135,7 @@ class Build:
             model=self.model,
             objectives=[
                 *observed,
-                self.prior,
+                *([] if self.model.skinning is None else [self.prior]),
                 Isometry(refresh=config.isometry_refresh, samples=config.isometry_samples),
             ],
             weights={

@@ -14,8 +14,9 @@ from evsplat.calibration import estimate_from_capture
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig
 from evsplat.methods.composition import Composition
-from evsplat.methods.config import Weight
+from evsplat.methods.config import LearningRates, OptimisationConfig, Weight
 from evsplat.methods.paper import EventConfig, PaperConfig, build_model, composition
+from evsplat.methods.starts import HumanStartConfig
 from evsplat.objectives import (
     ContrastThresholds,
     EventWindows,
@@ -62,8 +63,25 @@ class EvsplatConfig(PaperConfig):
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
     event: EventConfig = field(default_factory=lambda: EventConfig(weight=0.2))
+    human: HumanStartConfig = field(
+        default_factory=lambda: HumanStartConfig(
+            spacing_px=0.85, opacity=0.88, width=0.8, flatness=0.3
+        )
+    )
+    """A closed surface of flat discs from the first step on: light and shadow need one."""
     deform: DeformConfig = field(
-        default_factory=lambda: DeformConfig(networks_once=True, shading=True, shadow_lights=4)
+        default_factory=lambda: DeformConfig(
+            networks_once=True,
+            skinning="surface",
+            human_colour="own",
+            shading=True,
+            shadow_lights=4,
+        )
+    )
+    optimisation: OptimisationConfig = field(
+        default_factory=lambda: OptimisationConfig(
+            rates=LearningRates(means=3e-4, features=1e-2), human_start=0
+        )
     )
 
 

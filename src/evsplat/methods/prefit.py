@@ -19,6 +19,7 @@ def fit_skinning(
     model: HumanSceneModel, prior: SkinningPrior, steps: int, generator: torch.Generator
 ) -> None:
     """Start the skinning network at the body's weights instead of at random ones."""
+    assert model.skinning is not None
     rate = 5e-3
     adam = torch.optim.Adam(model.skinning.parameters(), lr=rate, fused=True)
     for step in range(steps):

@@ -71,13 +71,9 @@ def learning_of(model: HumanSceneModel, config: OptimisationConfig) -> Learning:
     rows["means"] = RowRate(at(rates.means, rates.means_final))
     rows["semantic_logits"] = RowRate(at(rates.semantic_logits, kept), config.semantics_window)
     clipped: list[tuple[list[nn.Parameter], float, float]] = [
-        (list(model.skinning.parameters()), rates.skinning, 0.0),
-        ([*model.non_rigid.parameters(), *model.pose_encoder.parameters()], rates.non_rigid, 0.0),
-        (
-            [*model.human_colour.parameters(), *model.scene_colour.parameters()],
-            rates.colour,
-            0.0,
-        ),
+        (_parameters(model.skinning), rates.skinning, 0.0),
+        (_parameters(model.non_rigid, model.pose_encoder), rates.non_rigid, 0.0),
+        (_parameters(model.human_colour, model.scene_colour), rates.colour, 0.0),
         ([model.latents], rates.latents, rates.latent_weight_decay),
         ([model.rotation_residuals, model.translation_residuals], rates.pose_correction, 0.0),
     ]
@@ -91,8 +87,15 @@ def learning_of(model: HumanSceneModel, config: OptimisationConfig) -> Learning:
         if part is not None
     ]
     networks = [
-        Network(parameters, at(rate), decay, clipped=True) for parameters, rate, decay in clipped
+        Network(parameters, at(rate), decay, clipped=True)
+        for parameters, rate, decay in clipped
+        if parameters
     ]
     return Learning(
         {"gaussians": rows}, [*networks, *free], rates.clip_networks, config.human_start
     )
+
+
+def _parameters(*parts: nn.Module | None) -> list[nn.Parameter]:
+    """Of those parts that the model has."""
+    return [parameter for part in parts if part is not None for parameter in part.parameters()]

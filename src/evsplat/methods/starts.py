@@ -12,6 +12,7 @@ from evsplat.errors import ConfigError
 from evsplat.gaussians.flip import carry
 from evsplat.gaussians.initialise import (
     backdrop_depth,
+    facing,
     gaussians_at,
     median_backdrop,
     nearest_spacing,
@@ -32,6 +33,10 @@ class HumanStartConfig:
     """Upper bound of the automatic count."""
     opacity: float = 0.1
     """Opacity of every sample."""
+    width: float = 1.0
+    """Standard deviation along the surface as a share of the distance between neighbours."""
+    flatness: float = 1.0
+    """That along the surface's normal as a share of the one along the surface."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +71,14 @@ def human_start(
 ) -> dict[str, Tensor]:
     """Start values of the person's Gaussians: samples of the canonical body's surface."""
     count = config.count or _automatic_count(config, capture, track)
-    points = track.body.sample_surface(count, generator).points
-    scales = nearest_spacing(points)[:, None].repeat(1, 3)
+    samples = track.body.sample_surface(count, generator)
+    scales = config.width * nearest_spacing(samples.points)[:, None].repeat(1, 3)
+    scales[:, 2] *= config.flatness
     return gaussians_at(
-        points,
+        samples.points,
         scales,
         opacity=config.opacity,
+        quaternions=None if config.flatness == 1.0 else facing(samples.normals),
         semantic_logit=semantic_logit,
     )
 

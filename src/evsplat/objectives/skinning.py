@@ -28,7 +28,8 @@ class SkinningPrior(Stateless):
         return {"skinning": self.of(step.model, step.generator)}
 
     def of(self, model: HumanSceneModel, generator: torch.Generator) -> Tensor:
-        """The prior of a model at random surface points."""
+        """The prior of a model with a skinning network, at random surface points."""
+        assert model.skinning is not None
         chosen = torch.randint(
             len(self.surface.points), (self.points_per_step,), generator=generator
         )
