@@ -151,6 +151,18 @@ def test_release_compatible_repeats_the_other_slips(tiny_capture):
         assert scene.opacity_reset == ((500,) if slip else ())
 
 
+def test_a_backdrop_is_not_densified_and_hardly_moves(tiny_capture):
+    path = tiny_capture(frames=10)
+    cube, backdrop = (
+        composed(path, scene=SMALL["scene"] | {"kind": kind})
+        for kind in ("random_cube", "median_backdrop")
+    )
+    assert {*cube.densify} == {"human", "scene"}
+    assert {*backdrop.densify} == {"human"}
+    rates = [c.learning.rows["scene"]["means"].rate.start for c in (cube, backdrop)]
+    assert rates[1] == pytest.approx(0.1 * rates[0])
+
+
 def test_a_scene_colour_has_the_harmonics_that_are_asked_for(tiny_capture):
     path = tiny_capture()
     assert composed(path).model.scene.directional.shape[1] == 0  # one static camera

@@ -31,6 +31,9 @@ from evsplat.objectives.perceptual import PerceptualName, make_perceptual
 
 FIT_SAMPLES = 50_000
 """Points of the body's surface that the decoders start from."""
+BACKDROP_SHARE = 0.1
+"""Of the rate of scene centres where they start on the median backdrop. One camera sees no depth:
+Adam makes a walk of its noise, and what walks in front of the person hides it."""
 FINEST = 256
 """Texels along a side of the released triplane."""
 
@@ -99,8 +102,8 @@ class HugsRates:
 
     human_means: float = 3.2e-4
     """Centres, metres; a tenth of it at the end, as after half of the released 30,000."""
-    triplane: float = 1e-3
-    """The triplane, its appearance and its geometry decoder."""
+    triplane: float = 3e-3
+    """The triplane, its appearance and its geometry decoder; released: 1e-3 over all 15,000."""
     skinning: float = 1e-4
     pose: float = 1e-4
     """Per-frame rotations and translations."""
@@ -147,8 +150,9 @@ class HugsConfig:
     )  # fmt: skip
     """Released: at most 524,288."""
     densify_scene: DensifyConfig | None = None
-    """Null: 3DGS's, with a hundredth of the scene's extent as the size above which Gaussians are
-    split, and at most 150,000 of them (released: 2,097,152)."""
+    """Null: for a random cube 3DGS's, with a hundredth of the scene's extent as the size above
+    which Gaussians are split, and at most 150,000 of them (released: 2,097,152); none for a median
+    backdrop, which would only grow where the person passes, and in front of it."""
 
 
 def compose(
@@ -305,20 +309,27 @@ def _seen(points: Float[Tensor, "N 3"], capture: Capture) -> Tensor:
 
 
 def _limits(config: HugsConfig, extent: float) -> dict[Part, DensifyConfig]:
-    scene = config.densify_scene or DensifyConfig(
-        start=500, end=15_000, every=100, split_above_m=0.01 * extent, prune_opacity=0.005,
-        prune_screen_px=None, prune_scale_m=None, max_count=150_000,
-    )  # fmt: skip
+    human, scene = config.densify_human, config.densify_scene
+    if scene is None and config.scene.kind == "median_backdrop":
+        return {"human": human}
+    if scene is None:
+        scene = DensifyConfig(
+            start=500, end=15_000, every=100, split_above_m=0.01 * extent, prune_opacity=0.005,
+            prune_screen_px=None, prune_scale_m=None, max_count=150_000,
+        )  # fmt: skip
     if config.release_compatible:
         # For a stored background that is white, though every picture is drawn over another one.
         scene = replace(scene, opacity_reset=(500,))
-    return {"human": config.densify_human, "scene": scene}
+    return {"human": human, "scene": scene}
 
 
 def _learning(model: HugsModel, config: HugsConfig, extent: float) -> Learning:
     rates = config.optimisation.rates
     human = model.human
     falling = 0.1
+    start = rates.scene_means * extent
+    if config.scene.kind == "median_backdrop":
+        start *= BACKDROP_SHARE
     decoders = [
         *human.triplane.parameters(),
         *human.appearance.parameters(),
@@ -332,7 +343,7 @@ def _learning(model: HugsModel, config: HugsConfig, extent: float) -> Learning:
                 "scales_log": RowRate(Rate(0.0)),
             },
             "scene": {
-                "means": RowRate(Rate(rates.scene_means * extent, falling)),
+                "means": RowRate(Rate(start, falling)),
                 "scales_log": RowRate(Rate(rates.scales_log)),
                 "quaternions": RowRate(Rate(rates.quaternions)),
                 "opacity_logits": RowRate(Rate(rates.opacity_logits)),
