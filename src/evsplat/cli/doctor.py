@@ -52,8 +52,6 @@ def doctor(*, json: Flag = False) -> None:
 
 def run_checks() -> Iterator[Check]:
     """Look at the installation, one check after the other; none of them raises."""
-    from evsplat.restore import WEIGHT_FILES
-
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores"
     yield Check("evsplat", "ok", evsplat.__version__)
     yield Check("python", "ok", f"{platform.python_version()} on {machine}")
