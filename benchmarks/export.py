@@ -1,0 +1,185 @@
+"""Exported files drawn by renderers that others wrote, and the avatar page, beside our own picture.
+
+    npm install --prefix FOLDER @sparkjsdev/spark@2.2.0 three@0.187.0 playwright-core
+    python benchmarks/export.py RUN --node-modules FOLDER/node_modules [--out PICTURES]
+
+A test frame is exported as .ply, .spz and .splat, drawn by Spark (WebGL) in headless Chromium from
+the recording camera, and compared with evsplat's own picture: with Spark set to the rules of 3DGS,
+and as it comes. The avatar page is compared with the same avatar drawn by our rasteriser, and timed.
+The files are also read by gsply where that is installed. The last line is JSON.
+"""
+
+import argparse
+import io
+import json
+import shutil
+import subprocess
+import tempfile
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import torch
+from PIL import Image
+
+import evsplat as ev
+from evsplat.capture import Camera
+from evsplat.export.avatar.export import at_rest
+from evsplat.export.avatar.figure import figure_of
+from evsplat.export.cloud import cloud_of
+from evsplat.export.gaussians import file_rotation
+from evsplat.render import render
+from evsplat.similarity import psnr
+
+CHROMIUM = (
+    "--no-sandbox --disable-quic --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--ignore-gpu-blocklist --disable-background-networking --disable-component-update "
+    "--disable-sync --no-first-run"
+).split()
+HERE = Path(__file__).parent / "browser"
+
+
+def main() -> None:
+    """Print a table and one line of JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--node-modules", type=Path, required=True)
+    parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium")
+    parser.add_argument("--out", type=Path, help="folder for the pictures")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        out = arguments.out or Path(folder) / "pictures"
+        out.mkdir(parents=True, exist_ok=True)
+        figures = compare(arguments, Path(folder), out)
+    print(json.dumps(figures))
+
+
+@torch.no_grad()
+def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str, float]:
+    """Export, draw in the browser, compare."""
+    run = ev.load_run(arguments.run, device="cpu")
+    capture, source = run.capture, run.reconstruction
+    frame = next(f for f in capture.frames if f.split == "test")
+    camera = capture.camera(frame)
+    person, scene = source.splats(camera, [frame.mid_us])
+    ours = render(person, camera, static=scene).image[0, ..., :3]
+    model = source.render(camera, [frame.mid_us]).rgb[0]
+
+    site = folder / "site"
+    site.mkdir()
+    shots = []
+    for kind in ("ply", "spz", "splat"):
+        ev.export_run(arguments.run, kind, frame=frame.name, out=site / f"run.{kind}", device="cpu")
+        view = seen_from(camera, file_rotation(source.track, kind, None))
+        for rules in ("3dgs", "default"):
+            shots.append(
+                {"page": "spark.html", "file": f"run.{kind}", "rules": rules, "camera": view,
+                 "picture": f"spark-{kind}-{rules}.png"}
+            )  # fmt: skip
+    page = site / "avatar.html"
+    ev.export_run(arguments.run, "avatar", parts="all", out=page, device="cpu")
+    first = min(f.mid_us for f in capture.frames)
+    seconds = (frame.mid_us - first) / 1e6
+    shots.append(
+        {"page": "avatar.html", "seconds": seconds, "camera": seen_from(camera, np.eye(3)),
+         "picture": "avatar.png"}
+    )  # fmt: skip
+    seen = photograph(arguments, site, shots, out)
+
+    figure = figure_of(at_rest(run, None))
+    skinned = figure.gaussians.posed(source.pose([frame.mid_us])[1])
+    (alone,) = source.splats(camera, [frame.mid_us], parts="scene")
+    avatar = render(skinned, camera, static=alone).image[0, ..., :3]
+    save(out / "ours.png", ours)
+    save(out / "ours-avatar.png", avatar)
+
+    figures = {
+        "gaussians": len(cloud_of(person)) + len(cloud_of(scene)),
+        "file_to_model_psnr_db": float(psnr(ours.clamp(0, 1), model)),
+    }
+    for shot in shots:
+        name = shot["picture"].removesuffix(".png")
+        picture = torch.from_numpy(read(out / shot["picture"]))
+        reference = avatar if shot["page"] == "avatar.html" else ours
+        figures[f"{name}_psnr_db"] = float(psnr(picture, reference.clamp(0, 1)))
+        print(f"{name:20} {figures[f'{name}_psnr_db']:6.2f} dB against our own picture")
+    print(f"avatar page: {seen['avatar_ms']:.1f} ms per picture {camera.width} x {camera.height}")
+    figures["avatar_page_ms_per_picture"] = seen["avatar_ms"]
+    return {name: round(value, 3) for name, value in figures.items()} | gsply_agrees(site)
+
+
+def seen_from(camera: Camera, rotation: np.ndarray) -> dict[str, object]:
+    """The camera in the axes of a file."""
+    pose = camera.world_to_camera.double().numpy().copy()
+    pose[:3, :3] = pose[:3, :3] @ rotation.T
+    size = {"width": camera.width, "height": camera.height}
+    return {**size, "K": camera.K.tolist(), "world_to_camera": pose.tolist()}
+
+
+def photograph(
+    arguments: argparse.Namespace, site: Path, shots: list[dict], out: Path
+) -> dict[str, float]:
+    """Let Chromium draw the shots from a local server; returns what the script measured."""
+    shutil.copy(HERE / "spark.html", site)
+    (site / "node_modules").symlink_to(arguments.node_modules.resolve())
+    handler = partial(QuietHandler, directory=str(site))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    Thread(target=server.serve_forever, daemon=True).start()
+    order = {
+        "address": f"http://127.0.0.1:{server.server_port}",
+        "chromium": arguments.chromium,
+        "arguments": CHROMIUM,
+        "playwright": str((arguments.node_modules / "playwright-core/index.mjs").resolve()),
+        "out": str(out.resolve()),
+        "shots": shots,
+    }
+    try:
+        done = subprocess.run(
+            ["node", str(HERE / "photograph.mjs")],
+            input=json.dumps(order),
+            capture_output=True,
+            text=True,
+        )
+    finally:
+        server.shutdown()
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves a folder and says nothing."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Drop the line."""
+
+
+def gsply_agrees(site: Path) -> dict[str, float]:
+    """Largest difference between the .ply and the .spz as gsply reads them, in the .spz's axes."""
+    try:
+        import gsply
+    except ImportError:
+        return {}
+    ply, spz = gsply.plyread(str(site / "run.ply")), gsply.read_spz(str(site / "run.spz"))
+    turn = np.linalg.lstsq(ply.means, spz.means, rcond=None)[0]
+    return {
+        "gsply_spz_centre_error_m": round(float(np.abs(ply.means @ turn - spz.means).max()), 7),
+        "gsply_spz_scale_error_nepers": round(float(np.abs(ply.scales - spz.scales).max()), 4),
+    }
+
+
+def save(path: Path, image: torch.Tensor) -> None:
+    """Write an sRGB picture in [0, 1]."""
+    Image.fromarray((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()).save(path)
+
+
+def read(path: Path) -> np.ndarray:
+    """An sRGB picture in [0, 1]."""
+    with Image.open(io.BytesIO(path.read_bytes())) as image:
+        return np.float32(np.asarray(image.convert("RGB"))) / 255
+
+
+if __name__ == "__main__":
+    main()
