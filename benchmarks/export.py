@@ -3,10 +3,10 @@
     npm install --prefix FOLDER @sparkjsdev/spark@2.2.0 three@0.187.0 playwright-core
     python benchmarks/export.py RUN --node-modules FOLDER/node_modules [--out PICTURES]
 
-A test frame is exported as .ply, .spz and .splat, drawn by Spark (WebGL) in headless Chromium from
-the recording camera, and compared with evsplat's own picture: with Spark set to the rules of 3DGS,
-and as it comes. The avatar page is compared with the same avatar drawn by our rasteriser, and timed.
-The files are also read by gsply where that is installed. The last line is JSON.
+A test frame is exported as .ply, .spz and .splat, drawn by Spark (WebGL) in headless Chromium
+from the recording camera, and compared with evsplat's own picture: with Spark set to the rules of
+3DGS, and as it comes. The avatar page is compared with the same avatar drawn by our rasteriser,
+and timed. The files are also read by gsply where that is installed. The last line is JSON.
 """
 
 import argparse

@@ -34,8 +34,11 @@ class Skinned(Protocol):
         """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4)."""
         ...
 
-    def skinning_weights(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
-        """Weights of the bones at canonical points (metres); rows sum to 1."""
+    def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Weights of the bones for the person's Gaussians, their canonical centres (metres) here.
+
+        Rows sum to 1.
+        """
         ...
 
 
@@ -59,7 +62,9 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
         first = quaternions if first is None else first
         # q and -q are one rotation: only those on one side have a mean.
         quaternions = quaternions * torch.where((quaternions * first).sum(-1) < 0, -1, 1)[:, None]
-        values = [centers, person.scales[0].double().log(), quaternions, person.rgb[0].double()]
+        # Covariances know no sign of a scale; decoders of HUGS may give either.
+        log_scales = person.scales[0].double().abs().log()
+        values = [centers, log_scales, quaternions, person.rgb[0].double()]
         sums = [a + b for a, b in zip(sums, values, strict=True)] if sums else values
     centers, log_scales, quaternions, rgb = ((total / len(views)).float().cpu() for total in sums)
     return SkinnedGaussians(

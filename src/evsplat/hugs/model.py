@@ -100,8 +100,8 @@ class HugsModel(nn.Module):
         """
         return 0 if self.release_compatible else min(3, int(self.nominal) // DEGREE_EVERY)
 
-    def pose(self, times_us: Sequence[int]) -> Float[Tensor, "T J 4 4"]:
-        """Bone transforms canonical to world.
+    def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4).
 
         A training frame's middle has that frame's correction; any other time the recorded pose.
         """
@@ -111,7 +111,12 @@ class HugsModel(nn.Module):
         kept = self.turns.new_tensor(_NO_TURN) * (1 - frames.sum(1))[:, None, None]
         turns = kept + torch.einsum("tf,fjc->tjc", frames, self.turns)
         rotations = rotations @ six_to_matrix(turns)
-        return self.track.body.canonical_to_world(rotations, translation + frames @ self.shifts)
+        translation = translation + frames @ self.shifts
+        return rotations, self.track.body.canonical_to_world(rotations, translation)
+
+    def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Weights of the Gaussians; they belong to the learned centres, not to ``centers``."""
+        return self.human.look_up(self.human.means).weights
 
     def at(
         self,
@@ -150,9 +155,8 @@ class HugsModel(nn.Module):
         self, decoded: Decoded, times_us: Sequence[int], camera_center: Tensor
     ) -> PosedGaussians:
         human, scene = self.human, self.scene
-        world, transforms = skin(
-            human.means + decoded.offsets, decoded.weights, self.pose(times_us)
-        )
+        _, bones = self.pose(times_us)
+        world, transforms = skin(human.means + decoded.offsets, decoded.weights, bones)
         times = (len(times_us), -1, -1)
         return PosedGaussians(
             human=PosedHuman(
