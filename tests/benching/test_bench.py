@@ -15,11 +15,16 @@ from evsplat.benching.cell import run_cell
 from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.benching.plan import make_plan
 from evsplat.benching.suite import read_suite
+from evsplat.capture import load_capture
 from evsplat.cli import main
 from evsplat.errors import ConfigError
+from evsplat.evaluation import evaluate
+from evsplat.files import read_json
+from evsplat.training import load_run
 from evsplat.training.checkpoint import latest_checkpoint
 from evsplat.training.trainer import Trainer
 
+from ..small_model import SMALL_MODEL
 from .helpers import MEDIAN, PAPER, records, write_suite
 
 training = importlib.import_module("evsplat.training.train")
@@ -105,6 +110,25 @@ def test_failures_are_recorded_kept_and_tried_again_only_when_asked(tiny_capture
     message = capsys.readouterr().err
     assert "was made with method 'median_background', and 'nearest_frame' is asked for" in message
     assert records(out) == first
+
+
+def test_a_person_without_scene_can_be_measured_before_the_background(tiny_capture, tmp_path):
+    row = {"name": "alone", "method": "avatar3dgs", "backdrop": True}
+    settings = [setting for setting in SMALL_MODEL if not setting.startswith("scene.")]
+    settings.append("loss.perceptual=none")
+    capture = tiny_capture("one")
+    suite = write_suite(tmp_path / "suite.yaml", {"one": capture}, row | {"settings": settings})
+    folder = BenchFolder(tmp_path / "out")
+    (cell,) = make_plan(read_suite(suite), folder).cells
+    run_cell(folder.path, cell, threads=1, device="cpu")
+    record = read_json(folder.record_of(cell.id))
+    assert record["status"] == "done", record
+    trained = load_run(folder.run_of(cell.id))
+    again = evaluate(
+        load_capture(capture), trained.reconstruction, out_dir=tmp_path / "again", human_only=True
+    )
+    assert record["protocols"]["standard"] == again["composited"]["standard"]
+    assert record["protocols"]["standard"]["full"] != again["protocols"]["standard"]["full"]
 
 
 def test_two_benches_do_not_share_a_folder(tiny_capture, tmp_path):

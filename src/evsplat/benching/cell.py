@@ -19,6 +19,7 @@ from evsplat.capture import Capture, load_capture
 from evsplat.errors import EvsplatError
 from evsplat.evaluation.evaluator import evaluate
 from evsplat.files import read_json, write_json
+from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
 from evsplat.render import choose_device
@@ -60,6 +61,8 @@ class Cell:
     settings: tuple[str, ...]
     iterations: int | None
     max_minutes: float | None
+    backdrop: bool = False
+    """Whether it is measured before the median background."""
 
     @property
     def id(self) -> str:
@@ -122,6 +125,8 @@ def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) 
         reconstruction, facts = _trained(run, trained_on, cell, threads, device)
     else:
         reconstruction = UNTRAINED[cell.method](load_capture(trained_on))
+    if cell.backdrop:
+        reconstruction = OnMedianBackground(reconstruction, recorded)
     measured = evaluate(recorded, reconstruction, out_dir=run, device=device, alone=True)
     kept = ("frames", "protocols", "per_frame", "reasons", "weights", "protocol_notes")
     return {**facts, **{key: measured[key] for key in kept}}

@@ -110,6 +110,7 @@ def _cells(suite: Suite, sources: Iterable[CaptureSource]) -> list[Cell]:
             row.settings if row.method not in UNTRAINED else (),
             suite.iterations if row.method not in UNTRAINED else None,
             suite.max_minutes if row.method not in UNTRAINED else None,
+            row.backdrop,
         )
         for seed in suite.seeds
         for source in sources

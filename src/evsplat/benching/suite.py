@@ -48,6 +48,9 @@ class SuiteRow:
     """In tables; the name where it is not given."""
     restore: str | None = None
     """Restoration of the training frames before (`evsplat restore --with`)."""
+    backdrop: bool = False
+    """Measure it before the median of the training frames: for a person without a scene, of whom
+    black says nothing on a full frame."""
     settings: tuple[str, ...] = ()
     """Settings of the method as for ``--set``: ``event.weight=0``."""
     published: Published | None = None
