@@ -102,8 +102,8 @@ class HugsRates:
 
     human_means: float = 3.2e-4
     """Centres, metres; a tenth of it at the end, as after half of the released 30,000."""
-    triplane: float = 3e-3
-    """The triplane, its appearance and its geometry decoder; released: 1e-3 over all 15,000."""
+    triplane: float = 1e-3
+    """The triplane, its appearance and its geometry decoder."""
     skinning: float = 1e-4
     pose: float = 1e-4
     """Per-frame rotations and translations."""
