@@ -56,8 +56,8 @@ function draw() {
   let lens = [K[0][0], K[1][1], K[0][2], K[1][2]];
   if (!state.exact) {
     const ratio = Math.min(devicePixelRatio, 2);
-    // As much in height as the recording camera saw, whatever the width.
-    const focal = (K[1][1] * innerHeight * ratio) / height;
+    // As much in height as the recording camera saw; on a narrow screen two thirds of its width.
+    const focal = K[1][1] * ratio * Math.min(innerHeight / height, (1.5 * innerWidth) / width);
     [width, height] = [Math.round(innerWidth * ratio), Math.round(innerHeight * ratio)];
     lens = [focal, focal, width / 2, height / 2];
     view = orbit.pose();
@@ -126,6 +126,8 @@ for (const slider of document.querySelectorAll("[data-axis]")) {
     slider.nextElementSibling.textContent = `${slider.value}°`;
   };
 }
+
+find("fold").setAttribute("aria-expanded", String(innerWidth > 560));
 
 let before = performance.now();
 function frame(now) {
