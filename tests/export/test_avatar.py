@@ -18,6 +18,7 @@ from evsplat.body import load_body_track
 from evsplat.capture import load_capture
 from evsplat.config import override
 from evsplat.deform.at_rest import mean_at_rest
+from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.errors import DataError
 from evsplat.export import export_run
 from evsplat.export.avatar.figure import clip_of, figure_of, recorded_clip
@@ -25,7 +26,6 @@ from evsplat.export.avatar.loss import measure_loss
 from evsplat.export.avatar.package import avatar_document
 from evsplat.export.cloud import cloud_of
 from evsplat.gaussians import PosedHuman
-from evsplat.gaussians.skinned import SkinnedGaussians
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.reconstruction import Bakeable
 from evsplat.training.run import GaussianReconstruction
@@ -63,6 +63,7 @@ def _skinned(track, count: int, seed: int) -> SkinnedGaussians:
         tensor(rng.random(count)),
         tensor(rng.random((count, 3))),
         tensor(weights),
+        None,
     )
 
 
@@ -92,6 +93,7 @@ def test_mean_at_rest_undoes_any_skinning(seed):
         device=torch.device("cpu"),
         at=at,
         skinning_weights=lambda points: seen.append(points) or torch.ones(count, 1),
+        surface_light=lambda: None,
     )
     camera = SimpleNamespace(center=lambda: torch.zeros(3))
     mean = mean_at_rest(model, [(time, camera) for time in range(times)])
@@ -109,6 +111,9 @@ def test_a_model_without_pose_dependence_is_its_avatar(tiny_capture, method):
     values = SMALL_HUGS if method == "hugs" else override({}, SMALL)
     config = method_config(method, values, where="test")
     model = TRAINABLE[method][1](config, capture, 0, fit=False).model
+    if method == "evsplat":
+        with torch.no_grad():
+            model.shading.coefficients.normal_(std=0.1)
     source = GaussianReconstruction(method, model)
     assert isinstance(source, Bakeable)
     frame = capture.frames[8]
@@ -121,8 +126,10 @@ def test_a_model_without_pose_dependence_is_its_avatar(tiny_capture, method):
     shapes = [covariances(cloud.quaternions, cloud.scales) for cloud in (want, got)]
     np.testing.assert_allclose(shapes[1], shapes[0], atol=1e-5 * np.abs(shapes[0]).max())
     np.testing.assert_allclose(got.opacities, want.opacities, atol=1e-6)
-    if method == "hugs":
+    if method in ("hugs", "evsplat"):
+        # Colours of their own, under no light or under one that the avatar has.
         np.testing.assert_allclose(got.rgb, want.rgb, atol=1e-5)
+        assert (mean.light is None) == (method == "hugs")
 
 
 @SEEDS

@@ -1,5 +1,6 @@
 """The mean of a person over recorded times, in canonical space, moved by bones alone."""
 
+import copy
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
@@ -10,8 +11,9 @@ from torch.nn.functional import normalize
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera
+from evsplat.deform.shading import SurfaceLight
+from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.gaussians import PosedGaussians
-from evsplat.gaussians.skinned import SkinnedGaussians
 
 
 @runtime_checkable
@@ -41,15 +43,21 @@ class Skinned(Protocol):
         """
         ...
 
+    def surface_light(self) -> SurfaceLight | None:
+        """The light on the person's Gaussians, where it is learned apart from their colours."""
+        ...
+
 
 @torch.no_grad()
 def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
     """What skinning can show of a model: its mean over ``views``, instants (us) and their cameras.
 
     Centre, log-scales, rotation and colour are the means of what the model shows at those instants
-    with the skinning undone. That drops less than switching the pose-dependent part off: what all
-    poses have in common stays. Weights are those at the mean centre.
+    with the skinning undone, and the light where the model knows it. That drops less than switching
+    the pose-dependent part off: what all poses have in common stays. Weights are those at the mean
+    centre.
     """
+    light = model.surface_light()
     sums: list[Tensor] = []
     first: Tensor | None = None
     for time_us, camera in views:
@@ -64,15 +72,27 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
         quaternions = quaternions * torch.where((quaternions * first).sum(-1) < 0, -1, 1)[:, None]
         # Covariances know no sign of a scale; decoders of HUGS may give either.
         log_scales = person.scales[0].double().abs().log()
-        values = [centers, log_scales, quaternions, person.rgb[0].double()]
+        rgb = person.rgb[0].double()
+        factors = torch.ones_like(rgb)
+        if light is not None:
+            factors = light.factors(person.transforms, person.means)[0].double()
+        values = [centers, log_scales, quaternions, rgb * factors, factors.square()]
         sums = [a + b for a, b in zip(sums, values, strict=True)] if sums else values
-    centers, log_scales, quaternions, rgb = ((total / len(views)).float().cpu() for total in sums)
+    centers, log_scales, quaternions, lit, squares = (
+        (total / len(views)).float().cpu() for total in sums
+    )
     return SkinnedGaussians(
         body=model.track.body.to("cpu"),
         means=centers,
         quaternions=normalize(quaternions, dim=-1),
         scales=log_scales.exp(),
         opacities=posed.human_opacities.cpu(),
-        rgb=rgb,
+        # The colour c with the least sum of (c * factor - rgb)^2.
+        rgb=lit / squares,
         weights=model.skinning_weights(centers.to(model.device)).cpu(),
+        light=None if light is None else _on_cpu(light),
     )
+
+
+def _on_cpu(light: SurfaceLight) -> SurfaceLight:
+    return SurfaceLight(copy.deepcopy(light.shading).to("cpu"), light.normals.cpu())

@@ -20,7 +20,7 @@ from evsplat.deform.mlp import PointMLP, Precision
 from evsplat.deform.model import RowCache
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
-from evsplat.deform.shading import NearestSurface, Shading
+from evsplat.deform.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.deform.shadow import BodyShadow
 from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.deform.skinning_turns import SkinningTurns
@@ -235,11 +235,18 @@ class HumanSceneModel(nn.Module):
             translation = translation + weights @ self.translation_residuals
         return rotations, self.track.body.canonical_to_world(rotations, translation)
 
-    def skinning_weights(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
-        """Weights of the bones at canonical points (metres)."""
+    def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Weights of the bones for Gaussians with these canonical centres (metres)."""
         if self.skinning is None:
-            return self.surface.weights_at(points)
-        return self.skinning(self.normalise(points))
+            return self.surface.weights_at(centers)
+        return self.skinning(self.normalise(centers))
+
+    def surface_light(self) -> SurfaceLight | None:
+        """The light on the person's Gaussians, where it is learned."""
+        if self.shading is None:
+            return None
+        means = self.gaussians.means[self.gaussians.human]
+        return SurfaceLight(self.shading, self.surface.normals(means))
 
     def at(
         self,
@@ -298,8 +305,10 @@ class HumanSceneModel(nn.Module):
             seen_times,
             noise,
         )
-        if self.shading is not None:
-            rgb = rgb * self._shade(parts["means"][0], human_means, transforms[:, people])
+        light = self.surface_light()
+        if light is not None:
+            # Geometry gets no gradient by the light.
+            rgb = rgb * light.factors(transforms[:, people].detach(), human_means.detach())
         hidden = noise is not None and noise.hide_scene_direction
         directions = view_directions(scene_means[None], camera_center)[0]
         if hidden:
@@ -423,15 +432,6 @@ class HumanSceneModel(nn.Module):
         )
         delta = self.non_rigid(self.normalise(canonical), self.pose_encoder(seen))
         return delta.shape(canonical, moving["scales_log"], quaternions)
-
-    def _shade(
-        self, canonical: Tensor, world: Tensor, transforms: Tensor
-    ) -> Float[Tensor, "T H 3"]:
-        """Factor of the light on the person's colours; geometry gets no gradient by it."""
-        assert self.shading is not None
-        normals = self.surface.normals(canonical)[None, ..., None]
-        turned = (transforms[..., :3, :3].detach() @ normals)[..., 0]
-        return self.shading(nn.functional.normalize(turned, dim=-1), world.detach())
 
     def _human_rgb(
         self,

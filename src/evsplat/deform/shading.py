@@ -1,5 +1,7 @@
 """How bright the person's surface is, by where it stands and how it is turned."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -42,6 +44,22 @@ class Shading(nn.Module):
         at_normals = (turned @ self.coefficients.movedim(1, 0).flatten(1)).unflatten(-1, (4, 3))
         bent = at_normals[..., 0, :] + (moved[..., None] * at_normals[..., 1:, :]).sum(-2)
         return (1 + bent).clamp(_DARKEST, _BRIGHTEST)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceLight:
+    """The light on Gaussians whose normals are known in canonical space."""
+
+    shading: Shading
+    normals: Float[Tensor, "N 3"]
+    """Unit."""
+
+    def factors(
+        self, transforms: Float[Tensor, "T N 4 4"], places: Float[Tensor, "T N 3"]
+    ) -> Float[Tensor, "T N 3"]:
+        """Factors on colours, for transforms canonical to world and world places (metres)."""
+        turned = (transforms[..., :3, :3] @ self.normals[..., None])[..., 0]
+        return self.shading(nn.functional.normalize(turned, dim=-1), places)
 
 
 class NearestSurface:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from evsplat.body import load_body_track
 from evsplat.errors import ConfigError, DataError
-from evsplat.export.avatar import at_rest, export_avatar, identity_bones
+from evsplat.export.avatar import at_rest, export_avatar
 from evsplat.export.clip import export_clip
 from evsplat.export.cloud import cloud_of
 from evsplat.export.gaussians import (
@@ -107,9 +107,12 @@ def _export_instant(
     facts = facts_of(run)
     if canonical:
         gaussians = at_rest(run, camera)
-        cloud = cloud_of(gaussians.posed(identity_bones(gaussians)))
+        cloud = cloud_of(gaussians.at_rest())
         rotation = file_rotation(rest_track(gaussians.body), kind, up)
-        label, when = "canonical", "at rest, colours as their mean over the training frames"
+        label, when = (
+            "canonical",
+            "at rest, colours as their mean over the training frames, without known light",
+        )
         facts |= {"pose": "canonical"}
     else:
         rotation = file_rotation(load_body_track(capture), kind, up)

@@ -118,6 +118,9 @@ class HugsModel(nn.Module):
         """Weights of the Gaussians; they belong to the learned centres, not to ``centers``."""
         return self.human.look_up(self.human.means).weights
 
+    def surface_light(self) -> None:
+        """No light is learned apart from the colours."""
+
     def at(
         self,
         times_us: Sequence[int],

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.capture.camera import Camera
-from evsplat.gaussians.skinned import SkinnedGaussians
+from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.render import Splats
 
 Parts = Literal["all", "human", "scene"]

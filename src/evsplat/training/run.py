@@ -20,10 +20,10 @@ from evsplat.config import load_yaml, to_dict
 from evsplat.deform.at_rest import Skinned, mean_at_rest
 from evsplat.deform.drawing import draw, draw_depth, shadowed_scene
 from evsplat.deform.model import Model
+from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.devices import hardware
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
-from evsplat.gaussians.skinned import SkinnedGaussians
 from evsplat.methods import TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
 from evsplat.render import Splats, choose_device, render

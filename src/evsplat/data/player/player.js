@@ -18,6 +18,7 @@ const chosen = bytes(avatar.skin.bones), weights = bytes(avatar.skin.weights);
 const clouds = [{
   count: avatar.person.count, values: floats(avatar.person.values),
   bones: (row, k) => chosen[4 * row + k], weights: (row, k) => weights[4 * row + k] / 255,
+  normals: avatar.light ? floats(avatar.light.normals) : null,
 }];
 if (avatar.scene) {
   clouds.push({
@@ -28,7 +29,7 @@ if (avatar.scene) {
 
 let renderer = null;
 try {
-  renderer = new SplatRenderer(canvas, clouds, joints + 1);
+  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.light);
   find("message").remove();
 } catch (error) {
   find("message").textContent = error.message;

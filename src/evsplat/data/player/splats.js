@@ -1,7 +1,9 @@
 // Draws skinned Gaussians with WebGL 2 by the rules of evsplat's rasteriser: EWA projection with a
 // low-pass of 0.3 px², contributions from 1/255 on, back to front by depth.
 
-const TEXELS = 6; // of a Gaussian: centre and opacity, covariance (2), colour, weights, bones
+// Of a Gaussian: centre and opacity, covariance (2) and colour with the normal in what is left of
+// both, weights, bones.
+const TEXELS = 6;
 const WIDTH = 1020; // of its texture, a multiple of TEXELS
 const MIN_ALPHA = 1 / 255;
 
@@ -12,6 +14,9 @@ uniform highp sampler2D gaussians, bones;
 uniform mat4 view;         // world to camera: x right, y down, z forward
 uniform vec4 lens;         // focal lengths and principal point, pixels
 uniform vec2 size;         // of the picture, pixels
+uniform bool lit;
+uniform vec4 room;         // middle and radius of the places that the light knows
+uniform vec3 light[36];    // of 1, x, y, z of the place, nine each, in the order of basis below
 in uint index;
 out vec2 offset;           // pixels from the centre
 flat out vec3 conic;
@@ -20,6 +25,18 @@ flat out vec4 colour;
 vec4 texel(int k) {
   int at = int(index) * ${TEXELS} + k;
   return texelFetch(gaussians, ivec2(at % ${WIDTH}, at / ${WIDTH}), 0);
+}
+
+// A factor on the colour: a polynomial of degree 2 in the normal, linear in the place.
+vec3 shade(vec3 n, vec3 world) {
+  float basis[9] = float[9](
+    1.0, -0.48860251 * n.y, 0.48860251 * n.z, -0.48860251 * n.x, 1.09254843 * n.x * n.y,
+    -1.09254843 * n.y * n.z, 0.31539157 * (2.0 * n.z * n.z - n.x * n.x - n.y * n.y),
+    -1.09254843 * n.x * n.z, 0.54627422 * (n.x * n.x - n.y * n.y));
+  vec4 place = vec4(1, clamp((world - room.xyz) / room.w, -2.0, 2.0));
+  vec3 factor = vec3(1);
+  for (int p = 0; p < 4; p++) for (int k = 0; k < 9; k++) factor += place[p] * basis[k] * light[9 * p + k];
+  return clamp(factor, 0.2, 3.0);
 }
 
 void main() {
@@ -41,7 +58,8 @@ void main() {
   // The Jacobian is taken inside the field of view, enlarged by 30 % of its half width.
   vec2 margin = 0.15 * size / focal;
   tangent = clamp(tangent, -middle / focal - margin, (size - middle) / focal + margin);
-  mat3 linear = mat3(view) * transpose(mat3(blend[0].xyz, blend[1].xyz, blend[2].xyz));
+  mat3 moved = transpose(mat3(blend[0].xyz, blend[1].xyz, blend[2].xyz));
+  mat3 linear = mat3(view) * moved;
   mat3 covariance = mat3(b.x, b.y, b.z, b.y, b.w, c.x, b.z, c.x, c.y);
   mat3 seen = linear * covariance * transpose(linear);
   vec3 right = vec3(focal.x, 0, -focal.x * tangent.x) / local.z;
@@ -51,7 +69,10 @@ void main() {
   if (determinant <= 0.0) return;
 
   conic = vec3(yy, -xy, xx) / determinant;
-  colour = vec4(texel(3).rgb, a.w);
+  vec4 paint = texel(3);
+  vec3 normal = vec3(c.zw, paint.w);
+  colour = vec4(paint.rgb, a.w);
+  if (lit && dot(normal, normal) > 0.5) colour.rgb *= shade(normalize(moved * normal), world);
   float extent = sqrt(2.0 * log(a.w / ${MIN_ALPHA}));
   vec2 reach = ceil(extent * sqrt(vec2(xx, yy)));
   vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
@@ -82,13 +103,15 @@ out vec4 result;
 void main() { result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1); }`;
 
 class SplatRenderer {
-  // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with bones and weights.
-  constructor(canvas, clouds, boneCount) {
+  // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with bones, weights and,
+  // where light falls on them, normals. light: center, radius_m, coefficients (4 x 9 x 3), or null.
+  constructor(canvas, clouds, boneCount, light) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2, which drawing Gaussians needs.");
     this.gl = gl;
     this.canvas = canvas;
     this.boneCount = boneCount;
+    this.light = light;
     // Sixteen bits per channel where the device can blend them: eight add a rounding per Gaussian.
     this.fine = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.count = clouds.reduce((sum, cloud) => sum + cloud.count, 0);
@@ -116,11 +139,12 @@ class SplatRenderer {
     this.centers = new Float32Array(3 * this.count);
     this.skin = { bones: new Uint16Array(4 * this.count), weights: new Float32Array(4 * this.count) };
     let k = 0;
-    for (const { count, values, bones, weights } of clouds) {
+    for (const { count, values, bones, weights, normals } of clouds) {
       for (let row = 0; row < count; row++, k++) {
         const v = values.subarray(14 * row, 14 * row + 14), at = 4 * TEXELS * k;
         const c = covarianceOf(v.subarray(3, 7), v.subarray(7, 10));
-        texels.set([v[0], v[1], v[2], v[10], ...c, 0, 0, v[11], v[12], v[13], 0], at);
+        const n = normals ? normals.subarray(3 * row, 3 * row + 3) : [0, 0, 0];
+        texels.set([v[0], v[1], v[2], v[10], ...c, n[0], n[1], v[11], v[12], v[13], n[2]], at);
         for (let j = 0; j < 4; j++) {
           texels[at + 16 + j] = this.skin.weights[4 * k + j] = weights(row, j);
           texels[at + 20 + j] = this.skin.bones[4 * k + j] = bones(row, j);
@@ -183,6 +207,12 @@ class SplatRenderer {
     gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "view"), false, view);
     gl.uniform4fv(gl.getUniformLocation(this.program, "lens"), lens);
     gl.uniform2f(gl.getUniformLocation(this.program, "size"), width, height);
+    gl.uniform1i(gl.getUniformLocation(this.program, "lit"), this.light ? 1 : 0);
+    if (this.light) {
+      const { center, radius_m, coefficients } = this.light;
+      gl.uniform4f(gl.getUniformLocation(this.program, "room"), ...center, radius_m);
+      gl.uniform3fv(gl.getUniformLocation(this.program, "light"), coefficients.flat(2));
+    }
     gl.bindVertexArray(this.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, this.order.subarray(0, count), gl.DYNAMIC_DRAW);

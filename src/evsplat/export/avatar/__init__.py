@@ -1,6 +1,5 @@
 """The avatar: a person who plays and can be posed in any browser, without evsplat."""
 
 from evsplat.export.avatar.export import at_rest, export_avatar
-from evsplat.export.avatar.figure import identity_bones
 
-__all__ = ["at_rest", "export_avatar", "identity_bones"]
+__all__ = ["at_rest", "export_avatar"]

@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.body.rotations import matrix_to_quaternion
+from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.errors import DataError
-from evsplat.gaussians.skinned import SkinnedGaussians
 from evsplat.methods.reconstruction import Bakeable
 
 BONES_EACH = 4
@@ -61,11 +61,6 @@ def figure_of(gaussians: SkinnedGaussians) -> Figure:
         bones=torch.nn.functional.pad(bones, padding).to(torch.uint8).numpy(),
         weights=torch.nn.functional.pad(weights, padding).to(torch.uint8).numpy(),
     )
-
-
-def identity_bones(gaussians: SkinnedGaussians) -> Float[Tensor, "1 J 4 4"]:
-    """Bone transforms that leave a person at rest."""
-    return torch.eye(4).expand(1, gaussians.weights.shape[1], 4, 4)
 
 
 def recorded_clip(source: Bakeable, gaussians: SkinnedGaussians, times_us: tuple[int, int]) -> Clip:

@@ -30,6 +30,8 @@ class Loss:
     """Model and avatar on the test frames, in the same scene, drawn by the same rasteriser."""
 
     frames: int
+    keeps_light: bool
+    """Whether the avatar has the light, which a method may know."""
     avatar_to_model: Psnr
     model_to_truth: Psnr | None
     """None where the capture has no sharp truth."""
@@ -37,8 +39,9 @@ class Loss:
 
     def sentence(self) -> str:
         """The loss in words, with its figures."""
+        dropped = "non-rigid motion, colour" + ("" if self.keeps_light else ", light")
         said = (
-            "Dropped: what poses do beyond skinning (non-rigid motion, colour, light). On the "
+            f"Dropped: what poses do beyond skinning ({dropped}). On the "
             f"person's pixels of {self.frames} test frames the avatar is "
             f"{self.avatar_to_model.person:.2f} dB PSNR from the model"
         )
@@ -79,7 +82,11 @@ def measure_loss(source: Bakeable, figure: Figure, capture: Capture) -> Loss:
     if between is None:
         raise DataError(f"{capture.path}: the person is in none of the test frames.")
     return Loss(
-        len(rows["avatar"]), between, _mean(rows["model_truth"]), _mean(rows["avatar_truth"])
+        len(rows["avatar"]),
+        figure.gaussians.light is not None,
+        between,
+        _mean(rows["model_truth"]),
+        _mean(rows["avatar_truth"]),
     )
 
 

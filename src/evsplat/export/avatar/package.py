@@ -13,8 +13,9 @@ import torch
 
 from evsplat.body import BodyTrack, up_axis
 from evsplat.capture import Camera
+from evsplat.deform.shading import SurfaceLight
 from evsplat.errors import DataError
-from evsplat.export.avatar.figure import Clip, Figure, identity_bones
+from evsplat.export.avatar.figure import Clip, Figure
 from evsplat.export.cloud import SplatCloud, cloud_of
 from evsplat.export.formats import write_ply
 from evsplat.files import new_folder, write_json, write_text
@@ -66,7 +67,7 @@ def write_avatar(
 
 def rest_cloud(figure: Figure) -> SplatCloud:
     """The person in the canonical pose."""
-    return cloud_of(figure.gaussians.posed(identity_bones(figure.gaussians)))
+    return cloud_of(figure.gaussians.at_rest())
 
 
 def avatar_document(
@@ -79,6 +80,7 @@ def avatar_document(
 ) -> dict[str, Any]:
     """What avatar.json holds; arrays are base64 of little-endian numbers, rows after rows."""
     body = figure.gaussians.body
+    light = figure.gaussians.light
     inverse = torch.linalg.inv(body.canonical_bone_transforms().double())
     return {
         "format": FORMAT,
@@ -103,6 +105,7 @@ def avatar_document(
             "bones": _base64(figure.bones, "u1"),
             "weights": _base64(figure.weights, "u1"),
         },
+        "light": None if light is None else _light(light),
         "clips": [
             {
                 "name": clip.name,
@@ -140,6 +143,16 @@ def _cloud(cloud: SplatCloud) -> dict[str, Any]:
     """14 float32 per Gaussian: centre, rotation (w, x, y, z), scales, opacity, RGB."""
     columns = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities[:, None], cloud.rgb)
     return {"count": len(cloud), "values": _base64(np.concatenate(columns, axis=1), "<f4")}
+
+
+def _light(light: SurfaceLight) -> dict[str, Any]:
+    shading = light.shading
+    return {
+        "center": shading.center.tolist(),
+        "radius_m": float(shading.radius_m),
+        "coefficients": shading.coefficients.tolist(),
+        "normals": _base64(light.normals.numpy(), "<f4"),
+    }
 
 
 def _base64(values: np.ndarray, kind: str) -> str:
