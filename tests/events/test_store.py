@@ -22,12 +22,26 @@ def random_events(seed: int, count: int, length_us: int, first_us: int = 0) -> E
     times = np.sort(rng.integers(first_us, first_us + length_us, count))
     # bursts: many events in one microsecond and across a millisecond's edge
     times[count // 3 : count // 2] = times[count // 3] // 1000 * 1000 if count > 5 else times[0]
+    polarity = rng.choice(np.array([-1, 1], dtype=np.int8), count)
+    polarity[-1] = 1  # a file with darker events only would be one without polarity
     return EventStream(
         np.sort(times).astype(np.int64),
         rng.integers(0, WIDTH, count).astype(np.uint16),
         rng.integers(0, HEIGHT, count).astype(np.uint16),
-        rng.choice(np.array([-1, 1], dtype=np.int8), count),
+        polarity,
     )
+
+
+def test_events_without_polarity_are_told_from_others(tmp_path: Path) -> None:
+    events = random_events(3, 500, 60_000)
+    write_events(tmp_path / "signed.h5", events)
+    write_events(
+        tmp_path / "blind.h5", EventStream(events.t, events.x, events.y, np.zeros_like(events.p))
+    )
+    signed, blind = (EventStore(tmp_path / f"{n}.h5", WIDTH, HEIGHT) for n in ("signed", "blind"))
+    assert signed.has_polarity and not blind.has_polarity
+    unsigned = blind.between(*blind.time_range_us)
+    assert not unsigned.p.any() and np.array_equal(unsigned.t, events.t)
 
 
 def same(a: EventStream, b: EventStream) -> bool:

@@ -2,12 +2,15 @@
 
 import json
 
+import h5py
 import pytest
 
 from evsplat.calibration import SensorEstimate, ThresholdEstimate
 from evsplat.capture import load_capture
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods import evsplat as method
+from evsplat.objectives import EventChange, EventWindows
+from evsplat.training import train
 
 SMALL = {
     "human": {"count": 60},
@@ -58,3 +61,46 @@ def test_what_cannot_be_told_is_said(tiny_capture, monkeypatch, caplog):
     monkeypatch.setattr(method, "estimate_from_capture", lambda capture, *, frames: None)
     assert thresholds(path) == pytest.approx((0.2, 0.2), rel=1e-6)
     assert "contrast thresholds are neither given nor to be found" in caplog.text
+
+
+@pytest.mark.parametrize("missing", ["events", "polarity"])
+def test_it_trains_on_what_is_there_and_says_so(tiny_capture, tmp_path, caplog, missing):
+    path = tiny_capture()
+    metadata = json.loads((path / "capture.json").read_text())
+    if missing == "polarity":
+        with h5py.File(path / metadata["events"]["file"], "r+") as file:
+            file["events/p"][:] = 0
+    else:
+        metadata["events"] = None
+        (path / "capture.json").write_text(json.dumps(metadata))
+    overrides = ("human.count=60", "scene.prefit_steps=1", "deform.width=16")
+    run = train(path, method="evsplat", out=tmp_path / "run", iterations=4, overrides=overrides)
+    lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    assert ("event" in lines[-1]["terms"]) == (missing == "polarity")
+    said = {"events": "has no events", "polarity": "events have no polarity"}[missing]
+    assert said in caplog.text
+
+
+@pytest.mark.parametrize("term", ["windows", "paper"])
+def test_the_event_term_is_chosen(tiny_capture, term):
+    config = method_config("evsplat", {**SMALL, "event_term": term}, where="test")
+    objectives = method.compose(config, load_capture(tiny_capture()), 0).objectives
+    assert any(isinstance(one, EventWindows) for one in objectives) == (term == "windows")
+    assert any(isinstance(one, EventChange) for one in objectives) == (term == "paper")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_papers_term_takes_events_without_polarity(tiny_capture, seed):
+    """Where all pixels only brighten, sizes and signed changes say the same."""
+    path = tiny_capture(seed=seed)
+    with h5py.File(path / "events.h5", "r+") as file:
+        file["events/p"][:] = 1
+    signed = method.paper_events(method.EventConfig(), load_capture(path))
+    pair = next(iter(signed.weights))
+    changed = signed._map(*pair)
+    signed.events.close()
+    with h5py.File(path / "events.h5", "r+") as file:
+        file["events/p"][:] = 0
+    blind = method.paper_events(method.EventConfig(), load_capture(path))
+    assert changed.any() and (changed == blind._map(*pair)).all()
+    assert signed.weights == blind.weights

@@ -1,5 +1,6 @@
 """Event windows: right thresholds explain what a changing picture did, wrong ones do not."""
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from evsplat.events import EventStream
-from evsplat.objectives import ContrastThresholds, EventWindows
+from evsplat.objectives import EventSensor, EventWindows
 
 HEIGHT, WIDTH, EPS = 9, 11, 0.004
 
@@ -17,8 +18,9 @@ class Recording:
 
     height, width = HEIGHT, WIDTH
 
-    def __init__(self, stream: EventStream) -> None:
-        self.stream = stream
+    def __init__(self, stream: EventStream, has_polarity: bool = True) -> None:
+        self.stream, self.has_polarity = stream, has_polarity
+        self.time_range_us = (int(stream.t[0]), int(stream.t[-1]) + 1)
 
     def between(self, start: int, end: int) -> EventStream:
         return self.stream.between(start, end)
@@ -52,10 +54,11 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
     return capture, SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0)
 
 
-def make(capture, on: float, off: float) -> EventWindows:
-    thresholds = ContrastThresholds(on, off).double()
+def make(capture, on: float, off: float, *, noise_aware=False, **learned) -> EventWindows:
+    sensor = EventSensor(on, off, **learned).double()
     generator = torch.Generator().manual_seed(0)
-    return EventWindows(capture, thresholds, generator, start=750, eps=EPS, reach=0.5)
+    options = {"start": 750, "eps": EPS, "reach": 0.5, "noise_aware": noise_aware}
+    return EventWindows(capture, sensor, generator, **options)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -64,34 +67,33 @@ def test_right_thresholds_explain_every_window_and_wrong_ones_by_how_much(seed):
     assert float(make(capture, 0.3, 0.2).loss(step)["event"]) < 1e-6
     wrong = make(capture, 0.4, 0.2)
     loss = wrong.loss(step)["event"]
-    counts = wrong._counts(capture.events.stream, step.times_us).double()[:, 0]
+    edges = list(itertools.pairwise(step.times_us))
+    counts = wrong._counts(capture.events.stream, edges, torch.device("cpu")).double()[:, 0]
     expected = 0.5 * 0.1 * (float(counts.mean()) + float(counts.sum(0).mean()))
     assert float(loss) == pytest.approx(expected, rel=1e-6)
     loss.backward()
-    assert wrong.thresholds.logs.grad[0] > 0  # a smaller threshold fits better
+    assert wrong.sensor.logs.grad[0] > 0  # a smaller threshold fits better
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_learned_thresholds_come_back(seed):
     capture, step = scene(seed)
     objective = make(capture, 0.2, 0.2)
-    adam = torch.optim.Adam(objective.thresholds.parameters(), lr=0.02)
+    adam = torch.optim.Adam(objective.sensor.parameters(), lr=0.02)
     for _ in range(150):
         adam.zero_grad()
         objective.loss(step)["event"].backward()
         adam.step()
-    assert torch.allclose(
-        objective.thresholds.logs.exp(), torch.tensor([0.3, 0.2]).double(), rtol=0.05
-    )
+    assert torch.allclose(objective.sensor.logs.exp(), torch.tensor([0.3, 0.2]).double(), rtol=0.05)
 
 
 def test_thresholds_are_held_where_they_started():
-    thresholds = ContrastThresholds(0.2, 0.3)
+    thresholds = EventSensor(0.2, 0.3)
     assert float(thresholds.apart()) == 0.0
     with torch.no_grad():
         thresholds.logs += torch.tensor([0.1, -0.3])
     assert float(thresholds.apart()) == pytest.approx((0.01 + 0.09) / 2)
-    resumed = ContrastThresholds(1.0, 1.0)
+    resumed = EventSensor(1.0, 1.0)
     resumed.load_state_dict(thresholds.state_dict())
     assert float(resumed.apart()) == pytest.approx(0.05)
 
@@ -104,3 +106,108 @@ def test_a_time_outside_of_the_exposure_is_asked_for_after_the_start():
     drawn = [objective.times(frame, 800)[0] for _ in range(100)]
     assert all(3_999 <= time < 9_000 or 11_000 <= time <= 16_000 for time in drawn)
     assert any(time < 9_000 for time in drawn) and any(time > 9_000 for time in drawn)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_pixel_learns_its_own_threshold(seed):
+    capture, step = scene(seed, on=0.2, off=0.2)
+    factors = 1 + 0.3 * torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed))
+    log = torch.log(step.linear + EPS).double()
+    step.linear = torch.exp(-2 + (log + 2) * factors[..., None]) - EPS
+    objective = make(capture, 0.2, 0.2, pixels=(HEIGHT, WIDTH))
+    objective.sensor.logs.requires_grad_(False)
+    adam = torch.optim.Adam(objective.sensor.parameters(), lr=0.01)
+    for _ in range(200):
+        adam.zero_grad()
+        objective.loss(step)["event"].backward()
+        adam.step()
+    counts = objective._counts(capture.events.stream, [(0, 10_000)], torch.device("cpu"))
+    seen = counts.sum((0, 1)) > 0
+    learned = objective.sensor.pixel_logs.exp()
+    assert torch.allclose(learned[seen], factors[seen].double(), rtol=0.03)
+    assert float(objective.sensor.apart()) == pytest.approx(
+        float(objective.sensor.pixel_logs.square().mean())
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_polarity_the_size_of_the_change_is_compared(seed):
+    capture, step = scene(seed, on=0.25, off=0.25)
+    stream = capture.events.stream
+    blind = EventStream(stream.t, stream.x, stream.y, np.zeros_like(stream.p))
+    capture.events = Recording(blind, has_polarity=False)
+    assert float(make(capture, 0.25, 0.25).loss(step)["event"]) < 1e-6
+    counts = np.zeros(HEIGHT * WIDTH)
+    np.add.at(counts, stream.y.astype(int) * WIDTH + stream.x, 1)
+    off_by = make(capture, 0.35, 0.35).loss(step)["event"]
+    assert float(off_by) == pytest.approx(0.1 * counts.mean() / 3, rel=1e-5)  # three windows
+
+
+def moving_edge(late_us: int):
+    """A bright edge that runs over the picture, and its events, stamped ``late_us`` too late."""
+    times = (20_000, 28_000, 36_000, 44_000)
+    column = torch.arange(WIDTH).double()
+
+    def log(time):
+        return -3 + 2 * torch.sigmoid((time / 5_000 - 1 - column) / 0.8)
+
+    parts = []
+    grid = np.arange(0, 80_000, 50)
+    for x in range(WIDTH):
+        crossed = np.floor(torch.stack([log(t) for t in grid.tolist()])[:, x] / 0.02)
+        at = grid[1:][np.diff(crossed.numpy()) > 0]
+        parts += [(at, np.full(len(at), x), np.full(len(at), y)) for y in range(HEIGHT)]
+    t, x, y = (np.concatenate(values) for values in zip(*parts, strict=True))
+    order = np.argsort(t, kind="stable")
+    stream = EventStream(
+        (t[order] + late_us).astype(np.int64),
+        x[order].astype(np.uint16),
+        y[order].astype(np.uint16),
+        np.ones(len(t), dtype=np.int8),
+    )
+    frames = [SimpleNamespace(mid_us=mid) for mid in (0, 40_000, 80_000)]
+    linear = torch.stack([log(t).exp() - EPS for t in times])
+    step = SimpleNamespace(
+        times_us=times,
+        linear=linear[:, None, :, None].expand(-1, HEIGHT, -1, 3),
+        nominal=5_000.0,
+    )
+    return SimpleNamespace(events=Recording(stream), frames=frames), step
+
+
+@pytest.mark.parametrize("late_us", [-3_000, 0, 4_000])
+def test_a_clock_that_is_late_is_found(late_us):
+    capture, step = moving_edge(late_us)
+    objective = make(capture, 0.02, 0.02, clock=True)
+    objective.sensor.logs.requires_grad_(False)
+    adam = torch.optim.Adam([objective.sensor.offset], lr=0.02)
+    for iteration in range(150):
+        adam.param_groups[0]["lr"] = 0.02 * 0.97**iteration
+        adam.zero_grad()
+        objective.loss(step)["event"].backward()
+        adam.step()
+    assert float(objective.sensor.offset_us) == pytest.approx(late_us, abs=300)
+
+
+@pytest.mark.parametrize("rate_hz", [0.3, 8.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_lowers_the_weight_and_hot_pixels_have_none(seed, rate_hz):
+    rng = np.random.default_rng(seed)
+    height, width, seconds = 60, 80, 4
+    pixels = height * width
+    count = rng.poisson(rate_hz * seconds * pixels)
+    place = np.concatenate([rng.integers(0, pixels, count), np.full(4_000, 17 * width + 23)])
+    t = np.concatenate([rng.integers(0, seconds * 1_000_000, count), np.arange(4_000) * 999])
+    order = np.argsort(t, kind="stable")
+    y, x = np.divmod(place[order], width)
+    sign = rng.choice([-1, 1], len(t))
+    stream = EventStream(t[order], x.astype(np.uint16), y.astype(np.uint16), sign.astype(np.int8))
+    events = Recording(stream)
+    events.height, events.width = height, width
+    capture = SimpleNamespace(events=events, frames=[SimpleNamespace(mid_us=0)])
+    objective = make(capture, 0.2, 0.2, noise_aware=True)
+    found_hz, sound = objective._noise
+    assert found_hz == pytest.approx(rate_hz, rel=0.2)
+    assert sound[17, 23] == 0 and float(sound.sum()) == pixels - 1
+    assert objective._weight(500_000) == pytest.approx(1 / (1 + 2 * (found_hz / 2) ** 0.5))
+    assert make(capture, 0.2, 0.2)._weight(500_000) == 1.0

@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -124,6 +125,11 @@ def test_edi_says_what_it_lacks(tiny_capture: Factory, tmp_path: Path) -> None:
     _edit(path)
     with pytest.raises(DataError, match="no events.*edi"):
         restore_capture(path, tmp_path / "sharp")
+    blind = tiny_capture("blind")
+    with h5py.File(blind / "events.h5", "r+") as file:
+        file["events/p"][:] = 0
+    with pytest.raises(DataError, match="no event has a polarity.*edi"):
+        restore_capture(blind, tmp_path / "sharp")
     small = tiny_capture("small", frames=2)
     _edit(small, contrast_threshold=None)
     with pytest.raises(DataError, match="--contrast-threshold"):

@@ -13,7 +13,7 @@ from evsplat.calibration.brightness import (
     pair_indices,
 )
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
-from evsplat.calibration.noise import NoiseEstimate, NoiseMeter
+from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ __all__ = [
     "estimate_from_capture",
     "estimate_from_pairs",
     "estimate_thresholds",
+    "noise_of",
     "exposure",
     "pair",
     "pair_indices",
@@ -63,12 +64,13 @@ def estimate_from_capture(
 ) -> SensorEstimate | None:
     """Estimate from at most 60 pairs of consecutive frames; None where that is not possible.
 
-    ``frames`` are those whose pictures may be looked at, in the order of time; without it all.
+    Events without polarity tell nothing. ``frames`` are those whose pictures may be looked at, in
+    the order of time; without it all.
 
     The lag is what is left after the capture's own ``clock_offset_us``. A moving camera changes
     nothing: both sides see what moves in the picture.
     """
-    if capture.events is None or len(capture.events) == 0:
+    if capture.events is None or len(capture.events) == 0 or not capture.events.has_polarity:
         return None
     frames = capture.frames if frames is None else frames
     indices = pair_indices([frame.exposure_us for frame in frames], MOST_PAIRS)

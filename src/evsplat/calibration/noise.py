@@ -6,12 +6,14 @@ import numpy as np
 from jaxtyping import Int64
 from scipy.ndimage import binary_dilation
 
-from evsplat.events import EventStream
+from evsplat.events import EventStore, EventStream
 
 SUPPORT_US = 10_000
 """An event with another one at or beside its pixel within about this time is not noise."""
+_PIECE_US = 1_000_000
 HOT_RATIO = 10.0
 HOT_RATE_HZ = 5.0
+_FLOOR_QUANTILE = 0.2
 LEAST_QUIET_SHARE = 0.05
 QUIET_DISTANCE_PX = 3
 """Nothing moves at pixels that are farther than this from any that had a supported event."""
@@ -28,6 +30,9 @@ class NoiseEstimate:
     """Share of ON events among them (leak events of most sensors are all ON)."""
     hot_pixels: Int64[np.ndarray, "K 2"]
     """(x, y) of pixels that fire without cause, the most active first."""
+    floor_hz: float = 0.0
+    """Events per second that four pixels in five exceed: close to the background activity where it
+    is so dense that all pixels look supported, above it where most of the picture moves."""
 
 
 class NoiseMeter:
@@ -64,17 +69,28 @@ class NoiseMeter:
         """
         seconds = max(duration_us, 1) / 1e6
         hot = _hot_pixels(self.total, seconds)
+        floor_hz = float(np.quantile(self.total, _FLOOR_QUANTILE)) / seconds
         quiet = ~binary_dilation(self._supported, iterations=QUIET_DISTANCE_PX)
         quiet[hot[:, 1], hot[:, 0]] = False
         if quiet.mean() < LEAST_QUIET_SHARE:
-            return NoiseEstimate(None, None, hot)
+            return NoiseEstimate(None, None, hot, floor_hz)
         brighter, darker = (int(side[quiet].sum()) for side in self._lonely)
         events = brighter + darker
         return NoiseEstimate(
             rate_hz=events / (float(quiet.sum()) * seconds),
             brighter_share=brighter / events if events else None,
             hot_pixels=hot,
+            floor_hz=floor_hz,
         )
+
+
+def noise_of(events: EventStore) -> NoiseEstimate:
+    """Background rate and hot pixels of a whole recording, read a second at a time."""
+    start, end = events.time_range_us
+    meter = NoiseMeter(events.width, events.height)
+    for first in range(start, end, _PIECE_US):
+        meter.add(events.between(first, min(first + _PIECE_US, end)))
+    return meter.estimate(end - start)
 
 
 def _has_support(chunk: EventStream, width: int, height: int) -> np.ndarray:

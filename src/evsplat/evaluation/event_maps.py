@@ -82,6 +82,8 @@ def evaluate_event_maps(
 def _cannot(capture: Capture) -> Absent | None:
     if capture.events is None:
         return Absent("the capture has no events")
+    if not capture.events.has_polarity:
+        return Absent("the events have no polarity")
     for camera in {frame.camera for frame in capture.frames}:
         size = (capture.cameras[camera].width, capture.cameras[camera].height)
         if size != (capture.events.width, capture.events.height):

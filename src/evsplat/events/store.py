@@ -18,6 +18,7 @@ from evsplat.events.stream import EventStream
 
 # HDF5 keeps decoded chunks per dataset; 4 MiB hold eight chunks of int64 times.
 _CHUNK_CACHE_BYTES = 4 << 20
+_POLARITY_BLOCK = 1 << 16
 
 
 class EventStore:
@@ -43,6 +44,7 @@ class EventStore:
         self._file: h5py.File | None = None
         self._owner_pid = -1
         self._shift_us = 0
+        self._has_polarity: bool | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_file": None, "_owner_pid": -1}
@@ -61,6 +63,17 @@ class EventStore:
         if len(t) == 0:
             return 0, 0
         return int(t[0]) + self._shift_us, int(t[-1]) + self._shift_us + 1
+
+    @property
+    def has_polarity(self) -> bool:
+        """False where every stored polarity is 0: the sensor did not say, and slices have p = 0."""
+        if self._has_polarity is None:
+            stored: h5py.Dataset = self._open()["events/p"]
+            blocks = range(0, len(stored), _POLARITY_BLOCK)
+            self._has_polarity = not len(stored) or any(
+                bool(stored[first : first + _POLARITY_BLOCK].any()) for first in blocks
+            )
+        return self._has_polarity
 
     def between(self, start_us: int, end_us: int) -> EventStream:
         """Events with ``start_us <= t < end_us``, read from disk.
@@ -85,9 +98,8 @@ class EventStore:
         y = self._read(file, "events/y", first + low, first + high).astype(np.uint16)
         p = self._read(file, "events/p", first + low, first + high)
         self._check_pixels(x, y, first + low)
-        stream = EventStream(
-            t[low:high] + self._shift_us, x, y, np.where(p > 0, np.int8(1), np.int8(-1))
-        )
+        signs = np.where(p > 0, np.int8(1), np.int8(-1)) if self.has_polarity else 0 * p
+        stream = EventStream(t[low:high] + self._shift_us, x, y, signs.astype(np.int8))
         return stream if self._pixel_lookup is None else self._undistort(stream)
 
     def rate(self, bins: int) -> tuple[Int64[np.ndarray, "bins+1"], Float[np.ndarray, "bins"]]:

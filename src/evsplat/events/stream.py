@@ -17,7 +17,7 @@ class EventStream:
     y: UInt16[np.ndarray, "N"]
     """Row, 0 at the top."""
     p: Int8[np.ndarray, "N"]
-    """Polarity: +1 brighter, -1 darker."""
+    """Polarity: +1 brighter, -1 darker; 0 throughout where the sensor does not say."""
 
     def __len__(self) -> int:
         """Count of events."""

@@ -7,18 +7,26 @@ depends on how the surface is turned and where it stands; the person casts shado
 
 import logging
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 
 from evsplat.calibration import estimate_from_capture
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig
+from evsplat.methods.build import Build
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import LearningRates, OptimisationConfig, Weight
-from evsplat.methods.paper import EventConfig, PaperConfig, build_model, composition
+from evsplat.methods.paper import (
+    EventConfig,
+    PaperConfig,
+    build_model,
+    composition,
+    paper_events,
+)
 from evsplat.methods.starts import HumanStartConfig
 from evsplat.objectives import (
-    ContrastThresholds,
+    EventSensor,
     EventWindows,
     Exposure,
     Objective,
@@ -39,7 +47,7 @@ class ExposureConfig:
     px_per_render: float = 3.0
     """How far, in pixels, the body moves between neighbouring renders."""
     most_renders: int = 7
-    """Upper bound of renders in an exposure, odd."""
+    """Upper bound of renders in an exposure, odd; 1 compares the sharp middle, as `paper` does."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,12 @@ class WindowConfig:
     """Weight of the squared distance of the thresholds' logarithms from where they started."""
     reach: float = 0.5
     """How far before or after an exposure windows reach, in frame intervals."""
+    noise_aware: bool = True
+    """Weigh differences by the sensor's background noise, and leave hot pixels out."""
+    pixel_thresholds: bool = False
+    """Each pixel learns a factor on its contrast thresholds."""
+    clock: bool = False
+    """Learn by how much the events' clock is late, on top of the capture's own offset."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +76,9 @@ class EvsplatConfig(PaperConfig):
 
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
+    event_term: Literal["windows", "paper"] = "windows"
+    """``paper`` compares normalised changes between neighbouring frames' middles (its eq. 8-9) in
+    place of windows."""
     event: EventConfig = field(default_factory=lambda: EventConfig(weight=0.2))
     human: HumanStartConfig = field(
         default_factory=lambda: HumanStartConfig(
@@ -105,24 +122,50 @@ def compose(
     }
     observed: list[Objective] = [Exposure(capture, renders, build.ground.generator)]
     weights: dict[str, Weight] = {}
-    if capture.events is not None and config.event.weight != 0.0:
-        # A loaded model brings its own.
-        known = _thresholds(capture) if fit else (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD)
-        thresholds = ContrastThresholds(*known).to(device)
-        build.model.sensor = thresholds
-        windows = config.windows
-        observed.append(
-            EventWindows(
-                capture,
-                thresholds,
-                build.ground.generator,
-                start=windows.start,
-                eps=windows.eps,
-                reach=windows.reach,
-            )
+    if config.event.weight == 0.0:
+        pass
+    elif capture.events is None:
+        logger.warning(
+            "%s: has no events; the blur of the frames alone tells what moved.", capture.path
         )
-        weights = {"event": config.event.weight, "contrast": windows.contrast_weight}
+    elif config.event_term == "paper":
+        observed.append(paper_events(config.event, capture))
+        weights = {"event": config.event.weight}
+    else:
+        observed.append(_windows(config, capture, build, device=device, fit=fit))
+        weights = {"event": config.event.weight, "contrast": config.windows.contrast_weight}
     return composition(config, build, observed, weights)
+
+
+def _windows(
+    config: EvsplatConfig,
+    capture: Capture,
+    build: Build,
+    *,
+    device: torch.device | str,
+    fit: bool,
+) -> EventWindows:
+    """The event term, and the sensor that the model learns with it."""
+    assert capture.events is not None
+    windows = config.windows
+    # A loaded model brings its own.
+    known = _thresholds(capture) if fit else (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD)
+    pixels = (capture.events.height, capture.events.width) if windows.pixel_thresholds else None
+    build.model.sensor = EventSensor(*known, pixels=pixels, clock=windows.clock).to(device)
+    if fit and not capture.events.has_polarity:
+        logger.warning(
+            "%s: its events have no polarity; the size of changes is compared with their number.",
+            capture.path,
+        )
+    return EventWindows(
+        capture,
+        build.model.sensor,
+        build.ground.generator,
+        start=windows.start,
+        eps=windows.eps,
+        reach=windows.reach,
+        noise_aware=windows.noise_aware,
+    )
 
 
 def _thresholds(capture: Capture) -> tuple[float, float]:

@@ -185,16 +185,19 @@ def observed(
                 f"{capture.path}: method paper needs events, and capture.json names no event file; "
                 "add one, or train without the term: --set event.weight=0."
             )
-        objectives.append(
-            EventChange(
-                capture,
-                start=config.event.start,
-                floor=config.event.floor,
-                eps=config.event.eps,
-                across_gaps=config.event.across_gaps,
-                weight_by_activity=config.event.weight_by_activity,
-                min_active=config.event.min_active,
-            )
-        )
+        objectives.append(paper_events(config.event, capture))
         weights["event"] = config.event.weight
     return objectives, weights
+
+
+def paper_events(config: EventConfig, capture: Capture) -> EventChange:
+    """The paper's event term (eq. 8-9)."""
+    return EventChange(
+        capture,
+        start=config.start,
+        floor=config.floor,
+        eps=config.eps,
+        across_gaps=config.across_gaps,
+        weight_by_activity=config.weight_by_activity,
+        min_active=config.min_active,
+    )

@@ -3,7 +3,8 @@
 from evsplat.objectives.alpha import Alpha
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event import EventChange, event_loss
-from evsplat.objectives.event_windows import ContrastThresholds, EventWindows
+from evsplat.objectives.event_sensor import EventSensor
+from evsplat.objectives.event_windows import EventWindows
 from evsplat.objectives.exposure import Exposure, motion_px, renders_for
 from evsplat.objectives.isometry import Isometry
 from evsplat.objectives.photometric import Photometric
@@ -12,8 +13,8 @@ from evsplat.objectives.skinning import SkinningPrior
 
 __all__ = [
     "Alpha",
-    "ContrastThresholds",
     "EventChange",
+    "EventSensor",
     "EventWindows",
     "Exposure",
     "Isometry",

@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from evsplat.capture import Capture, Frame
 from evsplat.compiled import native, runs_native
 from evsplat.devices import DeviceCache
-from evsplat.events import count_map
+from evsplat.events import count_map, polarity_counts
 from evsplat.imaging import log_brightness_change
 from evsplat.objectives.base import Stateless, Step
 
@@ -67,7 +67,10 @@ class _NativeEventLoss(torch.autograd.Function):
 
 
 class EventChange(Stateless):
-    """Event loss between consecutive training frames, at their mid-exposures (A13)."""
+    """Event loss between consecutive training frames, at their mid-exposures (A13).
+
+    Where events have no polarity, the size of the change is compared with their number.
+    """
 
     def __init__(
         self,
@@ -134,6 +137,8 @@ class EventChange(Stateless):
             step.rgb[step.index(before)], step.rgb[step.index(after)], eps=self.eps
         )
         events = step.data.get(("events", before, after), partial(self._map, before, after))
+        if not self.events.has_polarity:
+            change = change.abs()
         return {"event": weight * event_loss(change, events, floor=self.floor)}
 
     def _pair(self, frame: Frame) -> tuple[int, int]:
@@ -141,11 +146,15 @@ class EventChange(Stateless):
         return times[0], times[1]
 
     def _map(self, start_us: int, end_us: int) -> Float[Tensor, "H W"]:
-        """Signed event count between two times, from a bounded cache."""
+        """Signed event count between two times, from a bounded cache; unsigned without polarity."""
         key = (start_us, end_us)
         if key not in self._maps:
             window = self.events.between(start_us, end_us)
-            self._maps[key] = count_map(window, self.events.height, self.events.width)
+            size = self.events.height, self.events.width
+            signed = self.events.has_polarity
+            self._maps[key] = (
+                count_map(window, *size) if signed else polarity_counts(window, *size).sum(0)
+            )
             if len(self._maps) > CACHED_MAPS:
                 self._maps.popitem(last=False)
         return self._maps[key]

@@ -1,43 +1,23 @@
 """Events at full time resolution: brightness change between any two rendered times."""
 
+import math
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
+from evsplat.calibration import noise_of
 from evsplat.capture import Capture, Frame
 from evsplat.devices import send
 from evsplat.events import EventStream, polarity_counts
 from evsplat.imaging import luminance
 from evsplat.objectives.base import Stateless, Step
+from evsplat.objectives.event_sensor import EventSensor
 
-
-class ContrastThresholds(nn.Module):
-    """How much the logarithm of brightness changes per event, for either polarity; learned.
-
-    Events alone would have them shrink: the mean absolute difference to a change that is not yet
-    reconstructed is smallest when events mean little. `apart` is what holds them.
-    """
-
-    start_logs: Tensor
-
-    def __init__(self, on: float, off: float) -> None:
-        """Thresholds to start from and to stay near, above 0."""
-        super().__init__()
-        self.register_buffer("start_logs", torch.tensor([on, off]).log())
-        self.logs = nn.Parameter(self.start_logs.clone())
-
-    def apart(self) -> Float[Tensor, ""]:
-        """Squared distance of the logarithms from where they started, mean over polarities."""
-        return (self.logs - self.start_logs).square().mean()
-
-    def change(
-        self, on: Float[Tensor, "*shape"], off: Float[Tensor, "*shape"]
-    ) -> Float[Tensor, "*shape"]:
-        """Log-brightness change that counts of events of both polarities report."""
-        threshold = self.logs.exp()
-        return threshold[0] * on - threshold[1] * off
+_RATE_US = 1_000
+"""How far before and after an instant events are counted for their rate there."""
 
 
 class EventWindows(Stateless):
@@ -47,26 +27,35 @@ class EventWindows(Stateless):
     times of other objectives one more is asked for, at random before or after the exposure, within
     ``reach`` frame intervals, so that the gaps between exposures teach as well. All pixels count:
     where there is no event, nothing changed.
+
+    Events that nothing caused are allowed for: with a background rate r an interval T holds r T of
+    them per pixel, give or take the root, and its differences weigh ``1 / (1 + 2 sqrt(r T))``, as a
+    Laplace likelihood does whose width is half a threshold and that noise. Hot pixels do not count.
+
+    Where events have no polarity the size of the change is compared with their number, between
+    neighbouring times only: over a longer span what went up and down again is in the number alone.
     """
 
     def __init__(
         self,
         capture: Capture,
-        thresholds: ContrastThresholds,
+        sensor: EventSensor,
         generator: torch.Generator,
         *,
         start: float,
         eps: float,
         reach: float = 0.5,
+        noise_aware: bool = True,
     ) -> None:
         """``start`` in nominal iterations; ``eps`` is added to linear luminance."""
         assert capture.events is not None
-        self.events, self.thresholds, self.generator = capture.events, thresholds, generator
+        self.events, self.sensor, self.generator = capture.events, sensor, generator
         self.start, self.eps, self.reach = start, eps, reach
         mids = sorted(frame.mid_us for frame in capture.frames)
         gaps = sorted(b - a for a, b in zip(mids, mids[1:], strict=False))
         self.interval_us = gaps[len(gaps) // 2] if gaps else 0
         self.range_us = (mids[0], mids[-1])
+        self.noise_aware = noise_aware
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """One time outside of the exposure."""
@@ -80,20 +69,53 @@ class EventWindows(Stateless):
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``event``: mean over windows, pixels and the whole span; ``contrast``: `apart`."""
-        if step.nominal < self.start or len(step.times_us) < 2:
-            return {}
         times = step.times_us
-        stream = self.events.between(times[0], times[-1])
+        if step.nominal < self.start or len(times) < 2:
+            return {}
+        offset = self.sensor.offset_us
+        shift = 0 if offset is None else round(float(offset))
+        late = [time + shift for time in times]
         brightness = torch.log(luminance(step.linear) + self.eps)
-        on, off = send(self._counts(stream, times), brightness.device).unbind(1)
-        reported = self.thresholds.change(on, off)
+        stream = self.events.between(late[0] - _RATE_US, late[-1] + _RATE_US)
+        windows = list(zip(late, late[1:], strict=False))
+        counts = self._counts(stream, windows, brightness.device)
         changes = brightness[1:] - brightness[:-1]
-        windows = (changes - reported).abs().mean()
-        whole = (brightness[-1] - brightness[0] - reported.sum(0)).abs().mean()
-        return {"event": 0.5 * (windows + whole), "contrast": self.thresholds.apart()}
+        weights = [self._weight(end - start) for start, end in windows]
+        sound = send(self._noise[1], brightness.device)
+        weight = sound * sound.new_tensor(weights)[:, None, None]
+        if not self.events.has_polarity:
+            moved = self.sensor.path(counts.sum(1))
+            event = (weight * (changes.abs() - moved).abs()).mean()
+            return {"event": event, "contrast": self.sensor.apart()}
+        reported = self.sensor.change(*counts.unbind(1))
+        if offset is not None:
+            # Events per microsecond at each instant tell what a later clock would have counted.
+            around = [(time - _RATE_US, time + _RATE_US) for time in late]
+            rates = self.sensor.change(*self._counts(stream, around, brightness.device).unbind(1))
+            rates = rates.detach() / (2 * _RATE_US)
+            reported = reported + (offset - offset.detach()) * (rates[1:] - rates[:-1])
+        each = (weight * (changes - reported).abs()).mean()
+        whole = (brightness[-1] - brightness[0] - reported.sum(0)).abs()
+        whole = (self._weight(late[-1] - late[0]) * sound * whole).mean()
+        return {"event": 0.5 * (each + whole), "contrast": self.sensor.apart()}
 
-    def _counts(self, stream: EventStream, times: Sequence[int]) -> Float[Tensor, "T-1 2 H W"]:
+    @cached_property
+    def _noise(self) -> tuple[float, Float[Tensor, "H W"]]:
+        """Background events per second and pixel, and 0 at hot pixels, 1 elsewhere."""
+        sound = torch.ones(self.events.height, self.events.width)
+        if not self.noise_aware:
+            return 0.0, sound
+        noise = noise_of(self.events)
+        sound[noise.hot_pixels[:, 1], noise.hot_pixels[:, 0]] = 0.0
+        return noise.floor_hz if noise.rate_hz is None else noise.rate_hz, sound
+
+    def _weight(self, duration_us: int) -> float:
+        return 1 / (1 + 2 * math.sqrt(self._noise[0] * duration_us * 1e-6))
+
+    def _counts(
+        self, stream: EventStream, windows: Sequence[tuple[int, int]], device: torch.device
+    ) -> Float[Tensor, "W 2 H W"]:
         """Events per window, polarity (brighter first) and pixel."""
         size = self.events.height, self.events.width
-        windows = zip(times, times[1:], strict=False)
-        return torch.stack([polarity_counts(stream.between(*ends), *size) for ends in windows])
+        maps = [polarity_counts(stream.between(*ends), *size) for ends in windows]
+        return send(torch.stack(maps), device)

@@ -10,6 +10,7 @@ from evsplat.calibration import estimate_from_capture
 from evsplat.capture import Capture, Frame
 from evsplat.errors import ConfigError, DataError
 from evsplat.imaging import Transfer, deblur
+from evsplat.restore.needs import require_signed_events
 
 
 class Edi:
@@ -27,14 +28,11 @@ class Edi:
         """``contrast_threshold``: C+ and C-; without them the capture's, or else estimated ones.
 
         Raises:
-            DataError: The capture has no events, or no thresholds and none can be estimated.
+            DataError: The capture has no events or no polarity, or no thresholds and none can be
+                estimated.
             ConfigError: A threshold is not above 0.
         """
-        if capture.events is None:
-            raise DataError(
-                f"{capture.path}: has no events, which the event double integral (edi) needs; "
-                "record or simulate them first."
-            )
+        require_signed_events(capture, "the event double integral (edi)")
         self._transfer: Transfer = transfer
         if contrast_threshold is not None and min(contrast_threshold) <= 0:
             raise ConfigError(

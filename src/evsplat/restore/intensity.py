@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from evsplat.capture import Capture, Frame
-from evsplat.errors import DataError
 from evsplat.events import EventStream
 from evsplat.events.maps import polarity_counts
 from evsplat.imaging.srgb import REC709
+from evsplat.restore.needs import require_signed_events
 
 MATCHED_OVER = 0.02
 """Standard deviation, over the picture's shorter side, of the weights of brightness matching."""
@@ -55,12 +55,8 @@ class FromEvents:
     name: str
 
     def __init__(self, capture: Capture, network: IntensityNetwork) -> None:
-        """Raises `DataError` where the capture has no events."""
-        if capture.events is None:
-            raise DataError(
-                f"{capture.path}: has no events, which {self.name} makes its pictures of; record "
-                "or simulate them first."
-            )
+        """Raises `DataError` where the capture has no events, or they have no polarity."""
+        require_signed_events(capture, self.name)
         self._network = network
 
     def restore(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:

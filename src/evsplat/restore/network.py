@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from evsplat.capture import Capture, Frame
 from evsplat.devices import network_device
-from evsplat.errors import BackendError, DataError
+from evsplat.errors import BackendError
+from evsplat.restore.needs import require_signed_events
 from evsplat.restore.tiles import OVERLAP_PX, SIDE_PX, in_tiles
 from evsplat.weights import WeightFile, sha256_of
 
@@ -36,13 +37,10 @@ class NetworkRestorer(ABC):
 
         Raises:
             WeightsError: There is none, or it is not this network's.
-            DataError: The capture has no events and the network needs them.
+            DataError: The capture has no events, or no polarity, and the network needs it.
         """
-        if self.needs_events and capture.events is None:
-            raise DataError(
-                f"{capture.path}: has no events, which {self.name} needs; record or simulate them "
-                "first."
-            )
+        if self.needs_events:
+            require_signed_events(capture, self.name)
         self.weights = self.file.find(weights)
         self.device = network_device(device)
         self.network = self.load(self.weights).to(self.device)

@@ -1,0 +1,59 @@
+"""What training learns of the event camera: contrast thresholds and a clock that runs apart."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+_OFFSET_UNIT_US = 10_000.0
+"""One unit of the offset's parameter, so that all parameters learn well at one rate."""
+
+
+class EventSensor(nn.Module):
+    """How much log-brightness changes per event, for either polarity, and how late events come.
+
+    Events alone would have thresholds shrink: the mean absolute difference to a change that is not
+    yet reconstructed is smallest when events mean little. `apart` is what holds them.
+    """
+
+    start_logs: Tensor
+
+    def __init__(
+        self, on: float, off: float, *, pixels: tuple[int, int] | None = None, clock: bool = False
+    ) -> None:
+        """Thresholds to start from and to stay near, above 0.
+
+        With ``pixels`` (height, width) each pixel learns a factor on both of its thresholds, as
+        sensors have it; with ``clock`` the offset of the events' clock is learned, starting at 0.
+        """
+        super().__init__()
+        self.register_buffer("start_logs", torch.tensor([on, off]).log())
+        self.logs = nn.Parameter(self.start_logs.clone())
+        self.pixel_logs = None if pixels is None else nn.Parameter(torch.zeros(pixels))
+        self.offset = nn.Parameter(torch.zeros(())) if clock else None
+
+    @property
+    def offset_us(self) -> Float[Tensor, ""] | None:
+        """How much later events are stamped than the frames' clock says; None: not learned."""
+        return None if self.offset is None else _OFFSET_UNIT_US * self.offset
+
+    def apart(self) -> Float[Tensor, ""]:
+        """Squared distance of the logarithms from where they started, mean over polarities.
+
+        That of the pixels, mean over pixels, comes on top.
+        """
+        together = (self.logs - self.start_logs).square().mean()
+        return together if self.pixel_logs is None else together + self.pixel_logs.square().mean()
+
+    def change(
+        self, on: Float[Tensor, "*batch H W"], off: Float[Tensor, "*batch H W"]
+    ) -> Float[Tensor, "*batch H W"]:
+        """Log-brightness change that counts of events of both polarities report."""
+        threshold = self.logs.exp()
+        return self._per_pixel(threshold[0] * on - threshold[1] * off)
+
+    def path(self, count: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
+        """How far log-brightness moved, up or down, when events do not say which way."""
+        return self._per_pixel(self.logs.mean().exp() * count)
+
+    def _per_pixel(self, values: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
+        return values if self.pixel_logs is None else values * self.pixel_logs.exp()
