@@ -73,8 +73,49 @@ def test_terms_are_those_of_the_description(tiny_capture):
     torch.testing.assert_close(terms["human_dssim"], dssim, rtol=1e-3, atol=1e-5)
     weights = step.drawing.decoded.weights.detach()
     assert weights.shape[1] == len(step.model.track.body.parents)
-    target = composition.objectives[2].target
+    target = composition.objectives[-1].target
     torch.testing.assert_close(terms["skinning"], (weights - target).square().mean())
+
+
+def test_mode_human_learns_the_person_alone_from_one_masked_picture(tiny_capture):
+    capture = load_capture(tiny_capture(frames=10))
+    composition = composed(capture.path, mode="human")
+    model, masked = composition.model, composition.capture
+    frame = masked.train_frames[3]
+    assert (len(model.scene), {*composition.densify}) == (0, {"human"})
+    inside = (capture.mask(frame) > 0.5)[..., None]
+    assert torch.equal(masked.image(frame), capture.image(frame) * inside)
+
+    step, terms = step_of(composition, masked, frame)
+    assert {*terms} == {"human_l1", "human_dssim", "skinning"}
+    generator = torch.Generator().manual_seed(0)
+    generator.set_state(composed(capture.path, mode="human").generator.get_state())
+    colour = torch.rand(3, generator=generator)
+    # The same Gaussians drawn over the colour itself.
+    behind = torch.cat([colour, torch.zeros(1)])
+    alone = render(step.posed.moving(), capture.camera(frame), background=behind)
+    alone = alone.image[0, ..., :3].detach().clamp(0, 1)
+    expected = torch.where(inside, capture.image(frame), colour)
+    l1 = (alone - expected).abs().sum() / inside.sum()
+    torch.testing.assert_close(terms["human_l1"], l1, rtol=1e-3, atol=1e-5)
+    dssim = (1 - ssim(alone, expected)) * inside.float().mean()
+    torch.testing.assert_close(terms["human_dssim"], dssim, rtol=1e-3, atol=1e-5)
+
+
+def test_a_run_of_the_person_alone_is_drawn_on_black_and_measured_as_such(tiny_capture, tmp_path):
+    path = tiny_capture(frames=10)
+    settings = ("mode=human", "human.count=80", "triplane.resolution=16", "fit.steps=5")
+    run = load_run(
+        train(path, method="hugs", out=tmp_path / "run", iterations=20, overrides=settings)
+    )
+    assert run.human_only and run.gaussians["scene"] == 0
+    frame = run.capture.test_frames[0]
+    whole, scene = (
+        run.reconstruction.render(run.capture.camera(frame), [frame.mid_us], parts=parts)
+        for parts in ("all", "scene")
+    )
+    assert float(whole.rgb.amax()) > 0 and float(scene.rgb.abs().amax()) == 0
+    torch.testing.assert_close(whole.alpha, whole.human)
 
 
 def test_every_set_of_parameters_learns(tiny_capture):

@@ -83,11 +83,6 @@ class JointPicture(Stateless):
         """The middle of the exposure."""
         return (frame.mid_us,)
 
-    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
-        """The recorded picture and the mask."""
-        data.prefetch(*picture(self.capture, frame))
-        data.prefetch(("mask", frame.name), lambda: mask_of(self.capture, frame))
-
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``l1``, ``dssim`` and ``perceptual``, means over the picture."""
         drawn = step.rgb[step.index(step.frame.mid_us)].clamp(0, 1)
@@ -103,7 +98,10 @@ class JointPicture(Stateless):
 
 
 class HumanPicture(Stateless):
-    """The person alone, over another random colour, against its pixels over the same colour."""
+    """The person alone, over a random colour of its own, against its pixels over the same colour.
+
+    Where the model has no scene, the step's picture shows the person alone already, over black.
+    """
 
     def __init__(self, capture: Capture, perceptual: Perceptual | None) -> None:
         """Pictures and masks are the capture's."""
@@ -113,7 +111,12 @@ class HumanPicture(Stateless):
         """The middle of the exposure."""
         return (frame.mid_us,)
 
-    def loss(self, step: Step) -> dict[str, Tensor]:
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """The recorded picture and the mask."""
+        data.prefetch(*picture(self.capture, frame))
+        data.prefetch(("mask", frame.name), lambda: mask_of(self.capture, frame))
+
+    def loss(self, step: Step[HugsModel]) -> dict[str, Tensor]:
         """``human_l1``, ``human_dssim`` and ``human_perceptual``.
 
         The L1 is a sum over pixels and channels by the number of the person's pixels; 1 - SSIM is a
@@ -123,19 +126,7 @@ class HumanPicture(Stateless):
         index, observed = step.index(step.frame.mid_us), step.observed(step.frame)
         mask = step.data.get(("mask", step.frame.name), lambda: mask_of(self.capture, step.frame))
         colour = send(torch.rand(3, generator=step.generator), mask.device)
-        moving = step.drawing.moving
-        person = replace(
-            moving,
-            **{
-                name: getattr(moving, name)[index : index + 1]
-                for name in ("means", "quats", "scales", "linear")
-            },
-            channels=moving.channels[index : index + 1, :, :3],
-            centers2d_offset=None,
-        )
-        camera = step.capture.camera(step.frame).to(mask.device)
-        output = render(person, camera, background=colour)
-        drawn, inside = output.image[0].clamp(0, 1), mask[..., None]
+        drawn, inside = self._drawn(step, index, colour).clamp(0, 1), mask[..., None]
         expected = observed * inside + colour * (1 - inside)
         l1, similarity = l1_and_ssim(drawn, expected)
         terms = {
@@ -147,6 +138,25 @@ class HumanPicture(Stateless):
             shown, wanted = (noise * (1 - inside) + value * inside for value in (drawn, observed))
             terms["human_perceptual"] = self.perceptual(shown, wanted, mask, step.generator)
         return terms
+
+    def _drawn(
+        self, step: Step[HugsModel], index: int, colour: Float[Tensor, "3"]
+    ) -> Float[Tensor, "H W 3"]:
+        if len(step.model.scene) == 0:
+            through = 1 - step.drawing.output.alpha[index]
+            return step.rgb[index] + through[..., None] * colour
+        moving = step.drawing.moving
+        person = replace(
+            moving,
+            **{
+                name: getattr(moving, name)[index : index + 1]
+                for name in ("means", "quats", "scales", "linear")
+            },
+            channels=moving.channels[index : index + 1, :, :3],
+            centers2d_offset=None,
+        )
+        camera = step.capture.camera(step.frame).to(colour.device)
+        return render(person, camera, background=colour).image[0]
 
 
 class SkinningTarget:

@@ -138,8 +138,10 @@ class HugsModel(nn.Module):
         camera: Camera,
         generator: torch.Generator,
     ) -> Drawing:
-        """Person and scene over a random colour; see `Model`."""
-        background = send(torch.rand(3, generator=generator), self.device)
+        """Person and scene over a random colour, the person alone over black; see `Model`."""
+        background = None
+        if len(self.scene):
+            background = send(torch.rand(3, generator=generator), self.device)
         decoded = self.human.for_training()
         posed = self._posed(decoded, times_us, camera.center())
         drawing = draw(self, posed, camera, center_gradients=True, background=background)

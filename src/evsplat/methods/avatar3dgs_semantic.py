@@ -19,7 +19,7 @@ from evsplat.methods.composition import Composition
 from evsplat.methods.config import OptimisationConfig
 from evsplat.methods.paper import EventConfig, LossConfig, PaperConfig, composition, observed
 from evsplat.methods.starts import (
-    SceneStartConfig,
+    FittedSceneConfig,
     as_person,
     human_start,
     no_gaussians,
@@ -33,7 +33,7 @@ class AvatarSemanticConfig(PaperConfig):
 
     semantic_start: float = 0.5
     """Logit of all Gaussians."""
-    scene: SceneStartConfig = field(default_factory=lambda: SceneStartConfig(prefit_steps=0))
+    scene: FittedSceneConfig = field(default_factory=lambda: FittedSceneConfig(prefit_steps=0))
     """Where the scene's points start; nothing is fitted to them before training."""
     deform: DeformConfig = field(default_factory=avatar_deform)
     loss: LossConfig = field(

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack, load_body_track
 from evsplat.capture import Capture
+from evsplat.capture.masked import MaskedCapture
 from evsplat.errors import DataError
 from evsplat.gaussians import DensifyConfig, Part
 from evsplat.gaussians.initialise import nearest_spacing
@@ -25,7 +26,13 @@ from evsplat.hugs.start import fit_to_body
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import NOMINAL_ITERATIONS, Weight
 from evsplat.methods.rates import Learning, Network, Rate, RowRate
-from evsplat.methods.starts import HumanStartConfig, SceneStartConfig, human_start, scene_start
+from evsplat.methods.starts import (
+    HumanStartConfig,
+    SceneStartConfig,
+    human_start,
+    no_gaussians,
+    scene_start,
+)
 from evsplat.objectives import Objective
 from evsplat.objectives.perceptual import PerceptualName, make_perceptual
 
@@ -62,20 +69,12 @@ class FitConfig:
 
 
 @dataclass(frozen=True)
-class HugsSceneConfig:
+class HugsSceneConfig(SceneStartConfig):
     """The scene's start and colour."""
 
-    kind: Literal["random_cube", "median_backdrop"] = "random_cube"
+    kind: Literal["median_backdrop", "random_cube"] = "random_cube"
     """``random_cube``: as in the paper's comparison (2.9). ``median_backdrop``: the temporal median
-    of the training frames on a floor and a wall; static cameras only."""
-    cube_count: int = 100_000
-    """Points of the random cube, before those that no training camera sees are left out."""
-    cube_half_side_m: float | None = None
-    """Null = the larger of 2 m and 1.5 times the camera's distance."""
-    cube_opacity: float = 0.1
-    backdrop_stride_px: int = 2
-    backdrop_edge_share: float = 0.18
-    backdrop_opacity: float = 0.9
+    of the training frames on a floor and a wall; static cameras only, and far fewer steps."""
     sh_degree: int | None = None
     """Of the spherical harmonics. Null: 3 as released, but 0 for one static camera, where a
     Gaussian is seen from one direction and all harmonics say the same."""
@@ -129,6 +128,9 @@ class HugsOptimisation:
 class HugsConfig:
     """All settings of method `hugs`."""
 
+    mode: Literal["human_scene", "human"] = "human_scene"
+    """What is reconstructed, in the released code's words. ``human``: the person alone, on black,
+    from pictures that are black outside of the mask; the settings of the scene mean nothing."""
     release_compatible: bool = False
     """Repeat the released code's slips (2.7); docs/baselines.md lists them."""
     human: HumanStartConfig = field(default_factory=HumanStartConfig)
@@ -168,6 +170,9 @@ def compose(
     A `DataError` where the capture has no masks.
     """
     _require_masks(capture)
+    alone = config.mode == "human"
+    if alone:
+        capture = MaskedCapture(capture)
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     track = load_body_track(capture)
@@ -194,10 +199,11 @@ def compose(
     rescaled = not config.release_compatible
     perceptual = None if metric is None else Perceptual(metric, rescaled=rescaled)
     objectives: list[Objective] = [
-        JointPicture(capture, perceptual),
         HumanPicture(capture, perceptual),
         SkinningTarget(refresh=config.skinning_refresh),
     ]
+    if not alone:
+        objectives.insert(0, JointPicture(capture, perceptual))
     loss = config.loss
     return Composition(
         model=model,
@@ -215,6 +221,7 @@ def compose(
         densify=_limits(config, extent),
         body_frames=None,
         generator=generator,
+        capture=capture if alone else None,
     )
 
 
@@ -280,16 +287,9 @@ def _scene(
     config: HugsConfig, capture: Capture, track: BodyTrack, generator: torch.Generator
 ) -> SphericalScene:
     scene = config.scene
-    start = SceneStartConfig(
-        kind=scene.kind,
-        cube_count=scene.cube_count,
-        cube_half_side_m=scene.cube_half_side_m,
-        cube_opacity=scene.cube_opacity,
-        backdrop_stride_px=scene.backdrop_stride_px,
-        backdrop_edge_share=scene.backdrop_edge_share,
-        backdrop_opacity=scene.backdrop_opacity,
-    )
-    values, colours = scene_start(start, capture, track, generator, 0.0)
+    if config.mode == "human":
+        return SphericalScene(no_gaussians(), torch.zeros(0, 3), 0)
+    values, colours = scene_start(scene, capture, track, generator, 0.0)
     seen = _seen(values["means"], capture)
     degree = scene.sh_degree
     if degree is None:
@@ -310,7 +310,8 @@ def _seen(points: Float[Tensor, "N 3"], capture: Capture) -> Tensor:
 
 def _limits(config: HugsConfig, extent: float) -> dict[Part, DensifyConfig]:
     human, scene = config.densify_human, config.densify_scene
-    if scene is None and config.scene.kind == "median_backdrop":
+    still = config.scene.kind == "median_backdrop"
+    if config.mode == "human" or (scene is None and still):
         return {"human": human}
     if scene is None:
         scene = DensifyConfig(

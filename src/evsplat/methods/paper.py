@@ -16,7 +16,7 @@ from evsplat.methods.build import Build, Ground, PersonConfig, PersonLossConfig
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import Weight
 from evsplat.methods.prefit import fit_scene, fit_scene_colours
-from evsplat.methods.starts import SceneStartConfig, human_start, scene_start
+from evsplat.methods.starts import FittedSceneConfig, human_start, scene_start
 from evsplat.objectives import (
     EventChange,
     Objective,
@@ -69,7 +69,7 @@ class PaperConfig(PersonConfig):
     """Labels start as logits +a and -a (A1)."""
     semantic_band_px_at_256: float = 9.0
     """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
-    scene: SceneStartConfig = field(default_factory=SceneStartConfig)
+    scene: FittedSceneConfig = field(default_factory=FittedSceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     event: EventConfig = field(default_factory=EventConfig)
     densify_scene: DensifyConfig | None = None

@@ -58,6 +58,12 @@ class SceneStartConfig:
     backdrop_opacity: float = 0.9
     backdrop_margin: float = 0.15
     """How far behind the deepest body point the wall stands, as a fraction of its depth."""
+
+
+@dataclass(frozen=True)
+class FittedSceneConfig(SceneStartConfig):
+    """A start that is fitted to what it shall show."""
+
     prefit_steps: int = 300
     """Steps of fitting the sheet to the median before training proper."""
 
