@@ -26,9 +26,9 @@ import websockets
 import zstandard
 
 from evsplat.capture import load_capture
-from evsplat.cli.demo import demo_capture
 from evsplat.config import override
 from evsplat.methods import compose, method_config
+from evsplat.shipped import demo_capture
 from evsplat.training.run import GaussianReconstruction, Run
 from evsplat.view.server import Viewer
 from evsplat.view.wish import Motion
@@ -58,7 +58,7 @@ def untrained_run(gaussians: int) -> Run:
     rows.set_rows(grown, rows.human_count)
     counts = {"human": rows.human_count, "scene": rows.scene_count}
     made = GaussianReconstruction("paper", model)
-    return Run(Path("none"), config, "paper", capture, made, 0, 0.0, "cpu", counts)
+    return Run(Path("none"), config, "paper", capture, made, 0, 0.0, "cpu", counts, False)
 
 
 async def pictures(port: int, seconds: float, change, viewer: Viewer) -> list[float]:

@@ -82,6 +82,7 @@ struct TileWork {
     uint32_t count;
     const uint32_t* times;
     uint32_t time_count;
+    bool bare;                    // nothing moving is among the entries
     // What the backward pass starts from, by patch, not by row:
     float* final_t;               // (256) transmittance behind the last entry
     int32_t* last;                // (256) last entry before compositing stopped

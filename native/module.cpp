@@ -9,6 +9,7 @@
 #include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
+#include <memory>
 #include <optional>
 #include <stdexcept>
 
@@ -92,14 +93,26 @@ class Render {
         }
     }
 
-    void forward(Out image, Out alpha, OutInt radii, OutInt still_radii) {
+    // With `keep` a later render can take the still layer over; `earlier` is one that kept the same.
+    void forward(Out image, Out alpha, OutInt radii, OutInt still_radii, bool keep, const Render* earlier) {
         const size_t pixels = size_t(scene_.view.width) * scene_.view.height * scene_.times;
         require(image.size() == pixels * scene_.channels, "image");
         require(alpha.size() == pixels, "alpha");
         require(radii.size() == size_t(scene_.moving.count) * scene_.times, "radii");
         require(still_radii.size() == scene_.still.count, "radii of what stands still");
+        std::shared_ptr<Still> still;
+        if (earlier) {
+            const View &a = scene_.view, &b = earlier->scene_.view;
+            require(earlier->record_ && earlier->record_->still->kept && a.width == b.width && a.height == b.height &&
+                        earlier->scene_.channels == scene_.channels &&
+                        earlier->scene_.still.count == scene_.still.count &&
+                        earlier->scene_.moving.count == scene_.moving.count,
+                    "the earlier render");
+            still = earlier->record_->still;
+        }
         nb::gil_scoped_release release;
-        record_ = render_forward(scene_, threads_, image.data(), alpha.data(), radii.data(), still_radii.data());
+        record_ = render_forward(scene_, threads_, keep, std::move(still), image.data(), alpha.data(), radii.data(),
+                                 still_radii.data());
     }
 
     void backward(std::optional<Strided> image_grad, std::optional<Strided> alpha_grad, OutFields moving,
@@ -391,7 +404,7 @@ NB_MODULE(_native, m) {
              nb::arg("width"), nb::arg("height"), nb::arg("K"), nb::arg("world_to_camera"), nb::arg("near"),
              nb::arg("moving"), nb::arg("still"), nb::arg("background").none(), nb::arg("times"), nb::arg("threads"))
         .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"),
-             nb::arg("still_radii"))
+             nb::arg("still_radii"), nb::arg("keep") = false, nb::arg("earlier").none() = nb::none())
         .def("backward", &Render::backward, nb::arg("image_grad").none(), nb::arg("alpha_grad").none(),
              nb::arg("moving"), nb::arg("still"), nb::arg("view").none(), nb::arg("background").none())
         .def_prop_ro("seconds", &Render::seconds, "Work so far by stage, summed over threads.")

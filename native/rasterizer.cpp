@@ -221,6 +221,7 @@ void for_pictures(const Record& r, uint32_t tile, F f) {
     const auto work = [&](const Binned& d, const uint32_t* times, size_t count) {
         TileWork w = {};
         w.index = tile;
+        w.bare = &d == &r.still->binned;
         w.entries = d.entries.data() + d.tile_begin[tile];
         w.count = d.in_tile(tile);
         w.times = times, w.time_count = uint32_t(count);
@@ -230,7 +231,7 @@ void for_pictures(const Record& r, uint32_t tile, F f) {
         ++picture;
         f(w);
     };
-    if (!bare.empty()) work(r.still, bare.data(), bare.size());
+    if (!bare.empty()) work(r.still->binned, bare.data(), bare.size());
     for (uint32_t t = 0; t < r.moving.size(); ++t)
         if (r.moving[t].in_tile(tile)) work(r.moving[t], &t, 1);
 }
@@ -249,7 +250,7 @@ ForwardJob forward_job(const Scene& s, const Record& r, size_t time, int first_c
     job.view = s.view;
     job.channels = channels;
     job.split = s.moving.count;
-    job.projected[0] = r.moving[time].projected.data(), job.projected[1] = r.still.projected.data();
+    job.projected[0] = r.moving[time].projected.data(), job.projected[1] = r.still->binned.projected.data();
     job.values[0] = s.moving.values.data ? s.moving.values.at(time) + first_channel : nullptr;
     job.values[1] = s.still.values.data ? s.still.values.data + first_channel : nullptr;
     job.value_stride = s.channels;
@@ -275,10 +276,12 @@ void for_tiles(int threads, size_t tiles, F f) {
 // Puts the entries of a tile into the order of compositing.
 void sort_tile(const Scene& s, Record& r, uint32_t tile) {
     thread_local TileSorter sorter;
-    const Projected* still_projected = r.still.projected.data() - s.moving.count;
-    Entry* still = r.still.entries.data() + r.still.tile_begin[tile];
-    const uint32_t still_count = r.still.in_tile(tile);
-    sorter.sort(still, still_projected, still_count);
+    Binned& all_still = r.still->binned;
+    const Projected* still_projected = all_still.projected.data() - s.moving.count;
+    Entry* still = all_still.entries.data() + all_still.tile_begin[tile];
+    const uint32_t still_count = all_still.in_tile(tile);
+    if (!r.still->sorted[tile]) sorter.sort(still, still_projected, still_count);
+    r.still->sorted[tile] = 1;
     for (Binned& d : r.moving)
         if (const uint32_t all = d.in_tile(tile)) {
             Entry* entries = d.entries.data() + d.tile_begin[tile];
@@ -287,14 +290,47 @@ void sort_tile(const Scene& s, Record& r, uint32_t tile) {
         }
 }
 
+// Copies a tile of `planes` planes.
+void copy_tile(const View& view, uint32_t tile, size_t planes, const float* from, float* to) {
+    const size_t width = view.width, x = tile % view.tiles_x * kTile, y = tile / view.tiles_x * kTile;
+    const size_t columns = std::min<size_t>(kTile, width - x), rows = std::min<size_t>(kTile, view.height - y);
+    for (size_t plane = 0; plane < planes; ++plane)
+        for (size_t row = y; row < y + rows; ++row) {
+            const size_t at = (plane * view.height + row) * width + x;
+            std::memcpy(to + at, from + at, columns * sizeof(float));
+        }
+}
+
+size_t bytes_of(const Binned& d) {
+    return d.projected.bytes() + d.first_slot.bytes() + d.entries.bytes() + d.tile_begin.bytes();
+}
+
+std::shared_ptr<Still> project_still(const Record& r, const Scene& s, bool keep, int threads, int32_t* radii) {
+    const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y, pixels = size_t(s.view.width) * s.view.height;
+    auto still = std::make_shared<Still>();
+    project_and_bin(r, s.view, gaussians_at(s.still, 0), s.moving.count, nullptr, threads, still->binned, radii);
+    still->sorted.reset(tiles);
+    std::fill_n(still->sorted.data(), tiles, uint8_t(0));
+    if ((still->kept = keep)) {
+        still->drawn.reset(tiles);
+        std::fill_n(still->drawn.data(), tiles, uint8_t(0));
+        still->radii.reset(s.still.count);
+        std::copy_n(radii, s.still.count, still->radii.data());
+        still->image.reset(s.channels * pixels);
+        still->alpha.reset(pixels);
+    }
+    return still;
+}
+
 }  // namespace
 
+size_t Still::bytes() const {
+    return bytes_of(binned) + sorted.bytes() + drawn.bytes() + radii.bytes() + image.bytes() + alpha.bytes();
+}
+
 size_t Record::bytes() const {
-    const auto of = [](const Binned& d) {
-        return d.projected.bytes() + d.first_slot.bytes() + d.entries.bytes() + d.tile_begin.bytes();
-    };
-    size_t total = of(still) + picture.bytes() + final_t.bytes() + last.bytes() + patch_end.bytes();
-    for (const Binned& d : moving) total += of(d);
+    size_t total = still->bytes() + picture.bytes() + final_t.bytes() + last.bytes() + patch_end.bytes();
+    for (const Binned& d : moving) total += bytes_of(d);
     return total;
 }
 
@@ -310,20 +346,26 @@ size_t Record::patch_steps() const {
     return total;
 }
 
-std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image, float* alpha, int32_t* radii,
-                                       int32_t* still_radii) {
+std::unique_ptr<Record> render_forward(const Scene& s, int threads, bool keep, std::shared_ptr<Still> earlier,
+                                       float* image, float* alpha, int32_t* radii, int32_t* still_radii) {
     const Kernels& kernels = select_kernels();
     const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y, pixels = size_t(s.view.width) * s.view.height;
     auto record = std::make_unique<Record>();
     Record& r = *record;
     r.kernels = &kernels;
     r.moving.resize(s.times);
-    project_and_bin(r, s.view, gaussians_at(s.still, 0), s.moving.count, nullptr, threads, r.still, still_radii);
-    size_t slots = r.still.slots;
+    if (earlier) {
+        r.still = std::move(earlier);
+        std::copy_n(r.still->radii.data(), s.still.count, still_radii);
+    } else {
+        r.still = project_still(r, s, keep, threads, still_radii);
+    }
+    Still& still = *r.still;
+    size_t slots = still.binned.slots;
     for (int t = 0; t < s.times; ++t) {
         Binned& d = r.moving[t];
         d.slot_base = slots;
-        project_and_bin(r, s.view, gaussians_at(s.moving, t), 0, &r.still, threads, d,
+        project_and_bin(r, s.view, gaussians_at(s.moving, t), 0, &still.binned, threads, d,
                         radii + size_t(t) * s.moving.count);
         slots += d.slots;
     }
@@ -342,11 +384,26 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image
 
     const auto draw = [&](uint32_t tile) {
         for_pictures(r, tile, [&](const TileWork& work) {
+            const bool kept = still.kept && work.bare;
+            if (kept && still.drawn[tile]) {
+                for (uint32_t i = 0; i < work.time_count; ++i) {
+                    const size_t t = work.times[i];
+                    copy_tile(s.view, tile, s.channels, still.image.data(), image + t * s.channels * pixels);
+                    copy_tile(s.view, tile, 1, still.alpha.data(), alpha + t * pixels);
+                }
+                return;
+            }
             for (int c = 0; c < s.channels; c += kMaxChannels) {
                 ForwardJob job = forward_job(s, r, work.times[0], c, std::min(kMaxChannels, s.channels - c));
                 job.image = image + c * pixels, job.image_t = s.channels * pixels;
                 job.alpha = alpha, job.alpha_t = pixels;
                 kernels.forward(job, work);
+            }
+            if (kept) {
+                const size_t t = work.times[0];
+                copy_tile(s.view, tile, s.channels, image + t * s.channels * pixels, still.image.data());
+                copy_tile(s.view, tile, 1, alpha + t * pixels, still.alpha.data());
+                still.drawn[tile] = 1;
             }
         });
     };
@@ -361,6 +418,7 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, float* image
 }
 
 void render_backward(const Scene& s, const Record& r, int threads, const OutputGrads& out, const InputGrads& in) {
+    if (r.still->kept) throw std::runtime_error("a render whose still layer is kept has no backward pass");
     const Kernels& kernels = *r.kernels;
     const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y;
     const auto blocks_of = [](const Layer& l) { return (size_t(l.count) + kBlock - 1) / kBlock; };
@@ -428,7 +486,7 @@ void render_backward(const Scene& s, const Record& r, int threads, const OutputG
                 for (size_t b = 0; b < blocks_of(layer); ++b)
                     for (int k = 0; k < 12; ++k) view_total[k] += view_parts[b * 12 + k];
         };
-        to_fields(s.still, in.still, r.still, 0);
+        to_fields(s.still, in.still, r.still->binned, 0);
         for (int t = 0; t < s.times; ++t) to_fields(s.moving, in.moving, r.moving[t], t);
     }
     if (in.view)

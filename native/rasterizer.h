@@ -2,7 +2,8 @@
 //
 // Gaussians come in two layers: those that move, with a place per time, and those that stand still.
 // The still ones are projected and sorted once; a tile that nothing moving touches is composited once
-// for all the times at which that is so.
+// for all the times at which that is so. Renders of one still layer by one view can share what is found
+// of it (see Still).
 #pragma once
 
 #include <atomic>
@@ -53,13 +54,25 @@ struct Binned {
     uint32_t in_tile(size_t tile) const { return tile_begin[tile + 1] - tile_begin[tile]; }
 };
 
+// The still layer on the screen and, if it is kept for renders that follow, its picture in the tiles that
+// nothing moving has touched so far. One render at a time.
+struct Still {
+    Binned binned;
+    Buffer<uint8_t> sorted, drawn;  // (tiles)
+    Buffer<int32_t> radii;          // (N), if it is kept
+    Buffer<float> image, alpha;     // (C, H, W) and (H, W), if it is kept
+    bool kept = false;
+
+    size_t bytes() const;
+};
+
 // What a render's time goes into.
 enum Stage { kProject, kSort, kComposite, kCompositeBackward, kProjectBackward, kStages };
 
 // What the backward pass needs; grows with what is drawn.
 struct Record {
     const Kernels* kernels;
-    Binned still;
+    std::shared_ptr<Still> still;  // a kept one has no backward pass
     std::vector<Binned> moving;    // (T)
     // Per picture of a tile (see TileWork); `picture` counts them, per tile.
     Buffer<uint32_t> picture;      // (tiles + 1)
@@ -73,9 +86,11 @@ struct Record {
     size_t patch_steps() const;    // the same with patches
 };
 
-// image (T, C, H, W), alpha (T, H, W), radii (T, moving) and still_radii are written.
-std::unique_ptr<Record> render_forward(const Scene&, int threads, float* image, float* alpha, int32_t* radii,
-                                       int32_t* still_radii);
+// image (T, C, H, W), alpha (T, H, W), radii (T, moving) and still_radii are written. With `keep` the still
+// layer is there for later renders; `earlier` is one of an earlier render of the same still layer, view,
+// background and number of moving Gaussians, or null.
+std::unique_ptr<Record> render_forward(const Scene&, int threads, bool keep, std::shared_ptr<Still> earlier,
+                                       float* image, float* alpha, int32_t* radii, int32_t* still_radii);
 
 struct OutputGrads {
     const float *image_data = nullptr, *alpha_data = nullptr;  // null: zero

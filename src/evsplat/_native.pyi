@@ -24,7 +24,15 @@ class Render:
         times: int,
         threads: int,
     ) -> None: ...
-    def forward(self, image: Tensor, alpha: Tensor, radii: Tensor, still_radii: Tensor) -> None: ...
+    def forward(
+        self,
+        image: Tensor,
+        alpha: Tensor,
+        radii: Tensor,
+        still_radii: Tensor,
+        keep: bool = False,
+        earlier: Render | None = None,
+    ) -> None: ...
     def backward(
         self,
         image_grad: Tensor | None,

@@ -68,7 +68,7 @@ def test_places_of_a_slanted_plane_are_on_it(posed):
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
     z = distance / (rays @ normal)
     share = torch.rand_like(z) * 0.01 + 0.5
-    places = _places(torch.stack([z * share, share], -1), camera)
+    places = _places(torch.stack([z * share, share], -1), camera, 2)
     local = places @ turn.T + pose[:3, 3]
     # The mean over two by two pixels is the depth in their middle, up to the plane's curvature.
     assert (local @ normal - distance).abs().max() < 0.01

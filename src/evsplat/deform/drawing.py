@@ -10,9 +10,9 @@ from torch.nn import functional as F
 
 from evsplat.deform.shadow import BodyShadow
 from evsplat.gaussians import PosedGaussians
-from evsplat.render import PinholeCamera, RenderOutput, Splats, render, split_channels
+from evsplat.render import Backdrop, PinholeCamera, RenderOutput, Splats, render, split_channels
 
-_SHADOW_STEP_PX = 2
+SHADOW_STEP_PX = 2
 """Shadows are soft: they are looked up at every second pixel and interpolated."""
 _LEAST_SCENE = 1e-3
 """Share of a pixel below which its scene has no place of its own."""
@@ -49,10 +49,13 @@ def draw(
     *,
     center_gradients: bool = False,
     background: Float[Tensor, "3"] | None = None,
+    backdrop: Backdrop | None = None,
+    shadow_step_px: int = SHADOW_STEP_PX,
 ) -> Drawing:
     """Draw person and scene; ``center_gradients`` makes the projected centres tell theirs.
 
-    ``background`` is the sRGB colour behind all of it, black without.
+    ``background`` is the sRGB colour behind all of it, black without. ``backdrop`` is what the
+    scene looked like to the picture before, see `render`.
 
     With shadows the person's and the scene's share of each pixel are composited as channels of
     their own, in one pass and in the right order of depth, and the scene's is multiplied.
@@ -64,15 +67,15 @@ def draw(
     if center_gradients:
         moving, static = _with_centers(moving), _with_centers(static)
     behind = None if background is None else _behind(background, moving)
-    output = render(moving, camera, static=static, background=behind)
+    output = render(moving, camera, static=static, background=behind, backdrop=backdrop)
     if shadow is None:
         rgb, semantic = split_channels(output.image, (3, 1))
     else:
         person, scene, depth, semantic = split_channels(output.image, (3, 3, 2, 1))
         assert posed.casters is not None
         # What hides the scene hides its shadow as well: the first picture's depth serves all.
-        places = _places(depth[0].detach(), camera)
-        light = _enlarge(shadow(posed.casters, places), camera)
+        places = _places(depth[0].detach(), camera, shadow_step_px)
+        light = _enlarge(shadow(posed.casters, places), camera, shadow_step_px)
         rgb = tuple(
             a + b * factor[..., None] for a, b, factor in zip(person, scene, light, strict=True)
         )
@@ -135,9 +138,10 @@ def _in_layers(moving: Splats, static: Splats, camera: PinholeCamera) -> tuple[S
     return moving, replace(static, channels=torch.cat(parts, -1))
 
 
-def _places(depth: Float[Tensor, "H W 2"], camera: PinholeCamera) -> Float[Tensor, "h w 3"]:
-    """World places of the scene at every second pixel."""
-    step = _SHADOW_STEP_PX
+def _places(
+    depth: Float[Tensor, "H W 2"], camera: PinholeCamera, step: int
+) -> Float[Tensor, "h w 3"]:
+    """World places of the scene at every ``step``-th pixel."""
     sums = F.avg_pool2d(depth.movedim(-1, 0), step, ceil_mode=True, count_include_pad=False)
     z = sums[0] / sums[1].clamp_min(_LEAST_SCENE)
     y, x = ((torch.arange(count, device=z.device) + 0.5) * step for count in z.shape)
@@ -153,8 +157,10 @@ def _places(depth: Float[Tensor, "H W 2"], camera: PinholeCamera) -> Float[Tenso
     return (rays * z[..., None] - pose[:3, 3]) @ pose[:3, :3]
 
 
-def _enlarge(light: Float[Tensor, "T h w"], camera: PinholeCamera) -> Float[Tensor, "T H W"]:
-    full = F.interpolate(light[:, None], scale_factor=_SHADOW_STEP_PX, mode="bilinear")
+def _enlarge(
+    light: Float[Tensor, "T h w"], camera: PinholeCamera, step: int
+) -> Float[Tensor, "T H W"]:
+    full = F.interpolate(light[:, None], scale_factor=step, mode="bilinear")
     return full[:, 0, : camera.height, : camera.width]
 
 

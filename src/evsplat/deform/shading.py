@@ -73,16 +73,22 @@ class NearestSurface:
         """``surface``: samples of the canonical body."""
         self.surface = surface
         self.index = torch.zeros(0, dtype=torch.long)
+        self._found: tuple[Tensor, Tensor, Tensor] | None = None
 
     def normals(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Unit normals at the canonical centres of all Gaussians."""
-        index = self._of(means)
-        return self._on(means.device).normals[index]
+        return self._at_all(means)[0]
 
     def weights(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Skinning weights at the canonical centres of all Gaussians."""
+        return self._at_all(means)[1]
+
+    def _at_all(self, means: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor]:
         index = self._of(means)
-        return self._on(means.device).weights[index]
+        if self._found is None or self._found[2] is not index:
+            surface = self._on(means.device)
+            self._found = surface.normals[index], surface.weights[index], index
+        return self._found[:2]
 
     def weights_at(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Skinning weights at any canonical points, looked up now."""

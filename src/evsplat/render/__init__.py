@@ -1,11 +1,13 @@
 """Drawing posed Gaussians: one function, several backends that give the same numbers."""
 
 from evsplat.render.api import BackendName, choose_device, render
+from evsplat.render.backdrop import Backdrop
 from evsplat.render.pictures import split_channels
 from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
 __all__ = [
     "BackendName",
+    "Backdrop",
     "PinholeCamera",
     "RenderOutput",
     "Splats",

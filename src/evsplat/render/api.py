@@ -3,19 +3,21 @@
 import logging
 from typing import Literal, get_args
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.cuda_support import needs, what_is_missing
 from evsplat.errors import BackendError, ConfigError
 from evsplat.render import cuda, native, reference
+from evsplat.render.backdrop import Backdrop
 from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
 logger = logging.getLogger(__name__)
 
 BackendName = Literal["auto", "native", "gsplat", "reference"]
 
-_BACKENDS = {"native": native.render, "gsplat": cuda.render, "reference": reference.render}
+_BACKENDS = {"gsplat": cuda.render, "reference": reference.render}
 _BACKEND_OF_DEVICE = {"cpu": "native", "cuda": "gsplat"}
 
 
@@ -27,6 +29,7 @@ def render(
     background: Float[Tensor, "C"] | Float[Tensor, "H W C"] | None = None,
     backend: BackendName = "auto",
     near: float = 0.01,
+    backdrop: Backdrop | None = None,
 ) -> RenderOutput:
     """Composite the Gaussians front to back, by the rules of gsplat 1.5 ("classic" mode).
 
@@ -38,6 +41,9 @@ def render(
     ``static`` are more Gaussians of the same picture, the same at all times. The native backend
     projects and sorts them once, and composites tiles that no other Gaussian touches once for all
     times; gsplat projects them once. The result is that of passing them in ``splats`` at each time.
+
+    ``backdrop`` keeps what the native backend finds of ``static`` for the next render with the same
+    one, where neither ``static`` nor the camera has changed; no gradients then.
 
     ``auto`` takes ``native`` for tensors on the CPU and ``gsplat`` for those on a CUDA device. A
     backend that cannot run is a `BackendError` with the reason, never another one's work.
@@ -54,6 +60,8 @@ def render(
             raise BackendError("render: static Gaussians have no axis of times but 1.")
         _check_alike(splats, static)
     _check_camera(splats, camera, background)
+    if backdrop is not None and torch.is_grad_enabled():
+        raise BackendError("render: a backdrop has no gradients; draw within torch.no_grad().")
 
     device, chosen = splats.means.device, str(backend)
     if backend == "auto":
@@ -63,6 +71,8 @@ def render(
                 f"No render backend for device {device}; move the tensors to the CPU or a CUDA "
                 "device, or ask for backend='reference', which is slow."
             )
+    if chosen == "native":
+        return native.render(splats, static, times, camera, background, near, backdrop)
     return _BACKENDS[chosen](splats, static, times, camera, background, near)
 
 

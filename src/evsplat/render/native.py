@@ -9,6 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.compiled import import_error, native, runs_native
 from evsplat.errors import BackendError
+from evsplat.render.backdrop import Backdrop
 from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
 
@@ -19,6 +20,7 @@ def render(
     camera: PinholeCamera,
     background: Tensor | None,
     near: float,
+    backdrop: Backdrop | None,
 ) -> RenderOutput:
     """Draw with the native kernels; fields have their leading axis of times."""
     if native is None:
@@ -32,8 +34,12 @@ def render(
             f"The native render backend needs float32 tensors on the CPU, not {means.dtype} on "
             f"{means.device}; convert them, or ask for backend='reference'."
         )
+    if static is None:
+        backdrop = None
+    if backdrop is not None and static is not None:
+        backdrop.show(splats, static, camera, background, near)
     image, alpha, radii, static_radii = _Rasterize.apply(
-        times, camera.width, camera.height, camera.K, near,
+        backdrop, times, camera.width, camera.height, camera.K, near,
         camera.world_to_camera, background, *_fields(splats), *_fields(static),
     )  # fmt: skip
     return RenderOutput(image, alpha, radii, static_radii)
@@ -55,7 +61,14 @@ def _plain(tensor: Tensor | None) -> Tensor | None:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, times: int, width: int, height: int, K: Tensor, near: float, *inputs: Any
+        ctx: Any,
+        backdrop: Backdrop | None,
+        times: int,
+        width: int,
+        height: int,
+        K: Tensor,
+        near: float,
+        *inputs: Any,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         pose, background, *layers = map(_plain, inputs)
         moving, still = layers[:_FIELDS], layers[_FIELDS:]
@@ -71,7 +84,10 @@ class _Rasterize(torch.autograd.Function):
             alpha = torch.empty(times, height, width)
             radii = torch.empty(times, means.shape[1], dtype=torch.int32)
             still_radii = torch.empty(1, still_count, dtype=torch.int32)
-            job.forward(image, alpha, radii, still_radii)
+            earlier = None if backdrop is None else backdrop.job
+            job.forward(image, alpha, radii, still_radii, backdrop is not None, earlier)
+            if backdrop is not None:
+                backdrop.job = job
         except (RuntimeError, ValueError) as error:
             raise BackendError(f"The native render backend failed: {error}.") from error
         # Planar in memory, which is what the kernels and convolutions like.
@@ -86,10 +102,10 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> Any:
         # Reading saved_tensors also refuses inputs that were changed in place since.
-        inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[5:]
+        inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[6:]
         image_grad, alpha_grad, *_ = upstream
         if image_grad is None and alpha_grad is None:
-            return (None,) * (5 + len(inputs))
+            return (None,) * (6 + len(inputs))
         _, background, *layers = [
             torch.zeros(tensor.shape) if tensor is not None and need else None
             for tensor, need in zip(inputs, needed, strict=True)
@@ -103,4 +119,4 @@ class _Rasterize(torch.autograd.Function):
             pose[:3, :3] = view[:9].view(3, 3)
             pose[:3, 3] = view[9:]
             pose = pose.to(inputs[0].dtype)
-        return *(None,) * 5, pose, background, *layers
+        return *(None,) * 6, pose, background, *layers

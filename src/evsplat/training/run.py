@@ -18,7 +18,7 @@ from evsplat.capture import Camera, Capture, load_capture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.config import load_yaml, to_dict
 from evsplat.deform.at_rest import Skinned, mean_at_rest
-from evsplat.deform.drawing import draw, draw_depth, shadowed_scene
+from evsplat.deform.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.deform.model import Model
 from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.devices import hardware
@@ -26,7 +26,7 @@ from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
 from evsplat.methods import TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
-from evsplat.render import Splats, choose_device, render
+from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, load_model
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
@@ -109,6 +109,10 @@ class GaussianReconstruction:
 
     name: str
     model: Model
+    backdrop: Backdrop | None = None
+    """What the scene looked like to the picture before, for a camera that mostly stands still."""
+    shadow_step_px: int = SHADOW_STEP_PX
+    """Shadows are looked up so far apart."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
@@ -116,11 +120,17 @@ class GaussianReconstruction:
             camera = camera.to(self.model.device)
             posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
             if parts == "all":
-                drawing = draw(self.model, posed, camera)
+                drawing = draw(
+                    self.model,
+                    posed,
+                    camera,
+                    backdrop=self.backdrop,
+                    shadow_step_px=self.shadow_step_px,
+                )
                 return Rendering(
-                    rgb=torch.stack(drawing.rgb).cpu().clamp(0, 1),
+                    rgb=_stacked(drawing.rgb).cpu().clamp(0, 1),
                     alpha=drawing.output.alpha.cpu(),
-                    human=torch.stack(drawing.semantic).cpu().clamp(0, 1),
+                    human=_stacked(drawing.semantic).cpu().clamp(0, 1),
                 )
             output = render(posed.moving() if parts == "human" else posed.static(), camera)
         times = len(times_us)
@@ -182,6 +192,11 @@ class GaussianReconstruction:
             f"Method {self.name} does not tell the skinning weights of its Gaussians, so that its "
             "person cannot be taken apart from its poses; export an instant or an html clip."
         )
+
+
+def _stacked(pictures: tuple[Tensor, ...]) -> Tensor:
+    """With an axis of times; one picture is not copied."""
+    return pictures[0][None] if len(pictures) == 1 else torch.stack(pictures)
 
 
 @dataclass(frozen=True)

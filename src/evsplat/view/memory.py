@@ -1,33 +1,64 @@
 """Networks that are not asked twice: what a viewer changes from picture to picture is little."""
 
 import copy
-from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
-NETWORKS = ("non_rigid", "skinning", "human_colour", "scene_colour")
+from evsplat.deform.non_rigid import NonRigid
+from evsplat.render.backdrop import same_values
+
+
+@dataclass(frozen=True)
+class Turns:
+    """How a draft asks a network about its points: about one in so many, in turns."""
+
+    every: int
+    axes: tuple[int | None, ...]
+    """Axis of each input that counts the points; None: the input is the same for all of them."""
+
+    def part(self, question: tuple[Any, ...], turn: int) -> tuple[Any, ...]:
+        """The question about the points of one turn."""
+        rows = slice(turn, None, self.every)
+        return tuple(
+            value if axis is None else value[(slice(None),) * axis + (rows,)]
+            for value, axis in zip(question, self.axes, strict=True)
+        )
+
+
+NETWORKS = {
+    "non_rigid": Turns(4, (0, None)),
+    "skinning": Turns(16, (1,)),
+    "human_colour": Turns(4, (0, 1, 1, None)),
+    "scene_colour": Turns(8, (0, 0)),
+}
 """Modules of a model that map all Gaussians at once, whose last answer is kept.
 
-Turning the camera asks the first two nothing new; moving in time asks the last nothing new.
+Turning the camera asks the first two nothing new; moving in time asks the last nothing new. The
+less the answer changes with pose and view, the longer a draft may take to renew it.
 """
-ROUGH = ("skinning", "scene_colour")
-"""Those that change so little with pose and view that a draft takes their last answer."""
 
 
 class Remembering(nn.Module):
     """A network with its last answer, given again to the same question.
 
-    With ``rough`` set it is given to any question about as many points.
+    With ``rough`` set, another question about as many points renews the answer for the points of
+    one turn; the others keep theirs. After all turns of one question the answer is that of the
+    network up to rounding, which is good enough for drafts.
     """
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, turns: Turns) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.turns = network, turns
         self.rough = False
-        self._asked: tuple[Any, ...] | None = None
+        self._asked: tuple[Any, ...] = ()
         self._answer: Any = None
+        self._turn = 0
+        self._known = 0
+        """How many turns have been asked the last question."""
+        self._exact = False
+        """Whether it was asked about all points at once."""
 
     def __getattr__(self, name: str) -> Any:
         """What is asked of the network itself, such as its sizes."""
@@ -38,13 +69,31 @@ class Remembering(nn.Module):
 
     def forward(self, *question: Any) -> Any:
         """The network's answer, new or remembered."""
-        if self._asked is not None:
-            alike = _same_size if self.rough else _same
-            if len(question) == len(self._asked) and all(map(alike, question, self._asked)):
+        asked, every = self._asked, self.turns.every
+        known = len(asked) == len(question)
+        if known and all(map(_same, question, asked)):
+            if self._exact or (self.rough and self._known >= every):
                 return self._answer
-        self._answer = self.network(*question)
+        else:
+            self._known = 0
+        if self.rough and known and all(map(_same_size, question, asked)):
+            self._renew(self.network(*self.turns.part(question, self._turn)))
+            self._turn = (self._turn + 1) % every
+            self._known += 1
+            self._exact = False
+        else:
+            self._answer, self._exact = self.network(*question), True
         self._asked = question
         return self._answer
+
+    def _renew(self, part: Any) -> None:
+        """Take the answer for the points of this turn; what was given before stays as it is."""
+        values = _values(self._answer).clone()
+        values[..., self._turn :: self.turns.every, :] = _values(part)
+        if isinstance(self._answer, NonRigid):
+            self._answer = replace(self._answer, changes=values)
+        else:
+            self._answer = values
 
 
 def remembering(model: nn.Module) -> nn.Module:
@@ -54,24 +103,29 @@ def remembering(model: nn.Module) -> nn.Module:
     """
     twin = copy.copy(model)
     twin._modules = dict(model._modules)
-    for name in NETWORKS:
+    for name, turns in NETWORKS.items():
         network = twin._modules.get(name)
         if network is not None:
-            twin._modules[name] = Remembering(network)
+            twin._modules[name] = Remembering(network, turns)
     return twin
 
 
-def set_rough(model: nn.Module, rough: bool, names: Sequence[str] = ROUGH) -> None:
-    """Let some networks answer from memory, or not."""
-    for name in names:
-        network = model._modules.get(name)
+def set_rough(model: nn.Module, rough: bool) -> None:
+    """Let the networks that remember answer in turns, or exactly."""
+    for network in model._modules.values():
         if isinstance(network, Remembering):
             network.rough = rough
 
 
+def _values(answer: Any) -> Tensor:
+    """One row per point along the last axis but one."""
+    values: Tensor = answer.changes if isinstance(answer, NonRigid) else answer
+    return values
+
+
 def _same(new: Any, old: Any) -> bool:
     if isinstance(new, Tensor) and isinstance(old, Tensor):
-        return new is old or (new.shape == old.shape and torch.equal(new, old))
+        return same_values(new, old)
     return type(new) is type(old) and bool(new == old)
 
 

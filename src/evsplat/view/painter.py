@@ -65,6 +65,10 @@ class Painter:
             self._inset(picture, wish)
         return pixels.with_labels(pixels.to_bytes(picture), labels)
 
+    def camera(self, wish: Wish) -> Camera:
+        """From where a wish is seen."""
+        return self._pane(wish, wish.width, wish.height).camera
+
     def frame(self, camera: str | None, time_us: int) -> Frame:
         """The recorded frame nearest in time, of a camera where it recorded any."""
         return nearest_frame(self.capture, camera, time_us)

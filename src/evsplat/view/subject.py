@@ -12,13 +12,24 @@ from torch import nn
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera
+from evsplat.export.cloud import SplatCloud
+from evsplat.export.gaussians import Instant, cloud_at
 from evsplat.film import load_motion_of
 from evsplat.film.looks import Look, depth_colours
-from evsplat.methods.reconstruction import Posable, Reconstruction, WithDepth
-from evsplat.training.run import Run, reload_run
+from evsplat.methods.reconstruction import (
+    Parts,
+    Posable,
+    Reconstruction,
+    SplatReconstruction,
+    WithDepth,
+)
+from evsplat.render import Backdrop
+from evsplat.training.run import GaussianReconstruction, Run, reload_run
 from evsplat.view.memory import remembering, set_rough
 from evsplat.view.posing import HeldPose, PoseSlider, pose_sliders, turned
 from evsplat.view.wish import Motion
+
+_ROUGH_SHADOW_STEP_PX = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +70,11 @@ class Subject:
         """Whether depth can be shown."""
         return isinstance(self.run.reconstruction, WithDepth)
 
+    @property
+    def has_splats(self) -> bool:
+        """Whether its Gaussians can be had as a file."""
+        return isinstance(self.run.reconstruction, SplatReconstruction)
+
     @cached_property
     def sliders(self) -> tuple[PoseSlider, ...]:
         """Angles by which the person can be posed."""
@@ -80,12 +96,14 @@ class Subject:
     ) -> Float[np.ndarray, "H W 3"]:
         """One instant, sRGB in [0, 1].
 
-        ``rough`` may show the scene's colours and skin by the weights of the picture before.
+        ``rough`` asks networks about a part of the Gaussians only and makes shadows softer.
         """
         drawn = self._moving(time_us, motion)
-        model = getattr(drawn, "model", None)
-        if isinstance(model, nn.Module):
-            set_rough(model, rough)
+        if isinstance(drawn, GaussianReconstruction):
+            assert isinstance(drawn.model, nn.Module)
+            set_rough(drawn.model, rough)
+            if rough:
+                drawn = replace(drawn, shadow_step_px=_ROUGH_SHADOW_STEP_PX)
         with torch.no_grad():
             if look.shown == "rgb":
                 return drawn.render(camera, [time_us], parts=look.parts).rgb[0].numpy()
@@ -93,6 +111,15 @@ class Subject:
         if look.shown == "depth":
             exposure = depth_colours(exposure, self._nearest_m)
         return exposure.astype(np.float32) / 255
+
+    def cloud(self, camera: Camera, time_us: int, motion: Motion, parts: Parts) -> SplatCloud:
+        """The Gaussians of one instant in the world, coloured as ``camera`` sees them."""
+        drawn = self._moving(time_us, motion)
+        if isinstance(drawn, GaussianReconstruction):
+            assert isinstance(drawn.model, nn.Module)
+            set_rough(drawn.model, False)
+        assert isinstance(drawn, SplatReconstruction)
+        return cloud_at(drawn, Instant(time_us, camera, "the viewer's", ""), parts)
 
     @cached_property
     def _nearest_m(self) -> float:
@@ -121,8 +148,8 @@ class Subject:
 
 
 def _remembering(reconstruction: Reconstruction) -> Reconstruction:
-    model = getattr(reconstruction, "model", None)
-    if not isinstance(model, nn.Module):
+    if not isinstance(reconstruction, GaussianReconstruction):
         return reconstruction
-    fields: Any = reconstruction
-    return replace(fields, model=remembering(model))
+    assert isinstance(reconstruction.model, nn.Module)
+    model: Any = remembering(reconstruction.model)
+    return replace(reconstruction, model=model, backdrop=Backdrop())

@@ -1,0 +1,98 @@
+"""A run as the viewer draws it: still pictures are those of the run, whatever was drawn before."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from evsplat.capture import load_capture
+from evsplat.config import override
+from evsplat.film.looks import Look
+from evsplat.methods import compose, method_config
+from evsplat.methods.evsplat import compose as compose_evsplat
+from evsplat.training.run import GaussianReconstruction, Run
+from evsplat.view.posing import HeldPose, PoseSlider, turned
+from evsplat.view.subject import Subject
+from evsplat.view.wish import Motion
+
+SMALL = {
+    "paper": ("human.count=150", "deform.width=16", "deform.colour_width=16"),
+    "evsplat": ("human.count=150", "deform.width=16"),
+}
+COMPOSE = {"paper": compose, "evsplat": compose_evsplat}
+
+
+@pytest.fixture(name="run", params=SMALL)
+def _run(tiny_capture, request):
+    """A run of a method whose networks say something."""
+    torch.manual_seed(int(np.random.default_rng().integers(1 << 31)))
+    method, capture = request.param, load_capture(tiny_capture())
+    values = override({}, (*SMALL[method], "deform.non_rigid_start=0"))
+    config = method_config(method, values, where="test")
+    model = COMPOSE[method](config, capture, 0, fit=False).model
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if "logits" not in name:
+                parameter.add_(0.05 * torch.randn_like(parameter))
+    counts = {"human": model.gaussians.human_count, "scene": model.gaussians.scene_count}
+    made = GaussianReconstruction(method, model)
+    return Run(Path("none"), config, method, capture, made, 0, 0.0, "cpu", counts, False)
+
+
+def _views(run):
+    """Instants and cameras, back and forth, as somebody looks around."""
+    cameras, frames = list(run.capture.cameras.values()), run.capture.frames
+    for camera in (cameras[0], cameras[1], cameras[0]):
+        for frame in (frames[0], frames[2], frames[3], frames[0]):
+            yield camera, frame.mid_us
+
+
+def test_a_still_picture_is_that_of_the_run_bit_for_bit(run):
+    subject, look, motion = Subject(run, "it"), Look(), Motion()
+    for camera, time_us in _views(run):
+        for _ in range(3):
+            subject.picture(camera, time_us + 500, motion, look, rough=True)
+        found = subject.picture(camera, time_us, motion, look, rough=False)
+        expected = run.reconstruction.render(camera, [time_us]).rgb[0].numpy()
+        assert np.array_equal(found, expected)
+
+
+def test_drafts_of_a_view_that_stands_still_become_its_picture(run):
+    subject, look, motion = Subject(run, "it"), Look(), Motion()
+    (camera, first), (_, second), *_ = _views(run)
+    expected = run.reconstruction.render(camera, [second]).rgb[0].numpy()
+    subject.picture(camera, first, motion, look, rough=False)
+    errors = []
+    for _ in range(40):
+        draft = subject.picture(camera, second, motion, look, rough=True)
+        errors.append(np.abs(draft - expected).mean())
+    start = run.reconstruction.render(camera, [first]).rgb[0].numpy()
+    assert errors[0] < 0.5 * np.abs(start - expected).mean()
+    # Shadows stay a little softer.
+    assert errors[-1] < (1e-6 if run.method == "paper" else 2e-3)
+
+
+def test_gaussians_of_an_instant_are_those_that_are_drawn(run):
+    subject = Subject(run, "it")
+    # The body of the small capture has no limbs that are recognised.
+    slider = PoseSlider("arm", "bend", (2,), np.array([0.0, 0.0, 1.0]), False, 60)
+    subject.__dict__["sliders"] = (slider,)
+    (camera, time_us), *_ = _views(run)
+    angles = (30.0,)
+    subject.picture(camera, time_us, Motion(None, angles), Look(), rough=True)
+    cloud = subject.cloud(camera, time_us, Motion(None, angles), "human")
+    track = run.reconstruction.track
+    rotations, transl = track.at([time_us])
+    pose = HeldPose(track)
+    pose.hold(turned(subject.sliders, angles, rotations[0])[None], transl)
+    model = run.reconstruction.following(pose).model
+    with torch.no_grad():
+        expected = model.at([time_us], camera.center(), hard_semantics=True).human
+    np.testing.assert_allclose(cloud.means, expected.means[0].numpy(), atol=1e-6)
+    at_rest = subject.cloud(camera, time_us, Motion(), "human")
+    assert np.abs(at_rest.means - cloud.means).max() > 0.02
+    np.testing.assert_allclose(cloud.rgb, expected.rgb[0].numpy(), atol=1e-6)
+    everything = subject.cloud(camera, time_us, Motion(), "all")
+    assert len(everything) == run.gaussians["human"] + run.gaussians["scene"]
+    assert everything.semantic.sum() == run.gaussians["human"]
