@@ -1,11 +1,9 @@
 """The controls that a browser shows."""
 
-import io
 import time
 
 import numpy as np
 import viser
-from PIL import Image
 
 from evsplat.capture import Frame
 from evsplat.film import Look, camera_at
@@ -15,7 +13,9 @@ from evsplat.view.camera import Orbit, forward, framed, vertical_fov
 from evsplat.view.client import Client
 from evsplat.view.painter import comparisons
 from evsplat.view.pose_panel import PosePanel
+from evsplat.view.save_panel import SavePanel
 from evsplat.view.timeline import Playback
+from evsplat.view.wish import Wish
 
 SPEEDS = {
     "as recorded": 1.0,
@@ -62,7 +62,7 @@ class Panel:
             with self.gui.add_folder("Motion and pose"):
                 PosePanel(self)
         with self.gui.add_folder("Save"):
-            self._build_save()
+            SavePanel(self)
         client.on_time = self._follow
 
     def _build_time(self) -> None:
@@ -145,14 +145,6 @@ class Panel:
         for control in (parts, shown, compare, layout, divider, events, window):
             control.on_update(changed)
 
-    def _build_save(self) -> None:
-        picture = self.gui.add_button("Picture (PNG)", icon=viser.Icon.DOWNLOAD)
-
-        async def save(_: viser.GuiEvent) -> None:
-            self.client.desk.do(self._send_picture)
-
-        picture.on_click(save)
-
     def look_through(self, camera: str) -> None:
         """Put the browser's camera where a recording camera is at this time."""
         wish = self.client.standing
@@ -233,11 +225,8 @@ class Panel:
             where = "between exposures"
         return f"Frame {frame.name} ({split}), {where} of {(end - start) / 1e3:.3g} ms"
 
-    def _send_picture(self) -> None:
-        """Draw the present view with all its pixels and hand it to the browser as a file."""
-        wish = self.client.standing
-        picture = self.client.painter.paint(wish, (wish.width, wish.height), rough=False)
-        data = io.BytesIO()
-        Image.fromarray(picture).save(data, "PNG")
-        name = f"{self.capture.name}-{wish.time_us / 1e3:.1f}ms.png"
-        self.client.handle.send_file_download(name, data.getvalue(), save_immediately=True)
+    def instant_name(self, wish: Wish) -> str:
+        """What a file of this instant is called, without its ending."""
+        motion = "" if wish.motion.name is None else f"-{wish.motion.name}"
+        place_ms = wish.time_us / 1e3
+        return f"{self.capture.name}{motion}-{place_ms:.1f}ms"

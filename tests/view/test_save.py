@@ -1,0 +1,163 @@
+"""What the viewer's save buttons send, over the protocol that browsers speak."""
+
+import asyncio
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+viser = pytest.importorskip("viser", reason="needs the extra view: pip install 'evsplat[view]'")
+
+import msgspec  # noqa: E402
+import websockets  # noqa: E402
+import zstandard  # noqa: E402
+from PIL import Image  # noqa: E402
+
+from evsplat.capture import load_capture  # noqa: E402
+from evsplat.config import override  # noqa: E402
+from evsplat.methods import compose, method_config  # noqa: E402
+from evsplat.training.run import GaussianReconstruction, Run  # noqa: E402
+from evsplat.view.server import Viewer  # noqa: E402
+from evsplat.view.subject import Subject  # noqa: E402
+from evsplat.view.wish import Motion  # noqa: E402
+
+from ..export.clouds import read_ply, read_spz  # noqa: E402
+
+SIDE = 48
+
+
+class Browser:
+    """The other end of viser's protocol, as far as buttons and downloads go."""
+
+    def __init__(self, socket):
+        self.socket = socket
+        self.controls = {}
+
+    async def messages(self):
+        raw = await asyncio.wait_for(self.socket.recv(), 30)
+        size = int.from_bytes(raw[8:16], "little")
+        plain = zstandard.ZstdDecompressor().decompress(
+            raw[16 : 16 + size], max_output_size=int.from_bytes(raw[:8], "little")
+        )
+        found = msgspec.msgpack.decode(plain)["messages"]
+        for message in found:
+            if "props" in message and "label" in (message["props"] or {}):
+                self.controls[message["props"]["label"]] = message["uuid"]
+        return found
+
+    async def send(self, **message):
+        await self.socket.send(msgspec.msgpack.encode(message))
+
+    async def set(self, label, value):
+        while label not in self.controls:
+            await self.messages()
+        updates = {"value": value}
+        await self.send(type="GuiUpdateMessage", uuid=self.controls[label], updates=updates)
+
+    async def download(self, label):
+        """Press a button; the name and the content of the file that comes."""
+        await self.set(label, True)
+        start, parts = None, {}
+        while start is None or len(parts) < start["part_count"]:
+            for message in await self.messages():
+                if message["type"] == "FileTransferStartDownload":
+                    start = message
+                elif message["type"] == "FileTransferPart":
+                    parts[message["part_index"]] = message["content"]
+        content = b"".join(parts[i] for i in range(start["part_count"]))
+        assert len(content) == start["size_bytes"]
+        return start["filename"], content
+
+
+@pytest.fixture(name="run")
+def _run(tiny_capture):
+    capture = load_capture(tiny_capture())
+    values = override({}, ("human.count=60", "deform.width=16", "deform.colour_width=16"))
+    config = method_config("paper", values, where="test")
+    model = compose(config, capture, 0, fit=False).model
+    counts = {"human": model.gaussians.human_count, "scene": model.gaussians.scene_count}
+    made = GaussianReconstruction("paper", model)
+    return Run(Path("none"), config, "paper", capture, made, 7, 0.0, "cpu", counts, False)
+
+
+def in_browser(run, port, act):
+    """Let ``act`` use the viewer of a run as a browser does."""
+
+    async def visit(viewer):
+        address = f"ws://127.0.0.1:{viewer.port}"
+        protocol = [f"viser-v{viser.__version__}"]
+        async with websockets.connect(
+            address, subprotocols=protocol, max_size=None, compression=None
+        ) as socket:
+            browser = Browser(socket)
+            await browser.send(
+                **{
+                    "type": "ViewerCameraMessage",
+                    "wxyz": (1.0, 0.0, 0.0, 0.0),
+                    "position": (0.0, 0.0, -3.0),
+                    "fov": 0.8,
+                    "near": 0.01,
+                    "far": 100.0,
+                    "image_height": SIDE,
+                    "image_width": SIDE,
+                    "look_at": (0.0, 0.0, 0.0),
+                    "up_direction": (0.0, -1.0, 0.0),
+                }
+            )
+            return await act(browser)
+
+    viewer = Viewer([run], host="127.0.0.1", port=port)
+    try:
+        return asyncio.run(visit(viewer))
+    finally:
+        viewer.close()
+
+
+def test_the_picture_comes_with_all_pixels_of_the_window(run):
+    name, content = in_browser(run, 18650, lambda browser: browser.download("Picture (PNG)"))
+    assert name.startswith(f"{run.capture.name}-") and name.endswith("ms.png")
+    assert Image.open(io.BytesIO(content)).size == (SIDE, SIDE)
+
+
+def test_gaussians_come_in_every_format_and_as_the_parts_that_are_shown(run, tmp_path):
+    async def act(browser):
+        files = {}
+        for parts, formats in (
+            ("person and scene", ("PLY", "SPZ", "SPLAT", "glTF")),
+            ("person", ("PLY",)),
+            ("scene", ("SPLAT",)),
+        ):
+            await browser.set("Parts", parts)
+            for kind in formats:
+                await browser.set("Format", kind)
+                name, content = await browser.download("Gaussians")
+                files[parts, kind] = tmp_path / name
+                files[parts, kind].write_bytes(content)
+        return files
+
+    files = in_browser(run, 18660, act)
+    people, scene = run.gaussians["human"], run.gaussians["scene"]
+
+    whole = files["person and scene", "PLY"]
+    comments, columns = read_ply(whole)
+    assert any("angles_deg" in comment for comment in comments)
+    # The window shows the first frame; the file holds that instant.
+    first = min(run.capture.frames, key=lambda frame: frame.mid_us)
+    assert whole.name == f"{run.capture.name}-{first.mid_us / 1e3:.1f}ms.ply"
+    expected = Subject(run, "it").cloud(run.capture.camera(first), first.mid_us, Motion(), "all")
+    found = np.stack([columns[axis] for axis in "xyz"], 1)
+    np.testing.assert_allclose(found, expected.means, atol=1e-6)
+    np.testing.assert_array_equal(columns["semantic"], [1] * people + [0] * scene)
+
+    person = files["person", "PLY"]
+    assert person.name.endswith("ms-person.ply")
+    assert len(read_ply(person)[1]["x"]) == people
+    splat = files["scene", "SPLAT"]
+    assert splat.name.endswith("ms-scene.splat") and splat.stat().st_size == 32 * scene
+    spz = files["person and scene", "SPZ"]
+    assert spz.suffix == ".spz" and read_spz(spz)["mean"].size == 3 * (people + scene)
+    glb = files["person and scene", "glTF"]
+    magic, version, length = struct.unpack("<4sII", glb.read_bytes()[:12])
+    assert (glb.suffix, magic, version, length) == (".glb", b"glTF", 2, glb.stat().st_size)
