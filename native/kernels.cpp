@@ -132,7 +132,7 @@ INLINE uint64_t patches_reached(const Projected& p, float kx, float ky, float x0
         const F u1 = p.l11 * xc + p.l12 * ye, v1 = p.l22 * ye;
         const F u2 = p.l11 * xe + p.l12 * yc, v2 = p.l22 * yc;
         const F least = min(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2);
-        reached |= bits(least <= limit) << first;
+        reached |= bits_at_most(least, splat(limit)) << first;
     }
     return reached;
 }
@@ -398,7 +398,7 @@ void forward_tile(const ForwardJob& job, const TileWork& work) {
             }
             for (int k = 0; k < C; ++k) out[k] = c[k];
             live[p] = t, final[p] = t_final, last[p] = t_last;
-            if (!bits(t > 0.f)) {
+            if (bits_at_most(t, F{}) == (uint64_t(1) << W) - 1) {
                 open &= ~(uint64_t(1) << p);
                 work.patch_end[p] = first + chunk.count;
             }
@@ -432,15 +432,6 @@ INLINE void load_gradient(const Tile& t, const TileWork& work, F* patches, int s
         load_plane(t, more, 1, plane + work.times[i] * st, sx, sy);
         for (int p = 0; p < kPatches; ++p) patches[p * step] += more[p];
     }
-}
-
-INLINE void store_slot(float* slot, F4 value, bool add) {
-    if (add) {
-        F4 before;
-        __builtin_memcpy(&before, slot, sizeof before);
-        value += before;
-    }
-    __builtin_memcpy(slot, &value, sizeof value);
 }
 
 // Back to front, with two running scalars per pixel: the transmittance T_i and the gradient-weighted
@@ -508,14 +499,14 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
             const Projected g = chunk.projected[j];
             const float* colour = chunk.values[j];
             const int32_t index_in_tile = int32_t(first + j);
-            F h0 = F{}, hu = F{}, hv = F{}, huu = F{}, huv = F{}, hvv = F{};
-            F hc[C ? C : kMaxChannels];
-            for (int k = 0; k < channels; ++k) hc[k] = F{};
+            F slot[kMoments + (C ? C : kMaxChannels)];
+            for (int k = 0; k < kMoments + channels; ++k) slot[k] = F{};
+            F* hc = slot + kMoments;
             for (uint64_t left = entry.patches & open; left; left &= left - 1) {
                 const int p = __builtin_ctzll(left);
                 const Alpha a = alpha_at(g, pixels.x[p], pixels.y[p]);
                 const F alpha = select(last[p] >= index_in_tile, a.value, F{});
-                const F t = transmittance[p] / (1.f - alpha);
+                const F t = transmittance[p] * reciprocal(1.f - alpha);
                 const F weight = t * alpha;
                 transmittance[p] = t;
                 const F* v = grad + p * channels;
@@ -528,19 +519,11 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
                 behind[p] += alpha * differs;
                 const F h = select(a.raw <= kMaxAlpha, weight * differs, F{});
                 const F h_u = h * a.u, h_v = h * a.v;
-                h0 += h, hu += h_u, hv += h_v;
-                huu += h_u * a.u, huv += h_u * a.v, hvv += h_v * a.v;
+                slot[0] += h, slot[1] += h_u, slot[2] += h_v;
+                slot[3] += h_u * a.u, slot[4] += h_u * a.v, slot[5] += h_v * a.v;
             }
-            float* slot = back.slots + size_t(entry.slot) * stride;
-            const F zero = F{};
-            const bool more = add && entry.gaussian >= job.split;
-            store_slot(slot, sum4(h0, hu, hv, huu), more);
-            store_slot(slot + 4, sum4(huv, hvv, hc[0], channels > 1 ? hc[1] : zero), more);
-            for (int k = 2; k < channels; k += 4)
-                store_slot(slot + kMoments + k,
-                           sum4(hc[k], k + 1 < channels ? hc[k + 1] : zero, k + 2 < channels ? hc[k + 2] : zero,
-                                k + 3 < channels ? hc[k + 3] : zero),
-                           more);
+            sums(slot, kMoments + channels, back.slots + size_t(entry.slot) * stride,
+                 add && entry.gaussian >= job.split);
         }
     }
 }

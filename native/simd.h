@@ -39,8 +39,17 @@ INLINE void stream(float* p, F v) {
 #endif
 }
 
+// Where one of the two is no number, the second comes out. GCC makes a comparison and a blend of a < b ? a : b.
+#if defined(__AVX512F__) && EVSPLAT_LANES == 16
+INLINE F min(F a, F b) { return (F)_mm512_min_ps((__m512)a, (__m512)b); }
+INLINE F max(F a, F b) { return (F)_mm512_max_ps((__m512)a, (__m512)b); }
+#elif defined(__AVX__) && EVSPLAT_LANES == 8
+INLINE F min(F a, F b) { return (F)_mm256_min_ps((__m256)a, (__m256)b); }
+INLINE F max(F a, F b) { return (F)_mm256_max_ps((__m256)a, (__m256)b); }
+#else
 INLINE F min(F a, F b) { return a < b ? a : b; }
 INLINE F max(F a, F b) { return a > b ? a : b; }
+#endif
 INLINE F select(I mask, F a, F b) { return mask ? a : b; }
 
 INLINE F sqrt(F v) {
@@ -73,6 +82,25 @@ INLINE uint64_t bits(I mask) {
     uint64_t r = 0;
     for (int l = 0; l < W; ++l) r |= uint64_t(mask[l] & 1) << l;
     return r;
+#endif
+}
+
+// Bit l = lane l of a is at most that of b.
+INLINE uint64_t bits_at_most(F a, F b) {
+#if defined(__AVX512F__) && EVSPLAT_LANES == 16
+    return uint32_t(_mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ));
+#else
+    return bits(a <= b);
+#endif
+}
+
+// 1 / v to the last digit or two, exact at 1.
+INLINE F reciprocal(F v) {
+#if defined(__AVX512F__) && EVSPLAT_LANES == 16
+    const F r = (F)_mm512_rcp14_ps((__m512)v);
+    return r + r * (1.f - v * r);
+#else
+    return 1.f / v;
 #endif
 }
 
@@ -119,6 +147,46 @@ INLINE F4 sum4(F a, F b, F c, F d) {
     const F4 ab = SHUFFLE4(qa, qb, 0, 4, 1, 5) + SHUFFLE4(qa, qb, 2, 6, 3, 7);
     const F4 cd = SHUFFLE4(qc, qd, 0, 4, 1, 5) + SHUFFLE4(qc, qd, 2, 6, 3, 7);
     return SHUFFLE4(ab, cd, 0, 1, 4, 5) + SHUFFLE4(ab, cd, 2, 3, 6, 7);
+}
+
+// to[i] = the sum over the lanes of the i-th of `count` vectors, added to what is there with `add`; whole
+// groups of four are written.
+INLINE void sums(const F* vectors, int count, float* to, bool add) {
+    const int groups = (count + 3) / 4;
+    const F zero = F{};
+    const auto vector = [&](int i) { return i < count ? vectors[i] : zero; };
+#if EVSPLAT_LANES == 16
+#pragma GCC unroll 3
+    for (int first = 0; first < groups; first += 4) {
+        // Of vectors i, i + 4, i + 8, i + 12, quarter by quarter of the result.
+        __m512 quarters[4];
+#pragma GCC unroll 4
+        for (int i = 0; i < 4; ++i) {
+            const __m512 a = (__m512)vector(4 * first + i), b = (__m512)vector(4 * first + i + 4);
+            const __m512 c = (__m512)vector(4 * first + i + 8), d = (__m512)vector(4 * first + i + 12);
+            const __m512 ab = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xee));
+            const __m512 cd = _mm512_add_ps(_mm512_shuffle_f32x4(c, d, 0x44), _mm512_shuffle_f32x4(c, d, 0xee));
+            quarters[i] = _mm512_add_ps(_mm512_shuffle_f32x4(ab, cd, 0x88), _mm512_shuffle_f32x4(ab, cd, 0xdd));
+        }
+        const auto pair = [](__m512 a, __m512 b) {
+            return _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b));
+        };
+        const __m512 low = pair(quarters[0], quarters[1]), high = pair(quarters[2], quarters[3]);
+        __m512 total = _mm512_add_ps(_mm512_shuffle_ps(low, high, 0x44), _mm512_shuffle_ps(low, high, 0xee));
+        const __mmask16 there = __mmask16(groups - first >= 4 ? 0xffff : (1 << 4 * (groups - first)) - 1);
+        if (add) total = _mm512_add_ps(total, _mm512_maskz_loadu_ps(there, to + 4 * first));
+        _mm512_mask_storeu_ps(to + 4 * first, there, total);
+    }
+#else
+    for (int first = 0; first < 4 * groups; first += 4) {
+        F4 total = sum4(vector(first), vector(first + 1), vector(first + 2), vector(first + 3)), before;
+        if (add) {
+            __builtin_memcpy(&before, to + first, sizeof before);
+            total += before;
+        }
+        __builtin_memcpy(to + first, &total, sizeof total);
+    }
+#endif
 }
 
 INLINE float sum(F v) {
