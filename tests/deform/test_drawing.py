@@ -41,7 +41,7 @@ def test_a_shadow_darkens_the_scene_and_leaves_the_person(posed, monkeypatch):
     model, gaussians, camera = posed
     factors = torch.tensor([0.25, 0.75])[:, None, None]
     monkeypatch.setattr(
-        model.shadow, "forward", lambda body, places: factors.expand(-1, *places.shape[:2])
+        model.shadow, "forward", lambda body, places, lamps: factors.expand(-1, *places.shape[:2])
     )
     with torch.no_grad():
         drawn = draw(model, gaussians, camera)

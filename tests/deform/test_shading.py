@@ -36,14 +36,35 @@ def test_a_lamp_above_is_a_cosine_and_grows_along_an_axis(seed):
     assert torch.equal(factor[..., 2], torch.ones(1, 40))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lamp_lights_by_the_cosine_and_the_inverse_square(seed):
+    generator = torch.Generator().manual_seed(seed)
+    center = torch.tensor([1.0, 2.0, 3.0])
+    shading = Shading(center, 4.0, lamps=1)
+    lamp = center + torch.tensor([0.0, 0.0, 2.0])
+    with torch.no_grad():
+        shading.intensities[0] = torch.tensor([0.5, 0.2, 0.0])
+    normals = sphere(40, generator).normals[None]
+    # At the centre the factor is that of the cosine, at half the distance four times it.
+    for height, gain in ((0.0, 1.0), (1.0, 4.0)):
+        places = (center + torch.tensor([0.0, 0.0, height])).expand(1, 40, 3)
+        factor = shading(normals, places, lamp[None])
+        cosine = normals[..., 2].clamp_min(0)
+        expected = 1 + gain * cosine[..., None] * shading.intensities[0]
+        assert torch.allclose(factor, expected.clamp(0.2, 3.0), atol=1e-5)
+
+
 def test_gradcheck():
-    shading = Shading(torch.zeros(3), 2.0).double()
+    shading = Shading(torch.zeros(3), 2.0, lamps=2).double()
     with torch.no_grad():
         shading.coefficients.normal_(std=0.05)
+        shading.intensities.normal_(std=0.1)
     inputs = [torch.randn(2, 5, 3, dtype=torch.float64).requires_grad_() for _ in range(2)]
+    inputs.append((3 + torch.rand(2, 3, dtype=torch.float64)).requires_grad_())
     assert torch.autograd.gradcheck(lambda *x: shading(*x), inputs)
-    sums = lambda c: torch.func.functional_call(shading, {"coefficients": c}, tuple(inputs))  # noqa: E731
-    assert torch.autograd.gradcheck(sums, shading.coefficients.detach().requires_grad_())
+    for name, value in shading.named_parameters():
+        sums = lambda v, name=name: torch.func.functional_call(shading, {name: v}, tuple(inputs))  # noqa: E731
+        assert torch.autograd.gradcheck(sums, value.detach().requires_grad_())
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,14 +4,15 @@ import pytest
 import torch
 
 from evsplat.body import SurfaceSamples
+from evsplat.deform.lamps import Lamps
 from evsplat.deform.shadow import BodyShadow
 
-UP = torch.tensor([0.0, 0.0, 1.0])
+LAMP = torch.tensor([[0.3, -0.2, 3.5]], dtype=torch.float64)
 
 
-def make(lights: int = 1) -> BodyShadow:
+def make(lamps: int = 1) -> BodyShadow:
     casters = SurfaceSamples(torch.zeros(9, 3), torch.zeros(9, 3), torch.ones(9, 1))
-    return BodyShadow(casters, UP, lights).double()
+    return BodyShadow(casters, lamps).double()
 
 
 def column(seed: int = 0) -> torch.Tensor:
@@ -28,51 +29,78 @@ def floor(height: float = 0.0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_optical_depth_is_the_sum_over_the_casters(seed):
+def test_optical_depth_is_the_sum_over_the_casters_as_the_lamp_sees_them(seed):
     shadow, body, places = make(), column(seed), floor()
-    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
+    lamp = LAMP[0] + 0.5 * torch.randn(3, generator=generator, dtype=torch.float64)
     with torch.no_grad():
-        shadow.directions[0] = UP + 0.4 * torch.randn(3)
         shadow.widths_log.fill_(-1.5)
-    factor = shadow(body, places)[0]
-    light = torch.nn.functional.normalize(shadow.directions[0], dim=0)
+    factor = shadow(body, places, lamp[None])[0]
     width, share = 0.03 + torch.exp(torch.tensor(-1.5)), torch.sigmoid(shadow.share_logits[0])
-    apart = places[:, :, None] - body[0]
-    apart = apart - (apart @ light)[..., None] * light
+    middle = body[0].mean(0)
+    axis = (middle - lamp) / (middle - lamp).norm()
+
+    def on_plane(points):
+        """Where the ray from the lamp through a point meets the plane through the middle."""
+        ray = points - lamp
+        return lamp + ray * ((middle - lamp) @ axis / (ray @ axis))[..., None]
+
+    apart = on_plane(places)[:, :, None] - on_plane(body[0])
     bells = torch.exp(-0.5 * (apart.norm(dim=-1) / width).square()).sum(-1)
     depth = bells * 3.0 * 0.5 / (200 * 2 * torch.pi * width**2)
-    behind = (body.mean(1) - places) @ light  # fades out where the body is not between
+    behind = (places - middle) @ axis  # fades out where the body is not between
     depth = depth * torch.sigmoid((behind + 0.2) / 0.1)
     expected = 1 - share * (1 - torch.exp(-depth))
-    near = (places - body.mean(1)).norm(dim=-1) < 1.4
+    near = (on_plane(places) - middle).norm(dim=-1) < 1.4
     assert (factor - expected)[near].abs().max() < 0.01
     assert factor.min() < 1 - 0.5 * share
 
 
-def test_what_is_between_the_body_and_the_light_and_what_is_far_stays_lit():
+def test_a_lamp_far_away_casts_parallel_shadows():
+    shadow, body, places = make(), column(), floor()
+    far = shadow(body, places, 1e4 * LAMP)
+    farther = shadow(body + torch.tensor([0.4, 0.0, 0.0]), places, 1e5 * LAMP)
+    shifted = shadow(body, places - torch.tensor([0.4, 0.0, 0.0]), 1e5 * LAMP)
+    assert torch.allclose(farther, shifted, atol=1e-3)
+    assert torch.allclose(far, shadow(body, places, 1e5 * LAMP), atol=1e-3)
+
+
+def test_what_is_between_the_body_and_the_lamp_and_what_is_far_stays_lit():
     shadow, body = make(), column()
-    assert (shadow(body, floor(height=2.5)) > 0.999).all()
-    factor = shadow(body, floor())[0]
-    assert (factor[floor().norm(dim=-1) > 1.0] > 0.999).all()
+    assert (shadow(body, floor(height=2.5), LAMP) > 0.999).all()
+    factor = shadow(body, floor(), LAMP)[0]
+    assert (factor[floor().norm(dim=-1) > 1.6] > 0.999).all()
     assert factor[20, 20] < 0.95
 
 
 def test_no_share_of_the_light_is_no_shadow():
-    shadow = make(lights=3)
+    shadow = make(lamps=3)
     with torch.no_grad():
         shadow.share_logits.fill_(-50.0)
-    assert torch.equal(shadow(column(), floor()), torch.ones(1, 41, 41, dtype=torch.float64))
+    lit = shadow(column(), floor(), LAMP + torch.eye(3, dtype=torch.float64))
+    assert torch.equal(lit, torch.ones(1, 41, 41, dtype=torch.float64))
 
 
-def test_gradients_of_lights_and_body_equal_finite_differences():
-    shadow, places = make(lights=2), floor()[10:31:5, 10:31:5]
+def test_gradients_of_lamps_and_body_equal_finite_differences():
+    shadow, places = make(lamps=2), floor()[10:31:5, 10:31:5]
     parameters = dict(shadow.named_parameters())
 
-    def factor(body, *values):
+    def factor(body, lamps, *values):
         named = dict(zip(parameters, values, strict=True))
-        return torch.func.functional_call(shadow, named, (body, places))
+        return torch.func.functional_call(shadow, named, (body, places, lamps))
 
     body = column()[:, ::20].requires_grad_()
+    lamps = (LAMP + torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.5, -0.7]])).requires_grad_()
     values = [value.detach().requires_grad_() for value in parameters.values()]
     # Bilinear look-up has kinks at the cells' borders, which a small step does not meet.
-    assert torch.autograd.gradcheck(factor, (body, *values), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(factor, (body, lamps, *values), eps=1e-7, atol=1e-5)
+
+
+def test_lamps_start_around_the_zenith():
+    center, up = torch.tensor([1.0, 2.0, 0.9]), torch.tensor([0.0, 1.0, 0.0])
+    lamps = Lamps(center, up, 4)
+    rays = lamps.places().detach() - center
+    assert torch.allclose(rays.norm(dim=-1), torch.full((4,), 3.0), atol=1e-5)
+    cosines = (rays / 3) @ up
+    assert float(cosines[0]) == pytest.approx(1, abs=1e-6)
+    assert torch.allclose(cosines[1:], torch.tensor(1 / 1.49**0.5), atol=1e-5)

@@ -114,6 +114,7 @@ def test_a_model_without_pose_dependence_is_its_avatar(tiny_capture, method):
     if method == "evsplat":
         with torch.no_grad():
             model.shading.coefficients.normal_(std=0.1)
+            model.shading.intensities.normal_(std=0.3)
     source = GaussianReconstruction(method, model)
     assert isinstance(source, Bakeable)
     frame = capture.frames[8]

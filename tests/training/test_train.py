@@ -18,7 +18,7 @@ from evsplat.training import load_run, train
 from evsplat.training.bad_steps import MAX_BAD_STEPS
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.clock import Clock
-from evsplat.training.run import RunFolder
+from evsplat.training.run import RunFolder, read_config
 from evsplat.training.trainer import Trainer
 
 from ..small_model import SMALL_MODEL
@@ -127,6 +127,7 @@ def test_every_semantics_mode_trains_and_only_learning_modes_move_labels(
     capture = tiny_capture(frames=10)
     out = train(
         capture,
+        method="paper",
         out=tmp_path / mode,
         iterations=12,
         overrides=(*SMALL, f"semantics={mode}", "optimisation.semantics_window=[0, 15000]"),
@@ -139,6 +140,7 @@ def test_every_semantics_mode_trains_and_only_learning_modes_move_labels(
 def test_hash_grid_and_random_cube_are_selectable(tiny_capture, tmp_path):
     out = train(
         tiny_capture(frames=10),
+        method="paper",
         out=tmp_path / "run",
         iterations=6,
         overrides=(
@@ -201,6 +203,28 @@ def test_a_damaged_checkpoint_is_named(tiny_capture, tmp_path):
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(DataError, match="not a readable checkpoint"):
         load_run(out)
+
+
+@pytest.mark.parametrize(
+    ("named", "method", "expected"),
+    [(None, None, "evsplat"), ("paper", None, "paper"), ("paper", "evsplat", "evsplat")],
+)
+def test_the_method_is_the_one_asked_for_or_that_of_the_config(
+    tiny_capture, tmp_path, named, method, expected
+):
+    config = None
+    if named is not None:
+        config = tmp_path / "config.yaml"
+        config.write_text(f"method: {named}\n")
+    out = train(
+        tiny_capture(frames=10),
+        method=method,
+        out=tmp_path / "run",
+        iterations=1,
+        config=config,
+        overrides=SMALL,
+    )
+    assert read_config(RunFolder(out))[0] == expected
 
 
 def test_a_run_folder_holds_what_it_was_made_with(tiny_capture, tmp_path):

@@ -12,7 +12,7 @@ def train(
     capture: CaptureFolder,
     /,
     *,
-    method: str = "paper",
+    method: Annotated[str | None, option("NAME", default="that of --config, or evsplat")] = None,
     out: NewRunFolder = None,
     device: Device = "auto",
     iterations: Annotated[int | None, option("N", default="the method's")] = None,

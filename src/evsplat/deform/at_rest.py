@@ -95,4 +95,5 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
 
 
 def _on_cpu(light: SurfaceLight) -> SurfaceLight:
-    return SurfaceLight(copy.deepcopy(light.shading).to("cpu"), light.normals.cpu())
+    lamps = None if light.lamps is None else light.lamps.detach().cpu()
+    return SurfaceLight(copy.deepcopy(light.shading).to("cpu"), light.normals.cpu(), lamps)

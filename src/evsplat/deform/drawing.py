@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from evsplat.deform.lamps import Lamps
 from evsplat.deform.shadow import BodyShadow
 from evsplat.gaussians import PosedGaussians
 from evsplat.render import Backdrop, PinholeCamera, RenderOutput, Splats, render, split_channels
@@ -41,6 +42,9 @@ class _Drawable(Protocol):
     @property
     def shadow(self) -> BodyShadow | None: ...
 
+    @property
+    def lamps(self) -> Lamps | None: ...
+
 
 def draw(
     model: _Drawable,
@@ -72,10 +76,11 @@ def draw(
         rgb, semantic = split_channels(output.image, (3, 1))
     else:
         person, scene, depth, semantic = split_channels(output.image, (3, 3, 2, 1))
-        assert posed.casters is not None
+        assert posed.casters is not None and model.lamps is not None
         # What hides the scene hides its shadow as well: the first picture's depth serves all.
         places = _places(depth[0].detach(), camera, shadow_step_px)
-        light = _enlarge(shadow(posed.casters, places), camera, shadow_step_px)
+        factors = shadow(posed.casters, places, model.lamps.places())
+        light = _enlarge(factors, camera, shadow_step_px)
         rgb = tuple(
             a + b * factor[..., None] for a, b, factor in zip(person, scene, light, strict=True)
         )
@@ -120,7 +125,8 @@ def shadowed_scene(model: _Drawable, posed: PosedGaussians) -> Splats:
     scene = posed.static()
     if model.shadow is None or posed.casters is None:
         return scene
-    light = model.shadow(posed.casters, scene.means)[:, 0, :, None]
+    assert model.lamps is not None
+    light = model.shadow(posed.casters, scene.means, model.lamps.places())[:, 0, :, None]
     rgb, semantic = scene.channels.split((3, 1), -1)
     channels = [rgb * light, semantic.expand(posed.times, -1, -1)]
     return replace(scene, channels=torch.cat(channels, -1))

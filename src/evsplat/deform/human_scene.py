@@ -16,6 +16,7 @@ from evsplat.deform.colour import HumanColour, SceneColour, view_directions, vie
 from evsplat.deform.drawing import Drawing, draw
 from evsplat.deform.encodings import make_encoding
 from evsplat.deform.frame_weights import UnseenFrames, interpolated, seen, seen_or_last
+from evsplat.deform.lamps import Lamps
 from evsplat.deform.mlp import PointMLP, Precision
 from evsplat.deform.model import RowCache
 from evsplat.deform.non_rigid import NonRigidNetwork
@@ -87,7 +88,8 @@ class DeformConfig:
     shading: bool = False
     """The person's brightness depends on the surface's normal and place in the world."""
     shadow_lights: int = 0
-    """Lights whose shadows of the person fall on the scene; 0 = no shadows."""
+    """Lamps at learned places, at most 16, whose shadows of the person fall on the scene and which,
+    with ``shading``, light the person; 0 = none."""
     pose_correction_start: float | None = None
     """Nominal iteration from which per-frame pose residuals are learned; null = never.
     3DGS-Avatar starts at 5000 (A9). Exact poses get worse by it, noisy ones better."""
@@ -170,14 +172,17 @@ class HumanSceneModel(nn.Module):
             surface = body.sample_surface(NORMAL_SAMPLES, generator)
             self.surface = NearestSurface(surface)
             self.row_caches["surface"] = self.surface
-        if config.shading:
+        self.lamps: Lamps | None = None
+        if config.shading or config.shadow_lights:
             roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
-            middle = roots.mean(0)
-            radius = max(1.0, float((roots - middle).norm(dim=-1).max()))
-            self.shading = Shading(middle.float(), radius)
+            middle = roots.mean(0).float()
         if config.shadow_lights:
+            self.lamps = Lamps(middle, up_axis(track), config.shadow_lights)
             casters = body.sample_surface(CASTERS, generator)
-            self.shadow = BodyShadow(casters, up_axis(track), config.shadow_lights)
+            self.shadow = BodyShadow(casters, config.shadow_lights)
+        if config.shading:
+            radius = max(1.0, float((roots - middle).norm(dim=-1).max()))
+            self.shading = Shading(middle, radius, config.shadow_lights)
         # Zero, not random: what a frame has not learned must not show between frames.
         self.latents = nn.Parameter(torch.zeros(frames, config.latent_dim))
         self.rotation_residuals = nn.Parameter(torch.zeros(frames, joints, 3))
@@ -246,7 +251,8 @@ class HumanSceneModel(nn.Module):
         if self.shading is None:
             return None
         means = self.gaussians.means[self.gaussians.human]
-        return SurfaceLight(self.shading, self.surface.normals(means))
+        lamps = None if self.lamps is None else self.lamps.places()
+        return SurfaceLight(self.shading, self.surface.normals(means), lamps)
 
     def at(
         self,

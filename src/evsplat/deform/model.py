@@ -10,6 +10,7 @@ from torch import Tensor
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame
 from evsplat.deform.drawing import Drawing
+from evsplat.deform.lamps import Lamps
 from evsplat.deform.shadow import BodyShadow
 from evsplat.gaussians import PosedGaussians, Rows
 
@@ -53,6 +54,10 @@ class Model(Protocol):
     @property
     def shadow(self) -> BodyShadow | None:
         """Shadow of the person on the scene, where a model knows one."""
+
+    @property
+    def lamps(self) -> Lamps | None:
+        """Where the light comes from, where a model knows it."""
 
     def training_drawing(
         self,

@@ -12,6 +12,7 @@ from evsplat.neighbours import nearest
 
 _NORMAL_DIM = 9
 _DARKEST, _BRIGHTEST = 0.2, 3.0
+_NEAREST_M = 0.3
 
 
 class Shading(nn.Module):
@@ -26,15 +27,19 @@ class Shading(nn.Module):
     center: Tensor
     radius_m: Tensor
 
-    def __init__(self, center: Float[Tensor, "3"], radius_m: float) -> None:
+    def __init__(self, center: Float[Tensor, "3"], radius_m: float, lamps: int = 0) -> None:
         """Where the person goes: places are relative to ``center``, in units of ``radius_m``."""
         super().__init__()
         self.register_buffer("center", center.clone())
         self.register_buffer("radius_m", torch.tensor(float(radius_m)))
         self.coefficients = nn.Parameter(torch.zeros(4, _NORMAL_DIM, 3))
+        self.intensities = nn.Parameter(torch.zeros(lamps, 3))
 
     def forward(
-        self, normals: Float[Tensor, "T N 3"], places: Float[Tensor, "T N 3"]
+        self,
+        normals: Float[Tensor, "T N 3"],
+        places: Float[Tensor, "T N 3"],
+        lamps: Float[Tensor, "L 3"] | None = None,
     ) -> Float[Tensor, "T N 3"]:
         """Factors in 0.2..3 at unit world normals and world places (metres)."""
         turned = torch.cat([torch.ones_like(normals[..., :1]), sh_basis(normals, degree=2)], -1)
@@ -43,7 +48,14 @@ class Shading(nn.Module):
         # T x N x 36 is ever there.
         at_normals = (turned @ self.coefficients.movedim(1, 0).flatten(1)).unflatten(-1, (4, 3))
         bent = at_normals[..., 0, :] + (moved[..., None] * at_normals[..., 1:, :]).sum(-2)
-        return (1 + bent).clamp(_DARKEST, _BRIGHTEST)
+        factor = 1 + bent
+        for lamp, intensity in zip(() if lamps is None else lamps, self.intensities, strict=True):
+            ray = lamp - places
+            square = ray.square().sum(-1)
+            facing = (ray * normals).sum(-1).clamp_min(0) * square.rsqrt()
+            near = (lamp - self.center).square().sum() / square.clamp_min(_NEAREST_M**2)
+            factor = factor + (facing * near)[..., None] * intensity
+        return factor.clamp(_DARKEST, _BRIGHTEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +65,15 @@ class SurfaceLight:
     shading: Shading
     normals: Float[Tensor, "N 3"]
     """Unit."""
+    lamps: Float[Tensor, "L 3"] | None = None
+    """Places, metres."""
 
     def factors(
         self, transforms: Float[Tensor, "T N 4 4"], places: Float[Tensor, "T N 3"]
     ) -> Float[Tensor, "T N 3"]:
         """Factors on colours, for transforms canonical to world and world places (metres)."""
         turned = (transforms[..., :3, :3] @ self.normals[..., None])[..., 0]
-        return self.shading(nn.functional.normalize(turned, dim=-1), places)
+        return self.shading(nn.functional.normalize(turned, dim=-1), places, self.lamps)
 
 
 class NearestSurface:

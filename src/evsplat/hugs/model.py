@@ -13,6 +13,7 @@ from evsplat.body import BodyTrack, skin
 from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import Camera, Frame
 from evsplat.deform.drawing import Drawing, draw
+from evsplat.deform.lamps import Lamps
 from evsplat.deform.model import RowCache
 from evsplat.deform.shadow import BodyShadow
 from evsplat.devices import send
@@ -49,6 +50,7 @@ class HugsModel(nn.Module):
     """Both sets, and the body track with a correction of the pose per training frame."""
 
     shadow: BodyShadow | None = None
+    lamps: Lamps | None = None
 
     def __init__(
         self,

@@ -27,6 +27,9 @@ TRAINABLE: dict[str, tuple[type[Any], Callable[..., Composition]]] = {
 }
 """Configuration and composition of every method that is trained."""
 
+DEFAULT_METHOD = "evsplat"
+"""What `train` takes where nothing names a method."""
+
 
 def method_config(method: str, values: dict[str, Any], *, where: str) -> MethodConfig:
     """The configuration of a method with ``values`` over its defaults."""
@@ -39,6 +42,7 @@ def method_config(method: str, values: dict[str, Any], *, where: str) -> MethodC
 
 
 __all__ = [
+    "DEFAULT_METHOD",
     "NOMINAL_ITERATIONS",
     "TRAINABLE",
     "Composition",

@@ -131,12 +131,17 @@ class Build:
         method does not see all of it.
         """
         track = self.model.track
+        isometry = [loss.isometry_centers, loss.isometry_covariances] != [0.0, 0.0]
         return Composition(
             model=self.model,
             objectives=[
                 *observed,
                 *([] if self.model.skinning is None else [self.prior]),
-                Isometry(refresh=config.isometry_refresh, samples=config.isometry_samples),
+                *(
+                    [Isometry(refresh=config.isometry_refresh, samples=config.isometry_samples)]
+                    if isometry
+                    else []
+                ),
             ],
             weights={
                 "l1": loss.l1,

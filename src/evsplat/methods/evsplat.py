@@ -19,6 +19,7 @@ from evsplat.methods.composition import Composition
 from evsplat.methods.config import LearningRates, OptimisationConfig, Weight
 from evsplat.methods.paper import (
     EventConfig,
+    LossConfig,
     PaperConfig,
     build_model,
     composition,
@@ -74,6 +75,10 @@ class WindowConfig:
 class EvsplatConfig(PaperConfig):
     """All settings of method `evsplat`; those of `paper` that it shares keep their names."""
 
+    loss: LossConfig = field(
+        default_factory=lambda: LossConfig(isometry_centers=0.0, isometry_covariances=0.0)
+    )
+    """Without isometry: discs that hang on the body's own weights stretch with it already."""
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
     event_term: Literal["windows", "paper"] = "windows"

@@ -82,6 +82,7 @@ def learning_of(model: HumanSceneModel, config: OptimisationConfig) -> Learning:
         for part, rate in (
             (model.shading, rates.shading),
             (model.shadow, rates.shadow),
+            (model.lamps, rates.shadow),
             (model.sensor, rates.sensor),
         )
         if part is not None

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from evsplat.capture import load_capture
 from evsplat.config import load_yaml, override, save_yaml
 from evsplat.errors import ConfigError, DataError
-from evsplat.methods import TRAINABLE, MethodConfig, method_config
+from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.methods.config import Weight
 from evsplat.render import choose_device
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
@@ -50,7 +50,7 @@ class Stopped(KeyboardInterrupt):
 def train(
     capture_path: Path | str,
     *,
-    method: str = "paper",
+    method: str | None = None,
     out: Path | str | None = None,
     device: str = "auto",
     iterations: int | None = None,
@@ -65,6 +65,7 @@ def train(
 ) -> Path:
     """Train ``method`` on a capture and return the run folder.
 
+    Without ``method`` it is that of ``config``, or else `evsplat.methods.DEFAULT_METHOD`.
     ``iterations`` scales every schedule. ``max_minutes`` stops gracefully; without ``iterations``
     it also shortens the schedule so that it is finished in time. The cheap fits before the first
     step count as training. ``resume`` goes on from the last
@@ -96,15 +97,16 @@ def train(
         method, settings, facts = read_config(folder)
         seed = int(facts["seed"])
     else:
+        where = str(config) if config is not None else "--set"
+        values = load_yaml(config) if config is not None else {}
+        named = values.pop("method", None)
+        method = method or named or DEFAULT_METHOD
         folder = RunFolder(Path(out)) if out is not None else new_run_folder(capture, method)
         if folder.path.exists() and any(folder.path.iterdir()):
             raise ConfigError(
                 f"{folder.path}: the folder is not empty; pass --resume to go on with that run, "
                 "or another --out."
             )
-        where = str(config) if config is not None else "--set"
-        values = load_yaml(config) if config is not None else {}
-        values.pop("method", None)
         settings = method_config(method, override(values, overrides), where=where)
         seed = 0 if seed is None else seed
 

@@ -6,6 +6,7 @@
 const TEXELS = 6;
 const WIDTH = 1020; // of its texture, a multiple of TEXELS
 const MIN_ALPHA = 1 / 255;
+const MOST_LAMPS = 16;
 
 const VERTEX = `#version 300 es
 precision highp float;
@@ -17,6 +18,8 @@ uniform vec2 size;         // of the picture, pixels
 uniform bool lit;
 uniform vec4 room;         // middle and radius of the places that the light knows
 uniform vec3 light[36];    // of 1, x, y, z of the place, nine each, in the order of basis below
+uniform int lampCount;
+uniform vec3 lampPlaces[${MOST_LAMPS}], lampColours[${MOST_LAMPS}];
 in uint index;
 out vec2 offset;           // pixels from the centre
 flat out vec3 conic;
@@ -27,7 +30,8 @@ vec4 texel(int k) {
   return texelFetch(gaussians, ivec2(at % ${WIDTH}, at / ${WIDTH}), 0);
 }
 
-// A factor on the colour: a polynomial of degree 2 in the normal, linear in the place.
+// A factor on the colour: a polynomial of degree 2 in the normal, linear in the place, and lamps
+// whose light falls with the cosine and the inverse square.
 vec3 shade(vec3 n, vec3 world) {
   float basis[9] = float[9](
     1.0, -0.48860251 * n.y, 0.48860251 * n.z, -0.48860251 * n.x, 1.09254843 * n.x * n.y,
@@ -36,6 +40,12 @@ vec3 shade(vec3 n, vec3 world) {
   vec4 place = vec4(1, clamp((world - room.xyz) / room.w, -2.0, 2.0));
   vec3 factor = vec3(1);
   for (int p = 0; p < 4; p++) for (int k = 0; k < 9; k++) factor += place[p] * basis[k] * light[9 * p + k];
+  for (int k = 0; k < lampCount; k++) {
+    vec3 ray = lampPlaces[k] - world, middle = lampPlaces[k] - room.xyz;
+    float square = dot(ray, ray);
+    float facing = max(dot(ray, n), 0.0) * inversesqrt(square);
+    factor += facing * dot(middle, middle) / max(square, 0.09) * lampColours[k];
+  }
   return clamp(factor, 0.2, 3.0);
 }
 
@@ -104,7 +114,8 @@ void main() { result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 
 
 class SplatRenderer {
   // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with bones, weights and,
-  // where light falls on them, normals. light: center, radius_m, coefficients (4 x 9 x 3), or null.
+  // where light falls on them, normals. light: center, radius_m,
+  // coefficients (4 x 9 x 3), lamps and their intensities (L x 3), or null.
   constructor(canvas, clouds, boneCount, light) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2, which drawing Gaussians needs.");
@@ -209,7 +220,12 @@ class SplatRenderer {
     gl.uniform2f(gl.getUniformLocation(this.program, "size"), width, height);
     gl.uniform1i(gl.getUniformLocation(this.program, "lit"), this.light ? 1 : 0);
     if (this.light) {
-      const { center, radius_m, coefficients } = this.light;
+      const { center, radius_m, coefficients, lamps, intensities } = this.light;
+      gl.uniform1i(gl.getUniformLocation(this.program, "lampCount"), lamps.length);
+      if (lamps.length) {
+        gl.uniform3fv(gl.getUniformLocation(this.program, "lampPlaces"), lamps.flat());
+        gl.uniform3fv(gl.getUniformLocation(this.program, "lampColours"), intensities.flat());
+      }
       gl.uniform4f(gl.getUniformLocation(this.program, "room"), ...center, radius_m);
       gl.uniform3fv(gl.getUniformLocation(this.program, "light"), coefficients.flat(2));
     }

@@ -151,6 +151,8 @@ def _light(light: SurfaceLight) -> dict[str, Any]:
         "center": shading.center.tolist(),
         "radius_m": float(shading.radius_m),
         "coefficients": shading.coefficients.tolist(),
+        "lamps": [] if light.lamps is None else light.lamps.tolist(),
+        "intensities": shading.intensities.tolist(),
         "normals": _base64(light.normals.numpy(), "<f4"),
     }
 
