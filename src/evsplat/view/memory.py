@@ -39,6 +39,11 @@ Turning the camera asks the first two nothing new; moving in time asks the last 
 less the answer changes with pose and view, the longer a draft may take to renew it.
 """
 
+_WITHOUT_POSE = {
+    f"human.{name}": Turns(1, (0,)) for name in ("triplane", "skinning", "geometry", "appearance")
+}
+"""Networks of HUGS, which see neither pose nor view: one answer serves all pictures."""
+
 
 class Remembering(nn.Module):
     """A network with its last answer, given again to the same question.
@@ -76,7 +81,7 @@ class Remembering(nn.Module):
                 return self._answer
         else:
             self._known = 0
-        if self.rough and known and all(map(_same_size, question, asked)):
+        if self.rough and every > 1 and known and all(map(_same_size, question, asked)):
             self._renew(self.network(*self.turns.part(question, self._turn)))
             self._turn = (self._turn + 1) % every
             self._known += 1
@@ -101,12 +106,20 @@ def remembering(model: nn.Module) -> nn.Module:
 
     Parameters must not change while it is used; make another one when they have.
     """
-    twin = copy.copy(model)
-    twin._modules = dict(model._modules)
-    for name, turns in NETWORKS.items():
-        network = twin._modules.get(name)
-        if network is not None:
-            twin._modules[name] = Remembering(network, turns)
+    for path, turns in {**NETWORKS, **_WITHOUT_POSE}.items():
+        model = _with_memory(model, path, turns)
+    return model
+
+
+def _with_memory(module: nn.Module, path: str, turns: Turns) -> nn.Module:
+    """A shallow copy whose module at ``path`` remembers, where there is one."""
+    name, _, rest = path.partition(".")
+    network = module._modules.get(name)
+    if network is None:
+        return module
+    twin = copy.copy(module)
+    inner = _with_memory(network, rest, turns) if rest else Remembering(network, turns)
+    twin._modules = {**module._modules, name: inner}
     return twin
 
 
