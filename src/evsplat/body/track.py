@@ -44,6 +44,7 @@ class BodyTrack:
         _check(body, times, poses, transl, source)
         self.body = body
         self.times_us = times
+        self.poses, self.transl = poses, transl
         device = body.rest_joints.device
         seconds = (times - times[0]) * 1e-6
         keys, rates = _rotation_polynomials(seconds, poses)

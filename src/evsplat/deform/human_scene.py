@@ -21,6 +21,7 @@ from evsplat.deform.mlp import PointMLP, Precision
 from evsplat.deform.model import RowCache
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
+from evsplat.deform.pose_spline import PoseSpline
 from evsplat.deform.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.deform.shadow import BodyShadow
 from evsplat.deform.skinning_network import SkinningNetwork
@@ -91,7 +92,7 @@ class DeformConfig:
     """Lamps at learned places, at most 16, whose shadows of the person fall on the scene and which,
     with ``shading``, light the person; 0 = none."""
     pose_correction_start: float | None = None
-    """Nominal iteration from which per-frame pose residuals are learned; null = never.
+    """Nominal iteration from which pose residuals are learned; null = never.
     3DGS-Avatar starts at 5000 (A9). Exact poses get worse by it, noisy ones better."""
     unseen_frames: UnseenFrames = "interpolated"
     """Latent and pose residual of instants that are not the middle of a training frame (A22)."""
@@ -112,7 +113,8 @@ class HumanSceneModel(nn.Module):
     """Gaussians, networks and the body track; `at` poses them at given times.
 
     ``frame_times_us`` are the mid-exposures of the training frames, the anchors of the per-frame
-    latents and pose residuals; what other instants get is ``config.unseen_frames`` (A22).
+    latents and pose residuals; what other instants get is ``config.unseen_frames`` (A22). With a
+    ``pose_spline`` the residuals are its control points instead.
     """
 
     def __init__(
@@ -122,6 +124,7 @@ class HumanSceneModel(nn.Module):
         track: BodyTrack,
         frame_times_us: Sequence[int],
         gaussians: GaussianSet,
+        pose_spline: PoseSpline | None = None,
     ) -> None:
         """Build the networks for the track's body; ``gaussians`` is the start."""
         super().__init__()
@@ -185,8 +188,10 @@ class HumanSceneModel(nn.Module):
             self.shading = Shading(middle, radius, config.shadow_lights)
         # Zero, not random: what a frame has not learned must not show between frames.
         self.latents = nn.Parameter(torch.zeros(frames, config.latent_dim))
-        self.rotation_residuals = nn.Parameter(torch.zeros(frames, joints, 3))
-        self.translation_residuals = nn.Parameter(torch.zeros(frames, 3))
+        self.pose_spline = pose_spline
+        anchors = frames if pose_spline is None else pose_spline.count
+        self.rotation_residuals = nn.Parameter(torch.zeros(anchors, joints, 3))
+        self.translation_residuals = nn.Parameter(torch.zeros(anchors, 3))
         low, high = bounding_box(body)
         self.box_low: Tensor
         self.box_high: Tensor
@@ -233,12 +238,20 @@ class HumanSceneModel(nn.Module):
         """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4)."""
         rotations, translation = self.track.at(torch.as_tensor(times_us))
         if self.pose_correction_active:
-            share = interpolated if self.config.unseen_frames == "interpolated" else seen
-            weights = share(self.get_buffer("frame_times"), times_us)
-            residual = torch.einsum("tf,fjc->tjc", weights, self.rotation_residuals)
-            rotations = rotations @ axis_angle_to_matrix(residual)
-            translation = translation + weights @ self.translation_residuals
+            turn, shift = self.pose_residual(times_us)
+            rotations = rotations @ axis_angle_to_matrix(turn)
+            translation = translation + shift
         return rotations, self.track.body.canonical_to_world(rotations, translation)
+
+    def pose_residual(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """What is learned of the track's errors: axis-angle (T, J, 3) and shifts (T, 3), metres."""
+        if self.pose_spline is not None:
+            turn = self.pose_spline.rotation(self.rotation_residuals, times_us)
+            return turn, self.pose_spline.translation(self.translation_residuals, times_us)
+        share = interpolated if self.config.unseen_frames == "interpolated" else seen
+        weights = share(self.get_buffer("frame_times"), times_us)
+        turn = torch.einsum("tf,fjc->tjc", weights, self.rotation_residuals)
+        return turn, weights @ self.translation_residuals
 
     def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Weights of the bones for Gaussians with these canonical centres (metres)."""

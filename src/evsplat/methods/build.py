@@ -9,9 +9,10 @@ from evsplat.body import BodyTrack, SurfaceSamples, load_body_track
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
 from evsplat.deform.mlp import bfloat16_runs
+from evsplat.deform.pose_spline import PoseSpline
 from evsplat.errors import DataError
 from evsplat.gaussians import BodyFrames, DensifyConfig, GaussianSet, Part
-from evsplat.methods.composition import Composition
+from evsplat.methods.composition import Composition, HeldOut
 from evsplat.methods.config import OptimisationConfig, Weight
 from evsplat.methods.prefit import fit_skinning
 from evsplat.methods.rates import learning_of
@@ -69,11 +70,11 @@ class Ground:
     """All randomness of the run."""
 
     @classmethod
-    def of(cls, capture: Capture, seed: int) -> "Ground":
-        """Read the body and seed everything."""
+    def of(cls, capture: Capture, seed: int, track: BodyTrack | None = None) -> "Ground":
+        """Read the body, unless its ``track`` is given, and seed everything."""
         generator = torch.Generator().manual_seed(seed)
         torch.manual_seed(seed)
-        track = load_body_track(capture)
+        track = track or load_body_track(capture)
         if not capture.train_frames:
             raise DataError(f"{capture.path}: no frame has split 'train'; nothing to learn from.")
         return cls(capture, track, track.body.sample_surface(SURFACE_SAMPLES, generator), generator)
@@ -102,10 +103,11 @@ class Build:
         *,
         device: torch.device | str,
         fit: bool,
+        pose_spline: PoseSpline | None = None,
     ) -> "Build":
         """Make the networks and, with ``fit``, bring skinning to the body's weights."""
         model = HumanSceneModel(
-            config.deform, semantics, ground.track, ground.times_us, gaussians
+            config.deform, semantics, ground.track, ground.times_us, gaussians, pose_spline
         ).to(device)
         if config.deform.precision == "bfloat16" and not bfloat16_runs(model.box_low.device):
             logger.warning("This machine multiplies no bfloat16: the networks run in float32.")
@@ -123,12 +125,13 @@ class Build:
         weights: dict[str, Weight],
         densify: dict[Part, DensifyConfig],
         capture: Capture | None = None,
+        held_out: HeldOut | None = None,
     ) -> Composition:
         """Everything together.
 
         ``observed`` are the objectives that compare with recorded data; ``weights`` and ``densify``
         are those that the method has beyond the person's; ``capture`` is the recording where the
-        method does not see all of it.
+        method does not see all of it; ``held_out`` is what frames beside the training frames teach.
         """
         track = self.model.track
         isometry = [loss.isometry_centers, loss.isometry_covariances] != [0.0, 0.0]
@@ -158,4 +161,5 @@ class Build:
             else BodyFrames(track.body, track.bones(self.ground.times_us)),
             generator=self.ground.generator,
             capture=capture,
+            held_out=held_out,
         )

@@ -3,13 +3,28 @@
 from dataclasses import dataclass
 
 import torch
+from torch import nn
 
-from evsplat.capture import Capture
+from evsplat.capture import Capture, Frame
 from evsplat.deform.model import Model
 from evsplat.gaussians import BodyFrames, DensifyConfig, Part
 from evsplat.methods.config import Weight
 from evsplat.methods.rates import Learning
 from evsplat.objectives import Objective
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What is learned between training steps of frames whose pictures stay unseen."""
+
+    frames: list[Frame]
+    objective: Objective
+    parameters: list[nn.Parameter]
+    """What alone these frames teach; of the groups in `Learning.networks`."""
+    start: float
+    """First nominal iteration."""
+    every: int
+    """Training steps between two of these."""
 
 
 @dataclass(frozen=True)
@@ -29,3 +44,4 @@ class Composition:
     """All randomness of the training; part of the checkpoint."""
     capture: Capture | None = None
     """The recording as the method sees it, where that is not all of it (masked pictures)."""
+    held_out: HeldOut | None = None

@@ -44,6 +44,7 @@ class LearningRates:
     """Both colour networks."""
     latents: float = 1e-3
     pose_correction: float = 1e-4
+    """Pose residuals, radians and metres; of a spline, units of the errors expected."""
     shading: float = 3e-3
     shadow: float = 1e-2
     sensor: float = 1e-3

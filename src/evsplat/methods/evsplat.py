@@ -6,7 +6,7 @@ depends on how the surface is turned and where it stands; the person casts shado
 """
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -15,7 +15,7 @@ from evsplat.calibration import estimate_from_capture
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig
 from evsplat.methods.build import Build
-from evsplat.methods.composition import Composition
+from evsplat.methods.composition import Composition, HeldOut
 from evsplat.methods.config import LearningRates, OptimisationConfig, Weight
 from evsplat.methods.paper import (
     EventConfig,
@@ -25,12 +25,15 @@ from evsplat.methods.paper import (
     composition,
     paper_events,
 )
+from evsplat.methods.poses import PoseConfig, prepare_poses
 from evsplat.methods.starts import HumanStartConfig
 from evsplat.objectives import (
     EventSensor,
     EventWindows,
     Exposure,
+    HeldOutWindows,
     Objective,
+    PosePrior,
     motion_px,
     renders_for,
 )
@@ -102,9 +105,10 @@ class EvsplatConfig(PaperConfig):
     )
     optimisation: OptimisationConfig = field(
         default_factory=lambda: OptimisationConfig(
-            rates=LearningRates(means=3e-4, features=1e-2), human_start=0
+            rates=LearningRates(means=3e-4, features=1e-2, pose_correction=0.1), human_start=0
         )
     )
+    pose: PoseConfig = field(default_factory=PoseConfig)
 
 
 def compose(
@@ -116,7 +120,19 @@ def compose(
     fit: bool = True,
 ) -> Composition:
     """Put the method together for one capture; see `evsplat.methods.paper.compose`."""
-    build = build_model(config, capture, seed, device=device, fit=fit)
+    poses = prepare_poses(config.pose, capture)
+    if poses.spline is not None:
+        deform = replace(config.deform, pose_correction_start=config.pose.start)
+        config = replace(config, deform=deform)
+    build = build_model(
+        config,
+        capture,
+        seed,
+        device=device,
+        fit=fit,
+        track=poses.track,
+        pose_spline=poses.spline,
+    )
     renders = {
         frame.name: renders_for(
             motion_px(capture, build.ground.track, frame),
@@ -127,6 +143,10 @@ def compose(
     }
     observed: list[Objective] = [Exposure(capture, renders, build.ground.generator)]
     weights: dict[str, Weight] = {}
+    held_out = None
+    if poses.spline is not None:
+        observed.append(PosePrior(poses.track))
+        weights["pose_prior"] = config.pose.prior
     if config.event.weight == 0.0:
         pass
     elif capture.events is None:
@@ -135,11 +155,30 @@ def compose(
         )
     elif config.event_term == "paper":
         observed.append(paper_events(config.event, capture))
-        weights = {"event": config.event.weight}
+        weights["event"] = config.event.weight
     else:
-        observed.append(_windows(config, capture, build, device=device, fit=fit))
-        weights = {"event": config.event.weight, "contrast": config.windows.contrast_weight}
-    return composition(config, build, observed, weights)
+        windows = _windows(config, capture, build, device=device, fit=fit)
+        observed.append(windows)
+        weights |= {"event": config.event.weight, "contrast": config.windows.contrast_weight}
+        held_out = _held_out(config, capture, build, windows)
+    return composition(config, build, observed, weights, held_out)
+
+
+def _held_out(
+    config: EvsplatConfig, capture: Capture, build: Build, windows: EventWindows
+) -> HeldOut | None:
+    """What events around held-out frames teach of their poses, where that is asked for."""
+    model = build.model
+    frames = [frame for frame in capture.frames if frame.split != "train"]
+    if not config.pose.events_of_held_out or model.pose_spline is None or not frames:
+        return None
+    return HeldOut(
+        frames,
+        HeldOutWindows(windows, capture.train_frames),
+        [model.rotation_residuals, model.translation_residuals],
+        start=max(config.pose.start, config.windows.start),
+        every=max(1, len(capture.train_frames) // len(frames)),
+    )
 
 
 def _windows(

@@ -10,10 +10,11 @@ import torch
 from evsplat.body import BodyTrack, body_box, silhouette
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import Semantics
+from evsplat.deform.pose_spline import PoseSpline
 from evsplat.errors import DataError
 from evsplat.gaussians import DensifyConfig, GaussianSet, Part
 from evsplat.methods.build import Build, Ground, PersonConfig, PersonLossConfig
-from evsplat.methods.composition import Composition
+from evsplat.methods.composition import Composition, HeldOut
 from evsplat.methods.config import Weight
 from evsplat.methods.prefit import fit_scene, fit_scene_colours
 from evsplat.methods.starts import FittedSceneConfig, human_start, scene_start
@@ -100,15 +101,33 @@ def compose(
 
 
 def build_model(
-    config: PaperConfig, capture: Capture, seed: int, *, device: torch.device | str, fit: bool
+    config: PaperConfig,
+    capture: Capture,
+    seed: int,
+    *,
+    device: torch.device | str,
+    fit: bool,
+    track: BodyTrack | None = None,
+    pose_spline: PoseSpline | None = None,
 ) -> Build:
-    """Person and scene at their start; with ``fit`` after the cheap fits."""
-    ground = Ground.of(capture, seed)
+    """Person and scene at their start; with ``fit`` after the cheap fits.
+
+    ``track`` is the motion where it is not the capture's as given.
+    """
+    ground = Ground.of(capture, seed, track)
     label = config.semantic_start
     human = human_start(config.human, capture, ground.track, ground.generator, label)
     scene, colours = scene_start(config.scene, capture, ground.track, ground.generator, -label)
     gaussians = GaussianSet(human, scene)
-    build = Build.of(config, ground, gaussians, config.semantics, device=device, fit=fit)
+    build = Build.of(
+        config,
+        ground,
+        gaussians,
+        config.semantics,
+        device=device,
+        fit=fit,
+        pose_spline=pose_spline,
+    )
     if fit and config.scene.kind == "median_backdrop":
         steps = config.scene.prefit_steps
         camera = capture.camera(capture.train_frames[0]).to(device)
@@ -118,12 +137,16 @@ def build_model(
 
 
 def composition(
-    config: PaperConfig, build: Build, observed: list[Objective], weights: dict[str, Weight]
+    config: PaperConfig,
+    build: Build,
+    observed: list[Objective],
+    weights: dict[str, Weight],
+    held_out: HeldOut | None = None,
 ) -> Composition:
     """Everything together.
 
     ``observed`` are the objectives that compare with recorded data, ``weights`` those of their
-    terms beside ``l1`` and ``dssim``.
+    terms beside ``l1`` and ``dssim``; ``held_out`` is what held-out frames teach.
     """
     ground = build.ground
     if config.semantics == "rendered":
@@ -139,6 +162,7 @@ def composition(
             "binarise": config.loss.binarise,
         },
         densify=_scene_limits(config),
+        held_out=held_out,
     )
 
 

@@ -75,8 +75,12 @@ def learning_of(model: HumanSceneModel, config: OptimisationConfig) -> Learning:
         (_parameters(model.non_rigid, model.pose_encoder), rates.non_rigid, 0.0),
         (_parameters(model.human_colour, model.scene_colour), rates.colour, 0.0),
         ([model.latents], rates.latents, rates.latent_weight_decay),
-        ([model.rotation_residuals, model.translation_residuals], rates.pose_correction, 0.0),
     ]
+    residuals = Network(
+        [model.rotation_residuals, model.translation_residuals],
+        at(rates.pose_correction),
+        clipped=model.pose_spline is None,
+    )
     free = [
         Network(list(part.parameters()), at(rate))
         for part, rate in (
@@ -93,7 +97,10 @@ def learning_of(model: HumanSceneModel, config: OptimisationConfig) -> Learning:
         if parameters
     ]
     return Learning(
-        {"gaussians": rows}, [*networks, *free], rates.clip_networks, config.human_start
+        {"gaussians": rows},
+        [*networks, residuals, *free],
+        rates.clip_networks,
+        config.human_start,
     )
 
 

@@ -6,8 +6,10 @@ from evsplat.objectives.event import EventChange, event_loss
 from evsplat.objectives.event_sensor import EventSensor
 from evsplat.objectives.event_windows import EventWindows
 from evsplat.objectives.exposure import Exposure, motion_px, renders_for
+from evsplat.objectives.held_out_windows import HeldOutWindows
 from evsplat.objectives.isometry import Isometry
 from evsplat.objectives.photometric import Photometric
+from evsplat.objectives.pose_prior import PosePrior
 from evsplat.objectives.semantic import PackedBounds, RenderedSemantics, silhouette_bounds
 from evsplat.objectives.skinning import SkinningPrior
 
@@ -17,10 +19,12 @@ __all__ = [
     "EventSensor",
     "EventWindows",
     "Exposure",
+    "HeldOutWindows",
     "Isometry",
     "Objective",
     "PackedBounds",
     "Photometric",
+    "PosePrior",
     "RenderedSemantics",
     "SkinningPrior",
     "Step",

@@ -72,21 +72,29 @@ class EventWindows(Stateless):
         times = step.times_us
         if step.nominal < self.start or len(times) < 2:
             return {}
+        wrong = self.differences(step)
+        event = self.mean(
+            wrong, [end - start for start, end in zip(times, times[1:], strict=False)]
+        )
+        if self.events.has_polarity:
+            event = 0.5 * (event + self.mean(wrong.sum(0, keepdim=True), [times[-1] - times[0]]))
+        return {"event": event, "contrast": self.sensor.apart()}
+
+    def differences(self, step: Step) -> Float[Tensor, "T-1 H W"]:
+        """Rendered less reported change of log-brightness between neighbouring times.
+
+        Without polarity: of the change's size.
+        """
         offset = self.sensor.offset_us
         shift = 0 if offset is None else round(float(offset))
-        late = [time + shift for time in times]
+        late = [time + shift for time in step.times_us]
         brightness = torch.log(luminance(step.linear) + self.eps)
         stream = self.events.between(late[0] - _RATE_US, late[-1] + _RATE_US)
         windows = list(zip(late, late[1:], strict=False))
         counts = self._counts(stream, windows, brightness.device)
         changes = brightness[1:] - brightness[:-1]
-        weights = [self._weight(end - start) for start, end in windows]
-        sound = send(self._noise[1], brightness.device)
-        weight = sound * sound.new_tensor(weights)[:, None, None]
         if not self.events.has_polarity:
-            moved = self.sensor.path(counts.sum(1))
-            event = (weight * (changes.abs() - moved).abs()).mean()
-            return {"event": event, "contrast": self.sensor.apart()}
+            return changes.abs() - self.sensor.path(counts.sum(1))
         reported = self.sensor.change(*counts.unbind(1))
         if offset is not None:
             # Events per microsecond at each instant tell what a later clock would have counted.
@@ -94,10 +102,15 @@ class EventWindows(Stateless):
             rates = self.sensor.change(*self._counts(stream, around, brightness.device).unbind(1))
             rates = rates.detach() / (2 * _RATE_US)
             reported = reported + (offset - offset.detach()) * (rates[1:] - rates[:-1])
-        each = (weight * (changes - reported).abs()).mean()
-        whole = (brightness[-1] - brightness[0] - reported.sum(0)).abs()
-        whole = (self._weight(late[-1] - late[0]) * sound * whole).mean()
-        return {"event": 0.5 * (each + whole), "contrast": self.sensor.apart()}
+        return changes - reported
+
+    def mean(
+        self, differences: Float[Tensor, "N H W"], durations_us: Sequence[int]
+    ) -> Float[Tensor, ""]:
+        """Mean size of differences that built up over so long, weighed by the sensor's noise."""
+        sound = send(self._noise[1], differences.device)
+        weights = sound.new_tensor([self._weight(duration) for duration in durations_us])
+        return (sound * weights[:, None, None] * differences.abs()).mean()
 
     @cached_property
     def _noise(self) -> tuple[float, Float[Tensor, "H W"]]:

@@ -1,10 +1,11 @@
 """The optimisers of a run: Adam over Gaussian rows and Adam over networks."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Bool
-from torch import Tensor
+from torch import Tensor, nn
 
 from evsplat.deform.model import Model
 from evsplat.gaussians import RowAdam
@@ -76,6 +77,22 @@ class Optimiser:
             self.rows[name].step()
         if self.learning.clip is not None:
             torch.nn.utils.clip_grad_norm_(self.clipped, self.learning.clip)
+        self.networks.step()
+
+    def step_only(self, parameters: list[nn.Parameter], gradients: Sequence[Tensor]) -> None:
+        """Step these parameters of networks, by these gradients, and nothing else.
+
+        Gradients that are not finite move nothing.
+        """
+        self.zero_grad()
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        unsound = (~self.finite()).float()
+        if unsound.device.type == "cpu":
+            if bool(unsound):
+                return
+        else:
+            self.networks.found_inf = unsound  # type: ignore[attr-defined]
         self.networks.step()
 
     def finite(self) -> Bool[Tensor, ""]:

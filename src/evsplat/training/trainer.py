@@ -1,6 +1,7 @@
 """The training loop: draw a frame, render what the objectives need, compare, step, densify."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -16,7 +17,7 @@ from evsplat.gaussians import GaussianSet, Part, Rows, ScreenStatistics, densify
 from evsplat.gaussians.densify import reset_opacities
 from evsplat.methods.composition import Composition
 from evsplat.methods.config import weight_at
-from evsplat.objectives import Step
+from evsplat.objectives import Objective, Step
 from evsplat.training.bad_steps import BadSteps
 from evsplat.training.checkpoint import below, flatten, load_model
 from evsplat.training.clock import Clock
@@ -98,28 +99,11 @@ class Trainer:
         self.model.nominal.fill_(nominal)
         self.optimiser.set_progress(nominal)
         frame = self._draw_frame()
-        generator = self.composition.generator
-        times = sorted({t for o in self.composition.objectives for t in o.times(frame, nominal)})
-
-        camera = self.capture.camera(frame).to(self.device)
-        drawing = self.model.training_drawing(times, frame, camera, generator)
-        step = Step(
-            self.capture,
-            self.model,
-            frame,
-            tuple(times),
-            drawing,
-            nominal,
-            generator,
-            self.data,
-        )
+        step = self._drawn(frame, self.composition.objectives, nominal)
         terms: dict[str, Tensor] = {}
         for objective in self.composition.objectives:
             terms |= objective.loss(step)
-        weights = self.composition.weights
-        loss = torch.stack(
-            [weight_at(weights[name], nominal) * value for name, value in terms.items()]
-        ).sum()
+        loss = self._weighted(terms, nominal)
 
         self.optimiser.zero_grad()
         sound = loss.detach().isfinite()
@@ -133,11 +117,50 @@ class Trainer:
         # The host knows that the step is sound, or a GPU will know it.
         unsure = None if self.bad.at_once else sound
         self.optimiser.step(nominal, unsure)
-        self._count(drawing, unsure)
+        self._count(step.drawing, unsure)
         self._edit(frame, nominal)
-        drawn = drawing.rgb[step.index(frame.mid_us)].detach()
+        self._learn_held_out(nominal)
+        drawn = step.drawing.rgb[step.index(frame.mid_us)].detach()
         losses = tuple(number.detach() for number in (loss, *terms.values()))
         return StepReport(losses, tuple(terms), drawn, step.observed(frame))
+
+    def _drawn(self, frame: Frame, objectives: Sequence[Objective], nominal: float) -> Step:
+        """Pictures of a frame at all times that objectives ask for."""
+        times = sorted({t for o in objectives for t in o.times(frame, nominal)})
+        camera = self.capture.camera(frame).to(self.device)
+        generator = self.composition.generator
+        drawing = self.model.training_drawing(times, frame, camera, generator)
+        return Step(
+            self.capture,
+            self.model,
+            frame,
+            tuple(times),
+            drawing,
+            nominal,
+            generator,
+            self.data,
+        )
+
+    def _weighted(self, terms: dict[str, Tensor], nominal: float) -> Tensor:
+        weights = self.composition.weights
+        return torch.stack(
+            [weight_at(weights[name], nominal) * value for name, value in terms.items()]
+        ).sum()
+
+    def _learn_held_out(self, nominal: float) -> None:
+        """Now and then a step of what frames teach whose pictures stay unseen."""
+        held_out = self.composition.held_out
+        if held_out is None or nominal < held_out.start:
+            return
+        if self.clock.iteration % held_out.every:
+            return
+        drawn = torch.randint(len(held_out.frames), (), generator=self.composition.generator)
+        step = self._drawn(held_out.frames[int(drawn)], [held_out.objective], nominal)
+        terms = held_out.objective.loss(step)
+        if terms:
+            loss = self._weighted(terms, nominal)
+            gradients = torch.autograd.grad(loss, held_out.parameters)
+            self.optimiser.step_only(held_out.parameters, gradients)
 
     def counts(self) -> dict[str, int]:
         """Number of Gaussians per class."""

@@ -1,0 +1,167 @@
+"""How noisy given key poses are, told by their jitter, and the motion without it."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from evsplat.body.track import BodyTrack
+
+FEWEST_KEYS = 8
+"""With fewer key poses nothing is told."""
+_LONGEST_PIECE = 256
+"""Key poses looked at together when noise is told, whose cost grows with the cube."""
+_STIFFNESSES = np.geomspace(1e-6, 1e8, 100)
+"""In units of the cubed time between keys; the first leaves everything as it is."""
+_STILL = 1e-4
+"""A joint whose quaternions differ by less than this never moves."""
+
+
+@dataclass(frozen=True)
+class MotionNoise:
+    """Errors of key poses that are new in every pose."""
+
+    rotation_rad: float
+    """Standard deviation per axis, the median over the joints that move."""
+    translation_m: float
+    """Standard deviation per axis of the root."""
+    moving: Bool[np.ndarray, " J"]
+    """Joints that move at all."""
+    stiffness_s3: Float[np.ndarray, " J+1"]
+    """Weight, per joint and last for the root's place, of the squared second derivative in time
+    against squared errors at the keys; what smooths best."""
+
+
+def motion_noise(track: BodyTrack) -> MotionNoise:
+    """Tell the noise of a track's key poses.
+
+    Each joint's quaternions are compared with their smoothing spline, whose stiffness generalised
+    cross-validation picks (Craven and Wahba, Smoothing noisy data with spline functions, 1979).
+    That misjudges single joints, mostly fast ones; the median over joints holds. Given the noise,
+    the stiffness of each joint is the one of least unbiased risk (same paper, eq. 1.8).
+
+    Errors that change slowly look like motion and are not told.
+    """
+    joints = track.poses.shape[1]
+    if len(track.times_us) < FEWEST_KEYS:
+        return MotionNoise(0.0, 0.0, np.ones(joints, bool), np.zeros(joints + 1))
+    quaternions = _quaternions(track.poses)
+    moving = np.ptp(quaternions, axis=0).max(-1) > _STILL
+    pieces = _pieces(_seconds(track))
+    stiffness = np.zeros(joints + 1)
+    if not moving.any():
+        rotation = 0.0
+    else:
+        # A small rotation changes a unit quaternion by half of it, in three of four directions.
+        per_component = math.sqrt(3) / 4
+        told = [_cross_validated(pieces, quaternions[:, j]) for j in np.flatnonzero(moving)]
+        rotation = float(np.median(told)) / per_component
+        for joint in np.flatnonzero(moving):
+            stiffness[joint] = _least_risk(pieces, quaternions[:, joint], rotation * per_component)
+    translation = _cross_validated(pieces, track.transl)
+    stiffness[-1] = _least_risk(pieces, track.transl, translation)
+    return MotionNoise(rotation, translation, moving, stiffness)
+
+
+def smoothed(track: BodyTrack, noise: MotionNoise) -> BodyTrack:
+    """The track with key poses on the smoothing splines that ``noise`` names (Reinsch 1967)."""
+    seconds = _seconds(track)
+    series = [*np.moveaxis(_quaternions(track.poses), 1, 0), track.transl]
+    *rotations, transl = (
+        _smooth(seconds, values, stiffness) if stiffness > 0 else values
+        for values, stiffness in zip(series, noise.stiffness_s3, strict=True)
+    )
+    stacked = np.stack(rotations, 1)
+    poses = Rotation.from_quat(stacked.reshape(-1, 4)).as_rotvec().reshape(track.poses.shape)
+    return BodyTrack(track.body, track.times_us, poses, transl)
+
+
+def _seconds(track: BodyTrack) -> Float[np.ndarray, " P"]:
+    return (track.times_us - track.times_us[0]) * 1e-6
+
+
+def _quaternions(poses: Float[np.ndarray, "P J 3"]) -> Float[np.ndarray, "P J 4"]:
+    """Unit quaternions, each of the sign that is nearer to the one before."""
+    count, joints = poses.shape[:2]
+    found = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(count, joints, 4)
+    turned = (found[1:] * found[:-1]).sum(-1) < 0
+    signs = np.cumprod(np.where(turned, -1, 1), axis=0)
+    found[1:] *= signs[..., None]
+    return found
+
+
+def _roughness(seconds: np.ndarray) -> tuple[sparse.csc_array, sparse.csc_array]:
+    """Q and R of the natural cubic spline through values y at the keys.
+
+    ``y' Q R^-1 Q' y`` is the integral of its squared second derivative.
+    """
+    gaps = np.diff(seconds)
+    count = len(seconds)
+    inverse = 1 / gaps
+    bands = [inverse[:-1], -inverse[:-1] - inverse[1:], inverse[1:]]
+    q = sparse.diags_array(bands, offsets=[0, -1, -2], shape=(count, count - 2))
+    inner = gaps[1:-1] / 6
+    r = sparse.diags_array([inner, (gaps[:-1] + gaps[1:]) / 3, inner], offsets=[-1, 0, 1])
+    return q.tocsc(), r.tocsc()
+
+
+def _smooth(seconds: np.ndarray, values: np.ndarray, stiffness: float) -> np.ndarray:
+    """Values (P, C) of the smoothing spline at the keys."""
+    q, r = _roughness(seconds)
+    return values - stiffness * (q @ splu((r + stiffness * (q.T @ q)).tocsc()).solve(q.T @ values))
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Neighbouring keys, and the directions in which smoothing them shrinks."""
+
+    keys: slice
+    directions: np.ndarray
+    shrink: np.ndarray
+    """(S, P): what a stiffness leaves of each direction."""
+    scale: float
+    """Cubed median time between keys."""
+
+
+def _pieces(seconds: np.ndarray) -> list[_Piece]:
+    scale = float(np.median(np.diff(seconds))) ** 3
+    number = -(-len(seconds) // _LONGEST_PIECE)
+    ends = np.linspace(0, len(seconds), number + 1).astype(int).tolist()
+    pieces = []
+    for first, last in zip(ends, ends[1:], strict=False):
+        q, r = _roughness(seconds[first:last])
+        values, directions = np.linalg.eigh(q @ np.linalg.solve(r.toarray(), q.T.toarray()))
+        bent = np.maximum(values, 0) * scale
+        bent[:2] = 0  # constants and straight lines
+        shrink = 1 / (1 + _STIFFNESSES[:, None] * bent)
+        pieces.append(_Piece(slice(first, last), directions, shrink, scale))
+    return pieces
+
+
+def _misfit(pieces: list[_Piece], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Per stiffness: summed squared residual, and the residual's degrees of freedom."""
+    channels = values.shape[1]
+    residual, freedom = np.zeros(len(_STIFFNESSES)), np.zeros(len(_STIFFNESSES))
+    for piece in pieces:
+        energy = ((piece.directions.T @ values[piece.keys]) ** 2).sum(1)
+        residual += (1 - piece.shrink) ** 2 @ energy
+        freedom += channels * (1 - piece.shrink).sum(1)
+    return residual, freedom
+
+
+def _cross_validated(pieces: list[_Piece], values: np.ndarray) -> float:
+    """Standard deviation of the noise of values (P, C), per channel."""
+    residual, freedom = _misfit(pieces, values)
+    best = int(np.argmin(residual / freedom**2))
+    return float(np.sqrt(residual[best] / freedom[best]))
+
+
+def _least_risk(pieces: list[_Piece], values: np.ndarray, noise: float) -> float:
+    """Stiffness (s^3) of least expected squared error; 0 where leaving the values alone is best."""
+    residual, freedom = _misfit(pieces, values)
+    best = int(np.argmin(residual - 2 * noise**2 * freedom))
+    return 0.0 if best == 0 else float(_STIFFNESSES[best] * pieces[0].scale)

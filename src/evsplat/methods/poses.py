@@ -1,0 +1,83 @@
+"""Noisy body poses: how noisy they are, what is smoothed, and what training may correct."""
+
+import logging
+from dataclasses import dataclass
+from typing import Literal
+
+from evsplat.body import BodyTrack, load_body_track
+from evsplat.body.smoothing import motion_noise, smoothed
+from evsplat.capture import Capture
+from evsplat.deform.pose_spline import PoseSpline
+from evsplat.methods.config import Weight
+
+logger = logging.getLogger(__name__)
+
+When = Literal["auto", "always", "never"]
+"""``auto``: where the key poses jitter by `PoseConfig.noisy_rad` or more."""
+LEAST_STD_M = 1e-3
+"""Expected error of the root's place where its course shows no noise."""
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """Errors of the given poses."""
+
+    smooth: When = "auto"
+    """Take out of the given key poses what looks like noise."""
+    refine: When = "auto"
+    """Learn a residual of the poses, a cubic B-spline in time, from pictures and events."""
+    noisy_rad: float = 0.006
+    """Jitter of key poses, radians per axis, from which poses count as noisy."""
+    start: float = 1_500
+    """Nominal iteration from which the residual is learned."""
+    knot_frames: float = 1.0
+    """Time between its knots, in intervals of the key poses."""
+    prior: Weight = 1e-3
+    """Weight of the residual's mean square in units of the errors expected."""
+    std_rad: float | None = None
+    """Error expected of a joint, radians per axis; null = the jitter, at least `noisy_rad`."""
+    std_m: float | None = None
+    """Error expected of the root's place, metres per axis; null = its jitter."""
+    events_of_held_out: bool = False
+    """Let events around held-out frames correct the poses there. The pictures of those frames stay
+    unseen and nothing else is learned there, but figures are not those of other rows."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """What a model is to move by."""
+
+    track: BodyTrack
+    spline: PoseSpline | None
+    """None where nothing is to be learned of poses."""
+
+
+def prepare_poses(config: PoseConfig, capture: Capture) -> Poses:
+    """Look at a capture's key poses and do what the settings say; the log tells what that is."""
+    track = load_body_track(capture)
+    noise = motion_noise(track)
+    noisy = noise.rotation_rad >= config.noisy_rad
+    smooth, refine = (
+        noisy if when == "auto" else when == "always" for when in (config.smooth, config.refine)
+    )
+    logger.info(
+        "given poses jitter by %.4f rad per axis (noisy from %g): %s, %s",
+        noise.rotation_rad,
+        config.noisy_rad,
+        "smoothed in time" if smooth else "taken as they are",
+        "corrected in training" if refine else "not corrected",
+    )
+    if smooth:
+        track = smoothed(track, noise)
+    if not refine:
+        return Poses(track, None)
+    spline = PoseSpline.of(
+        track,
+        noise,
+        [frame.mid_us for frame in capture.train_frames],
+        knot_frames=config.knot_frames,
+        joint_rad=config.std_rad or max(noise.rotation_rad, config.noisy_rad),
+        root_m=config.std_m or max(noise.translation_m, LEAST_STD_M),
+        stiff=smooth,
+    )
+    return Poses(track, spline)

@@ -1,0 +1,103 @@
+"""Noisy poses in method `evsplat`: told, smoothed, corrected, and held-out pictures unseen."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from evsplat.body import load_body_track
+from evsplat.capture import Capture, load_capture
+from evsplat.config import override
+from evsplat.errors import ConfigError
+from evsplat.methods import TRAINABLE, method_config
+from evsplat.methods.poses import PoseConfig, prepare_poses
+from evsplat.training.clock import Clock
+from evsplat.training.trainer import Trainer
+
+from ..small_model import SMALL_MODEL
+
+SMALL = (
+    *SMALL_MODEL, "deform.shadow_lights=0", "exposure.most_renders=3",
+    "windows.start=0", "pose.start=0",
+)  # fmt: skip
+
+
+@pytest.fixture
+def captures(tiny_capture):
+    """The same recording with exact and with noisy key poses."""
+    exact, noisy = tiny_capture("exact", frames=20), tiny_capture("noisy", frames=20)
+    body = dict(np.load(noisy / "body.npz"))
+    rng = np.random.default_rng(0)
+    body["poses"] = body["poses"] + np.float32(0.05 * rng.normal(size=body["poses"].shape))
+    np.savez(noisy / "body.npz", **body)
+    return load_capture(exact), load_capture(noisy)
+
+
+def composed(capture: Capture, *settings: str):
+    config = method_config("evsplat", override({}, (*SMALL, *settings)), where="test")
+    return TRAINABLE["evsplat"][1](config, capture, 0)
+
+
+def test_noisy_poses_are_told_and_nothing_is_done_to_exact_ones(captures, caplog):
+    exact, noisy = captures
+    with caplog.at_level(logging.INFO):
+        untouched = prepare_poses(PoseConfig(), exact)
+    assert "taken as they are, not corrected" in caplog.text
+    assert untouched.spline is None
+    assert np.array_equal(untouched.track.poses, load_body_track(exact).poses)
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        found = prepare_poses(PoseConfig(), noisy)
+    assert "smoothed in time, corrected in training" in caplog.text
+    truth = load_body_track(exact).poses
+    before = np.abs(load_body_track(noisy).poses - truth).mean()
+    assert np.abs(found.track.poses - truth).mean() < before
+    assert found.spline is not None
+    assert float(found.spline.joint_rad.max()) == pytest.approx(0.05, rel=0.5)
+    off = prepare_poses(PoseConfig(smooth="never", refine="never"), noisy)
+    assert off.spline is None
+    assert np.array_equal(off.track.poses, load_body_track(noisy).poses)
+
+
+def test_held_out_frames_move_their_poses_only_and_their_pictures_stay_unseen(
+    captures, monkeypatch
+):
+    noisy = captures[1]
+    held_out = {frame.name for frame in noisy.test_frames}
+    read = Capture.image
+
+    def image(self, frame):
+        assert frame.name not in held_out
+        return read(self, frame)
+
+    monkeypatch.setattr(Capture, "image", image)
+    composition = composed(noisy, "pose.events_of_held_out=true")
+    model, found = composition.model, composition.held_out
+    assert found is not None and {frame.name for frame in found.frames} == held_out
+    trainer = Trainer(composition, noisy, Clock(8, None, shrink=False, seconds=0.0))
+    for _ in range(3):
+        assert trainer.step() is not None
+        trainer.clock.advance(0.1)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    count = trainer.statistics["gaussians"].seen.clone()
+    trainer.clock.iteration = found.every
+    trainer._learn_held_out(5_000.0)
+    changed = {
+        name for name, value in model.state_dict().items() if not torch.equal(value, before[name])
+    }
+    assert changed == {"rotation_residuals", "translation_residuals"}
+    assert torch.equal(count, trainer.statistics["gaussians"].seen)
+
+
+def test_without_being_asked_held_out_events_teach_nothing(captures):
+    composition = composed(captures[1])
+    assert composition.held_out is None
+    assert composition.model.pose_spline is not None
+    assert composition.weights["pose_prior"] == PoseConfig().prior
+    assert composed(captures[0]).model.pose_spline is None
+
+
+def test_an_unknown_choice_is_named():
+    with pytest.raises(ConfigError, match="pose.smooth"):
+        method_config("evsplat", override({}, ("pose.smooth=sometimes",)), where="test")
