@@ -16,6 +16,7 @@ import asyncio
 import io
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -178,9 +179,9 @@ def measure_training(turns: int, turn_s: float, method: str) -> dict[str, float]
             pass
         for turn in range(2 * turns + 1):
             if turn % 2:
-                asyncio.run(_watch(BEGINS_S))
+                _watched(BEGINS_S)
                 begin = time.monotonic()
-                seen += asyncio.run(_watch(turn_s))
+                seen += _watched(turn_s)
             else:
                 time.sleep(LINGERS_S)
                 begin = time.monotonic()
@@ -229,6 +230,13 @@ def _compared(rates: list[tuple[float, float]], seen: int, turn_s: float) -> dic
     }
 
 
+def _watched(seconds: float) -> int:
+    try:
+        return asyncio.run(_watch(seconds))
+    except (TimeoutError, OSError):
+        sys.exit("The viewer does not answer: this machine leaves nothing over for it.")
+
+
 async def _watch(seconds: float) -> int:
     """Be a browser whose camera turns all the time; returns how many pictures came."""
     came = 0
@@ -257,6 +265,7 @@ def _connected(port: int):
         subprotocols=[f"viser-v{viser.__version__}"],
         max_size=None,
         compression=None,
+        open_timeout=30,
     )
 
 
@@ -302,6 +311,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=12.0, help="of each measurement or turn")
     parser.add_argument("--turns", type=int, default=4, help="in which the training is watched")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # no process is left behind
     if options.training:
         figures = measure_training(options.turns, options.seconds, options.method)
     else:

@@ -140,11 +140,11 @@ def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> Non
             "compare runs of the same capture."
         )
     viewer = Viewer(runs, host=host, port=port)
-    if following:
-        yield_to_training()
     if viewer.port != port:
         print(f"Port {port} is in use; taking {viewer.port}.", flush=True)
     print(f"view: {viewer.address}  (Ctrl-C stops)", flush=True)
+    if following:
+        yield_to_training()
     # Closed by whoever started it as by Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
