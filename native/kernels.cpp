@@ -137,10 +137,8 @@ INLINE uint64_t patches_reached(const Projected& p, float kx, float ky, float x0
     return reached;
 }
 
-INLINE int clamp_tile(float pixel, int last) {
-    const float tile = pixel * (1.f / kTile);
-    return tile < 0.f ? 0 : tile > float(last) ? last : int(tile);
-}
+// The tile that holds a pixel, or the nearest of the image.
+INLINE I tile_at(F pixel, int last) { return to_int(min(max(pixel * (1.f / kTile), F{}), splat(float(last)))); }
 
 void project(const View& view, const Gaussians& g, uint32_t begin, uint32_t end, Projected* projected,
              int32_t* radii, uint32_t* first_slot, SlotList& slots) {
@@ -160,42 +158,46 @@ void project(const View& view, const Gaussians& g, uint32_t begin, uint32_t end,
         const F kx = p.cov_xy / p.cov_yy, ky = p.cov_xy / p.cov_xx;
         const F l12 = -l11 * kx;
         const F sx = sqrt(p.cov_xx), sy = sqrt(p.cov_yy);
+        const F log2_opacity = log2(opacity);
+        const F limit = log2_opacity + 7.9943534f;  // log2(255)
+        const F extent = sqrt(max(limit, F{}) / kHalfLog2e), drawn = min(extent, splat(kMaxExtent));
+        const F rx = ceil(drawn * sx), ry = ceil(drawn * sy);
         // Comparisons are written so that NaN fails them and is not drawn.
         const I ok = (p.z >= view.near_plane) & (p.det > 0.f) & (opacity >= kMinAlpha) & (p.det < 1e30f) &
                      (mx > -kMaxPixel) & (mx < kMaxPixel) & (my > -kMaxPixel) & (my < kMaxPixel) &
-                     (sx < kMaxPixel) & (sy < kMaxPixel) & (l11 < 1e6f);
+                     (sx < kMaxPixel) & (sy < kMaxPixel) & (l11 < 1e6f) & (mx + rx > 0.f) &
+                     (mx - rx < float(view.width)) & (my + ry > 0.f) & (my - ry < float(view.height));
+        const I radius = ok & to_int(max(rx, ry));
 
+        // Rounding must not cut a patch that the pixel test would keep; that test decides.
+        const F ex = extent * sx * 1.001f + 0.51f, ey = extent * sy * 1.001f + 0.51f;
+        const I tx0 = tile_at(mx - ex, view.tiles_x - 1), tx1 = tile_at(mx + ex, view.tiles_x - 1);
+        const I ty0 = tile_at(my - ey, view.tiles_y - 1), ty1 = tile_at(my + ey, view.tiles_y - 1);
+        __builtin_memcpy(radii + i, &radius, n * sizeof *radii);
+        const uint64_t drawn_lanes = bits(ok);
+        float x[W], y[W], a[W], b[W], c[W], o[W], z[W], fx[W], fy[W], slack[W];
+        store(x, mx), store(y, my), store(a, l11), store(b, l12), store(c, l22), store(o, log2_opacity), store(z, p.z);
+        store(fx, kx), store(fy, ky), store(slack, limit * 1.001f + 1e-3f);
+        int32_t left[W], right[W], top[W], bottom[W];
+        store_ints(left, tx0), store_ints(right, tx1), store_ints(top, ty0), store_ints(bottom, ty1);
         for (uint32_t l = 0; l < n; ++l) {
             const uint32_t gaussian = i + l;
             first_slot[gaussian] = uint32_t(slots.size);
-            radii[gaussian] = 0;
-            if (!ok[l]) continue;
-            const float log2_opacity = __builtin_log2f(opacity[l]);
-            const float limit = log2_opacity + 7.9943534f;  // log2(255)
-            const float extent = __builtin_sqrtf((limit > 0.f ? limit : 0.f) / kHalfLog2e);
-            const float drawn = extent < kMaxExtent ? extent : kMaxExtent;
-            const float rx = __builtin_ceilf(drawn * sx[l]), ry = __builtin_ceilf(drawn * sy[l]);
-            if (!(mx[l] + rx > 0.f && mx[l] - rx < float(view.width) && my[l] + ry > 0.f &&
-                  my[l] - ry < float(view.height)))
-                continue;
-            const Projected out = {mx[l], my[l], l11[l], l12[l], l22[l], log2_opacity, p.z[l], 0.f};
+            if (!(drawn_lanes >> l & 1)) continue;
+            const Projected out = {x[l], y[l], a[l], b[l], c[l], o[l], z[l], 0.f};
             projected[gaussian] = out;
-            radii[gaussian] = int32_t(rx > ry ? rx : ry);
-
-            // Rounding must not cut a patch that the pixel test would keep; that test decides.
-            const float slack = limit * 1.001f + 1e-3f;
-            const float ex = extent * sx[l] * 1.001f + 0.51f, ey = extent * sy[l] * 1.001f + 0.51f;
-            const int tx0 = clamp_tile(mx[l] - ex, view.tiles_x - 1), tx1 = clamp_tile(mx[l] + ex, view.tiles_x - 1);
-            const int ty0 = clamp_tile(my[l] - ey, view.tiles_y - 1), ty1 = clamp_tile(my[l] + ey, view.tiles_y - 1);
-            for (int ty = ty0; ty <= ty1; ++ty) {
-                for (int tx = tx0; tx <= tx1; ++tx) {
+            const size_t most = slots.size + size_t(right[l] - left[l] + 1) * (bottom[l] - top[l] + 1);
+            while (most > slots.capacity) slots.grow(slots);
+            Slot* next = slots.data + slots.size;
+            for (int ty = top[l]; ty <= bottom[l]; ++ty)
+                for (int tx = left[l]; tx <= right[l]; ++tx) {
                     const uint64_t reached =
-                        patches_reached(out, kx[l], ky[l], float(tx * kTile), float(ty * kTile), slack);
-                    if (!reached) continue;
-                    if (slots.size == slots.capacity) slots.grow(slots);
-                    slots.data[slots.size++] = {uint32_t(ty * view.tiles_x + tx), gaussian, reached};
+                        patches_reached(out, fx[l], fy[l], float(tx * kTile), float(ty * kTile), slack[l]);
+                    // Written in any case, as a branch here would be guessed wrong half of the time.
+                    *next = {uint32_t(ty * view.tiles_x + tx), gaussian, reached};
+                    next += reached != 0;
                 }
-            }
+            slots.size = size_t(next - slots.data);
         }
     }
 }
@@ -240,9 +242,29 @@ INLINE void for_pixels(const Tile& t, Function f) {
         }
 }
 
+#if EVSPLAT_LANES == 16
+// Four rows of a tile to its four patches there, or back: blocks of four pixels are transposed.
+INLINE void transpose_blocks(F (&v)[4]) {
+    const __m512 a = (__m512)v[0], b = (__m512)v[1], c = (__m512)v[2], d = (__m512)v[3];
+    const __m512 ab = _mm512_shuffle_f32x4(a, b, 0x44), ab2 = _mm512_shuffle_f32x4(a, b, 0xee);
+    const __m512 cd = _mm512_shuffle_f32x4(c, d, 0x44), cd2 = _mm512_shuffle_f32x4(c, d, 0xee);
+    v[0] = (F)_mm512_shuffle_f32x4(ab, cd, 0x88), v[1] = (F)_mm512_shuffle_f32x4(ab, cd, 0xdd);
+    v[2] = (F)_mm512_shuffle_f32x4(ab2, cd2, 0x88), v[3] = (F)_mm512_shuffle_f32x4(ab2, cd2, 0xdd);
+}
+#endif
+
 // Copies planar image rows to or from the patches' lanes.
 INLINE void store_plane(const Tile& t, const F* patches, int step, float* plane, int width) {
     if (t.columns == kTile && t.rows == kTile) {
+#if EVSPLAT_LANES == 16
+        for (int y = 0; y < kTile; y += kPatchH) {
+            F v[4];
+            for (int i = 0; i < 4; ++i) v[i] = patches[(y + i) * step];
+            transpose_blocks(v);
+            for (int i = 0; i < 4; ++i) store(plane + size_t(t.y0 + y + i) * width + t.x0, v[i]);
+        }
+        return;
+#endif
         for (int p = 0; p < kPatches; ++p) {
             float* out = plane + size_t(t.y0 + p / kPatchesX * kPatchH) * width + t.x0 + p % kPatchesX * kPatchW;
             const float* lanes = (const float*)&patches[p * step];
@@ -256,6 +278,17 @@ INLINE void store_plane(const Tile& t, const F* patches, int step, float* plane,
 
 INLINE void load_plane(const Tile& t, F* patches, int step, const float* plane, ptrdiff_t sx, ptrdiff_t sy) {
     if (t.columns == kTile && t.rows == kTile) {
+#if EVSPLAT_LANES == 16
+        if (sx == 1) {
+            for (int y = 0; y < kTile; y += kPatchH) {
+                F v[4];
+                for (int i = 0; i < 4; ++i) v[i] = load(plane + (t.y0 + y + i) * sy + t.x0);
+                transpose_blocks(v);
+                for (int i = 0; i < 4; ++i) patches[(y + i) * step] = v[i];
+            }
+            return;
+        }
+#endif
         for (int p = 0; p < kPatches; ++p) {
             const float* in = plane + (t.y0 + p / kPatchesX * kPatchH) * sy + (t.x0 + p % kPatchesX * kPatchW) * sx;
             // Not by way of a vector: reading what narrower stores have just written stalls.

@@ -11,23 +11,6 @@ namespace {
 
 #include "simd.h"
 
-// Base-2 logarithm of normal positive numbers, 1e-7 absolute: the exponent, and of the mantissa m in
-// [sqrt(1/2), sqrt(2)) the series of 2 atanh((m - 1) / (m + 1)).
-INLINE F log2(F v) {
-    const I shifted = (I)v - 0x3f3504f3;  // the bits of sqrt(1/2)
-    const I exponent = shifted >> 23;
-    const F m = (F)((shifted & 0x7fffff) + 0x3f3504f3);
-    const F t = (m - 1.f) / (m + 1.f), square = t * t;
-    F p = splat(2.f / 9.f);
-    p = p * square + 2.f / 7.f;
-    p = p * square + 2.f / 5.f;
-    p = p * square + 2.f / 3.f;
-    p = p * square + 2.f;
-    F whole;
-    for (int l = 0; l < W; ++l) whole[l] = float(exponent[l]);
-    return whole + p * t * 1.44269504f;
-}
-
 // The pixels from `at`, of which `count` are there.
 template <class Load, class Store>
 INLINE void pixels(const LogBrightness& job, size_t at, const Load& load_at, const Store& store_at) {

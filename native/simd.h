@@ -26,6 +26,7 @@ typedef int32_t I4 __attribute__((vector_size(16), may_alias));
 INLINE F splat(float value) { return value - F{}; }
 INLINE F load(const float* p) { F v; __builtin_memcpy(&v, p, sizeof v); return v; }
 INLINE void store(float* p, F v) { __builtin_memcpy(p, &v, sizeof v); }
+INLINE void store_ints(int32_t* p, I v) { __builtin_memcpy(p, &v, sizeof v); }
 // To an aligned place that is not read soon: past the cache, so that its line is not fetched first.
 INLINE void stream(float* p, F v) {
 #if defined(__AVX512F__) && EVSPLAT_LANES == 16
@@ -57,6 +58,15 @@ INLINE F sqrt(F v) {
     for (int l = 0; l < W; ++l) r[l] = __builtin_sqrtf(v[l]);
     return r;
 }
+
+INLINE F ceil(F v) {
+    F r;
+    for (int l = 0; l < W; ++l) r[l] = __builtin_ceilf(v[l]);
+    return r;
+}
+
+INLINE F to_float(I v) { return __builtin_convertvector(v, F); }
+INLINE I to_int(F v) { return __builtin_convertvector(v, I); }  // towards zero
 
 // Field `stride * row + 0` of `count` rows; missing rows repeat the last one.
 template <int stride>
@@ -118,6 +128,21 @@ INLINE F exp2(F e) {
     p = p * f + 0.693147f;
     p = p * f + 1.f;
     return (F)((I)p + ((I)shifted << 23));
+}
+
+// Base-2 logarithm of normal positive numbers, 1e-7 absolute: the exponent, and of the mantissa m in
+// [sqrt(1/2), sqrt(2)) the series of 2 atanh((m - 1) / (m + 1)).
+INLINE F log2(F v) {
+    const I shifted = (I)v - 0x3f3504f3;  // the bits of sqrt(1/2)
+    const I exponent = shifted >> 23;
+    const F m = (F)((shifted & 0x7fffff) + 0x3f3504f3);
+    const F t = (m - 1.f) / (m + 1.f), square = t * t;
+    F p = splat(2.f / 9.f);
+    p = p * square + 2.f / 7.f;
+    p = p * square + 2.f / 5.f;
+    p = p * square + 2.f / 3.f;
+    p = p * square + 2.f;
+    return to_float(exponent) + p * t * 1.44269504f;
 }
 
 // The sum of four of the lanes' quarters, so that four vectors reduce together.

@@ -14,6 +14,21 @@
 namespace evsplat {
 namespace {
 
+// A thread that sleeps takes tens of microseconds to be woken, as long as many a call here takes: for about that
+// long both sides look before they sleep.
+constexpr int kLooks = 1000;
+
+template <class Condition>
+void look_for(Condition holds) {
+    for (int i = 0; i < kLooks && !holds(); ++i) {
+#if defined(__x86_64__) || defined(__i386__)
+        __builtin_ia32_pause();
+#elif defined(__aarch64__)
+        asm volatile("yield");
+#endif
+    }
+}
+
 class Pool {
   public:
     void run(int threads, size_t count, const std::function<void(size_t)>& task) {
@@ -33,6 +48,9 @@ class Pool {
         // first time slice only milliseconds later.
         std::unique_lock<std::mutex> lock(mutex_);
         task_ = nullptr;
+        lock.unlock();
+        look_for([this] { return running_ == 0; });
+        lock.lock();
         done_.wait(lock, [this] { return running_ == 0; });
     }
 
@@ -46,6 +64,7 @@ class Pool {
     void work(int id) {
         uint64_t seen = 0;
         for (;;) {
+            look_for([&] { return generation_ != seen; });
             std::unique_lock<std::mutex> lock(mutex_);
             wake_.wait(lock, [&] { return generation_ != seen; });
             seen = generation_;
@@ -66,8 +85,9 @@ class Pool {
     const std::function<void(size_t)>* task_ = nullptr;
     size_t count_ = 0;
     std::atomic<size_t> next_{0};
-    int helpers_ = 0, running_ = 0;
-    uint64_t generation_ = 0;
+    int helpers_ = 0;
+    std::atomic<int> running_{0};  // changed under the lock
+    std::atomic<uint64_t> generation_{0};
 };
 
 // Never destroyed: joining threads while the process or the interpreter goes down can hang. A forked
