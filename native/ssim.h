@@ -22,7 +22,7 @@ struct SsimSums {
     double difference;                // absolute, over the pixels
 };
 
-inline size_t ssim_scratch(int width) { return size_t(8 * kSsimWindow + 9) * (width + kSsimWindow); }
+inline size_t ssim_scratch(int width) { return size_t(7 * (kSsimWindow + 3) + 19) * (width + 48); }
 
 // Sums over all planes; `planes` of (height, width) follow each other.
 SsimSums ssim_planes(size_t planes, int height, int width, const float* image, const float* reference,

@@ -1,126 +1,183 @@
 // Structural similarity of a band of one plane, compiled once per SIMD level.
 //
 // Windows are separable: rows are blurred along x, then along y. The map S is a function of the blurred
-// x, x^2 and x y; its three partial derivatives, blurred back, give the gradient of the sum of S. Rows
-// are taken one by one, and only as many are kept as a window is high, so that all stays in the cache.
+// x, y, x^2 + y^2 and x y; its three partial derivatives, blurred back, give the gradient of the sum of S.
+// Rows are taken some together, so that the blur along y reads each fewer times, and only as many are kept
+// as the windows of those reach, so that all stays in the cache. Rows in the scratch memory are whole vectors long.
 
 #include "kernels.h"
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
 
 namespace evsplat {
 namespace EVSPLAT_LEVEL {
 namespace {
 
-constexpr int K = kSsimWindow;
-#define INLINE static inline __attribute__((always_inline))
+#include "simd.h"
 
-// to[i] = sum over k of w[k] from[i + k * step]
-INLINE void blur(const float* from, size_t step, const float* w, int count, float* to) {
-#pragma GCC ivdep
-    for (int i = 0; i < count; ++i) {
-        float sum = 0.f;
+constexpr int K = kSsimWindow;
+constexpr int R = EVSPLAT_LANES == 16 ? 4 : 2;  // rows taken together, as many as the registers hold
+constexpr int kRows = K + R - 1;  // kept of each map: what R rows of windows reach
+
+// to[i] = sum over k of w[k] from[i + k]; `from` and `to` are at whole vectors, one more of `from` is there.
+INLINE void blur(const float* from, const float (&w)[K], int count, float* to) {
+#if EVSPLAT_LANES == 16
+    // Out of two registers, as most loads would lie across two lines of the cache.
+    __m512i lanes[K];
+    for (int k = 0; k < K; ++k) {
+        int32_t lane[W];
+        for (int l = 0; l < W; ++l) lane[l] = l + k;
+        __builtin_memcpy(&lanes[k], lane, sizeof lane);
+    }
+    F here = load(from);
+    for (int i = 0; i < count; i += W) {
+        const F next = load(from + i + W);
+        F sum = w[0] * here;
 #pragma GCC unroll 11
-        for (int k = 0; k < K; ++k) sum += w[k] * from[i + k * step];
-        to[i] = sum;
+        for (int k = 1; k < K; ++k) sum += w[k] * (F)_mm512_permutex2var_ps((__m512)here, lanes[k], (__m512)next);
+        store(to + i, sum);
+        here = next;
+    }
+#else
+    for (int i = 0; i < count; i += W) {
+        F sum = w[0] * load(from + i);
+#pragma GCC unroll 11
+        for (int k = 1; k < K; ++k) sum += w[k] * load(from + i + k);
+        store(to + i, sum);
+    }
+#endif
+}
+
+// to[r][i] = sum over k of w[k] from[r + k][i]
+INLINE void blur_rows(const float* const (&from)[kRows], const float (&w)[K], int count, float* const (&to)[R]) {
+    for (int i = 0; i < count; i += W) {
+        F sum[R] = {};
+#pragma GCC unroll 16
+        for (int k = 0; k < kRows; ++k) {
+            const F row = load(from[k] + i);
+#pragma GCC unroll 4
+            for (int r = 0; r < R; ++r)
+                if (k >= r && k - r < K) sum[r] += w[k - r] * row;
+        }
+#pragma GCC unroll 4
+        for (int r = 0; r < R; ++r) store(to[r] + i, sum[r]);
     }
 }
 
-// to[i] = sum over k of w[k] from[k][i]
-INLINE void blur_rows(const float* const (&from)[K], const float (&w)[K], int count, float* to) {
-#pragma GCC ivdep
-    for (int i = 0; i < count; ++i) {
-        float sum = 0.f;
-#pragma GCC unroll 11
-        for (int k = 0; k < K; ++k) sum += w[k] * from[k][i];
-        to[i] = sum;
+INLINE double difference(const float* x, const float* y, int count) {
+    F total = {};
+    int i = 0;
+    for (; i + W <= count; i += W) {
+        const F d = load(x + i) - load(y + i);
+        total += max(d, -d) + (d - d);  // max forgets what is no number
     }
+    double rest = 0.0;
+    for (; i < count; ++i) rest += __builtin_fabsf(x[i] - y[i]);
+    return rest + sum(total);
+}
+
+// The similarity of `columns` windows, summed, from what is blurred; its derivatives by the blurred x, by
+// x^2 and by x y.
+INLINE double similarity(const SsimBand& job, const float* const (&blurred)[4], int columns, float* const (&slope)[3]) {
+    F lane, sum = {};
+    for (int l = 0; l < W; ++l) lane[l] = float(l);
+    for (int i = 0; i < columns; i += W) {
+        const F mx = load(blurred[0] + i), my = load(blurred[1] + i), squares = mx * mx + my * my, product = mx * my;
+        const F a1 = 2.f * product + job.c1, b1 = squares + job.c1;
+        const F a2 = 2.f * (load(blurred[3] + i) - product) + job.c2, b2 = load(blurred[2] + i) - squares + job.c2;
+        const I there = lane < float(columns - i);
+        const F inverse = 1.f / (b1 * b2), s = a1 * a2 * inverse;
+        const F by_square = -s * b1 * inverse, by_product = 2.f * a1 * inverse;
+        // Through both factors: the luminance one directly, the other as variance and covariance.
+        const F by_mean =
+            2.f * my * a2 * inverse - 2.f * mx * s * b2 * inverse - 2.f * mx * by_square - my * by_product;
+        store(slope[0] + i, select(there, by_mean, F{}));
+        store(slope[1] + i, select(there, by_square, F{}));
+        store(slope[2] + i, select(there, by_product, F{}));
+        sum += select(there, s, F{});
+    }
+    return evsplat::EVSPLAT_LEVEL::sum(sum);
 }
 
 }  // namespace
 
 SsimSums ssim_band(const SsimBand& job) {
     const int h = job.height, w = job.width, rows = h - K + 1, columns = w - K + 1;
+    const int padded = (w + W - 1) / W * W, stride = padded + 2 * W;
     float window[K];
     for (int k = 0; k < K; ++k) window[k] = job.window[k];
     float* next = job.scratch;
-    const auto take = [&](int floats) { return (next += floats) - floats; };
-    // The last K rows of x, y, xx, yy, xy, blurred along x; of the derivatives, blurred back along x.
-    float *blurred[5][K], *back[3][K], *line[5], *slope[3];
+    const auto take = [&] {
+        for (int i = 0; i < stride; ++i) next[i] = 0.f;
+        return (next += stride) - stride;
+    };
+    // The last rows of x, y, xx + yy, xy, blurred along x; of the derivatives, blurred back along x.
+    float *blurred[4][kRows], *back[3][kRows], *line[4][R], *slope[3];
     for (auto& map : blurred)
-        for (float*& row : map) row = take(w);
+        for (float*& row : map) row = take();
     for (auto& map : back)
-        for (float*& row : map) row = take(w);
-    for (float*& row : line) row = take(w);
-    for (float*& row : slope) {  // with K - 1 zeros on both sides: the window is symmetric
-        row = take(w + K - 1);
-        for (int i = 0; i < K - 1; ++i) row[i] = row[columns + K - 1 + i] = 0.f;
-    }
+        for (float*& row : map) row = take();
+    for (auto& map : line)
+        for (float*& row : map) row = take();
+    for (float*& row : slope) row = take();
 
     const int first = job.begin > K - 1 ? job.begin - K + 1 : 0, last = job.end < rows ? job.end : rows;
     const int start = job.grad ? first : job.begin;
     SsimSums total = {};
+    for (int q = job.begin; q < job.end; ++q)
+        total.difference += difference(job.image + size_t(q) * w, job.reference + size_t(q) * w, w);
     int filled = start;  // rows up to here are blurred
-    for (int q = job.begin; q < job.end; ++q) {
-        const float *x = job.image + size_t(q) * w, *y = job.reference + size_t(q) * w;
-        float sum = 0.f;
-#pragma GCC ivdep
-        for (int i = 0; i < w; ++i) sum += __builtin_fabsf(x[i] - y[i]);
-        total.difference += sum;
-    }
-    for (int q = start; q < job.end; ++q) {
-        for (; q < last && filled < q + K; ++filled) {
+    for (int q = start; q < job.end; q += R) {
+        for (; q < last && filled < q + kRows && filled < h; ++filled) {
             const float *x = job.image + size_t(filled) * w, *y = job.reference + size_t(filled) * w;
-#pragma GCC ivdep
-            for (int i = 0; i < w; ++i) line[2][i] = x[i] * x[i], line[3][i] = y[i] * y[i], line[4][i] = x[i] * y[i];
-            const float* sources[5] = {x, y, line[2], line[3], line[4]};
-            for (int m = 0; m < 5; ++m) blur(sources[m], 1, window, columns, blurred[m][filled % K]);
+            __builtin_memcpy(line[0][0], x, w * sizeof *x), __builtin_memcpy(line[1][0], y, w * sizeof *y);
+            for (int i = 0; i < padded; i += W) {
+                const F a = load(line[0][0] + i), b = load(line[1][0] + i);
+                store(line[2][0] + i, a * a + b * b), store(line[3][0] + i, a * b);
+            }
+            for (int m = 0; m < 4; ++m) blur(line[m][0], window, columns, blurred[m][filled % kRows]);
         }
         if (q < last) {
-            for (int m = 0; m < 5; ++m) {
-                const float* row[K];
-                for (int k = 0; k < K; ++k) row[k] = blurred[m][(q + k) % K];
+            for (int m = 0; m < 4; ++m) {
+                const float* row[kRows];
+                for (int k = 0; k < kRows; ++k) row[k] = blurred[m][(q + k) % kRows];
                 blur_rows(row, window, columns, line[m]);
             }
-            float *d_mean = slope[0] + K - 1, *d_square = slope[1] + K - 1, *d_product = slope[2] + K - 1;
-            float sum = 0.f;
-#pragma GCC ivdep
-            for (int i = 0; i < columns; ++i) {
-                const float mx = line[0][i], my = line[1][i];
-                const float a1 = 2.f * mx * my + job.c1, b1 = mx * mx + my * my + job.c1;
-                const float a2 = 2.f * (line[4][i] - mx * my) + job.c2;
-                const float b2 = (line[2][i] - mx * mx) + (line[3][i] - my * my) + job.c2;
-                const float inverse = 1.f / (b1 * b2), s = a1 * a2 * inverse;
-                d_square[i] = -s * b1 * inverse;
-                d_product[i] = 2.f * a1 * inverse;
-                // Through both factors: the luminance one directly, the other as variance and covariance.
-                d_mean[i] =
-                    2.f * my * a2 * inverse - 2.f * mx * s * b2 * inverse - 2.f * mx * d_square[i] - my * d_product[i];
-                sum += s;
+        }
+        for (int r = 0; r < R; ++r) {
+            // The window is symmetric: with K - 1 zeros on both sides it blurs back too.
+            float* const inner[3] = {slope[0] + K - 1, slope[1] + K - 1, slope[2] + K - 1};
+            if (q + r < last) {
+                const double value = similarity(job, {line[0][r], line[1][r], line[2][r], line[3][r]}, columns, inner);
+                if (q + r >= job.begin && q + r < job.end) total.similarity += value;
             }
-            if (q >= job.begin) total.similarity += sum;
+            if (!job.grad) continue;
+            for (int m = 0; m < 3; ++m) {
+                float* to = back[m][(q + r) % kRows];
+                if (q + r < last)
+                    blur(slope[m], window, w, to);
+                else
+                    for (int i = 0; i < padded; ++i) to[i] = 0.f;  // below the last window
+            }
         }
         if (!job.grad) continue;
+        // Window q - k reaches row q with weight k; above the first window back is zero.
         for (int m = 0; m < 3; ++m) {
-            if (q < last)
-                blur(slope[m], 1, window, w, back[m][q % K]);
-            else
-                for (int i = 0; i < w; ++i) back[m][q % K][i] = 0.f;  // below the last window
+            const float* row[kRows];
+            for (int k = 0; k < kRows; ++k) row[k] = back[m][(q + R - 1 - k + kRows) % kRows];
+            float* to[R];
+            for (int r = 0; r < R; ++r) to[r] = line[m][R - 1 - r];
+            blur_rows(row, window, w, to);
         }
-        if (q < job.begin) continue;
-        for (int m = 0; m < 3; ++m) {
-            // Window q - k reaches row q with weight k; above the first window there is none.
-            const float* row[K];
-            float weights[K];
-            for (int k = 0; k < K; ++k) {
-                const bool there = q - k >= start;
-                row[k] = back[m][there ? (q - k) % K : q % K];
-                weights[k] = there ? window[k] : 0.f;
-            }
-            blur_rows(row, weights, w, line[m]);
-        }
-        const float *x = job.image + size_t(q) * w, *y = job.reference + size_t(q) * w;
-        float* out = job.grad + size_t(q) * w;
+        for (int r = 0; r < R; ++r) {
+            if (q + r < job.begin || q + r >= job.end) continue;
+            const float *x = job.image + size_t(q + r) * w, *y = job.reference + size_t(q + r) * w;
+            float* out = job.grad + size_t(q + r) * w;
+            const float *mean = line[0][r], *square = line[1][r], *product = line[2][r];
 #pragma GCC ivdep
-        for (int i = 0; i < w; ++i) out[i] = line[0][i] + 2.f * x[i] * line[1][i] + y[i] * line[2][i];
+            for (int i = 0; i < w; ++i) out[i] = mean[i] + 2.f * x[i] * square[i] + y[i] * product[i];
+        }
     }
     return total;
 }

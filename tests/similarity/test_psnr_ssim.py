@@ -7,6 +7,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from evsplat import _native
 from evsplat.similarity.psnr_ssim import (
     GAUSSIAN_SSIM,
     SCIKIT_DEFAULT_SSIM,
@@ -133,8 +134,16 @@ def test_what_is_not_defined_is_refused(call):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("shape", [(11, 11, 3), (12, 40, 3), (37, 19, 1), (64, 80, 3)])
-def test_compiled_ssim_and_its_gradient_equal_plain_torch_in_float64(seed, shape):
+@pytest.mark.parametrize(
+    "shape", [(11, 11, 3), (12, 40, 3), (37, 19, 1), (64, 80, 3), (141, 33, 2)]
+)
+@pytest.mark.parametrize("level", ["avx512", "avx2", "portable"])
+def test_compiled_ssim_and_its_gradient_equal_plain_torch_in_float64(
+    seed, shape, level, monkeypatch
+):
+    if level not in _native.levels():
+        pytest.skip(f"this CPU has no {level}")
+    monkeypatch.setenv("EVSPLAT_ISA", level)
     generator = torch.Generator().manual_seed(seed)
     image = torch.rand(shape, generator=generator)
     reference = (image + 0.1 * torch.randn(shape, generator=generator)).clamp(0, 1)
