@@ -65,7 +65,7 @@ def person_psnr(run_path: Path) -> dict[str, float]:
 
 
 def main() -> None:
-    """Train what is not there yet, and print."""
+    """Train what is left, and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("capture", type=Path)
     parser.add_argument("--noise-rad", type=float, default=0.03, help="per axis")
@@ -83,9 +83,12 @@ def main() -> None:
     for name in options.only:
         is_noisy, settings = ROWS[name]
         run = options.out / name
-        if not run.exists():
+        capture = noisy if is_noisy else options.capture
+        if run.exists():
+            ev.train(capture, out=run, resume=True, threads=options.threads)
+        else:
             ev.train(
-                noisy if is_noisy else options.capture,
+                capture,
                 method="evsplat",
                 out=run,
                 iterations=options.iterations,

@@ -4,7 +4,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import axis_angle_to_matrix, default_body
-from evsplat.body.pose_noise import NOISE_PRESETS, PoseNoise, joint_angles, noisy_poses
+from evsplat.body.pose_noise import (
+    NOISE_PRESETS,
+    PoseNoise,
+    joint_angles,
+    noisy_poses,
+    poses_off_by,
+)
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import ConfigError
 
@@ -25,6 +31,11 @@ def joints(body, poses, transl):
     return body.joint_transforms(rotations, torch.from_numpy(transl))[..., :3, 3].numpy()
 
 
+def wrists_and_ankles(body):
+    limbs = find_skeleton(body.parents.tolist(), body.joint_names).limbs
+    return [limbs[f"{side}_{part}"] for side in ("left", "right") for part in ("hand", "foot")]
+
+
 @pytest.mark.parametrize(
     ("preset", "axes", "millimetres"),
     [
@@ -37,10 +48,7 @@ def joints(body, poses, transl):
 def test_wrists_and_ankles_are_off_by_what_the_preset_says(body, preset, axes, millimetres):
     poses, still = bent_poses(body, 200), np.zeros((200, 3))
     times = np.arange(200) * 40_000
-    skeleton = find_skeleton(body.parents.tolist(), body.joint_names)
-    ends = [
-        skeleton.limbs[f"{side}_{part}"] for side in ("left", "right") for part in ("hand", "foot")
-    ]
+    ends = wrists_and_ankles(body)
     found = []
     for seed in range(3):
         moved = noisy_poses(body, poses, still, times, preset, seed=seed, view=(0, 1, 0))
@@ -103,3 +111,20 @@ def test_an_unknown_preset_is_named(body):
         ConfigError, match=f"No pose noise 'x'; there are {', '.join(NOISE_PRESETS)}"
     ):
         noisy_poses(body, np.zeros((1, 31, 3)), np.zeros((1, 3)), np.zeros(1), "x", seed=0)
+
+
+@pytest.mark.parametrize("millimetres", [5, 17, 34])
+def test_errors_can_be_scaled_to_a_distance(body, millimetres):
+    poses, still = bent_poses(body, 38), np.zeros((38, 3))
+    times = np.arange(38) * 40_000
+    ends = wrists_and_ankles(body)
+    seen = []
+    for seed in (1, 2):
+        *moved, error = poses_off_by(body, poses, still, times, millimetres / 1000, seed=seed)
+        off = np.linalg.norm(joints(body, *moved) - joints(body, poses, still), axis=-1)[:, ends]
+        assert 1000 * off.mean() == pytest.approx(millimetres, rel=0.02)
+        assert error == pytest.approx(off.mean(), rel=1e-6)
+        seen.append(moved[0])
+    assert not np.allclose(seen[0], seen[1])
+    untouched = poses_off_by(body, poses, still, times, 0.0, seed=1)
+    assert untouched[0] is poses and untouched[2] == 0

@@ -24,11 +24,8 @@ from evsplat.staging.cloth import Cloth
 from evsplat.staging.motion import (
     cut_motion,
     dressed_vertices,
-    height_m,
-    key_poses,
     place_motion,
 )
-from evsplat.staging.pose_noise import LEVELS, add_pose_noise
 from evsplat.staging.renderer import StageRenderer
 from evsplat.staging.room import load_room
 from evsplat.staging.timing import frame_times
@@ -190,23 +187,6 @@ def test_sub_frames_divide_the_exposure_and_the_gap_evenly():
             centre = before.exposure.mean() - (before.start_us + before.end_us) / 2
             assert abs(centre) <= 0.5
             assert before.start_us <= before.exposure[0] and before.exposure[-1] < before.end_us
-
-
-@pytest.mark.parametrize("level", [name for name in LEVELS if name != "none"])
-def test_pose_noise_is_as_large_as_it_says(level):
-    character = load_character(find_character("man"))
-    track = place_motion(load_motion(find_motion("kick")), character)
-    times = np.arange(0, 1_500_000, 40_000)
-    poses, transl = key_poses(track, times)
-    seen = []
-    for seed in (1, 2):
-        noisy = add_pose_noise(track.body, times, poses, transl, LEVELS[level], seed)
-        goal = LEVELS[level] * height_m(track.body)
-        assert noisy[2] == pytest.approx(goal, rel=0.02)
-        seen.append(noisy[0])
-    assert not np.allclose(seen[0], seen[1])
-    untouched = add_pose_noise(track.body, times, poses, transl, 0.0, 1)
-    assert untouched[0] is poses and untouched[2] == 0
 
 
 def test_cloth_moves_garments_only_by_its_amplitude_and_tilts_the_normals():

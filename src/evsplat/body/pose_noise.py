@@ -1,17 +1,20 @@
 """Errors of a pose estimator, made up: for synthetic captures and for tests of robustness."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from evsplat.body.body import Body
 from evsplat.body.continuity import nearest_axis_angle
+from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import ConfigError
 
 _WAVES = 64
+_ROUNDS = 6
 _TRUNK = 0.5
 """Share of a limb joint's angle that spine and neck get, each as a whole."""
 
@@ -90,6 +93,38 @@ def noisy_poses(
     return nearest_axis_angle(turned.reshape(np.shape(poses))), transl + shift
 
 
+def poses_off_by(
+    body: Body,
+    poses: Float[np.ndarray, "T J 3"],
+    transl: Float[np.ndarray, "T 3"],
+    times_us: Int[np.ndarray, "T"],
+    mean_m: float,
+    *,
+    seed: int,
+    view: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> tuple[Float[np.ndarray, "T J 3"], Float[np.ndarray, "T 3"], float]:
+    """Noisy poses whose wrists and ankles are off by ``mean_m`` in the mean, and what that became.
+
+    As `noisy_poses`, with the presets' proportions.
+    """
+    if mean_m == 0:
+        return poses, transl, 0.0
+    one, size = NOISE_PRESETS["one_percent"], 1.0
+    truth = _extremities(body, poses, transl)
+    for _ in range(_ROUNDS):
+        noise = replace(
+            one,
+            joint_rad=size * one.joint_rad,
+            root_rad=size * one.root_rad,
+            root_m=size * one.root_m,
+            depth_m=size * one.depth_m,
+        )
+        found = noisy_poses(body, poses, transl, times_us, noise, seed=seed, view=view)
+        error = float(np.linalg.norm(_extremities(body, *found) - truth, axis=-1).mean())
+        size *= mean_m / error
+    return *found, error
+
+
 def joint_angles(body: Body, noise: PoseNoise) -> Float[np.ndarray, "J"]:
     """Standard deviation of each joint's rotation, radians per axis."""
     skeleton = find_skeleton(body.parents.tolist(), body.joint_names, "body")
@@ -117,3 +152,12 @@ def _wander(
     for one_speed, one_phase in zip(speed, phase, strict=True):
         waves += np.cos(seconds[:, None] * one_speed + one_phase)
     return np.sqrt(2 / _WAVES) * waves
+
+
+def _extremities(body: Body, poses: np.ndarray, transl: np.ndarray) -> np.ndarray:
+    """Wrists and ankles in the world, (T, 4, 3)."""
+    limbs = find_skeleton(body.parents.tolist(), body.joint_names, "body").limbs
+    joints = [limbs[f"{side}_{part}"] for side in ("left", "right") for part in ("hand", "foot")]
+    rotations = axis_angle_to_matrix(torch.from_numpy(poses))
+    frames = body.joint_transforms(rotations, torch.from_numpy(transl))
+    return frames[:, joints, :3, 3].numpy()

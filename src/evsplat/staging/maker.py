@@ -13,6 +13,7 @@ from tqdm import tqdm
 import evsplat
 from evsplat.body import BodyTrack
 from evsplat.body.motion import load_motion
+from evsplat.body.pose_noise import poses_off_by
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.capture import Camera, CaptureWriter
 from evsplat.capture.parse import default_split
@@ -24,11 +25,16 @@ from evsplat.staging.assets import find_character, find_motion
 from evsplat.staging.camera_path import MAIN, NOVEL, CameraPath, make_camera
 from evsplat.staging.character import Character, load_character
 from evsplat.staging.cloth import Cloth
-from evsplat.staging.motion import cut_motion, key_poses, place_motion, warn_of_leaving
-from evsplat.staging.pose_noise import LEVELS, add_pose_noise
+from evsplat.staging.motion import (
+    cut_motion,
+    height_m,
+    key_poses,
+    place_motion,
+    warn_of_leaving,
+)
 from evsplat.staging.renderer import StageRenderer
 from evsplat.staging.room import load_room
-from evsplat.staging.settings import MOST_FRAMES, StageSettings
+from evsplat.staging.settings import MOST_FRAMES, POSE_ERRORS, StageSettings
 from evsplat.staging.timing import FrameTimes, frame_times
 
 _CHUNK_BYTES = 64 << 20
@@ -153,10 +159,14 @@ class _Film:
     def write_body(self, writer: CaptureWriter) -> None:
         """The bare body, its key poses (with noise where asked for) and the truth in between."""
         body, settings = self.track.body, self.settings
-        level = LEVELS[settings.pose_noise]
-        poses, transl = key_poses(self.track, self.mids_us)
-        poses, transl, error_m = add_pose_noise(
-            body, self.mids_us, poses, transl, level, settings.seed
+        x, y, z = self.camera.world_to_camera[2, :3].tolist()
+        poses, transl, error_m = poses_off_by(
+            body,
+            *key_poses(self.track, self.mids_us),
+            self.mids_us,
+            POSE_ERRORS[settings.pose_noise] * height_m(body),
+            seed=settings.seed,
+            view=(x, y, z),
         )
         writer.provenance["pose_error_wrists_ankles_m"] = error_m
         dense = np.concatenate([np.concatenate((t.exposure, t.after)) for t in self.times])
