@@ -34,6 +34,20 @@ def test_missing_capture_is_one_message_and_code_2(capsys, tmp_path, verb):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("arguments", [["--help"], ["inspect", "--help"]])
+def test_a_reader_that_goes_away_is_no_traceback(arguments):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "evsplat", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    assert process.wait() == 141
+
+
 @pytest.mark.parametrize("verb", ["evaluate", "report", "render"])
 def test_folder_that_is_no_run_is_one_message_and_code_2(capsys, tmp_path, verb):
     code, _, stderr = _outcome(capsys, verb, str(tmp_path))

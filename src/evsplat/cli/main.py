@@ -2,6 +2,7 @@
 
 import functools
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -41,13 +42,14 @@ _DESCRIPTION = (
 )
 _CODE_BAD_INPUT = 2
 _CODE_INTERRUPTED = 130
+_CODE_NOBODY_READS = 141
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
     0: done; 2: the input, the machine or an option is at fault (one message on stderr);
-    130: stopped by Ctrl-C.
+    130: stopped by Ctrl-C; 141: the reader of a pipe went away.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments == ["--version"]:
@@ -61,19 +63,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments[:1] == ["import"]:
         verbs = {**_VERBS, "import": import_with_kinds()}
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            verbs,
-            prog="evsplat",
-            description=_DESCRIPTION,
-            args=arguments or ["--help"],
-            config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
-        )
+        try:
+            tyro.extras.subcommand_cli_from_dict(
+                verbs,
+                prog="evsplat",
+                description=_DESCRIPTION,
+                args=arguments or ["--help"],
+                config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
+            )
+        finally:
+            # A reader that went away is noticed here, not at the interpreter's end.
+            sys.stdout.flush()
     except EvsplatError as error:
         print(f"evsplat: {error}", file=sys.stderr)
         return _CODE_BAD_INPUT
     except KeyboardInterrupt as stop:
         print(f"\nevsplat: {str(stop) or 'Stopped.'}", file=sys.stderr)
         return _CODE_INTERRUPTED
+    except BrokenPipeError:
+        # Whoever reads, such as head, has enough. What is still buffered goes nowhere, quietly.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _CODE_NOBODY_READS
     return 0
 
 
