@@ -7,11 +7,12 @@ import pytest
 import torch
 from PIL import Image, ImageSequence
 
+from evsplat.body import BodyTrack, load_body_track, up_axis
 from evsplat.capture import load_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import open_recording
 from evsplat.export import render_run, rendering, write_animation
-from evsplat.film import Film
+from evsplat.film import Film, scene
 from evsplat.methods.reconstruction import Rendering
 
 LAST_US = 9 * 40_000
@@ -38,6 +39,17 @@ class _Lamp:
         if parts == "human":
             rgb = rgb * alpha[..., None]
         return Rendering(rgb, alpha, alpha)
+
+
+class _Dancer(_Lamp):
+    """The same with a person who can be made to move otherwise."""
+
+    def __init__(self, track: BodyTrack) -> None:
+        super().__init__()
+        self.track = track
+
+    def following(self, track):
+        return _Dancer(track)
 
 
 @pytest.fixture
@@ -201,3 +213,22 @@ def test_file_names_say_what_is_in_them():
     assert Film(motion="poses/walk.npz", transparent=True).file_name() == (
         "sequence-walk-transparent.webp"
     )
+
+
+@pytest.mark.parametrize("path", ["orbit", "swing"])
+def test_the_camera_turns_about_the_vertical_of_the_recording_whatever_the_motion(
+    tiny_capture, monkeypatch, path
+):
+    capture = load_capture(tiny_capture())
+    recorded = load_body_track(capture)
+    poses = np.zeros((2, len(recorded.body.parents), 3))
+    across = (int(up_axis(recorded).abs().argmax()) + 1) % 3
+    poses[:, 0, across] = np.pi / 2  # a somersault: head and feet are level
+    lying = BodyTrack(recorded.body, np.array([0, 400_000]), poses, np.zeros((2, 3)))
+    up = up_axis(recorded)
+    assert float(up @ up_axis(lying)) == 0
+    monkeypatch.setattr(scene, "load_motion_of", lambda *_, **__: lying)
+    film = Film(path=path, motion="somersault")
+    shots = scene.Scene.of(film, capture, _Dancer(recorded)).shots
+    heights = torch.stack([shot.camera.center() for shot in shots]).double() @ up.double()
+    assert len(shots) > 5 and float(heights.max() - heights.min()) < 1e-4

@@ -89,6 +89,7 @@ class Scene:
             ConfigError: what the capture or the method cannot give.
         """
         poses: tuple[object, ...] = ()
+        recorded = reconstruction.track if isinstance(reconstruction, Posable) else None
         if film.motion is not None:
             if not isinstance(reconstruction, Posable):
                 raise ConfigError(
@@ -113,14 +114,15 @@ class Scene:
         recording = recorded_by(capture, film.camera)[0].camera
         view = film.camera or recording
 
-        def body() -> BodyTrack:
-            return (person or load_body_track(capture)).to("cpu")
-
         def middle() -> torch.Tensor:
-            return _middle(body(), times)
+            return _middle((person or load_body_track(capture)).to("cpu"), times)
+
+        def up() -> torch.Tensor:
+            # Where people stood in the recording: a motion may be a somersault.
+            return up_axis((recorded or load_body_track(capture)).to("cpu"))
 
         start = camera_at(capture, view, times[0])
-        way = _camera_path(film, capture, start, body, middle)
+        way = _camera_path(film, capture, start, up, middle)
         if way is not None:
             last = max(1, len(times) - 1)
             cameras = [way(index / last) for index in range(len(times))]
@@ -187,14 +189,14 @@ def _camera_path(
     film: Film,
     capture: Capture,
     start: Camera,
-    body: Callable[[], BodyTrack],
+    up: Callable[[], torch.Tensor],
     middle: Callable[[], torch.Tensor],
 ) -> CameraPath | None:
     if film.path is None:
         return None
     if film.path in ("orbit", "swing"):
         around = orbit if film.path == "orbit" else swing
-        return around(start, middle(), up_axis(body()))
+        return around(start, middle(), up())
     if film.path == "interpolate":
         return interpolated(capture)
     if not Path(film.path).is_file():

@@ -109,7 +109,8 @@ class EventWindows(Stateless):
     ) -> Float[Tensor, ""]:
         """Mean size of differences that built up over so long, weighed by the sensor's noise."""
         sound = send(self._noise[1], differences.device)
-        weights = sound.new_tensor([self._weight(duration) for duration in durations_us])
+        each = torch.tensor([self._weight(duration) for duration in durations_us])
+        weights = send(each.to(sound.dtype), differences.device)
         return (sound * weights[:, None, None] * differences.abs()).mean()
 
     @cached_property
