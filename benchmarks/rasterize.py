@@ -1,8 +1,8 @@
 """Speed of the native rasteriser on the random scene of many small Gaussians.
 
-Prints forward and forward+backward times on 1 and 2 threads, the ratio to the torch reference on
-a smaller scene, the share of one core's multiply-add peak, and memory. The last line is one JSON
-object with the same numbers.
+Prints forward and forward+backward times on 1 and 2 threads, the stages on one thread, the share of
+one core's peak, the ratio to the torch reference on a smaller scene, what five times of
+one camera cost, and memory. The last line is one JSON object with the same numbers.
 """
 
 import evsplat  # noqa: F401 - before torch: it sets how OpenMP's threads wait
@@ -133,6 +133,24 @@ def native_job(scene: Scene) -> _native.Render:
     return job
 
 
+def stages(scene: Scene, repeats: int) -> tuple[dict[str, float], int]:
+    """Best milliseconds of each stage on one thread, and the least page faults of a render."""
+    torch.set_num_threads(1)
+    best: dict[str, float] = {}
+    faults = []
+    s = scene.splats
+    for _ in range(repeats + 2):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        job = native_job(scene)
+        fields = (s.means, s.quats[None], s.scales[None], s.opacities[None], s.channels)
+        grads = [*map(torch.zeros_like, fields), None, None]
+        job.backward(scene.image_grad, scene.alpha_grad, grads, [], torch.zeros(12), None)
+        faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+        for stage, seconds in job.seconds.items():
+            best[stage] = min(best.get(stage, math.inf), 1e3 * seconds)
+    return best, min(faults)
+
+
 def with_gradient(splats: Splats) -> Splats:
     """The same with every field a leaf."""
     return Splats(
@@ -166,7 +184,7 @@ def many_times(size_px: int, channels: int, repeats: int) -> dict[str, float]:
     """Forward+backward of a person over a static scene: one time, five, five without sharing."""
     scene = person_over_scene(size_px, channels, 5)
 
-    def measured(name: str, moving: Splats, fixed: Splats | None) -> float:
+    def measured(name: str, moving: Splats, fixed: Splats | None) -> tuple[float, int]:
         moving = with_gradient(moving)
         fixed = None if fixed is None else with_gradient(fixed)
         grad = scene.image_grad.expand(len(moving.means), -1, -1, -1)
@@ -178,23 +196,26 @@ def many_times(size_px: int, channels: int, repeats: int) -> dict[str, float]:
             torch.autograd.grad(out.image, leaves, grad)
 
         timing = timed(both, repeats)
-        print(f"  {name}: {timing}")
-        return timing.best
+        alpha = render(moving, scene.camera, static=fixed).alpha
+        steps = alpha.grad_fn.job.patch_steps  # type: ignore[union-attr]
+        print(f"  {name}: {timing}, {steps} patch steps")
+        return timing.best, steps
 
     first = replace(scene.moving, means=scene.moving.means[:1])
-    single = measured("person and scene, 1 time", first, scene.static)
-    shared = measured("person and scene, 5 times", scene.moving, scene.static)
+    single, single_steps = measured("person and scene, 1 time", first, scene.static)
+    shared, shared_steps = measured("person and scene, 5 times", scene.moving, scene.static)
     everything = join(scene.moving.with_times(), scene.static.with_times(), 5)
-    apart = measured("the same without sharing", everything, None)
+    apart, _ = measured("the same without sharing", everything, None)
     print(
         f"  five times cost {shared / single:.2f} single renders, {apart / single:.2f} without "
-        "sharing"
+        f"sharing; they are {shared_steps / single_steps:.2f} times as many patch steps"
     )
     return {
         "person_and_scene_1_time_best_ms": round(single, 2),
         "person_and_scene_5_times_best_ms": round(shared, 2),
         "five_times_over_one": round(shared / single, 2),
         "five_times_unshared_over_one": round(apart / single, 2),
+        "five_times_patch_steps_over_one": round(shared_steps / single_steps, 2),
     }
 
 
@@ -241,6 +262,13 @@ def main() -> None:
     result |= {"tile_intersections": job.intersections, "patch_steps": job.patch_steps}
     print(f"  {job.intersections} tile intersections, {job.patch_steps} patch steps")
     result |= arithmetic(job.patch_steps * _native.lanes(), args.channels, *timings[1])
+
+    best, faults = stages(scene, args.repeats)
+    torch.set_num_threads(2)
+    print("  stages on 1 thread: " + ", ".join(f"{k} {v:.2f} ms" for k, v in best.items()))
+    print(f"  page faults of a render: {faults}")
+    result |= {f"{stage}_1thread_best_ms": round(value, 2) for stage, value in best.items()}
+    result |= {"page_faults_of_a_render": faults}
 
     small = make_scene(128, 1000, args.channels)
     native, reference = measure(small, "native", 15)[1], measure(small, "reference", 3)[1]
