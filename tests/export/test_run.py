@@ -51,7 +51,9 @@ def test_a_shadow_darkens_the_colours_of_the_scene(reconstruction, monkeypatch):
     plain = model.splats(camera, times, parts="scene")[0].channels
     factors = torch.tensor([0.25, 0.75])[:, None, None]
     monkeypatch.setattr(
-        model.model.shadow, "forward", lambda body, places: factors.expand(-1, *places.shape[:2])
+        model.model.shadow,
+        "forward",
+        lambda body, places, lamps: factors.expand(-1, *places.shape[:2]),
     )
     person, scene = model.splats(camera, times)
     torch.testing.assert_close(scene.channels[..., :3], plain[..., :3] * factors)

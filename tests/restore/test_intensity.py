@@ -13,6 +13,12 @@ from evsplat.restore.intensity import FromEvents, with_brightness
 LUMA = torch.tensor([0.2126, 0.7152, 0.0722])
 
 
+class Named(FromEvents):
+    """As a restorer has it."""
+
+    name = "net"
+
+
 def _scene(seed: int) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.rand((1, 3, 8, 10), generator=generator)
@@ -89,7 +95,7 @@ class _Counting:
 def test_windows_follow_each_other_from_mid_exposure_to_mid_exposure(tiny_capture) -> None:
     capture = load_capture(tiny_capture(width=64, height=48))
     network = _Counting()
-    restorer = FromEvents(capture, network)
+    restorer = Named(capture, network)
     frames = [frame for frame, _ in restorer.restore(capture)]
     mids = [frame.mid_us for frame in capture.frames]
     assert [frame.mid_us for frame in frames] == mids
@@ -102,9 +108,6 @@ def test_windows_follow_each_other_from_mid_exposure_to_mid_exposure(tiny_captur
 
 
 def test_what_it_cannot_work_with_is_said(tiny_capture) -> None:
-    class Named(FromEvents):
-        name = "net"
-
     path = tiny_capture()
     document = json.loads((path / "capture.json").read_text())
     (path / "capture.json").write_text(json.dumps({**document, "events": None}))
