@@ -9,6 +9,7 @@ import pytest
 
 import evsplat
 from evsplat.cli import main
+from evsplat.cli.main import _gathered
 from evsplat.shipped import demo_capture
 
 VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "masks")
@@ -32,6 +33,18 @@ def test_missing_capture_is_one_message_and_code_2(capsys, tmp_path, verb):
     assert str(tmp_path / "nothing") in stdout + stderr
     assert "Traceback" not in stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("train c --set A=1 --out o --set B=2 C=-3 -h", "train c --set A=1 B=2 C=-3 --out o -h"),
+        ("train --set A=1 B=2 --seed 3", "train --set A=1 B=2 --seed 3"),
+        ("inspect c --out o", "inspect c --out o"),
+    ],
+)
+def test_settings_given_one_by_one_all_count(given, meant):
+    assert _gathered(given.split()) == meant.split()
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["inspect", "--help"]])

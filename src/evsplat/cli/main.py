@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0: done; 2: the input, the machine or an option is at fault (one message on stderr);
     130: stopped by Ctrl-C; 141: the reader of a pipe went away.
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    arguments = _gathered(sys.argv[1:] if arguments is None else arguments)
     if arguments == ["--version"]:
         print(f"evsplat {evsplat.__version__}")
         return 0
@@ -85,6 +85,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _CODE_NOBODY_READS
     return 0
+
+
+def _gathered(arguments: Sequence[str]) -> list[str]:
+    """``--set A=1 --set B=2`` as ``--set A=1 B=2``: the parser would keep the last one alone."""
+    kept: list[str] = []
+    settings: list[str] = []
+    place: int | None = None
+    follows = False
+    for argument in arguments:
+        if argument == "--set":
+            place = len(kept) if place is None else place
+            follows = True
+        elif follows and not argument.startswith("-"):
+            settings.append(argument)
+        else:
+            follows = False
+            kept.append(argument)
+    return kept if place is None else [*kept[:place], "--set", *settings, *kept[place:]]
 
 
 def _in_a_line(verb: Callable[..., Any]) -> Callable[..., Any]:

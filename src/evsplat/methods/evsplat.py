@@ -120,7 +120,7 @@ def compose(
     fit: bool = True,
 ) -> Composition:
     """Put the method together for one capture; see `evsplat.methods.paper.compose`."""
-    poses = prepare_poses(config.pose, capture)
+    poses = prepare_poses(config.pose, capture, tell=fit)
     if poses.spline is not None:
         deform = replace(config.deform, pose_correction_start=config.pose.start)
         config = replace(config, deform=deform)

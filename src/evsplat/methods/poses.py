@@ -52,15 +52,16 @@ class Poses:
     """None where nothing is to be learned of poses."""
 
 
-def prepare_poses(config: PoseConfig, capture: Capture) -> Poses:
-    """Look at a capture's key poses and do what the settings say; the log tells what that is."""
+def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) -> Poses:
+    """Look at a capture's key poses and do what the settings say; the log can tell what it is."""
     track = load_body_track(capture)
     noise = motion_noise(track)
     noisy = noise.rotation_rad >= config.noisy_rad
     smooth, refine = (
         noisy if when == "auto" else when == "always" for when in (config.smooth, config.refine)
     )
-    logger.info(
+    logger.log(
+        logging.INFO if tell else logging.DEBUG,
         "given poses jitter by %.4f rad per axis (noisy from %g): %s, %s",
         noise.rotation_rad,
         config.noisy_rad,
