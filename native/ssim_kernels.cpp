@@ -104,7 +104,8 @@ INLINE double similarity(const SsimBand& job, const float* const (&blurred)[4], 
 
 SsimSums ssim_band(const SsimBand& job) {
     const int h = job.height, w = job.width, rows = h - K + 1, columns = w - K + 1;
-    const int padded = (w + W - 1) / W * W, stride = padded + 2 * W;
+    // The way back reads K - 1 past the last column, and blur() one vector more.
+    const int padded = (w + W - 1) / W * W, stride = (w + K - 1 + W - 1) / W * W + W;
     float window[K];
     for (int k = 0; k < K; ++k) window[k] = job.window[k];
     float* next = job.scratch;
