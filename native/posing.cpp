@@ -19,6 +19,24 @@ void in_pieces(size_t count, int threads, const Work& work) {
     });
 }
 
+// Where a coordinate lies among the bins: beyond [0, 1] on the nearest end, and with what is no number in the
+// first bin as no number.
+struct Bump {
+    int bin, before, after;   // the bins it reaches
+    float below, upto;        // ends of its own bin, from the bump's middle
+    bool moves;               // whether it follows the coordinate
+
+    Bump(float coordinate, int bins) {
+        const float scaled = (coordinate < 0.f ? 0.f : coordinate > 1.f ? 1.f : coordinate) * float(bins);
+        bin = scaled >= 0.f ? std::min(int(scaled), bins - 1) : 0;
+        before = bin ? bin - 1 : bins - 1, after = bin + 1 < bins ? bin + 1 : 0;
+        below = float(bin) - scaled, upto = float(bin + 1) - scaled;
+        moves = coordinate >= 0.f && coordinate <= 1.f;
+    }
+    static float sum(float u) { return 0.5f + u * (0.9375f + u * u * (0.1875f * u * u - 0.625f)); }
+    static float slope(float u) { return 0.9375f * (1.f - u * u) * (1.f - u * u); }
+};
+
 // A quaternion over its length.
 struct Unit {
     float w, x, y, z, inverse_length;
@@ -39,7 +57,35 @@ void view_directions(const ViewDirections& job, int threads) {
 
 void sh_rows(const ShRows& job, int threads) {
     const auto kernel = select_kernels().sh_rows;
-    in_pieces(job.points, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+        kernel(job, begin, end);
+        for (size_t i = begin; i < end; ++i)
+            std::copy_n(job.values + i * job.columns, job.columns, job.beside + i * job.stride);
+    });
+}
+
+void one_blob(const OneBlob& job, int threads, float* encoded) {
+    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+        std::fill(encoded + begin * 3 * job.bins, encoded + end * 3 * job.bins, 0.f);
+        for (size_t i = begin * 3; i < end * 3; ++i) {
+            const Bump bump(job.positions[i], job.bins);
+            const float below = Bump::sum(bump.below), upto = Bump::sum(bump.upto);
+            float* to = encoded + i * job.bins;
+            to[bump.before] = below, to[bump.bin] = upto - below, to[bump.after] = 1.f - upto;
+        }
+    });
+}
+
+void one_blob_backward(const OneBlob& job, const float* above, int threads, float* grad) {
+    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+        for (size_t i = begin * 3; i < end * 3; ++i) {
+            const Bump bump(job.positions[i], job.bins);
+            const float* by = above + i * job.bins;
+            const float slope = Bump::slope(bump.below) * (by[bump.bin] - by[bump.before]) +
+                                Bump::slope(bump.upto) * (by[bump.after] - by[bump.bin]);
+            grad[i] = bump.moves ? slope * float(job.bins) : 0.f;
+        }
+    });
 }
 
 void tree_softmax(const TreeSoftmax& job, int threads) {

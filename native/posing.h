@@ -16,12 +16,13 @@ struct ViewDirections {
     float* directions;        // (points, 3)
 };
 
-// The 15 real spherical harmonics of degrees 1 to 3, row i at to + i * stride.
+// The 15 real spherical harmonics of degrees 1 to 3, row i at to + i * stride, and `columns` other values, row
+// i at beside + i * stride.
 struct ShRows {
     size_t points;
-    const float* directions;  // (points, 3)
-    float* to;
-    size_t stride;
+    const float *directions, *values;  // (points, 3), (points, columns)
+    float *to, *beside;
+    size_t stride, columns;
 };
 
 constexpr int kShValues = 15;
@@ -45,6 +46,17 @@ struct TreeSoftmax {
 constexpr size_t tree_softmax_floats(int joints, int logits) { return size_t(16) * 4 * (joints + logits); }
 
 void tree_softmax(const TreeSoftmax&, int threads);
+
+// A bump per coordinate, integrated over `bins` bins of [0, 1]; see src/evsplat/deform/encodings.py.
+struct OneBlob {
+    size_t points;
+    int bins;
+    const float* positions;   // (points, 3)
+};
+
+void one_blob(const OneBlob&, int threads, float* encoded);  // (points, 3, bins)
+// Gradient of the positions from that of the encoded.
+void one_blob_backward(const OneBlob&, const float* above, int threads, float* grad);
 
 constexpr int kShapeChanges = 9;  // offset, change of log-scale, vector part of a quaternion
 

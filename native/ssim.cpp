@@ -11,7 +11,7 @@ namespace evsplat {
 
 SsimSums ssim_planes(size_t planes, int height, int width, const float* image, const float* reference,
                  const float* window, float c1, float c2, int threads, float* grad) {
-    constexpr int kBand = 64;  // fixes the order of sums
+    constexpr int kBand = 128;  // fixes the order of sums
     const size_t plane = size_t(height) * width, bands = (height + kBand - 1) / kBand;
     std::vector<SsimSums> parts(planes * bands);
     const auto kernel = select_kernels().ssim;

@@ -20,6 +20,15 @@ constexpr int K = kSsimWindow;
 constexpr int R = EVSPLAT_LANES == 16 ? 4 : 2;  // rows taken together, as many as the registers hold
 constexpr int kRows = K + R - 1;  // kept of each map: what R rows of windows reach
 
+// sum over k of w[k] from[k], for a window that is symmetric: a sum and a product run side by side.
+template <class At>
+INLINE F weighted(const float (&w)[K], At at) {
+    F sum = w[K / 2] * at(K / 2);
+#pragma GCC unroll 5
+    for (int k = 0; k < K / 2; ++k) sum += w[k] * (at(k) + at(K - 1 - k));
+    return sum;
+}
+
 // to[i] = sum over k of w[k] from[i + k]; `from` and `to` are at whole vectors, one more of `from` is there.
 INLINE void blur(const float* from, const float (&w)[K], int count, float* to) {
 #if EVSPLAT_LANES == 16
@@ -33,35 +42,24 @@ INLINE void blur(const float* from, const float (&w)[K], int count, float* to) {
     F here = load(from);
     for (int i = 0; i < count; i += W) {
         const F next = load(from + i + W);
-        F sum = w[0] * here;
-#pragma GCC unroll 11
-        for (int k = 1; k < K; ++k) sum += w[k] * (F)_mm512_permutex2var_ps((__m512)here, lanes[k], (__m512)next);
-        store(to + i, sum);
+        store(to + i, weighted(w, [&](int k) {
+                  return k ? (F)_mm512_permutex2var_ps((__m512)here, lanes[k], (__m512)next) : here;
+              }));
         here = next;
     }
 #else
-    for (int i = 0; i < count; i += W) {
-        F sum = w[0] * load(from + i);
-#pragma GCC unroll 11
-        for (int k = 1; k < K; ++k) sum += w[k] * load(from + i + k);
-        store(to + i, sum);
-    }
+    for (int i = 0; i < count; i += W) store(to + i, weighted(w, [&](int k) { return load(from + i + k); }));
 #endif
 }
 
 // to[r][i] = sum over k of w[k] from[r + k][i]
 INLINE void blur_rows(const float* const (&from)[kRows], const float (&w)[K], int count, float* const (&to)[R]) {
     for (int i = 0; i < count; i += W) {
-        F sum[R] = {};
+        F row[kRows];
 #pragma GCC unroll 16
-        for (int k = 0; k < kRows; ++k) {
-            const F row = load(from[k] + i);
+        for (int k = 0; k < kRows; ++k) row[k] = load(from[k] + i);
 #pragma GCC unroll 4
-            for (int r = 0; r < R; ++r)
-                if (k >= r && k - r < K) sum[r] += w[k - r] * row;
-        }
-#pragma GCC unroll 4
-        for (int r = 0; r < R; ++r) store(to[r] + i, sum[r]);
+        for (int r = 0; r < R; ++r) store(to[r] + i, weighted(w, [&](int k) { return row[r + k]; }));
     }
 }
 

@@ -114,14 +114,36 @@ void py_view_directions(In positions, std::optional<In> transforms, const std::a
     view_directions(job, threads);
 }
 
-// Into columns [first, first + 15) of `to`.
-void py_sh_rows(In directions, Out to, size_t first, int threads) {
+// The columns of `to` are those of `values` and the harmonics, in either order.
+void py_sh_rows(In directions, In values, Out to, bool values_first, int threads) {
     const size_t points = directions.size() / 3;
     require(to.ndim() >= 1 && directions.size() == points * 3, "the directions");
     const size_t stride = to.shape(to.ndim() - 1);
-    require(first + kShValues <= stride && to.size() == points * stride, "the values");
+    require(stride >= kShValues && to.size() == points * stride, "the rows");
+    const size_t columns = stride - kShValues;
+    require(values.size() == points * columns, "the values");
+    float *basis = to.data() + (values_first ? columns : 0), *beside = to.data() + (values_first ? 0 : kShValues);
     nb::gil_scoped_release release;
-    sh_rows({points, directions.data(), to.data() + first, stride}, threads);
+    sh_rows({points, directions.data(), values.data(), basis, beside, stride, columns}, threads);
+}
+
+OneBlob one_blob_job(const In& positions, size_t encoded, int bins) {
+    const size_t points = positions.size() / 3;
+    require(bins >= 3 && positions.size() == points * 3 && encoded == positions.size() * bins, "the positions");
+    return {points, bins, positions.data()};
+}
+
+void py_one_blob(In positions, int bins, Out encoded, int threads) {
+    const OneBlob job = one_blob_job(positions, encoded.size(), bins);
+    nb::gil_scoped_release release;
+    one_blob(job, threads, encoded.data());
+}
+
+void py_one_blob_backward(In positions, int bins, In above, Out grad, int threads) {
+    const OneBlob job = one_blob_job(positions, above.size(), bins);
+    require(grad.size() == positions.size(), "the gradient");
+    nb::gil_scoped_release release;
+    one_blob_backward(job, above.data(), threads, grad.data());
 }
 
 using Joints = std::vector<int32_t>;
@@ -207,8 +229,12 @@ void bind_step(nb::module_& m) {
     m.def("view_directions", &py_view_directions, nb::arg("positions"), nb::arg("transforms").none(),
           nb::arg("center"), nb::arg("turn"), nb::arg("directions"), nb::arg("threads"),
           "Unit vectors from a centre, turned back by transforms and then by one matrix.");
-    m.def("sh_rows", &py_sh_rows, nb::arg("directions"), nb::arg("to"), nb::arg("first"), nb::arg("threads"),
-          "Spherical harmonics of degrees 1 to 3 into columns of a matrix.");
+    m.def("sh_rows", &py_sh_rows, nb::arg("directions"), nb::arg("values"), nb::arg("to"), nb::arg("values_first"),
+          nb::arg("threads"), "Rows of spherical harmonics of degrees 1 to 3 beside other values.");
+    m.def("one_blob", &py_one_blob, nb::arg("positions"), nb::arg("bins"), nb::arg("encoded"), nb::arg("threads"),
+          "A bump per coordinate, integrated over equal bins of [0, 1].");
+    m.def("one_blob_backward", &py_one_blob_backward, nb::arg("positions"), nb::arg("bins"), nb::arg("above"),
+          nb::arg("grad"), nb::arg("threads"));
     m.def("tree_softmax", &py_tree_softmax, nb::arg("logits"), nb::arg("tree"), nb::arg("above").none(),
           nb::arg("result"), nb::arg("threads"), "Weights over the joints of a tree, or the gradient of its logits.");
     m.def("change_shape", &py_change_shape, nb::arg("changes"), nb::arg("means"), nb::arg("scales_log"),

@@ -63,6 +63,29 @@ def test_one_blob_gradient():
     assert torch.autograd.gradcheck(OneBlobEncoding(), (positions,))
 
 
+@pytest.mark.parametrize("bins", [3, 16])
+def test_compiled_one_blob_equals_float64(bins):
+    drawn = torch.rand(2, 2_100, 3, generator=torch.Generator().manual_seed(bins)) * 1.4 - 0.2
+    edges = torch.tensor([0.0, 1.0, 0.5, 1 / bins, -0.0, 1.5])
+    positions = torch.cat((drawn.flatten(), edges)).reshape(-1, 3)
+    upstream = torch.randn(len(positions), 3 * bins)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = positions.to(dtype).requires_grad_()
+        encoded = OneBlobEncoding(bins)(leaf)
+        found.append((encoded, *torch.autograd.grad(encoded, leaf, upstream.to(dtype))))
+    (encoded, gradient), (expected, slope) = found
+    assert encoded.dtype == torch.float32
+    assert (encoded - expected).abs().max() < 1e-6
+    # A coordinate has 24 bits before it is scaled by the bins, and the slope is scaled once more.
+    assert (gradient - slope).abs().max() < 1e-5 * bins
+
+
+def test_compiled_one_blob_says_no_number_where_there_is_none():
+    encoded = OneBlobEncoding(4)(torch.tensor([[float("nan"), 0.3, 0.9]])).view(3, 4)
+    assert encoded[0].isnan().any() and not encoded[1:].isnan().any()
+
+
 def hash_grid_loop(grid, position):
     """Instant-NGP, corner by corner."""
     values = []

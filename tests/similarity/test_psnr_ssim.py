@@ -180,3 +180,11 @@ def test_compiled_difference_and_similarity_share_one_gradient(seed):
         results.append((l1, similarity, gradient))
     for compiled, plain in zip(*results, strict=True):
         assert (compiled - plain).norm() < 2e-6 * plain.norm()
+
+
+def test_a_second_gradient_of_the_same_ssim_is_refused():
+    image = torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(3)).requires_grad_()
+    value = sum(l1_and_ssim(image, torch.zeros(20, 30, 3)))
+    torch.autograd.grad(value, image, retain_graph=True)
+    with pytest.raises(RuntimeError, match="asked for twice"):
+        torch.autograd.grad(value, image)

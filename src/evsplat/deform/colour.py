@@ -112,9 +112,8 @@ class _NativeBesideBasis(torch.autograd.Function):
         first = 0 if values_first else _DIRECTION_DIM
         ctx.columns = slice(first, first + count)
         joined = values.new_empty(*values.shape[:-1], count + _DIRECTION_DIM)
-        joined[..., ctx.columns] = values
-        at = count if values_first else 0
-        native.sh_rows(directions.contiguous(), joined, at, torch.get_num_threads())
+        given = directions.contiguous(), values.detach().contiguous()
+        native.sh_rows(*given, joined, values_first, torch.get_num_threads())
         return joined
 
     @staticmethod

@@ -51,6 +51,9 @@ class OneBlobEncoding(nn.Module):
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch D"]:
         """Encode positions in [0, 1]."""
+        if runs_native(positions):
+            encoded: Tensor = _NativeOneBlob.apply(positions, self.bins)
+            return encoded
         scaled = positions.clamp(0, 1) * self.bins
         cell = scaled.detach().floor().clamp_max(self.bins - 1)
         # The bump's centre lies in `cell`, its ends in the two neighbours: three bins are not zero.
@@ -60,6 +63,28 @@ class OneBlobEncoding(nn.Module):
         index = cell.long()[..., None] + torch.arange(-1, 2, device=cell.device)
         empty = shares.new_zeros(*positions.shape, self.bins)
         return empty.scatter(-1, index % self.bins, shares).flatten(-2)
+
+
+class _NativeOneBlob(torch.autograd.Function):
+    """`OneBlobEncoding` in the compiled module."""
+
+    @staticmethod
+    def forward(ctx: Any, positions: Tensor, bins: int) -> Float[Tensor, "*batch D"]:
+        given = positions.detach().contiguous()
+        encoded = torch.empty(*positions.shape[:-1], positions.shape[-1] * bins)
+        native.one_blob(given, bins, encoded, torch.get_num_threads())
+        ctx.bins = bins
+        ctx.save_for_backward(given)
+        return encoded
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (positions,) = ctx.saved_tensors
+        gradient = torch.empty_like(positions)
+        above = upstream[0].contiguous()
+        native.one_blob_backward(positions, ctx.bins, above, gradient, torch.get_num_threads())
+        return gradient, None
 
 
 class HashGridEncoding(nn.Module):

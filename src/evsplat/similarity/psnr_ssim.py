@@ -178,15 +178,19 @@ class _NativeL1Ssim(torch.autograd.Function):
         size = GAUSSIAN_SSIM.size
         ctx.positions = planes * (height - size + 1) * (width - size + 1)
         if gradient is not None:
-            ctx.save_for_backward(x, y, gradient)
+            ctx.save_for_backward(x, y)
+            ctx.similarity_gradient = gradient
         l1, mean = difference / x.numel(), similarity / ctx.positions
         return image.new_tensor(l1), image.new_tensor(mean)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
-        x, y, similarity_gradient = ctx.saved_tensors
-        gradient = similarity_gradient.clone()
+        x, y = ctx.saved_tensors
+        # In place, as a picture's gradient is asked for once; a copy would be another picture.
+        gradient, ctx.similarity_gradient = ctx.similarity_gradient, None
+        if gradient is None:
+            raise RuntimeError("the gradient of l1_and_ssim was asked for twice; compute it anew")
         by_difference, scale = float(upstream[0]) / x.numel(), float(upstream[1]) / ctx.positions
         native.add_sign(x, y, by_difference, scale, gradient, torch.get_num_threads())
         return gradient.movedim(0, -1), None
