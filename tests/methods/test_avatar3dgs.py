@@ -232,14 +232,18 @@ def test_the_perceptual_term_has_the_name_of_what_ran(tiny_capture, monkeypatch,
     assert "st_lpips" not in without.step().terms
 
 
-def test_a_run_is_trained_read_back_measured_and_drawn(tiny_capture, tmp_path):
+def test_a_run_is_trained_read_back_measured_and_drawn(tiny_capture, tmp_path, monkeypatch):
     out = train(
         tiny_capture(), method="avatar3dgs", out=tmp_path / "run", iterations=10, overrides=SMALL
     )
     metrics = evaluate_run(out, device="cpu")
     assert metrics["method"] == "avatar3dgs" and metrics["gaussians"]["scene"] == 0
+    # Weights that only training needs are not read, and need not be there.
+    settings = out / "config.yaml"
+    settings.write_text(settings.read_text().replace("perceptual: none", "perceptual: lpips_vgg"))
+    monkeypatch.setattr(perceptual, "load_lpips", None)
     run = load_run(out)
-    assert run.human_only
+    assert run.human_only and run.config.loss.perceptual == "lpips_vgg"
     frame = run.capture.test_frames[0]
     camera = run.capture.camera(frame)
     both = run.reconstruction.render(camera, [frame.mid_us])

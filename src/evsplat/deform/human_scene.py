@@ -254,9 +254,12 @@ class HumanSceneModel(nn.Module):
         return turn, weights @ self.translation_residuals
 
     def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
-        """Weights of the bones for Gaussians with these canonical centres (metres)."""
+        """Weights of the bones for the person's Gaussians, their canonical centres (metres) here.
+
+        Weights of the surface are those that `at` draws with, whatever the centres.
+        """
         if self.skinning is None:
-            return self.surface.weights_at(centers)
+            return self.surface.weights(self.gaussians.means[self.gaussians.human])
         return self.skinning(self.normalise(centers))
 
     def surface_light(self) -> SurfaceLight | None:

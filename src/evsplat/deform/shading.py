@@ -104,18 +104,12 @@ class NearestSurface:
             self._found = surface.normals[index], surface.weights[index], index
         return self._found[:2]
 
-    def weights_at(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
-        """Skinning weights at any canonical points, looked up now."""
-        return self._on(points.device).weights[self._nearest(points)]
-
     def _of(self, means: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
         if len(self.index) != len(means):
-            self.index = self._nearest(means)
+            points = self._on(means.device).points
+            self.index = nearest(points, 1, means.detach())[1][:, 0]
         self.index = self.index.to(means.device)  # after a resume it is on the CPU
         return self.index
-
-    def _nearest(self, points: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
-        return nearest(self._on(points.device).points, 1, points.detach())[1][:, 0]
 
     def _on(self, device: torch.device) -> SurfaceSamples:
         if self.surface.points.device != device:

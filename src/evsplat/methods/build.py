@@ -134,18 +134,15 @@ class Build:
         method does not see all of it; ``held_out`` is what frames beside the training frames teach.
         """
         track = self.model.track
-        isometry = [loss.isometry_centers, loss.isometry_covariances] != [0.0, 0.0]
+        objectives = list(observed)
+        if self.model.skinning is not None:
+            objectives.append(self.prior)
+        if loss.isometry_centers != 0.0 or loss.isometry_covariances != 0.0:
+            isometry = Isometry(refresh=config.isometry_refresh, samples=config.isometry_samples)
+            objectives.append(isometry)
         return Composition(
             model=self.model,
-            objectives=[
-                *observed,
-                *([] if self.model.skinning is None else [self.prior]),
-                *(
-                    [Isometry(refresh=config.isometry_refresh, samples=config.isometry_samples)]
-                    if isometry
-                    else []
-                ),
-            ],
+            objectives=objectives,
             weights={
                 "l1": loss.l1,
                 "dssim": loss.dssim,

@@ -245,7 +245,9 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     tensors, progress = load_checkpoint(path)
     capture = load_capture(Path(facts["capture"]))
     compose = TRAINABLE[method][1]
-    composition = compose(config, capture, facts["seed"], device=device, fit=False)
+    composition = compose(
+        _without_perceptual(method, config), capture, facts["seed"], device=device, fit=False
+    )
     load_model(composition.model, tensors, progress["human_count"])
     return Run(
         path=folder.path,
@@ -257,6 +259,13 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         human_only=isinstance(composition.capture, MaskedCapture),
         **_progress(composition.model, progress),
     )
+
+
+def _without_perceptual(method: str, config: MethodConfig) -> MethodConfig:
+    """The settings without a term that only training needs and whose weights need not be here."""
+    values = to_dict(config)
+    values["loss"]["perceptual"] = "none"
+    return method_config(method, values, where="config.yaml")
 
 
 def reload_run(run: Run, state: Path) -> Run:
