@@ -1,8 +1,9 @@
-"""Time of the native kernels beside plain torch, and of the neighbour search beside SciPy's.
+"""Time of a step's native kernels beside plain torch, of the neighbour search beside SciPy's.
 
 python benchmarks/kernels.py [--points N] [--size PX] [--threads T] [--repeats R]
 
-All but the search are forward and backward. The last line is JSON with a unit in each key.
+All but the search are forward and backward. `benchmarks/deform.py` times the networks' layers,
+`benchmarks/rasterize.py` the rasteriser. The last line is JSON with a unit in each key.
 """
 
 import evsplat  # noqa: F401 - before torch: it sets how OpenMP's threads wait
@@ -18,12 +19,13 @@ from unittest import mock
 import torch
 from scipy.spatial import cKDTree
 
-from evsplat.body import body
-from evsplat.deform import encodings
-from evsplat.imaging import events
+from evsplat import body
+from evsplat.body import body as skin_module
+from evsplat.deform import colour, encodings, non_rigid, skinning_network
+from evsplat.imaging import events, srgb
 from evsplat.neighbours import nearest
-from evsplat.objectives import isometry
-from evsplat.similarity.psnr_ssim import GAUSSIAN_SSIM, ssim, ssim_map
+from evsplat.objectives import event, isometry, semantic
+from evsplat.similarity import psnr_ssim
 
 Call = Callable[[], object]
 
@@ -46,7 +48,7 @@ def main() -> None:
     print(f"{arguments.threads} thread(s)")
     for name, (native, plain) in cases(arguments.points, arguments.size).items():
         ours, theirs = best_ms(native, arguments.repeats), best_ms(plain, 3)
-        print(f"  {name:14s} native {ours:7.2f} ms   peer {theirs:8.2f} ms   {theirs / ours:.1f}x")
+        print(f"  {name:16s} native {ours:7.2f} ms   peer {theirs:8.2f} ms   {theirs / ours:.1f}x")
         results |= {
             f"{name}_native_best_ms": round(ours, 2),
             f"{name}_peer_best_ms": round(theirs, 2),
@@ -57,47 +59,113 @@ def main() -> None:
 
 def cases(points: int, size: int) -> dict[str, tuple[Call, Call]]:
     """Name -> (native, its peer), each one pass, backward too where there is a gradient."""
+    return picture_cases(size) | network_cases(points) | body_cases(points)
+
+
+def picture_cases(size: int) -> dict[str, tuple[Call, Call]]:
+    """What compares pictures and maps of a square picture."""
     image = torch.rand(3, size, size).permute(1, 2, 0).requires_grad_()
     truth = torch.rand(3, size, size).permute(1, 2, 0)
-    grid = encodings.HashGridEncoding()
+    change = torch.randn(size, size).requires_grad_()
+    counts = torch.randn(size, size).round()
+    share = torch.rand(size, size).requires_grad_()
+    disc = (torch.arange(size) - size / 2).square()
+    silhouette = (disc + disc[:, None] < (size / 5) ** 2).numpy()
+    packed = semantic.PackedBounds.of(silhouette, band_px=size // 32)
+    masks = packed.masks()
+
+    def similarity() -> None:
+        _backward(sum(psnr_ssim.l1_and_ssim(image, truth)), image)
+
+    def brightness() -> None:
+        _backward(events.log_brightness(image).sum(), image)
+
+    def power() -> None:
+        _backward(srgb.decode(image).sum(), image)
+
+    def event_maps() -> None:
+        _backward(event.event_loss(change, counts), change)
+
+    return {
+        "ssim_and_l1": (similarity, in_torch(similarity, psnr_ssim)),
+        "log_brightness": (brightness, in_torch(brightness, events)),
+        "power_curve": (power, in_torch(power, srgb)),
+        "event_loss": (event_maps, in_torch(event_maps, event)),
+        "membership": (
+            lambda: _backward(semantic.membership_loss(share, packed), share),
+            lambda: _backward(semantic.membership_loss(share, masks), share),
+        ),
+    }
+
+
+def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
+    """What lies before and behind the networks' layers, which `benchmarks/deform.py` times."""
+    times = 2
     positions = torch.rand(points, 3).requires_grad_()
-    upstream = torch.randn(points, grid.dim)
+    blob, grid = encodings.OneBlobEncoding(), encodings.HashGridEncoding()
+    blob_upstream, grid_upstream = torch.randn(points, blob.dim), torch.randn(points, grid.dim)
+    softmax = skinning_network.HierarchicalSoftmax(body.default_body().parents.tolist())
+    logits = torch.randn(points, softmax.logits).requires_grad_()
+    changes = (0.1 * torch.randn(times, points, 25)).requires_grad_()
+    shape = [torch.randn(points, n).requires_grad_() for n in (3, 3, 4)]
+    transforms = torch.randn(times, points, 4, 4)
+    world, feature = torch.randn(times, points, 3), torch.randn(times, points, 16)
+    feature.requires_grad_()
+
+    def one_blob() -> None:
+        torch.autograd.grad(blob(positions), positions, blob_upstream)
+
+    def hash_grid(lookup: type[torch.autograd.Function]) -> None:
+        encoded = lookup.apply(positions, grid.table, grid).T
+        torch.autograd.grad(encoded, (positions, grid.table), grid_upstream)
+
+    def tree_softmax() -> None:
+        torch.autograd.grad(softmax(logits), logits, torch.ones(points, 1).expand(-1, joints))
+
+    def change_shape() -> None:
+        changed = non_rigid.NonRigid(changes).shape(*shape)
+        torch.autograd.grad(changed, (changes, *shape), [torch.ones_like(v) for v in changed])
+
+    def view_basis() -> None:
+        seen = colour.view_directions(world, torch.zeros(3), transforms)
+        _backward(colour.beside_basis(seen, feature).sum(), feature)
+
+    joints = softmax(logits).shape[-1]
+    return {
+        "one_blob": (one_blob, in_torch(one_blob, encodings)),
+        "hash_grid": (
+            lambda: hash_grid(encodings._NativeLookup),
+            lambda: hash_grid(encodings._TorchLookup),
+        ),
+        "skinning_softmax": (tree_softmax, in_torch(tree_softmax, skinning_network)),
+        "shape_change": (change_shape, in_torch(change_shape, non_rigid)),
+        "view_basis": (view_basis, in_torch(view_basis, colour)),
+    }
+
+
+def body_cases(points: int) -> dict[str, tuple[Call, Call]]:
+    """What carries Gaussians into poses, and what compares them there."""
     times, joints = 2, 31
+    positions = torch.rand(points, 3).requires_grad_()
     weights = torch.rand(points, joints).softmax(-1).requires_grad_()
     bones = torch.randn(times, joints, 4, 4)
     quaternions, log_scales = torch.randn(points, 4), torch.randn(points, 3)
     moved = [torch.randn(times, points, n).requires_grad_() for n in (3, 4, 3, 16)]
     moved[3] = moved[3].detach().unflatten(-1, (4, 4)).requires_grad_()
     rows = torch.randint(points, (1_024, 5))
-
-    def hash_grid(lookup: type[torch.autograd.Function]) -> None:
-        encoded = lookup.apply(positions, grid.table, grid).T
-        torch.autograd.grad(encoded, (positions, grid.table), upstream)
+    places = positions.detach()
 
     def skinning() -> None:
-        carried, blended = body.skin(positions, weights, bones)
+        carried, blended = skin_module.skin(positions, weights, bones)
         torch.autograd.grad(carried.sum() + blended.sum(), (positions, weights))
 
     def isometric() -> None:
         terms = isometry.isometry_change(rows, (positions, quaternions, log_scales), tuple(moved))
         torch.autograd.grad(terms[0] + terms[1], (positions, *moved))
 
-    def brightness() -> None:
-        torch.autograd.grad(events.log_brightness(image).sum(), image)
-
-    places = positions.detach()
     return {
-        "ssim": (
-            lambda: _backward(ssim(image, truth), image),
-            lambda: _backward(ssim_map(image, truth, GAUSSIAN_SSIM).mean(), image),
-        ),
-        "hash_grid": (
-            lambda: hash_grid(encodings._NativeLookup),
-            lambda: hash_grid(encodings._TorchLookup),
-        ),
-        "skinning": (skinning, in_torch(skinning, body)),
+        "skinning": (skinning, in_torch(skinning, skin_module)),
         "isometry": (isometric, in_torch(isometric, isometry)),
-        "log_brightness": (brightness, in_torch(brightness, events)),
         "neighbours": (
             lambda: nearest(places, 4),
             lambda: cKDTree(places.numpy()).query(places.numpy(), k=5),
