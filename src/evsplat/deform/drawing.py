@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -31,11 +31,23 @@ class Drawing:
     static: Splats
 
     def center_gradients(self) -> tuple[Float[Tensor, "T H 2"], Float[Tensor, "1 S 2"]]:
-        """Gradients of the projected centres of person and scene, per pixel, after backward."""
+        """Gradients of the projected centres of person and scene, per pixel, after backward.
+
+        Those of the rows themselves, not of second copies.
+        """
         moving, static = self.moving.centers2d_offset, self.static.centers2d_offset
         assert moving is not None and moving.grad is not None
         assert static is not None and static.grad is not None
-        return moving.grad, static.grad
+        people, things = self._counts()
+        return moving.grad[:, :people], static.grad[:, :things]
+
+    def radii(self) -> tuple[Int[Tensor, "T H"], Int[Tensor, "1 S"]]:
+        """Radii on the screen of the same rows, pixels; 0 = not drawn."""
+        people, things = self._counts()
+        return self.output.radii[:, :people], self.output.static_radii[:, :things]
+
+    def _counts(self) -> tuple[int, int]:
+        return len(self.posed.human_opacities), len(self.posed.scene_opacities)
 
 
 class _Drawable(Protocol):

@@ -26,9 +26,16 @@ from evsplat.deform.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.deform.shadow import BodyShadow
 from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.deform.skinning_turns import SkinningTurns
+from evsplat.deform.two_branch import Branches, Open
 from evsplat.devices import send
 from evsplat.errors import ConfigError
-from evsplat.gaussians import ATTRIBUTES, GaussianSet, PosedGaussians, PosedHuman, StaticScene
+from evsplat.gaussians import (
+    ATTRIBUTES,
+    GaussianSet,
+    PosedGaussians,
+    PosedHuman,
+    StaticScene,
+)
 from evsplat.gaussians.initialise import COLOUR_LOGITS
 
 NORMAL_SAMPLES = 20_000
@@ -36,7 +43,7 @@ NORMAL_SAMPLES = 20_000
 CASTERS = 400
 """Points of the body that hide lights."""
 
-Semantics = Literal["fixed", "ste", "rendered"]
+Semantics = Literal["fixed", "ste", "rendered", "two_branch"]
 
 
 @dataclass(frozen=True)
@@ -169,6 +176,8 @@ class HumanSceneModel(nn.Module):
         """What is learned of the event camera, by methods that do."""
         self.shading: Shading | None = None
         self.shadow: BodyShadow | None = None
+        self.branches: Branches | None = None
+        """What `two_branch` draws twice in training; see `draw_twice`."""
         self.row_caches: dict[str, RowCache] = {"skinning_turns": self.skinning_turns}
         generator = torch.Generator().manual_seed(0)
         if config.shading or config.skinning == "surface":
@@ -230,6 +239,10 @@ class HumanSceneModel(nn.Module):
         start = self.config.pose_correction_start
         return start is not None and float(self.nominal) >= start
 
+    def draw_twice(self, branches: Branches) -> None:
+        """From now on draw rows of an open class twice in training."""
+        self.branches = self.row_caches["branches"] = branches
+
     def normalise(self, positions: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
         """Canonical metres to [-1, 1] over the enlarged bounding box of the body."""
         return 2 * (positions - self.box_low) / (self.box_high - self.box_low) - 1
@@ -279,6 +292,7 @@ class HumanSceneModel(nn.Module):
         hard_semantics: bool = False,
         share_skinning: bool = False,
         networks_at_us: int | None = None,
+        both_branches: bool = False,
     ) -> PosedGaussians:
         """All Gaussians in world space at ``times_us``, coloured for a camera at that centre.
 
@@ -291,17 +305,23 @@ class HumanSceneModel(nn.Module):
 
         ``hard_semantics`` puts the hard label into the semantic channel (evaluation); otherwise it
         is the soft attribute m.
+
+        ``both_branches`` adds second copies of rows whose class is open, see `Branches`.
         """
         gaussians = self.gaussians
         parts = {name: gaussians.of_parts(getattr(gaussians, name)) for name in ATTRIBUTES}
+        twice = None
+        if both_branches and self.branches is not None:
+            twice = self.branches.of(gaussians, float(self.nominal))
         rotations, bones = self.pose(times_us)
-        moving = self._moving(parts)
+        moving = self._moving(parts, twice)
         seen_times, seen = list(times_us), rotations
         if networks_at_us is not None:
             seen_times, seen = [networks_at_us], self.pose([networks_at_us])[0]
         deformed, scales, quaternions, feature = self._non_rigid(moving, seen, noise)
         if self.skinning is None:
-            weights = self.surface.weights(moving["means"])[None]
+            weights = self.surface.weights(parts["means"][0])
+            weights = (weights if twice is None else torch.cat([weights, twice.weights]))[None]
         elif share_skinning:
             shared = self.normalise(deformed.mean(0))
             weights = self.skinning_turns.weights(self.skinning, shared)[None]
@@ -336,30 +356,46 @@ class HumanSceneModel(nn.Module):
         if hidden:
             directions = torch.zeros_like(directions)
         soft = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
-        opacities = gaussians.of_parts(gaussians.opacities())
-        semantics = gaussians.of_parts(soft)
+        opacities = gaussians.opacities()
         times = len(times_us)
+
+        def posed(rows: slice, means: Tensor, colours: Tensor) -> PosedHuman:
+            return PosedHuman(
+                means,
+                quaternions[:, rows].expand(times, -1, -1),
+                scales[:, rows].expand(times, -1, -1),
+                colours.expand(times, -1, -1),
+                transforms[:, rows],
+            )
+
+        scene_rgb = self.scene_colour(
+            scene_features, torch.zeros_like(directions) if hidden else directions
+        )
+        copies = None
+        if twice is not None:
+            shares = twice.shares(gaussians)
+            soft = torch.where(shares < 1, gaussians.human_mask().to(soft.dtype), soft)
+            rest = slice(gaussians.human_count, None)
+            copies = twice.copies(
+                gaussians,
+                opacities * (1 - shares),
+                posed(rest, world[:, rest], rgb[:, twice.human_donors]),
+                scene_rgb[twice.scene_donors],
+            )
+            opacities = opacities * shares
+        human_opacities, scene_opacities = gaussians.of_parts(opacities)
+        human_semantics, scene_semantics = gaussians.of_parts(soft)
         return PosedGaussians(
-            human=PosedHuman(
-                human_means,
-                quaternions[:, people].expand(times, -1, -1),
-                scales[:, people].expand(times, -1, -1),
-                rgb.expand(times, -1, -1),
-                transforms[:, people],
+            posed(people, human_means, rgb),
+            StaticScene(
+                scene_means, parts["quaternions"][1], parts["scales_log"][1].exp(), scene_rgb
             ),
-            scene=StaticScene(
-                scene_means,
-                parts["quaternions"][1],
-                parts["scales_log"][1].exp(),
-                self.scene_colour(
-                    scene_features, torch.zeros_like(directions) if hidden else directions
-                ),
-            ),
-            human_opacities=opacities[0],
-            scene_opacities=opacities[1],
-            human_semantics=semantics[0],
-            scene_semantics=semantics[1],
+            human_opacities,
+            scene_opacities,
+            human_semantics,
+            scene_semantics,
             casters=None if self.shadow is None else self.shadow.place(bones),
+            copies=copies,
         )
 
     def training_drawing(
@@ -377,6 +413,7 @@ class HumanSceneModel(nn.Module):
             noise=self.draw_noise(1 if once else len(times_us), generator),
             share_skinning=True,
             networks_at_us=frame.mid_us if once else None,
+            both_branches=True,
         )
         return draw(self, posed, camera, center_gradients=True)
 
@@ -406,8 +443,16 @@ class HumanSceneModel(nn.Module):
         hide = float(torch.rand((), generator=generator)) < config.scene_direction_dropout
         return Noise(rotations, send(turn, self.box_low.device), hide)
 
-    def _moving(self, parts: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-        """What the networks see: the person, and with ``ste`` scene rows inside the box as well."""
+    def _moving(
+        self, parts: dict[str, tuple[Tensor, Tensor]], twice: Open | None = None
+    ) -> dict[str, Tensor]:
+        """What the networks see: the person, and scene rows that stand for it as well.
+
+        Those are the ones drawn ``twice``, or with ``ste`` those inside the box.
+        """
+        if twice is not None:
+            more = twice.canonical({name: scene for name, (_, scene) in parts.items()})
+            return {name: torch.cat([human, more[name]]) for name, (human, _) in parts.items()}
         if self.semantics != "ste":
             return {name: human for name, (human, _) in parts.items()}
         inside = self._scene_inside_box()

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from evsplat.body import Body, skin
@@ -26,14 +26,13 @@ class BodyFrames:
     """Canonical to world, one set per frame."""
 
 
-def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, drawn: int) -> int:
+def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames) -> int:
     """Move every row whose soft label disagrees with its class; how many moved.
 
-    Person to scene: placed where the body carries it at frame ``drawn``, the one rendered last.
-    Scene to person: carried back by the nearest body vertex over all frames; beyond `REACH_M` of
-    all of them the row stays in the scene and its logit returns to the boundary. The two classes
-    have separate colour networks, to which the other's features mean nothing: a moved row takes
-    those of the nearest row of its new class.
+    Person to scene: see `to_world`. Scene to person: see `to_canonical`; beyond `REACH_M` the row
+    stays in the scene and its logit returns to the boundary. The two classes have separate colour
+    networks, to which the other's features mean nothing: a moved row takes those of the nearest row
+    of its new class.
     """
     wants_human = gaussians.semantic_logits.detach() > 0
     human = gaussians.human_mask()
@@ -44,17 +43,12 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
     values = {name: getattr(gaussians, name).detach().clone() for name in ATTRIBUTES}
 
     if len(leaving):
-        vertices = frames.body.canonical_vertices()
-        vertex = _nearest(vertices, values["means"][leaving])[1]
-        transforms = _blend(frames, vertex, torch.full_like(vertex, drawn))
-        carry(values, leaving, transforms)
+        carry(values, leaving, to_world(frames, values["means"][leaving]))
         _take_features(values, leaving, torch.nonzero(~human)[:, 0])
     if len(joining):
-        distance, frame, vertex = _nearest_over_frames(frames, values["means"][joining])
-        near = distance <= REACH_M
+        near, transforms, _ = to_canonical(frames, values["means"][joining])
         values["semantic_logits"][joining[~near]] = 0.0
         joining = joining[near]
-        transforms = torch.linalg.inv(_blend(frames, vertex[near], frame[near]))
         carry(values, joining, transforms)
         _take_features(values, joining, torch.nonzero(human)[:, 0])
 
@@ -68,46 +62,101 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames, 
 
 def carry(values: dict[str, Tensor], rows: Tensor, transforms: Float[Tensor, "M 4 4"]) -> None:
     """Apply rigid-like transforms to centres and rotations of some rows, in place."""
-    rotation, translation = transforms[:, :3, :3], transforms[:, :3, 3]
-    values["means"][rows] = (rotation @ values["means"][rows][..., None])[..., 0] + translation
-    turn = matrix_to_quaternion(rotation)
-    values["quaternions"][rows] = quaternion_multiply(turn, values["quaternions"][rows])
+    values["means"][rows], values["quaternions"][rows] = carried(
+        values["means"][rows], values["quaternions"][rows], transforms
+    )
+
+
+def carried(
+    means: Float[Tensor, "M 3"], quaternions: Float[Tensor, "M 4"], transforms: Tensor
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 4"]]:
+    """Centres and rotations after rigid-like transforms (M, 4, 4)."""
+    turn = matrix_to_quaternion(transforms[:, :3, :3])
+    return applied(transforms, means), quaternion_multiply(turn, quaternions)
+
+
+def to_world(frames: BodyFrames, means: Float[Tensor, "M 3"]) -> Float[Tensor, "M 4 4"]:
+    """Transforms that place the person's rows, by canonical centres, in the scene.
+
+    The nearest body vertex carries them, at the frame that brings them nearest to the mean of their
+    places over all frames: what does not move with the body is best explained where it dwells.
+    """
+    if len(means) == 0:
+        return means.new_zeros(0, 4, 4)
+    vertex = nearest_row(frames.body.canonical_vertices(), means)[1]
+    places = torch.stack(
+        [applied(_blend(frames, vertex, number), means) for number in range(len(frames.bones))]
+    )
+    dwelling = (places - places.mean(0)).square().sum(-1).argmin(0)
+    return _blend(frames, vertex, dwelling)
+
+
+def to_canonical(
+    frames: BodyFrames, points: Float[Tensor, "M 3"]
+) -> tuple[Bool[Tensor, " M"], Float[Tensor, "K 4 4"], Float[Tensor, "K J"]]:
+    """Which scene rows can be the person's, and transforms that place these K on it.
+
+    The nearest posed body vertex over all frames carries a row back; it lies within `REACH_M`. The
+    last are the vertices' skinning weights.
+    """
+    distance, frame, vertex = _nearest_over_frames(frames, points)
+    near = distance <= REACH_M
+    vertex = vertex[near]
+    transforms = torch.linalg.inv(_blend(frames, vertex, frame[near]))
+    return near, transforms, frames.body.weights[vertex]
 
 
 def _take_features(values: dict[str, Tensor], rows: Tensor, others: Tensor) -> None:
     """Copy the colour features of the nearest of ``others`` to ``rows``, in place."""
     if len(others):
-        source = _nearest(values["means"][others], values["means"][rows])[1]
+        source = nearest_row(values["means"][others], values["means"][rows])[1]
         values["features"][rows] = values["features"][others[source]]
 
 
 def _blend(
-    frames: BodyFrames, vertex: Int[Tensor, " M"], frame: Int[Tensor, " M"]
+    frames: BodyFrames, vertex: Int[Tensor, " M"], frame: Int[Tensor, " M"] | int
 ) -> Float[Tensor, "M 4 4"]:
     """Skinning transform of body vertices at given frames."""
-    return torch.einsum("mj,mjab->mab", frames.body.weights[vertex], frames.bones[frame])
+    weights = frames.body.weights[vertex]
+    if isinstance(frame, int):
+        return torch.einsum("mj,jab->mab", weights, frames.bones[frame])
+    return torch.einsum("mj,mjab->mab", weights, frames.bones[frame])
 
 
-def _nearest(
-    vertices: Float[Tensor, "V 3"], points: Float[Tensor, "M 3"]
+def applied(
+    transforms: Float[Tensor, "M 4 4"], points: Float[Tensor, "M 3"]
+) -> Float[Tensor, "M 3"]:
+    """Points after transforms, one each."""
+    return (transforms[:, :3, :3] @ points[..., None])[..., 0] + transforms[:, :3, 3]
+
+
+def nearest_row(
+    points: Float[Tensor, "V 3"], queries: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, " M"], Int[Tensor, " M"]]:
-    distance, index = nearest(vertices, 1, points)
+    """Distance to the nearest of ``points`` and its row, per query."""
+    distance, index = nearest(points, 1, queries)
     return distance[:, 0], index[:, 0]
 
 
 def _nearest_over_frames(
     frames: BodyFrames, points: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, " M"], Int[Tensor, " M"], Int[Tensor, " M"]]:
-    """Distance, frame and vertex of the nearest posed body vertex over all frames."""
+    """Distance, frame and vertex of the nearest posed body vertex over all frames.
+
+    Points farther than `REACH_M` from the body's box in every frame are at an infinite distance.
+    """
     canonical = frames.body.canonical_vertices()
     best = torch.full((len(points),), torch.inf, device=points.device)
     best_frame = torch.zeros(len(points), dtype=torch.long, device=points.device)
     best_vertex = torch.zeros_like(best_frame)
     for number in range(len(frames.bones)):
         posed, _ = skin(canonical, frames.body.weights, frames.bones[number : number + 1])
-        distance, vertex = _nearest(posed[0], points)
-        better = distance < best
-        best = torch.where(better, distance, best)
-        best_frame[better] = number
-        best_vertex = torch.where(better, vertex, best_vertex)
+        low, high = posed[0].amin(0) - REACH_M, posed[0].amax(0) + REACH_M
+        rows = torch.nonzero(((points >= low) & (points <= high)).all(-1))[:, 0]
+        if len(rows) == 0:
+            continue
+        distance, vertex = nearest_row(posed[0], points[rows])
+        better = distance < best[rows]
+        rows = rows[better]
+        best[rows], best_frame[rows], best_vertex[rows] = distance[better], number, vertex[better]
     return best, best_frame, best_vertex

@@ -10,6 +10,7 @@ from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
 from evsplat.deform.mlp import bfloat16_runs
 from evsplat.deform.pose_spline import PoseSpline
+from evsplat.deform.two_branch import Branches
 from evsplat.errors import DataError
 from evsplat.gaussians import BodyFrames, DensifyConfig, GaussianSet, Part
 from evsplat.methods.composition import Composition, HeldOut
@@ -114,7 +115,16 @@ class Build:
         prior = SkinningPrior(ground.surface.to(device), config.skinning_points)
         if fit and model.skinning is not None:
             fit_skinning(model, prior, config.skinning_prefit_steps, ground.generator)
-        return cls(ground, model, prior)
+        build = cls(ground, model, prior)
+        if semantics == "two_branch":
+            window = config.optimisation.semantics_window
+            model.draw_twice(Branches(build.body_frames(), window))
+        return build
+
+    def body_frames(self) -> BodyFrames:
+        """The body as given at the training frames."""
+        track = self.model.track
+        return BodyFrames(track.body, track.bones(self.ground.times_us))
 
     def composition(
         self,
@@ -133,7 +143,6 @@ class Build:
         are those that the method has beyond the person's; ``capture`` is the recording where the
         method does not see all of it; ``held_out`` is what frames beside the training frames teach.
         """
-        track = self.model.track
         objectives = list(observed)
         if self.model.skinning is not None:
             objectives.append(self.prior)
@@ -153,9 +162,7 @@ class Build:
             },
             learning=learning_of(self.model, config.optimisation),
             densify={"human": config.densify_human, **densify},
-            body_frames=None
-            if self.model.semantics == "fixed"
-            else BodyFrames(track.body, track.bones(self.ground.times_us)),
+            body_frames=None if self.model.semantics == "fixed" else self.body_frames(),
             generator=self.ground.generator,
             capture=capture,
             held_out=held_out,

@@ -19,6 +19,7 @@ from evsplat.methods.config import Weight
 from evsplat.methods.prefit import fit_scene, fit_scene_colours
 from evsplat.methods.starts import FittedSceneConfig, human_start, scene_start
 from evsplat.objectives import (
+    Activity,
     EventChange,
     Objective,
     PackedBounds,
@@ -65,11 +66,16 @@ class PaperConfig(PersonConfig):
     """All settings of method `paper`."""
 
     semantics: Semantics = "rendered"
-    """How the attribute learns: ``fixed``, ``ste`` (straight-through) or ``rendered`` (A2)."""
+    """How the attribute learns (A2): ``fixed``; ``ste`` (straight-through); ``rendered``, by the
+    posed body's silhouette; ``two_branch``, by that and by which copy explains the pixels of
+    Gaussians that are drawn both posed and standing still while 0.05 < m < 0.95."""
     semantic_start: float = 2.0
     """Labels start as logits +a and -a (A1)."""
     semantic_band_px_at_256: float = 9.0
     """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
+    semantic_activity: bool = False
+    """Pixels of that band at which no event tells of anything moving are the scene's, where the
+    body beside them moves; static cameras with events only (A8)."""
     scene: FittedSceneConfig = field(default_factory=FittedSceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     event: EventConfig = field(default_factory=EventConfig)
@@ -149,7 +155,7 @@ def composition(
     terms beside ``l1`` and ``dssim``; ``held_out`` is what held-out frames teach.
     """
     ground = build.ground
-    if config.semantics == "rendered":
+    if config.semantics in ("rendered", "two_branch"):
         bounds = _bounds(config, ground.capture, ground.track)
         observed = [*observed, RenderedSemantics(bounds)]
     return build.composition(
@@ -175,11 +181,13 @@ def _scene_limits(config: PaperConfig) -> dict[Part, DensifyConfig]:
 def _bounds(config: PaperConfig, capture: Capture, track: BodyTrack) -> dict[int, PackedBounds]:
     """Where the posed body says that the person is, by mid-exposure."""
     bounds = {}
+    activity = Activity.of(capture) if config.semantic_activity else None
     for frame in capture.train_frames:
         camera = capture.camera(frame)
         mask = silhouette(track.vertices(frame.mid_us), track.body.faces, camera)
         band = max(1, round(config.semantic_band_px_at_256 * camera.height / 256))
-        bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band)
+        still = None if activity is None else activity.still_scene(frame, track, mask.numpy(), band)
+        bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band, still)
     return bounds
 
 

@@ -1,5 +1,6 @@
 """Losses, each a small object: which times it needs, what it compares."""
 
+from evsplat.objectives.activity import Activity
 from evsplat.objectives.alpha import Alpha
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event import EventChange, event_loss
@@ -14,6 +15,7 @@ from evsplat.objectives.semantic import PackedBounds, RenderedSemantics, silhoue
 from evsplat.objectives.skinning import SkinningPrior
 
 __all__ = [
+    "Activity",
     "Alpha",
     "EventChange",
     "EventSensor",

@@ -118,7 +118,7 @@ class Trainer:
         unsure = None if self.bad.at_once else sound
         self.optimiser.step(nominal, unsure)
         self._count(step.drawing, unsure)
-        self._edit(frame, nominal)
+        self._edit(nominal)
         self._learn_held_out(nominal)
         drawn = step.drawing.rgb[step.index(frame.mid_us)].detach()
         losses = tuple(number.detach() for number in (loss, *terms.values()))
@@ -229,7 +229,7 @@ class Trainer:
         """Add the step to the statistics, nothing where ``unsure`` is false."""
         height, width = drawing.output.alpha.shape[1:]
         gradients = drawing.center_gradients()
-        radii = (drawing.output.radii, drawing.output.static_radii)
+        radii = drawing.radii()
         for name, rows in self.model.sets.items():
             for part, gradient, radius in zip(PARTS, gradients, radii, strict=True):
                 place = rows.rows_of(part)
@@ -239,7 +239,7 @@ class Trainer:
                     gradient, radius = (torch.where(unsure, v, 0) for v in (gradient, radius))
                 self.statistics[name].add(place, gradient, radius, width, height)
 
-    def _edit(self, frame: Frame, nominal: float) -> None:
+    def _edit(self, nominal: float) -> None:
         """Edit the sets where the schedule crosses a densification step."""
         generator, edited = self.composition.generator, False
         previous, self.previous_nominal = self.previous_nominal, nominal
@@ -260,8 +260,7 @@ class Trainer:
             densify(rows, optimiser, self.statistics[name], limits, nominal, generator)
             if self.composition.body_frames is not None:
                 assert isinstance(rows, GaussianSet)  # only there classes share a set
-                drawn = self.capture.train_frames.index(frame)
-                flip_labels(rows, optimiser, self.composition.body_frames, drawn)
+                flip_labels(rows, optimiser, self.composition.body_frames)
             self.statistics[name] = _fresh(rows)
         for keeper in (*self.model.row_caches.values(), *self.composition.objectives):
             if edited:
