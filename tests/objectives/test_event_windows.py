@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from evsplat.events import EventStream
-from evsplat.objectives import EventSensor, EventWindows
+from evsplat.objectives import EventNoise, EventSensor, EventWindows
 
 HEIGHT, WIDTH, EPS = 9, 11, 0.004
 
@@ -54,11 +54,12 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
     return capture, SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0)
 
 
-def make(capture, on: float, off: float, *, noise_aware=False, **learned) -> EventWindows:
+def make(capture, on: float, off: float, **learned) -> EventWindows:
     sensor = EventSensor(on, off, **learned).double()
     generator = torch.Generator().manual_seed(0)
-    options = {"start": 750, "eps": EPS, "reach": 0.5, "noise_aware": noise_aware}
-    return EventWindows(capture, sensor, generator, **options)
+    options = {"start": 750, "eps": EPS, "reach": 0.5}
+    noise = EventNoise(capture.events, aware=False)
+    return EventWindows(capture, sensor, generator, noise=noise, **options)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -204,10 +205,9 @@ def test_noise_lowers_the_weight_and_hot_pixels_have_none(seed, rate_hz):
     stream = EventStream(t[order], x.astype(np.uint16), y.astype(np.uint16), sign.astype(np.int8))
     events = Recording(stream)
     events.height, events.width = height, width
-    capture = SimpleNamespace(events=events, frames=[SimpleNamespace(mid_us=0)])
-    objective = make(capture, 0.2, 0.2, noise_aware=True)
-    found_hz, sound = objective._noise
-    assert found_hz == pytest.approx(rate_hz, rel=0.2)
-    assert sound[17, 23] == 0 and float(sound.sum()) == pixels - 1
-    assert objective._weight(500_000) == pytest.approx(1 / (1 + 2 * (found_hz / 2) ** 0.5))
-    assert make(capture, 0.2, 0.2)._weight(500_000) == 1.0
+    noise = EventNoise(events)
+    allowed = rate_hz * np.array([0.8, 1.2]) / 2
+    low, high = 1 / (1 + 2 * np.sqrt(allowed[::-1]))
+    assert low < noise.weight(500_000) < high
+    assert noise.sound[17, 23] == 0 and float(noise.sound.sum()) == pixels - 1
+    assert EventNoise(events, aware=False).weight(500_000) == 1.0

@@ -28,6 +28,8 @@ from evsplat.methods.paper import (
 from evsplat.methods.poses import PoseConfig, prepare_poses
 from evsplat.methods.starts import HumanStartConfig
 from evsplat.objectives import (
+    EdiTarget,
+    EventNoise,
     EventSensor,
     EventWindows,
     Exposure,
@@ -75,6 +77,22 @@ class WindowConfig:
 
 
 @dataclass(frozen=True)
+class EdiConfig:
+    """Frames sharpened by the events of their exposure, as targets at mid-exposure.
+
+    For events with polarity; thresholds are those that the windows start from.
+    """
+
+    alone_until: float = 0.0
+    """Nominal iteration until which they stand in place of the blurry frames, at weight 1: one
+    render a step brings the person into place."""
+    weight: float = 0.0
+    """From then on, beside the blurry frames."""
+    until: float = 8_000.0
+    """Nominal iteration at which they are gone; the weight falls to there in a straight line."""
+
+
+@dataclass(frozen=True)
 class EvsplatConfig(PaperConfig):
     """All settings of method `evsplat`; those of `paper` that it shares keep their names."""
 
@@ -84,6 +102,7 @@ class EvsplatConfig(PaperConfig):
     """Without isometry: discs that hang on the body's own weights stretch with it already."""
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
+    edi: EdiConfig = field(default_factory=EdiConfig)
     event_term: Literal["windows", "paper"] = "windows"
     """``paper`` compares normalised changes between neighbouring frames' middles (its eq. 8-9) in
     place of windows."""
@@ -141,26 +160,32 @@ def compose(
         )
         for frame in capture.train_frames
     }
-    observed: list[Objective] = [Exposure(capture, renders, build.ground.generator)]
+    windows = edi = held_out = None
+    if config.event.weight != 0.0 and config.event_term == "windows" and capture.events is not None:
+        windows = _windows(config.windows, capture, build, device=device, fit=fit)
+        edi = _edi(config.edi, capture, windows)
+        held_out = _held_out(config, capture, build, windows)
+    alone_until = 0.0 if edi is None else config.edi.alone_until
+    exposure = Exposure(capture, renders, build.ground.generator, start=alone_until)
+    observed: list[Objective] = [exposure]
     weights: dict[str, Weight] = {}
-    held_out = None
     if poses.spline is not None:
         observed.append(PosePrior(poses.track))
         weights["pose_prior"] = config.pose.prior
-    if config.event.weight == 0.0:
-        pass
-    elif capture.events is None:
-        logger.warning(
-            "%s: has no events; the blur of the frames alone tells what moved.", capture.path
-        )
-    elif config.event_term == "paper":
-        observed.append(paper_events(config.event, capture))
+    if config.event.weight != 0.0:
         weights["event"] = config.event.weight
-    else:
-        windows = _windows(config, capture, build, device=device, fit=fit)
-        observed.append(windows)
-        weights |= {"event": config.event.weight, "contrast": config.windows.contrast_weight}
-        held_out = _held_out(config, capture, build, windows)
+        if capture.events is None:
+            logger.warning(
+                "%s: has no events; the blur of the frames alone tells what moved.", capture.path
+            )
+        elif windows is None:
+            observed.append(paper_events(config.event, capture))
+        else:
+            observed.append(windows)
+            weights["contrast"] = config.windows.contrast_weight
+    if edi is not None:
+        observed.append(edi)
+        weights["edi"] = 1.0
     return composition(config, build, observed, weights, held_out)
 
 
@@ -182,7 +207,7 @@ def _held_out(
 
 
 def _windows(
-    config: EvsplatConfig,
+    windows: WindowConfig,
     capture: Capture,
     build: Build,
     *,
@@ -191,7 +216,6 @@ def _windows(
 ) -> EventWindows:
     """The event term, and the sensor that the model learns with it."""
     assert capture.events is not None
-    windows = config.windows
     # A loaded model brings its own.
     known = _thresholds(capture) if fit else (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD)
     pixels = (capture.events.height, capture.events.width) if windows.pixel_thresholds else None
@@ -207,8 +231,23 @@ def _windows(
         build.ground.generator,
         start=windows.start,
         eps=windows.eps,
+        noise=EventNoise(capture.events, aware=windows.noise_aware),
         reach=windows.reach,
-        noise_aware=windows.noise_aware,
+    )
+
+
+def _edi(config: EdiConfig, capture: Capture, windows: EventWindows) -> EdiTarget | None:
+    """The frames sharpened by their events, where they are asked for and events have polarity."""
+    asked = config.alone_until > 0.0 or config.weight > 0.0
+    if not asked or not windows.events.has_polarity:
+        return None
+    return EdiTarget(
+        capture,
+        windows.sensor,
+        windows.noise,
+        alone_until=config.alone_until,
+        weight=config.weight,
+        end=config.until,
     )
 
 

@@ -1,19 +1,17 @@
 """Events at full time resolution: brightness change between any two rendered times."""
 
-import math
 from collections.abc import Sequence
-from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.calibration import noise_of
 from evsplat.capture import Capture, Frame
 from evsplat.devices import send
 from evsplat.events import EventStream, polarity_counts
 from evsplat.imaging import luminance
 from evsplat.objectives.base import Stateless, Step
+from evsplat.objectives.event_noise import EventNoise
 from evsplat.objectives.event_sensor import EventSensor
 
 _RATE_US = 1_000
@@ -28,9 +26,8 @@ class EventWindows(Stateless):
     ``reach`` frame intervals, so that the gaps between exposures teach as well. All pixels count:
     where there is no event, nothing changed.
 
-    Events that nothing caused are allowed for: with a background rate r an interval T holds r T of
-    them per pixel, give or take the root, and its differences weigh ``1 / (1 + 2 sqrt(r T))``, as a
-    Laplace likelihood does whose width is half a threshold and that noise. Hot pixels do not count.
+    Events that nothing caused are allowed for: differences weigh by the noise of their time
+    (`EventNoise`), and hot pixels do not count.
 
     Where events have no polarity the size of the change is compared with their number, between
     neighbouring times only: over a longer span what went up and down again is in the number alone.
@@ -44,8 +41,8 @@ class EventWindows(Stateless):
         *,
         start: float,
         eps: float,
+        noise: EventNoise,
         reach: float = 0.5,
-        noise_aware: bool = True,
     ) -> None:
         """``start`` in nominal iterations; ``eps`` is added to linear luminance."""
         assert capture.events is not None
@@ -55,7 +52,7 @@ class EventWindows(Stateless):
         gaps = sorted(b - a for a, b in zip(mids, mids[1:], strict=False))
         self.interval_us = gaps[len(gaps) // 2] if gaps else 0
         self.range_us = (mids[0], mids[-1])
-        self.noise_aware = noise_aware
+        self.noise = noise
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """One time outside of the exposure."""
@@ -108,23 +105,10 @@ class EventWindows(Stateless):
         self, differences: Float[Tensor, "N H W"], durations_us: Sequence[int]
     ) -> Float[Tensor, ""]:
         """Mean size of differences that built up over so long, weighed by the sensor's noise."""
-        sound = send(self._noise[1], differences.device)
-        each = torch.tensor([self._weight(duration) for duration in durations_us])
+        sound = send(self.noise.sound, differences.device)
+        each = torch.tensor([self.noise.weight(duration) for duration in durations_us])
         weights = send(each.to(sound.dtype), differences.device)
         return (sound * weights[:, None, None] * differences.abs()).mean()
-
-    @cached_property
-    def _noise(self) -> tuple[float, Float[Tensor, "H W"]]:
-        """Background events per second and pixel, and 0 at hot pixels, 1 elsewhere."""
-        sound = torch.ones(self.events.height, self.events.width)
-        if not self.noise_aware:
-            return 0.0, sound
-        noise = noise_of(self.events)
-        sound[noise.hot_pixels[:, 1], noise.hot_pixels[:, 0]] = 0.0
-        return noise.floor_hz if noise.rate_hz is None else noise.rate_hz, sound
-
-    def _weight(self, duration_us: int) -> float:
-        return 1 / (1 + 2 * math.sqrt(self._noise[0] * duration_us * 1e-6))
 
     def _counts(
         self, stream: EventStream, windows: Sequence[tuple[int, int]], device: torch.device
