@@ -52,6 +52,10 @@ def test_a_lamp_lights_by_the_cosine_and_the_inverse_square(seed):
         cosine = normals[..., 2].clamp_min(0)
         expected = 1 + gain * cosine[..., None] * shading.intensities[0]
         assert torch.allclose(factor, expected.clamp(0.2, 3.0), atol=1e-5)
+        share = torch.rand(1, 1, 40, generator=generator)
+        shaded = 1 + share[0, ..., None] * (expected - 1)
+        factor = shading(normals, places, lamp[None], share)
+        assert torch.allclose(factor, shaded.clamp(0.2, 3.0), atol=1e-5)
 
 
 def test_gradcheck():

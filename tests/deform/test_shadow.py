@@ -1,4 +1,4 @@
-"""The person's shadow against the sum over all casters, and where it must not fall."""
+"""The person's shadows against the sum over all casters, and where they must not fall."""
 
 import pytest
 import torch
@@ -73,6 +73,40 @@ def test_what_is_between_the_body_and_the_lamp_and_what_is_far_stays_lit():
     assert factor[20, 20] < 0.95
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_light_on_the_body_is_what_parts_nearer_to_the_lamp_leave(seed):
+    shadow, body = make(), column(seed)
+    generator = torch.Generator().manual_seed(seed)
+    lamp = LAMP[0] + 0.5 * torch.randn(3, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        shadow.own_widths_log.fill_(-1.5)
+    places = column(seed + 10)
+    lit = shadow.lit(body, places, lamp[None])[0, 0]
+    width = 0.03 + torch.exp(torch.tensor(-1.5))
+    middle = body[0].mean(0)
+    axis = (middle - lamp) / (middle - lamp).norm()
+
+    def seen(points):
+        """Where the ray through a point meets the plane through the middle, and how far behind."""
+        ray = points - lamp
+        at = lamp + ray * ((middle - lamp) @ axis / (ray @ axis))[..., None]
+        return at, (points - middle) @ axis
+
+    (at, behind), (own_at, own_behind) = seen(places[0]), seen(body[0])
+    bells = torch.exp(-0.5 * ((at[:, None] - own_at).norm(dim=-1) / width).square())
+    # 12 cm nearer, told between layers of 10 cm.
+    depth_in_layers = (behind - 0.12 + 1.5) / 0.1
+    layer, share = depth_in_layers.floor(), depth_in_layers % 1
+    nearer = torch.zeros_like(bells)
+    for step, weight in ((0, 1 - share), (1, share)):
+        edge = -1.5 + 0.1 * (layer + step)
+        nearer += weight[:, None] * torch.sigmoid((edge[:, None] - own_behind) / 0.03)
+    depth = (bells * nearer).sum(-1) * 3.0 * 0.5 / (200 * 2 * torch.pi * width**2)
+    assert (lit - torch.exp(-depth)).abs().max() < 0.02
+    top = places[0, :, 2] > 1.7
+    assert lit[top].min() > 0.8 and lit[places[0, :, 2] < 0.3].mean() < 0.5
+
+
 def test_no_share_of_the_light_is_no_shadow():
     shadow = make(lamps=3)
     with torch.no_grad():
@@ -92,8 +126,13 @@ def test_gradients_of_lamps_and_body_equal_finite_differences():
     body = column()[:, ::20].requires_grad_()
     lamps = (LAMP + torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.5, -0.7]])).requires_grad_()
     values = [value.detach().requires_grad_() for value in parameters.values()]
+    on_body = column(1)[:, :5]
     # Bilinear look-up has kinks at the cells' borders, which a small step does not meet.
     assert torch.autograd.gradcheck(factor, (body, lamps, *values), eps=1e-7, atol=1e-5)
+    with torch.no_grad():
+        shadow.own_widths_log.fill_(-1.5)
+    lit = lambda body, lamps: shadow.lit(body, on_body, lamps)  # noqa: E731
+    assert torch.autograd.gradcheck(lit, (body, lamps), eps=1e-7, atol=1e-5)
 
 
 def test_lamps_start_around_the_zenith():

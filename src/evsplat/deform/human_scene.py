@@ -98,6 +98,8 @@ class DeformConfig:
     shadow_lights: int = 0
     """Lamps at learned places, at most 16, whose shadows of the person fall on the scene and which,
     with ``shading``, light the person; 0 = none."""
+    self_shadow: bool = False
+    """With ``shading`` and lamps: parts of the person that are nearer to a lamp shade others."""
     pose_correction_start: float | None = None
     """Nominal iteration from which pose residuals are learned; null = never.
     3DGS-Avatar starts at 5000 (A9). Exact poses get worse by it, noisy ones better."""
@@ -350,7 +352,11 @@ class HumanSceneModel(nn.Module):
         light = self.surface_light()
         if light is not None:
             # Geometry gets no gradient by the light.
-            rgb = rgb * light.factors(transforms[:, people].detach(), human_means.detach())
+            places, lit = human_means.detach(), None
+            if self.config.self_shadow and self.shadow is not None and light.lamps is not None:
+                body = self.shadow.place(bones[middle]).detach()
+                lit = self.shadow.lit(body, places[middle], light.lamps)
+            rgb = rgb * light.factors(transforms[:, people].detach(), places, lit)
         hidden = noise is not None and noise.hide_scene_direction
         directions = view_directions(scene_means[None], camera_center)[0]
         if hidden:

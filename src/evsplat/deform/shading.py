@@ -40,8 +40,12 @@ class Shading(nn.Module):
         normals: Float[Tensor, "T N 3"],
         places: Float[Tensor, "T N 3"],
         lamps: Float[Tensor, "L 3"] | None = None,
+        lit: Float[Tensor, "L #T N"] | None = None,
     ) -> Float[Tensor, "T N 3"]:
-        """Factors in 0.2..3 at unit world normals and world places (metres)."""
+        """Factors in 0.2..3 at unit world normals and world places (metres).
+
+        ``lit``: share of each lamp's light that reaches the places; all of it without.
+        """
         turned = torch.cat([torch.ones_like(normals[..., :1]), sh_basis(normals, degree=2)], -1)
         moved = ((places - self.center) / self.radius_m).clamp(-2, 2)
         # First all coefficients at the normals, then their sum at the places: nothing of size
@@ -49,12 +53,15 @@ class Shading(nn.Module):
         at_normals = (turned @ self.coefficients.movedim(1, 0).flatten(1)).unflatten(-1, (4, 3))
         bent = at_normals[..., 0, :] + (moved[..., None] * at_normals[..., 1:, :]).sum(-2)
         factor = 1 + bent
-        for lamp, intensity in zip(() if lamps is None else lamps, self.intensities, strict=True):
+        if lamps is None:
+            return factor.clamp(_DARKEST, _BRIGHTEST)
+        shares = places.new_ones(len(lamps), 1, 1) if lit is None else lit
+        for lamp, share, intensity in zip(lamps, shares, self.intensities, strict=True):
             ray = lamp - places
             square = ray.square().sum(-1)
             facing = (ray * normals).sum(-1).clamp_min(0) * square.rsqrt()
             near = (lamp - self.center).square().sum() / square.clamp_min(_NEAREST_M**2)
-            factor = factor + (facing * near)[..., None] * intensity
+            factor = factor + (facing * near * share)[..., None] * intensity
         return factor.clamp(_DARKEST, _BRIGHTEST)
 
 
@@ -69,11 +76,17 @@ class SurfaceLight:
     """Places, metres."""
 
     def factors(
-        self, transforms: Float[Tensor, "T N 4 4"], places: Float[Tensor, "T N 3"]
+        self,
+        transforms: Float[Tensor, "T N 4 4"],
+        places: Float[Tensor, "T N 3"],
+        lit: Float[Tensor, "L #T N"] | None = None,
     ) -> Float[Tensor, "T N 3"]:
-        """Factors on colours, for transforms canonical to world and world places (metres)."""
+        """Factors on colours, for transforms canonical to world and world places (metres).
+
+        ``lit`` as in `Shading`.
+        """
         turned = (transforms[..., :3, :3] @ self.normals[..., None])[..., 0]
-        return self.shading(nn.functional.normalize(turned, dim=-1), places, self.lamps)
+        return self.shading(nn.functional.normalize(turned, dim=-1), places, self.lamps, lit)
 
 
 class NearestSurface:

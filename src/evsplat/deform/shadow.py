@@ -1,4 +1,6 @@
-"""Soft shadows that the person casts on the scene, from where the body is and learned lamps."""
+"""Soft shadows that the person casts on the scene and on itself, from learned lamps."""
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -10,6 +12,11 @@ from evsplat.body.surface import SurfaceSamples
 _REACH_M = 1.5
 """Half side of the square around the body, across the light, outside of which nothing is shaded."""
 _CELLS = 49
+_LAYERS = 31
+"""Of the space around the body along the light, in which it shades itself."""
+_LAYER_EDGE_M = 0.03
+_OWN_SURFACE_M = 0.12
+"""How far nearer to the lamp a part of the body must be to shade another."""
 _NEAREST_M = 0.1
 _LEAST_WIDTH_M = 0.03
 _DENSITY = 3.0
@@ -22,7 +29,8 @@ class BodyShadow(nn.Module):
 
     Each lamp has a share of the brightness that it gives and a width of its penumbra, both learned.
     Points of the body are seen from the lamp as round Gaussians of that width; a place of the scene
-    behind them loses the share times ``1 - exp(-depth)``. A sum of round Gaussians on a grid is a
+    behind them loses the share times ``1 - exp(-depth)``, and a place on the body itself, `lit`, the
+    lamp's own light, by points that are nearer to the lamp. A sum of round Gaussians on a grid is a
     product of two matrices, so that a shadow costs as good as nothing.
     """
 
@@ -36,6 +44,8 @@ class BodyShadow(nn.Module):
         self.register_buffer("caster_weights", casters.weights, persistent=False)
         self.share_logits = nn.Parameter(torch.full((lamps,), -2.0))
         self.widths_log = nn.Parameter(torch.full((lamps,), -2.5))
+        self.own_widths_log = nn.Parameter(torch.full((lamps,), -3.5))
+        """Of the shadows on the body, which lies right behind what casts them."""
 
     def place(self, bones: Float[Tensor, "T J 4 4"]) -> Float[Tensor, "T P 3"]:
         """The casters in the world, for bone transforms from canonical space."""
@@ -55,6 +65,20 @@ class BodyShadow(nn.Module):
             factor = factor * (1 - logit.sigmoid() * (1 - torch.exp(-depth)))
         return factor
 
+    def lit(
+        self,
+        body: Float[Tensor, "T P 3"],
+        places: Float[Tensor, "T N 3"],
+        lamps: Float[Tensor, "L 3"],
+    ) -> Float[Tensor, "L T N"]:
+        """Share of each lamp's light, in 0..1, that reaches places on the body itself."""
+        return torch.stack(
+            [
+                torch.exp(-self._depth_before(lamp, _LEAST_WIDTH_M + width_log.exp(), body, places))
+                for lamp, width_log in zip(lamps, self.own_widths_log, strict=True)
+            ]
+        )
+
     def _depth(
         self,
         lamp: Float[Tensor, "3"],
@@ -62,42 +86,83 @@ class BodyShadow(nn.Module):
         body: Float[Tensor, "T P 3"],
         places: Float[Tensor, "H W 3"],
     ) -> Float[Tensor, "T H W"]:
-        """Optical depth of the body between places and the lamp.
-
-        All is seen from the lamp, on the plane through the body's middle that faces it.
-        """
-        ray = body.mean(1) - lamp
-        distance = ray.norm(dim=-1)
-        axis = ray / distance[:, None]
-        across = _across(axis)
-        grid = torch.linspace(-_REACH_M, _REACH_M, _CELLS, dtype=lamp.dtype, device=lamp.device)
-        seen, _ = _project(body - lamp, axis, across, distance)
-        bells = torch.exp(-0.5 * ((grid[:, None, None] - seen[:, None]) / width).square())
-        scale = _DENSITY * _AREA_M2 / (body.shape[1] * 2 * torch.pi * width.square())
-        density = scale * bells[..., 0] @ bells[..., 1].transpose(1, 2)
-        at, along = _project((places - lamp).flatten(0, 1)[None], axis, across, distance)
-        at, along = (values.unflatten(1, places.shape[:2]) for values in (at, along))
+        """Optical depth of the body between places and the lamp."""
+        view = _LampView.of(lamp, body)
+        across, down = _bells(view.project(body)[0], width)
+        density = _scale(body, width) * across @ down.transpose(1, 2)
+        at, behind = view.project(places.flatten(0, 1)[None])
+        at, behind = (values.unflatten(1, places.shape[:2]) for values in (at, behind))
         # grid_sample wants the coordinate along the last axis first.
         sampled = nn.functional.grid_sample(
             density[:, None], at.flip(-1) / _REACH_M, align_corners=True
         )[:, 0]
-        behind = along - distance[:, None, None]
         return sampled * torch.sigmoid((behind + 0.2) / 0.1)
 
+    def _depth_before(
+        self,
+        lamp: Float[Tensor, "3"],
+        width: Float[Tensor, ""],
+        body: Float[Tensor, "T P 3"],
+        places: Float[Tensor, "T N 3"],
+    ) -> Float[Tensor, "T N"]:
+        """Optical depth of those parts of the body that are nearer to the lamp than places on it.
 
-def _project(
-    points: Float[Tensor, "#T N 3"],
-    axis: Float[Tensor, "T 3"],
-    across: Float[Tensor, "T 2 3"],
-    distance: Float[Tensor, "T"],
-) -> tuple[Float[Tensor, "T N 2"], Float[Tensor, "T N"]]:
-    """Points relative to a lamp on the plane at ``distance`` before it, and how far along they are.
+        In layers along the light, each of which holds what is nearer.
+        """
+        view = _LampView.of(lamp, body)
+        at, behind = view.project(body)
+        layers = torch.linspace(-_REACH_M, _REACH_M, _LAYERS, dtype=lamp.dtype, device=lamp.device)
+        nearer = torch.sigmoid((layers[:, None] - behind[:, None]) / _LAYER_EDGE_M)
+        across, down = _bells(at, width)
+        rows = (nearer[:, :, None] * across[:, None]).flatten(1, 2)
+        density = _scale(body, width) * rows @ down.transpose(1, 2)
+        at, behind = view.project(places)
+        seen = torch.cat([at.flip(-1), (behind - _OWN_SURFACE_M)[..., None]], -1)
+        return nn.functional.grid_sample(
+            density.unflatten(1, (_LAYERS, _CELLS))[:, None],
+            seen[:, None, None] / _REACH_M,
+            align_corners=True,
+        )[:, 0, 0, 0]
 
-    In metres on that plane.
-    """
-    along = (points @ axis[..., None])[..., 0]
-    spread = distance[:, None] / along.clamp_min(_NEAREST_M)
-    return (points @ across.transpose(1, 2)) * spread[..., None], along
+
+@dataclass(frozen=True, eq=False)
+class _LampView:
+    """What a lamp sees, on the plane through the body's middle that faces it."""
+
+    lamp: Float[Tensor, "3"]
+    axis: Float[Tensor, "T 3"]
+    across: Float[Tensor, "T 2 3"]
+    distance: Float[Tensor, "T"]
+
+    @classmethod
+    def of(cls, lamp: Float[Tensor, "3"], body: Float[Tensor, "T P 3"]) -> "_LampView":
+        ray = body.mean(1) - lamp
+        distance = ray.norm(dim=-1)
+        axis = ray / distance[:, None]
+        return cls(lamp, axis, _across(axis), distance)
+
+    def project(
+        self, points: Float[Tensor, "#T N 3"]
+    ) -> tuple[Float[Tensor, "T N 2"], Float[Tensor, "T N"]]:
+        """Points on the plane, and how far behind it they are, metres."""
+        points = points - self.lamp
+        along = (points @ self.axis[..., None])[..., 0]
+        spread = self.distance[:, None] / along.clamp_min(_NEAREST_M)
+        at = (points @ self.across.transpose(1, 2)) * spread[..., None]
+        return at, along - self.distance[:, None]
+
+
+def _bells(
+    at: Float[Tensor, "T P 2"], width: Float[Tensor, ""]
+) -> tuple[Float[Tensor, "T C P"], Float[Tensor, "T C P"]]:
+    """Round Gaussians at points of the plane, one factor per axis, at the cells of the grid."""
+    grid = torch.linspace(-_REACH_M, _REACH_M, _CELLS, dtype=at.dtype, device=at.device)
+    bells = torch.exp(-0.5 * ((grid[:, None, None] - at[:, None]) / width).square())
+    return bells[..., 0], bells[..., 1]
+
+
+def _scale(body: Float[Tensor, "T P 3"], width: Float[Tensor, ""]) -> Float[Tensor, ""]:
+    return _DENSITY * _AREA_M2 / (body.shape[1] * 2 * torch.pi * width.square())
 
 
 def _across(axis: Float[Tensor, "T 3"]) -> Float[Tensor, "T 2 3"]:

@@ -120,6 +120,7 @@ class EvsplatConfig(PaperConfig):
             human_colour="own",
             shading=True,
             shadow_lights=4,
+            self_shadow=True,
         )
     )
     optimisation: OptimisationConfig = field(
