@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, CubicSpline
 
 from evsplat.body import BodyTrack, axis_angle_to_matrix, default_body
 from evsplat.body.smoothing import motion_noise
@@ -76,8 +76,7 @@ def test_the_price_is_that_of_scipys_curve():
         pose_spline=spline, pose_correction_active=True,
         rotation_residuals=points, translation_residuals=root,
     )  # fmt: skip
-    track = SimpleNamespace(times_us=times)
-    found = PosePrior(track).loss(SimpleNamespace(model=model))["pose_prior"]
+    found = PosePrior(times.tolist()).loss(SimpleNamespace(model=model))["pose_prior"]
     gap, seconds, frames = 0.196, times * 1e-6, np.array(FRAMES) * 1e-6
     prices = []
     curves = [BSpline(scipys.t, scipys.c[:, joint], 3) for joint in (0, 2, 3)]
@@ -89,7 +88,33 @@ def test_the_price_is_that_of_scipys_curve():
         prices.append((value**2).mean() + float(stiff) * gap * (bend**2).mean())
     assert float(found) == pytest.approx(np.mean(prices), rel=1e-4)
     model.pose_correction_active = False
-    assert PosePrior(track).loss(SimpleNamespace(model=model)) == {}
+    assert PosePrior(times.tolist()).loss(SimpleNamespace(model=model)) == {}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_held_at_keys_it_is_scipys_curve_less_the_cubic_through_its_keys(seed):
+    rng = np.random.default_rng(seed)
+    keys = np.sort(rng.choice(np.arange(10_000, 990_001, 1_000), 9, replace=False))
+    keys[0], keys[-1] = 10_000, 990_000
+    spline = PoseSpline(
+        (10_000, 990_000), 50_000, FRAMES, joint_rad=torch.ones(2), root_m=1.0,
+        held_us=keys.tolist(),
+    )  # fmt: skip
+    knots = 10_000 + 50_000 * np.arange(-3, spline.count + 1)
+    free = BSpline(1e-6 * knots, rng.normal(size=(spline.count, 2, 3)), 3)
+    through = CubicSpline(1e-6 * keys, free(1e-6 * keys))
+    points = torch.tensor(free.c, dtype=torch.float32)
+    assert spline.rotation(points, keys.tolist()).abs().max() < 1e-5
+    times = rng.integers(10_000, 990_001, size=40)
+    seconds = 1e-6 * times
+    expected = free(seconds) - through(seconds)
+    assert np.abs(expected).max() > 0.3
+    assert np.allclose(spline.rotation(points, times.tolist()), expected, atol=1e-4)
+    bend = torch.einsum("tk,kjc->tjc", spline.weights(times.tolist(), derivative=2), points)
+    expected = free(seconds, 2) - through(seconds, 2)
+    assert np.allclose(bend, expected, atol=1e-4 * np.abs(expected).max())
+    outside = spline.rotation(points, [-5_000, 2_000_000])
+    assert outside.abs().max() < 1e-5
 
 
 def dance(seed: int):

@@ -39,12 +39,16 @@ def composed(capture: Capture, *settings: str):
     return TRAINABLE["evsplat"][1](config, capture, 0)
 
 
-def test_noisy_poses_are_told_and_nothing_is_done_to_exact_ones(captures, caplog):
+def test_noisy_poses_are_told_and_exact_ones_stay_at_every_key(captures, caplog):
     exact, noisy = captures
     with caplog.at_level(logging.INFO):
         untouched = prepare_poses(PoseConfig(), exact)
-    assert "taken as they are, not corrected" in caplog.text
-    assert untouched.spline is None
+    assert "taken as they are, corrected between keys only" in caplog.text
+    assert untouched.spline is not None
+    keys = untouched.track.times_us.tolist()
+    assert untouched.spline.weights(keys).abs().max() < 1e-5
+    assert set(untouched.priced_us).isdisjoint(keys)
+    assert prepare_poses(PoseConfig(between=False), exact).spline is None
     assert np.array_equal(untouched.track.poses, load_body_track(exact).poses)
     caplog.clear()
     with caplog.at_level(logging.INFO):
@@ -55,7 +59,7 @@ def test_noisy_poses_are_told_and_nothing_is_done_to_exact_ones(captures, caplog
     assert np.abs(found.track.poses - truth).mean() < before
     assert found.spline is not None
     assert float(found.spline.joint_rad.max()) == pytest.approx(0.05, rel=0.5)
-    off = prepare_poses(PoseConfig(smooth="never", refine="never"), noisy)
+    off = prepare_poses(PoseConfig(smooth="never", refine="never", between=False), noisy)
     assert off.spline is None
     assert np.array_equal(off.track.poses, load_body_track(noisy).poses)
 
@@ -95,7 +99,7 @@ def test_without_being_asked_held_out_events_teach_nothing(captures):
     assert composition.held_out is None
     assert composition.model.pose_spline is not None
     assert composition.weights["pose_prior"] == PoseConfig().prior
-    assert composed(captures[0]).model.pose_spline is None
+    assert composed(captures[0], "pose.between=false").model.pose_spline is None
 
 
 def test_an_unknown_choice_is_named():

@@ -6,9 +6,11 @@ from typing import Self
 
 import torch
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack
+from evsplat.body.between_keys import BetweenKeys
 from evsplat.body.smoothing import MotionNoise
 from evsplat.devices import send
 
@@ -29,15 +31,21 @@ class PoseSpline(nn.Module):
     Control points c are in units of what is expected: `joint_rad` for axis-angle vectors, `root_m`
     for the root's place, so that one learning rate and one prior fit all.
 
-    The mean over the training frames is taken out. A constant residual and a canonical shape that
-    is bent the other way look the same, and the shape follows all frames: left free, knots of
-    frames that no picture corrects would stay behind.
+    Where key poses are exact, the residual is zero at each (``held_us``): taken from it is the
+    cubic spline through its own values there. What is left is how the person moves from key to key,
+    which the track's spline cannot know.
+
+    Otherwise the mean over the training frames is taken out. A constant residual and a canonical
+    shape that is bent the other way look the same, and the shape follows all frames: left free,
+    knots of frames that no picture corrects would stay behind.
     """
 
     joint_rad: Tensor
     joint_stiffness: Tensor
     root_stiffness: Tensor
     mean: Tensor
+    held: Tensor
+    held_s: Tensor
 
     def __init__(
         self,
@@ -48,6 +56,7 @@ class PoseSpline(nn.Module):
         joint_rad: Float[Tensor, " J"],
         root_m: float,
         stiffness_s3: Float[Tensor, " J+1"] | None = None,
+        held_us: Sequence[int] = (),
     ) -> None:
         """Knots every ``knot_us`` from the start of ``span_us``; outside of it the ends are held.
 
@@ -64,10 +73,17 @@ class PoseSpline(nn.Module):
             "joint_stiffness": stiffness_s3[:-1].float(),
             "root_stiffness": stiffness_s3[-1].float(),
             "mean": torch.zeros(self.count),
+            "held": torch.zeros(0, 4, self.count, dtype=torch.float64),
+            "held_s": torch.zeros(0, dtype=torch.float64),
         }
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
-        self.mean = self.weights(frame_times_us).mean(0)
+        if len(held_us) > 1:
+            self.held_s = 1e-6 * (torch.tensor(held_us, dtype=torch.float64) - span_us[0])
+            through = CubicSpline(self.held_s.numpy(), self.weights(held_us).double().numpy())
+            self.held = torch.from_numpy(through.c.transpose(1, 0, 2).copy())
+        else:
+            self.mean = self.weights(frame_times_us).mean(0)
 
     @classmethod
     def of(
@@ -98,6 +114,19 @@ class PoseSpline(nn.Module):
             stiffness_s3=stiffness.clamp(max=STIFFEST * (1e-6 * gap) ** 3) if stiff else None,
         )
 
+    @classmethod
+    def between_keys(cls, track: BodyTrack, expected: BetweenKeys) -> Self:
+        """For a track with exact key poses: zero at each, two knots from one to the next."""
+        times = torch.from_numpy(track.times_us)
+        return cls(
+            (int(times[0]), int(times[-1])),
+            float(times.diff().double().median()) / 2,
+            (),
+            joint_rad=torch.from_numpy(expected.rotation_rad),
+            root_m=expected.translation_m,
+            held_us=times.tolist(),
+        )
+
     @property
     def count(self) -> int:
         """Number of control points."""
@@ -120,7 +149,20 @@ class PoseSpline(nn.Module):
         index = segment.long()[:, None] + torch.arange(4, device=device)
         found = torch.zeros(len(times), self.count, dtype=torch.float64, device=device)
         found.scatter_(1, index, powers @ _PIECES.to(device))
+        if len(self.held):
+            found = found - self._through_keys(times, derivative)
         return found.float() if derivative else found.float() - self.mean
+
+    def _through_keys(self, times: Float[Tensor, "T"], derivative: int) -> Float[Tensor, "T K"]:
+        """The cubic spline through what the control points weigh at the keys."""
+        seconds = 1e-6 * (times.clamp(*self.span_us) - self.span_us[0])
+        piece = torch.searchsorted(self.held_s, seconds, right=True) - 1
+        piece = piece.clamp(0, len(self.held) - 1)
+        step = (seconds - self.held_s[piece])[:, None]
+        c3, c2, c1, c0 = self.held[piece].unbind(1)
+        if derivative:
+            return 6 * c3 * step + 2 * c2
+        return ((c3 * step + c2) * step + c1) * step + c0
 
     def rotation(
         self, points: Float[Tensor, "K J 3"], times_us: Sequence[int]

@@ -29,9 +29,9 @@ class BodyShadow(nn.Module):
 
     Each lamp has a share of the brightness that it gives and a width of its penumbra, both learned.
     Points of the body are seen from the lamp as round Gaussians of that width; a place of the scene
-    behind them loses the share times ``1 - exp(-depth)``, and a place on the body itself, `lit`, the
-    lamp's own light, by points that are nearer to the lamp. A sum of round Gaussians on a grid is a
-    product of two matrices, so that a shadow costs as good as nothing.
+    behind them loses the share times ``1 - exp(-depth)``, and a place on the body itself (`lit`)
+    the lamp's own light, by points that are nearer to the lamp. A sum of round Gaussians on a grid
+    is a product of two matrices, so that a shadow costs as good as nothing.
     """
 
     caster_points: Tensor

@@ -171,7 +171,7 @@ def compose(
     observed: list[Objective] = [exposure]
     weights: dict[str, Weight] = {}
     if poses.spline is not None:
-        observed.append(PosePrior(poses.track))
+        observed.append(PosePrior(poses.priced_us))
         weights["pose_prior"] = config.pose.prior
     if config.event.weight != 0.0:
         weights["event"] = config.event.weight

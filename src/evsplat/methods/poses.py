@@ -1,10 +1,12 @@
 """Noisy body poses: how noisy they are, what is smoothed, and what training may correct."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from evsplat.body import BodyTrack, load_body_track
+from evsplat.body.between_keys import between_keys
 from evsplat.body.smoothing import motion_noise, smoothed
 from evsplat.capture import Capture
 from evsplat.deform.pose_spline import PoseSpline
@@ -26,6 +28,9 @@ class PoseConfig:
     """Take out of the given key poses what looks like noise."""
     refine: When = "auto"
     """Learn a residual of the poses, a cubic B-spline in time, from pictures and events."""
+    between: bool = True
+    """Where poses are taken as exact, learn how the person moves between them: such a residual that
+    is zero at every key pose."""
     noisy_rad: float = 0.006
     """Jitter of key poses, radians per axis, from which poses count as noisy."""
     start: float = 1_500
@@ -48,8 +53,10 @@ class Poses:
     """What a model is to move by."""
 
     track: BodyTrack
-    spline: PoseSpline | None
+    spline: PoseSpline | None = None
     """None where nothing is to be learned of poses."""
+    priced_us: Sequence[int] = ()
+    """Times at which the residual costs."""
 
 
 def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) -> Poses:
@@ -66,12 +73,21 @@ def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) ->
         noise.rotation_rad,
         config.noisy_rad,
         "smoothed in time" if smooth else "taken as they are",
-        "corrected in training" if refine else "not corrected",
+        "corrected in training"
+        if refine
+        else "corrected between keys only"
+        if config.between
+        else "not corrected",
     )
     if smooth:
         track = smoothed(track, noise)
+    times = track.times_us
     if not refine:
-        return Poses(track, None)
+        expected = between_keys(track)
+        if not config.between or not expected.rotation_rad.any():
+            return Poses(track)
+        middles = (times[1:] + times[:-1]) // 2
+        return Poses(track, PoseSpline.between_keys(track, expected), middles.tolist())
     spline = PoseSpline.of(
         track,
         noise,
@@ -81,4 +97,4 @@ def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) ->
         root_m=config.std_m or max(noise.translation_m, LEAST_STD_M),
         stiff=smooth,
     )
-    return Poses(track, spline)
+    return Poses(track, spline, times.tolist())

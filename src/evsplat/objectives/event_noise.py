@@ -1,4 +1,4 @@
-"""How far a recording's events can be trusted, per pixel and per time that they are counted over."""
+"""How far a recording's events can be trusted, per pixel and per time they are counted over."""
 
 import math
 from functools import cached_property

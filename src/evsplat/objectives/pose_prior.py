@@ -5,23 +5,22 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from evsplat.body import BodyTrack
 from evsplat.capture import Frame
 from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.objectives.base import Stateless, Step
 
 
 class PosePrior(Stateless):
-    """Mean over key poses, moving joints and axes of squares in units of what is expected.
+    """Mean over given times, moving joints and axes of squares in units of what is expected.
 
     ``r^2 + stiffness * gap * r''^2``: the negative logarithm of the probability of errors that are
     new in every key pose on a motion that bends as the smoothed one does, if the poses were
     smoothed with the same stiffness (see `evsplat.body.smoothing`).
     """
 
-    def __init__(self, track: BodyTrack) -> None:
-        """``track`` has the key poses."""
-        self.times_us = track.times_us.tolist()
+    def __init__(self, times_us: Sequence[int]) -> None:
+        """``times_us``: of the key poses, or between them where those are exact."""
+        self.times_us = list(times_us)
         span = self.times_us[-1] - self.times_us[0]
         self.gap_s = 1e-6 * span / max(1, len(self.times_us) - 1)
 
