@@ -11,6 +11,7 @@
 #include "sensor_kernels.h"
 #include "skinning.h"
 #include "ssim.h"
+#include "surface_light.h"
 
 namespace evsplat {
 
@@ -142,6 +143,10 @@ struct Kernels {
     // Points [begin, end).
     void (*skin)(const Skinning&, size_t begin, size_t end, float* moved, float* blended);
     void (*skin_backward)(const Skinning&, const SkinningGrads&, const float* blended, size_t begin, size_t end);
+    void (*surface_light)(const SurfaceLight&, size_t begin, size_t end, float* factors);
+    // Sums over the points, and the gradient of the shares unless it is null.
+    void (*surface_light_backward)(const SurfaceLight&, size_t begin, size_t end, const float* above, float* sums,
+                                   float* lit);
     void (*hash_forward)(const HashLevel&);
     void (*hash_backward)(const HashLevel&);
     void (*sensor_step)(const SensorPiece&);
@@ -163,6 +168,8 @@ struct Kernels {
     void tree_softmax(const TreeSoftmax&, size_t, size_t, float*);                  \
     void skin(const Skinning&, size_t, size_t, float*, float*);                                  \
     void skin_backward(const Skinning&, const SkinningGrads&, const float*, size_t, size_t);     \
+    void surface_light(const SurfaceLight&, size_t, size_t, float*);                             \
+    void surface_light_backward(const SurfaceLight&, size_t, size_t, const float*, float*, float*); \
     void hash_forward(const HashLevel&);         \
     void hash_backward(const HashLevel&);        \
     void sensor_step(const SensorPiece&);        \

@@ -13,6 +13,7 @@
 #include "isometry.h"
 #include "picture.h"
 #include "posing.h"
+#include "surface_light.h"
 
 namespace nb = nanobind;
 using namespace evsplat;
@@ -212,6 +213,44 @@ void py_change_shape_backward(In changes, In means, In scales_log, In quats, In 
                           scales_grad.data(), quats_grad.data());
 }
 
+SurfaceLight light_on(const In& transforms, const In& normals, const In& places, const In& coefficients,
+                      const std::array<float, 3>& center, float radius, const In& lamps, const In& intensities,
+                      const std::optional<In>& lit) {
+    require(places.ndim() == 3 && places.shape(2) == 3, "the places");
+    const size_t times = places.shape(0), points = places.shape(1), count = lamps.size() / 3;
+    require(transforms.size() == times * points * 16 && normals.size() == points * 3, "the surface");
+    require(coefficients.size() == size_t(kLightCoefficients), "the coefficients");
+    require(lamps.size() == count * 3 && intensities.size() == count * 3, "the lamps");
+    const size_t lit_times = lit && lit->ndim() == 3 ? lit->shape(1) : 1;
+    require(!lit || (lit->ndim() == 3 && lit->shape(0) == count && (lit_times == 1 || lit_times == times) &&
+                     lit->shape(2) == points),
+            "the shares of light");
+    return {times, points, transforms.data(), normals.data(), places.data(), coefficients.data(),
+            {center[0], center[1], center[2]}, radius, int(count), lamps.data(), intensities.data(), given(lit),
+            lit_times};
+}
+
+void py_surface_light(In transforms, In normals, In places, In coefficients, const std::array<float, 3>& center,
+                      float radius, In lamps, In intensities, std::optional<In> lit, Out factors, int threads) {
+    const SurfaceLight job =
+        light_on(transforms, normals, places, coefficients, center, radius, lamps, intensities, lit);
+    require(factors.size() == places.size(), "the factors");
+    nb::gil_scoped_release release;
+    surface_light(job, threads, factors.data());
+}
+
+void py_surface_light_backward(In transforms, In normals, In places, In coefficients,
+                               const std::array<float, 3>& center, float radius, In lamps, In intensities,
+                               std::optional<In> lit, In above, Out sums, std::optional<Out> lit_grad, int threads) {
+    const SurfaceLight job =
+        light_on(transforms, normals, places, coefficients, center, radius, lamps, intensities, lit);
+    require(above.size() == places.size() && sums.size() == light_sums(job.lamps), "the gradients");
+    require(!lit_grad || (lit && lit_grad->size() == lit->size()), "the gradient of the shares of light");
+    float* to = lit_grad ? lit_grad->data() : nullptr;
+    nb::gil_scoped_release release;
+    surface_light_backward(job, above.data(), threads, sums.data(), to);
+}
+
 }  // namespace
 
 void bind_step(nb::module_& m) {
@@ -237,6 +276,13 @@ void bind_step(nb::module_& m) {
           nb::arg("grad"), nb::arg("threads"));
     m.def("tree_softmax", &py_tree_softmax, nb::arg("logits"), nb::arg("tree"), nb::arg("above").none(),
           nb::arg("result"), nb::arg("threads"), "Weights over the joints of a tree, or the gradient of its logits.");
+    m.def("surface_light", &py_surface_light, nb::arg("transforms"), nb::arg("normals"), nb::arg("places"),
+          nb::arg("coefficients"), nb::arg("center"), nb::arg("radius"), nb::arg("lamps"), nb::arg("intensities"),
+          nb::arg("lit").none(), nb::arg("factors"), nb::arg("threads"), "Light on a surface, a factor on its colours.");
+    m.def("surface_light_backward", &py_surface_light_backward, nb::arg("transforms"), nb::arg("normals"),
+          nb::arg("places"), nb::arg("coefficients"), nb::arg("center"), nb::arg("radius"), nb::arg("lamps"),
+          nb::arg("intensities"), nb::arg("lit").none(), nb::arg("above"), nb::arg("sums"), nb::arg("lit_grad").none(),
+          nb::arg("threads"), "Gradients of coefficients, lamps and intensities in a row, and of the shares.");
     m.def("change_shape", &py_change_shape, nb::arg("changes"), nb::arg("means"), nb::arg("scales_log"),
           nb::arg("quats"), nb::arg("moved"), nb::arg("scales"), nb::arg("rotations"), nb::arg("feature"),
           nb::arg("threads"), "Moves, scales and turns Gaussians by what a network says.");

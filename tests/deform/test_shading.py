@@ -1,10 +1,13 @@
-"""The person's shading: one at the start, its polynomial in closed form, normals of the surface."""
+"""The person's shading: its polynomial and lamps in closed form, and normals of the surface."""
+
+import copy
+from functools import partial
 
 import pytest
 import torch
 
 from evsplat.body import SurfaceSamples
-from evsplat.deform.shading import NearestSurface, Shading
+from evsplat.deform.shading import NearestSurface, Shading, SurfaceLight
 
 
 def sphere(count: int, generator: torch.Generator) -> SurfaceSamples:
@@ -56,6 +59,44 @@ def test_a_lamp_lights_by_the_cosine_and_the_inverse_square(seed):
         shaded = 1 + share[0, ..., None] * (expected - 1)
         factor = shading(normals, places, lamp[None], share)
         assert torch.allclose(factor, shaded.clamp(0.2, 3.0), atol=1e-5)
+
+
+@pytest.mark.parametrize(("lamps", "lit_times"), [(0, None), (3, None), (3, 1), (2, 4)])
+@pytest.mark.parametrize("count", [1, 37, 2_050])
+def test_the_compiled_light_is_the_plain_one_in_float64(lamps, lit_times, count):
+    generator = torch.Generator().manual_seed(count + lamps)
+    random = partial(torch.randn, generator=generator)
+    shading = Shading(random(3), 1.7, lamps)
+    with torch.no_grad():
+        shading.coefficients.copy_(0.1 * random(4, 9, 3))
+        shading.intensities.copy_(0.6 * random(lamps, 3))
+    # Some places beyond what the polynomial knows, some nearer to a lamp than light grows.
+    places, transforms = 2 * random(4, count, 3), random(4, count, 4, 4)
+    lamp_places = (2 * random(lamps, 3)).requires_grad_()
+    places[:, :lamps] = (lamp_places.detach() + 0.1)[None, :count]
+    normals = sphere(count, generator).normals
+    lit = None
+    if lit_times is not None:
+        lit = torch.rand(lamps, lit_times, count, generator=generator).requires_grad_()
+    above = random(4, count, 3)
+    learned = [shading.coefficients, *([shading.intensities, lamp_places] if lamps else [])]
+    learned += [] if lit is None else [lit]
+    light = SurfaceLight(shading, normals, lamp_places if lamps else None)
+    factors = light.factors(transforms, places, lit)
+    grads = torch.autograd.grad((factors * above).sum(), learned)
+
+    exact = copy.deepcopy(shading).double()
+    lamps64 = lamp_places.detach().double().requires_grad_()
+    lit64 = None if lit is None else lit.detach().double().requires_grad_()
+    light = SurfaceLight(exact, normals.double(), lamps64 if lamps else None)
+    expected = light.factors(transforms.double(), places.double(), lit64)
+    learned = [exact.coefficients, *([exact.intensities, lamps64] if lamps else [])]
+    learned += [] if lit64 is None else [lit64]
+    expected_grads = torch.autograd.grad((expected * above.double()).sum(), learned)
+    assert (factors - expected).abs().max() < 1e-4
+    # Where a factor meets its bound the two may differ by a whole gradient.
+    for found, right in zip(grads, expected_grads, strict=True):
+        assert (found - right).norm() < 1e-3 * right.norm() + 1e-5
 
 
 def test_gradcheck():

@@ -1,12 +1,15 @@
 """How bright the person's surface is, by where it stands and how it is turned."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from evsplat.body.surface import SurfaceSamples
+from evsplat.compiled import native, runs_native
 from evsplat.deform.spherical_harmonics import sh_basis
 from evsplat.neighbours import nearest
 
@@ -85,8 +88,60 @@ class SurfaceLight:
 
         ``lit`` as in `Shading`.
         """
+        fixed = (transforms, self.normals, places)
+        if all(runs_native(tensor) and not tensor.requires_grad for tensor in fixed):
+            nothing = places.new_zeros(0, 3)
+            factors: Tensor = _NativeLight.apply(
+                *fixed,
+                self.shading,
+                self.shading.coefficients,
+                nothing if self.lamps is None else self.lamps,
+                nothing if self.lamps is None else self.shading.intensities,
+                lit if self.lamps is not None else None,
+            )
+            return factors
         turned = (transforms[..., :3, :3] @ self.normals[..., None])[..., 0]
         return self.shading(nn.functional.normalize(turned, dim=-1), places, self.lamps, lit)
+
+
+class _NativeLight(torch.autograd.Function):
+    """`SurfaceLight.factors` in the compiled module, for a surface that learns nothing by it."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        transforms: Tensor,
+        normals: Tensor,
+        places: Tensor,
+        shading: Shading,
+        *learned: Tensor | None,
+    ) -> Tensor:
+        *parts, lit = [None if t is None else t.detach().contiguous() for t in learned]
+        coefficients, lamps, intensities = parts
+        surface = [tensor.contiguous() for tensor in (transforms, normals, places)]
+        room = shading.center.tolist(), float(shading.radius_m)
+        ctx.given = (*surface, coefficients, *room, lamps, intensities, lit)
+        factors = torch.empty_like(surface[2])
+        native.surface_light(*ctx.given, factors, torch.get_num_threads())
+        return factors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        coefficients, lamps, intensities, lit = (ctx.given[k] for k in (3, 6, 7, 8))
+        sizes = [coefficients.numel(), lamps.numel(), intensities.numel()]
+        sums = coefficients.new_empty(sum(sizes))
+        by_lit = torch.empty_like(lit) if ctx.needs_input_grad[-1] else None
+        native.surface_light_backward(
+            *ctx.given, upstream[0].contiguous(), sums, by_lit, torch.get_num_threads()
+        )
+        parts = (
+            part.view_as(like)
+            for part, like in zip(
+                sums.split(sizes), (coefficients, lamps, intensities), strict=True
+            )
+        )
+        return None, None, None, None, *parts, by_lit
 
 
 class NearestSurface:
