@@ -135,6 +135,31 @@ def test_own_colours_on_the_body_surface_need_no_network(tiny_capture, seed):
     assert not {"skinning", "human_colour"} & names
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_what_the_body_hides_from_a_lamp_is_darker(tiny_capture, seed):
+    settings = "deform.shading=true deform.shadow_lights=2 deform.self_shadow=true"
+    settings += " deform.human_colour=own"
+    model = model_of(tiny_capture(), *settings.split())[0]
+    times = model.frame_times[:3].long().tolist()
+    center = torch.tensor([0.3, -2.0, 1.2])
+    with torch.no_grad():
+        dark = model.at(times, center).human
+        model.shading.intensities.copy_(0.2 + torch.rand(2, 3))
+        lit = model.at(times, center).human
+        lamps = model.lamps.places()
+        casters = model.shadow.place(model.pose(times)[1])
+        shares = model.shadow.lit(casters, lit.means, lamps)
+        light = model.surface_light()
+        expected = light.factors(lit.transforms, lit.means, shares)
+        assert torch.allclose(lit.rgb, dark.rgb * expected, atol=1e-5)
+        assert (expected < light.factors(lit.transforms, lit.means) - 0.01).any()
+        # A training step looks at its middle alone.
+        step = model.at(times, center, networks_at_us=times[1]).human
+        shares = shares[:, 1:2]
+        expected = light.factors(lit.transforms, lit.means, shares)
+    assert torch.allclose(step.rgb, dark.rgb * expected, atol=1e-5)
+
+
 def test_weights_of_the_surface_and_points_far_from_it_exclude_each_other(tiny_capture):
     with pytest.raises(ConfigError, match="deform.skinning=network"):
         model_of(tiny_capture(), "semantics=ste", "deform.skinning=surface")

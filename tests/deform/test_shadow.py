@@ -12,7 +12,7 @@ LAMP = torch.tensor([[0.3, -0.2, 3.5]], dtype=torch.float64)
 
 def make(lamps: int = 1) -> BodyShadow:
     casters = SurfaceSamples(torch.zeros(9, 3), torch.zeros(9, 3), torch.ones(9, 1))
-    return BodyShadow(casters, lamps).double()
+    return BodyShadow(casters, lamps, on_body=True).double()
 
 
 def column(seed: int = 0) -> torch.Tensor:

@@ -169,7 +169,7 @@ def foreign(monkeypatch):
         {
             "method": "evsplat",
             "deform": SMALL["deform"]
-            | {"shading": True, "shadow_lights": 2, "networks_once": True},
+            | {"shading": True, "shadow_lights": 2, "self_shadow": True, "networks_once": True},
         },
         {"deform": SMALL["deform"] | {"encoding": "hashgrid", "pose_correction_start": 0}},
         pytest.param(

@@ -193,7 +193,9 @@ class HumanSceneModel(nn.Module):
         if config.shadow_lights:
             self.lamps = Lamps(middle, up_axis(track), config.shadow_lights)
             casters = body.sample_surface(CASTERS, generator)
-            self.shadow = BodyShadow(casters, config.shadow_lights)
+            self.shadow = BodyShadow(
+                casters, config.shadow_lights, on_body=config.self_shadow and config.shading
+            )
         if config.shading:
             radius = max(1.0, float((roots - middle).norm(dim=-1).max()))
             self.shading = Shading(middle, radius, config.shadow_lights)
@@ -353,7 +355,7 @@ class HumanSceneModel(nn.Module):
         if light is not None:
             # Geometry gets no gradient by the light.
             places, lit = human_means.detach(), None
-            if self.config.self_shadow and self.shadow is not None and light.lamps is not None:
+            if self.shadow is not None and self.shadow.on_body and light.lamps is not None:
                 body = self.shadow.place(bones[middle]).detach()
                 lit = self.shadow.lit(body, places[middle], light.lamps)
             rgb = rgb * light.factors(transforms[:, people].detach(), places, lit)

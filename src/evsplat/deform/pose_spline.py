@@ -148,7 +148,7 @@ class PoseSpline(nn.Module):
             powers = torch.stack([zero, zero, 2 + zero, 6 * step], 1) / (self.knot_us * 1e-6) ** 2
         index = segment.long()[:, None] + torch.arange(4, device=device)
         found = torch.zeros(len(times), self.count, dtype=torch.float64, device=device)
-        found.scatter_(1, index, powers @ _PIECES.to(device))
+        found.scatter_(1, index, powers @ send(_PIECES, device))
         if len(self.held):
             found = found - self._through_keys(times, derivative)
         return found.float() if derivative else found.float() - self.mean

@@ -37,15 +37,23 @@ class BodyShadow(nn.Module):
     caster_points: Tensor
     caster_weights: Tensor
 
-    def __init__(self, casters: SurfaceSamples, lamps: int) -> None:
-        """``casters``: a few hundred samples of the canonical body."""
+    def __init__(self, casters: SurfaceSamples, lamps: int, *, on_body: bool = False) -> None:
+        """``casters``: a few hundred samples of the canonical body.
+
+        ``on_body``: whether they shade the body as well.
+        """
         super().__init__()
         self.register_buffer("caster_points", casters.points, persistent=False)
         self.register_buffer("caster_weights", casters.weights, persistent=False)
         self.share_logits = nn.Parameter(torch.full((lamps,), -2.0))
         self.widths_log = nn.Parameter(torch.full((lamps,), -2.5))
-        self.own_widths_log = nn.Parameter(torch.full((lamps,), -3.5))
+        self.own_widths_log = nn.Parameter(torch.full((lamps,), -3.5)) if on_body else None
         """Of the shadows on the body, which lies right behind what casts them."""
+
+    @property
+    def on_body(self) -> bool:
+        """Whether the body is shaded as well."""
+        return self.own_widths_log is not None
 
     def place(self, bones: Float[Tensor, "T J 4 4"]) -> Float[Tensor, "T P 3"]:
         """The casters in the world, for bone transforms from canonical space."""
@@ -72,6 +80,7 @@ class BodyShadow(nn.Module):
         lamps: Float[Tensor, "L 3"],
     ) -> Float[Tensor, "L T N"]:
         """Share of each lamp's light, in 0..1, that reaches places on the body itself."""
+        assert self.own_widths_log is not None
         return torch.stack(
             [
                 torch.exp(-self._depth_before(lamp, _LEAST_WIDTH_M + width_log.exp(), body, places))
