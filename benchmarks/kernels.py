@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from evsplat import body
 from evsplat.body import body as skin_module
-from evsplat.deform import colour, encodings, non_rigid, skinning_network
+from evsplat.deform import colour, encodings, non_rigid, shading, skinning_network
 from evsplat.imaging import events, srgb
 from evsplat.neighbours import nearest
 from evsplat.objectives import event, isometry, semantic
@@ -163,7 +163,21 @@ def body_cases(points: int) -> dict[str, tuple[Call, Call]]:
         terms = isometry.isometry_change(rows, (positions, quaternions, log_scales), tuple(moved))
         torch.autograd.grad(terms[0] + terms[1], (positions, *moved))
 
+    light = shading.SurfaceLight(
+        shading.Shading(torch.zeros(3), 1.0, lamps=4),
+        torch.nn.functional.normalize(torch.randn(points, 3), dim=-1),
+        torch.randn(4, 3).requires_grad_(),
+    )
+    lit = torch.rand(4, 1, points).requires_grad_()
+    carried = bones[:, :1].expand(-1, points, -1, -1).contiguous()
+    stands = torch.rand(times, points, 3)
+
+    def surface_light() -> None:
+        factors = light.factors(carried, stands, lit)
+        torch.autograd.grad(factors.sum(), (lit, *light.shading.parameters()))
+
     return {
+        "surface_light": (surface_light, in_torch(surface_light, shading)),
         "skinning": (skinning, in_torch(skinning, skin_module)),
         "isometry": (isometric, in_torch(isometric, isometry)),
         "neighbours": (
