@@ -55,6 +55,38 @@ void view_directions(const ViewDirections& job, int threads) {
     in_pieces(job.points, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
 }
 
+size_t rows_in_view(const InView& job, int64_t* rows) {
+    const float *r = job.pose, fx = job.k[0], fy = job.k[4], cx = job.k[2], cy = job.k[5];
+    // An opacity of 1 falls below 1/255 at 3.33 deviations; radii are whole pixels, and rounding is not known.
+    constexpr float kReach = 3.34f * 3.34f, kLowPass = 0.3f, kMargin = 2.f, kNear = 0.0099f;
+    // The projection's slope is taken at most 0.15 of a picture beyond its sides.
+    const auto widest = [](float side, float center, float focal) {
+        const float low = (center + 0.15f * side) / focal, high = (1.15f * side - center) / focal;
+        return std::max(low * low, high * high);
+    };
+    const float wide_x = widest(float(job.width), cx, fx), wide_y = widest(float(job.height), cy, fy);
+    size_t count = 0;
+    for (size_t i = 0; i < job.points; ++i) {
+        const float *p = job.means + i * 3, *s = job.scales + i * 3;
+        const float x = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3];
+        const float y = r[4] * p[0] + r[5] * p[1] + r[6] * p[2] + r[7];
+        const float z = r[8] * p[0] + r[9] * p[1] + r[10] * p[2] + r[11];
+        const float xn = x / z, yn = y / z;
+        const float largest = std::max({s[0] * s[0], s[1] * s[1], s[2] * s[2]}) / (z * z);
+        // A row of the slope is f / z sqrt(1 + (x / z)^2) long.
+        const float reach_x = kReach * (fx * fx * largest * (1.f + wide_x) + kLowPass);
+        const float reach_y = kReach * (fy * fy * largest * (1.f + wide_y) + kLowPass);
+        const float px = fx * xn + cx, py = fy * yn + cy;
+        const float beyond_x = std::max(-px, px - float(job.width)) - kMargin;
+        const float beyond_y = std::max(-py, py - float(job.height)) - kMargin;
+        const bool out = (beyond_x > 0.f && beyond_x * beyond_x > reach_x) ||
+                         (beyond_y > 0.f && beyond_y * beyond_y > reach_y) || z < kNear;
+        rows[count] = int64_t(i);
+        count += !out;
+    }
+    return count;
+}
+
 void sh_rows(const ShRows& job, int threads) {
     const auto kernel = select_kernels().sh_rows;
     in_pieces(job.points, threads, [&](size_t begin, size_t end) {

@@ -16,6 +16,17 @@ struct ViewDirections {
     float* directions;        // (points, 3)
 };
 
+// Gaussians of any rotation and opacity whose footprint, as kernels.cpp finds it, may reach into a picture.
+struct InView {
+    size_t points;
+    const float *means, *scales;  // (points, 3), (points, 3)
+    const float *k, *pose;        // (3, 3) camera matrix, (4, 4) world to camera
+    int width, height;
+};
+
+// Writes their rows, in order, and returns how many there are.
+size_t rows_in_view(const InView&, int64_t* rows);
+
 // The 15 real spherical harmonics of degrees 1 to 3, row i at to + i * stride, and `columns` other values, row
 // i at beside + i * stride.
 struct ShRows {

@@ -115,6 +115,15 @@ void py_view_directions(In positions, std::optional<In> transforms, const std::a
     view_directions(job, threads);
 }
 
+size_t py_rows_in_view(In means, In scales, In k, In pose, int width, int height,
+                       nb::ndarray<int64_t, nb::c_contig, nb::device::cpu> rows) {
+    const size_t points = rows.size();
+    require(means.size() == points * 3 && scales.size() == points * 3, "the Gaussians");
+    require(k.size() == 9 && pose.size() == 16, "the camera");
+    nb::gil_scoped_release release;
+    return rows_in_view({points, means.data(), scales.data(), k.data(), pose.data(), width, height}, rows.data());
+}
+
 // The columns of `to` are those of `values` and the harmonics, in either order.
 void py_sh_rows(In directions, In values, Out to, bool values_first, int threads) {
     const size_t points = directions.size() / 3;
@@ -268,6 +277,9 @@ void bind_step(nb::module_& m) {
     m.def("view_directions", &py_view_directions, nb::arg("positions"), nb::arg("transforms").none(),
           nb::arg("center"), nb::arg("turn"), nb::arg("directions"), nb::arg("threads"),
           "Unit vectors from a centre, turned back by transforms and then by one matrix.");
+    m.def("rows_in_view", &py_rows_in_view, nb::arg("means"), nb::arg("scales"), nb::arg("K"),
+          nb::arg("world_to_camera"), nb::arg("width"), nb::arg("height"), nb::arg("rows"),
+          "Writes the rows of Gaussians that a picture may show and returns their number.");
     m.def("sh_rows", &py_sh_rows, nb::arg("directions"), nb::arg("values"), nb::arg("to"), nb::arg("values_first"),
           nb::arg("threads"), "Rows of spherical harmonics of degrees 1 to 3 beside other values.");
     m.def("one_blob", &py_one_blob, nb::arg("positions"), nb::arg("bins"), nb::arg("encoded"), nb::arg("threads"),

@@ -6,6 +6,7 @@ import torch
 from evsplat.body import skin
 from evsplat.capture import load_capture
 from evsplat.config import override
+from evsplat.deform.drawing import draw
 from evsplat.errors import ConfigError
 from evsplat.gaussians import ATTRIBUTES
 from evsplat.methods import PaperConfig, compose, method_config
@@ -168,3 +169,30 @@ def test_weights_of_the_surface_and_points_far_from_it_exclude_each_other(tiny_c
 def _parts(model):
     gaussians = model.gaussians
     return {name: gaussians.of_parts(getattr(gaussians, name)) for name in ATTRIBUTES}
+
+
+def test_colours_of_rows_out_of_view_are_not_missed(tiny_capture):
+    path = tiny_capture()
+    model, times, center = model_of(path, "scene.kind=random_cube", "scene.cube_count=800")
+    activate(model)
+    capture = load_capture(path)
+    camera = capture.camera(capture.train_frames[0])
+    black, found = [], []
+    for shown in (None, camera):
+        posed = model.at(times, center, shown=shown)
+        black.append(int((posed.scene.rgb == 0).all(-1).sum()))
+        drawing = draw(model, posed, camera)
+        loss = torch.stack([picture.square().mean() for picture in drawing.rgb]).sum()
+        names, leaves = zip(*model.named_parameters(), strict=True)
+        gradients = torch.autograd.grad(loss, leaves, allow_unused=True)
+        found.append((drawing.rgb, dict(zip(names, gradients, strict=True))))
+    (pictures, expected), (fewer, gradients) = found
+    assert black[0] == 0 and black[1] > 100
+    for whole, part in zip(pictures, fewer, strict=True):
+        assert torch.allclose(whole, part, atol=1e-6)
+    for name, value in expected.items():
+        if value is None:
+            assert gradients[name] is None
+        elif value.numel():
+            bound = 1e-6 * float(value.abs().max())
+            torch.testing.assert_close(gradients[name], value, rtol=1e-4, atol=bound)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack, bounding_box, skin, up_axis
@@ -37,6 +37,7 @@ from evsplat.gaussians import (
     StaticScene,
 )
 from evsplat.gaussians.initialise import COLOUR_LOGITS
+from evsplat.render import PinholeCamera, rows_in_view
 
 NORMAL_SAMPLES = 20_000
 """Points of the body's surface among which a Gaussian finds its normal."""
@@ -297,6 +298,7 @@ class HumanSceneModel(nn.Module):
         share_skinning: bool = False,
         networks_at_us: int | None = None,
         both_branches: bool = False,
+        shown: PinholeCamera | None = None,
     ) -> PosedGaussians:
         """All Gaussians in world space at ``times_us``, coloured for a camera at that centre.
 
@@ -311,6 +313,9 @@ class HumanSceneModel(nn.Module):
         is the soft attribute m.
 
         ``both_branches`` adds second copies of rows whose class is open, see `Branches`.
+
+        ``shown``: only this camera's picture is asked for; rows of the scene outside of it may be
+        black.
         """
         gaussians = self.gaussians
         parts = {name: gaussians.of_parts(getattr(gaussians, name)) for name in ATTRIBUTES}
@@ -359,10 +364,6 @@ class HumanSceneModel(nn.Module):
                 body = self.shadow.place(bones[middle]).detach()
                 lit = self.shadow.lit(body, places[middle], light.lamps)
             rgb = rgb * light.factors(transforms[:, people].detach(), places, lit)
-        hidden = noise is not None and noise.hide_scene_direction
-        directions = view_directions(scene_means[None], camera_center)[0]
-        if hidden:
-            directions = torch.zeros_like(directions)
         soft = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
         opacities = gaussians.opacities()
         times = len(times_us)
@@ -376,9 +377,11 @@ class HumanSceneModel(nn.Module):
                 transforms[:, rows],
             )
 
-        scene_rgb = self.scene_colour(
-            scene_features, torch.zeros_like(directions) if hidden else directions
-        )
+        scene_scales = parts["scales_log"][1].exp()
+        rows = None
+        if shown is not None and twice is None:  # else the colours are read by other rows as well
+            rows = rows_in_view(scene_means, scene_scales, shown)
+        scene_rgb = self._scene_rgb(scene_features, scene_means, rows, camera_center, noise)
         copies = None
         if twice is not None:
             shares = twice.shares(gaussians)
@@ -395,9 +398,7 @@ class HumanSceneModel(nn.Module):
         human_semantics, scene_semantics = gaussians.of_parts(soft)
         return PosedGaussians(
             posed(people, human_means, rgb),
-            StaticScene(
-                scene_means, parts["quaternions"][1], parts["scales_log"][1].exp(), scene_rgb
-            ),
+            StaticScene(scene_means, parts["quaternions"][1], scene_scales, scene_rgb),
             human_opacities,
             scene_opacities,
             human_semantics,
@@ -422,6 +423,7 @@ class HumanSceneModel(nn.Module):
             share_skinning=True,
             networks_at_us=frame.mid_us if once else None,
             both_branches=True,
+            shown=camera,
         )
         return draw(self, posed, camera, center_gradients=True)
 
@@ -507,6 +509,24 @@ class HumanSceneModel(nn.Module):
         )
         delta = self.non_rigid(self.normalise(canonical), self.pose_encoder(seen))
         return delta.shape(canonical, moving["scales_log"], quaternions)
+
+    def _scene_rgb(
+        self,
+        features: Tensor,
+        means: Tensor,
+        rows: Int[Tensor, " V"] | None,
+        camera_center: Tensor,
+        noise: Noise | None,
+    ) -> Float[Tensor, "S 3"]:
+        """Colours of the scene, of some ``rows`` of it or of all; the others are black."""
+        count = len(means)
+        if rows is not None:
+            features, means = features.index_select(0, rows), means.detach().index_select(0, rows)
+        directions = view_directions(means[None], camera_center)[0]
+        if noise is not None and noise.hide_scene_direction:
+            directions = torch.zeros_like(directions)
+        rgb: Tensor = self.scene_colour(features, directions)
+        return rgb if rows is None else rgb.new_zeros(count, 3).index_copy(0, rows, rgb)
 
     def _human_rgb(
         self,

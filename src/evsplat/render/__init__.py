@@ -2,6 +2,7 @@
 
 from evsplat.render.api import BackendName, choose_device, render
 from evsplat.render.backdrop import Backdrop
+from evsplat.render.in_view import rows_in_view
 from evsplat.render.pictures import split_channels
 from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
@@ -13,5 +14,6 @@ __all__ = [
     "Splats",
     "choose_device",
     "render",
+    "rows_in_view",
     "split_channels",
 ]
