@@ -50,7 +50,7 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
         p[order].astype(np.int8),
     )
     frames = [SimpleNamespace(mid_us=mid) for mid in (0, 10_000, 20_000)]
-    capture = SimpleNamespace(events=Recording(stream), frames=frames)
+    capture = SimpleNamespace(events=Recording(stream), frames=frames, train_frames=frames)
     return capture, SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0)
 
 
@@ -173,7 +173,7 @@ def moving_edge(late_us: int):
         linear=linear[:, None, :, None].expand(-1, HEIGHT, -1, 3),
         nominal=5_000.0,
     )
-    return SimpleNamespace(events=Recording(stream), frames=frames), step
+    return SimpleNamespace(events=Recording(stream), frames=frames, train_frames=frames), step
 
 
 @pytest.mark.parametrize("late_us", [-3_000, 0, 4_000])

@@ -67,7 +67,7 @@ class WindowConfig:
     contrast_weight: float = 1.0
     """Weight of the squared distance of the thresholds' logarithms from where they started."""
     reach: float = 0.5
-    """How far before or after an exposure windows reach, in frame intervals."""
+    """How far before or after an exposure windows reach, in intervals of the training frames."""
     noise_aware: bool = True
     """Weigh differences by the sensor's background noise, and leave hot pixels out."""
     pixel_thresholds: bool = False

@@ -23,8 +23,8 @@ class EventWindows(Stateless):
 
     Windows lie between neighbouring rendered times and from the first to the last. Besides the
     times of other objectives one more is asked for, at random before or after the exposure, within
-    ``reach`` frame intervals, so that the gaps between exposures teach as well. All pixels count:
-    where there is no event, nothing changed.
+    ``reach`` intervals of the training frames, so that the gaps between exposures teach as well.
+    All pixels count: where there is no event, nothing changed.
 
     Events that nothing caused are allowed for: differences weigh by the noise of their time
     (`EventNoise`), and hot pixels do not count.
@@ -47,11 +47,11 @@ class EventWindows(Stateless):
         """``start`` in nominal iterations; ``eps`` is added to linear luminance."""
         assert capture.events is not None
         self.events, self.sensor, self.generator = capture.events, sensor, generator
-        self.start, self.eps, self.reach = start, eps, reach
-        mids = sorted(frame.mid_us for frame in capture.frames)
-        gaps = sorted(b - a for a, b in zip(mids, mids[1:], strict=False))
-        self.interval_us = gaps[len(gaps) // 2] if gaps else 0
-        self.range_us = (mids[0], mids[-1])
+        self.start, self.eps = start, eps
+        mids = [frame.mid_us for frame in capture.frames]
+        self.interval_us = _median_gap(mids)
+        self.reach_us = reach * _median_gap([frame.mid_us for frame in capture.train_frames])
+        self.range_us = (min(mids), max(mids))
         self.noise = noise
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
@@ -60,7 +60,7 @@ class EventWindows(Stateless):
             return ()
         draw = torch.rand(2, generator=self.generator).tolist()
         start, end = frame.exposure_us
-        far = int(draw[0] * self.reach * self.interval_us)
+        far = int(draw[0] * self.reach_us)
         time = start - 1 - far if draw[1] < 0.5 else end + far
         return (min(max(time, self.range_us[0]), self.range_us[1]),)
 
@@ -117,3 +117,9 @@ class EventWindows(Stateless):
         size = self.events.height, self.events.width
         maps = [polarity_counts(stream.between(*ends), *size) for ends in windows]
         return send(torch.stack(maps), device)
+
+
+def _median_gap(times_us: Sequence[int]) -> int:
+    ordered = sorted(times_us)
+    gaps = sorted(b - a for a, b in zip(ordered, ordered[1:], strict=False))
+    return gaps[len(gaps) // 2] if gaps else 0
