@@ -166,8 +166,9 @@ def test_released_code_gives_the_scene_gradients_of_rows_shifted_by_the_person(s
         offset.grad = torch.tensor(values)[None, :, None].expand(1, -1, 2)
         return SimpleNamespace(centers2d_offset=offset)
 
+    posed = SimpleNamespace(human_opacities=torch.zeros(2), scene_opacities=torch.zeros(3))
     drawing = HugsDrawing(
-        rgb=(), semantic=(), output=None, posed=None, moving=layer([1.0, 2.0]),
+        rgb=(), semantic=(), output=None, posed=posed, moving=layer([1.0, 2.0]),
         static=layer([3.0, 4.0, 5.0]), decoded=None, shifted=shifted,
     )  # fmt: skip
     human, scene = drawing.center_gradients()

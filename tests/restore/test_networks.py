@@ -239,7 +239,7 @@ def test_tiles_join_to_what_a_local_network_makes_of_the_whole(size: tuple[int, 
     inner = (..., slice(2, size[0] - 2), slice(2, size[1] - 2))
     # only where a tile's own border is all there is of it would the two differ
     assert (made - whole)[inner].abs().mean() < 0.01 * whole.mean()
-    assert torch.equal(made, made.clamp(whole.min(), whole.max() + 1))
+    assert made.min() > whole.min() - 1e-5 and made.max() < whole.max() + 1
 
 
 @pytest.fixture(params=CHECKPOINTS)

@@ -5,9 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from evsplat.body import BodyTrack, load_body_track
-from evsplat.body.between_keys import between_keys
-from evsplat.body.smoothing import motion_noise, smoothed
+from evsplat.body.between_keys import BetweenKeys, between_keys
+from evsplat.body.smoothing import MotionNoise, motion_noise, smoothed
 from evsplat.capture import Capture
 from evsplat.deform.pose_spline import PoseSpline
 from evsplat.methods.config import Weight
@@ -29,8 +31,8 @@ class PoseConfig:
     refine: When = "auto"
     """Learn a residual of the poses, a cubic B-spline in time, from pictures and events."""
     between: bool = True
-    """Where poses are taken as exact, learn how the person moves between them: such a residual that
-    is zero at every key pose."""
+    """Where poses are taken as exact and jitter by less than what a spline misses between them,
+    learn how the person moves there: such a residual that is zero at every key pose."""
     noisy_rad: float = 0.006
     """Jitter of key poses, radians per axis, from which poses count as noisy."""
     start: float = 1_500
@@ -67,6 +69,8 @@ def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) ->
     smooth, refine = (
         noisy if when == "auto" else when == "always" for when in (config.smooth, config.refine)
     )
+    expected = between_keys(track)
+    between = config.between and not refine and _surer_than_between(noise, expected)
     logger.log(
         logging.INFO if tell else logging.DEBUG,
         "given poses jitter by %.4f rad per axis (noisy from %g): %s, %s",
@@ -76,18 +80,17 @@ def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) ->
         "corrected in training"
         if refine
         else "corrected between keys only"
-        if config.between
+        if between
         else "not corrected",
     )
     if smooth:
         track = smoothed(track, noise)
     times = track.times_us
-    if not refine:
-        expected = between_keys(track)
-        if not config.between or not expected.rotation_rad.any():
-            return Poses(track)
+    if between:
         middles = (times[1:] + times[:-1]) // 2
         return Poses(track, PoseSpline.between_keys(track, expected), middles.tolist())
+    if not refine:
+        return Poses(track)
     spline = PoseSpline.of(
         track,
         noise,
@@ -98,3 +101,12 @@ def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) ->
         stiff=smooth,
     )
     return Poses(track, spline, times.tolist())
+
+
+def _surer_than_between(noise: MotionNoise, expected: BetweenKeys) -> bool:
+    """Whether key poses err by less than half of the variance of what lies between them.
+
+    Otherwise a residual that is held at the keys would bend to make up for them.
+    """
+    between = np.square(expected.rotation_rad[noise.moving])
+    return len(between) > 0 and 2 * noise.rotation_rad**2 < float(between.mean())
