@@ -34,6 +34,11 @@ class NoiseEstimate:
     """Events per second that four pixels in five exceed: close to the background activity where it
     is so dense that all pixels look supported, above it where most of the picture moves."""
 
+    @property
+    def background_hz(self) -> float:
+        """Background events per second and pixel: `rate_hz`, or `floor_hz` where that is None."""
+        return self.floor_hz if self.rate_hz is None else self.rate_hz
+
 
 class NoiseMeter:
     """Gathers unsupported events piece by piece.

@@ -356,13 +356,14 @@ class HumanSceneModel(nn.Module):
             seen_times,
             noise,
         )
+        casters = None if self.shadow is None else self.shadow.place(bones)
         light = self.surface_light()
         if light is not None:
             # Geometry gets no gradient by the light.
             places, lit = human_means.detach(), None
             if self.shadow is not None and self.shadow.on_body and light.lamps is not None:
-                body = self.shadow.place(bones[middle]).detach()
-                lit = self.shadow.lit(body, places[middle], light.lamps)
+                assert casters is not None
+                lit = self.shadow.lit(casters[middle].detach(), places[middle], light.lamps)
             rgb = rgb * light.factors(transforms[:, people].detach(), places, lit)
         soft = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
         opacities = gaussians.opacities()
@@ -403,7 +404,7 @@ class HumanSceneModel(nn.Module):
             scene_opacities,
             human_semantics,
             scene_semantics,
-            casters=None if self.shadow is None else self.shadow.place(bones),
+            casters=casters,
             copies=copies,
         )
 

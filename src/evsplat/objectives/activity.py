@@ -51,8 +51,8 @@ class Activity:
         hot = self.noise.hot_pixels
         counts[hot[:, 1], hot[:, 0]] = 0
         around = np.rint(9 * uniform_filter(counts.astype(np.float64), 3, mode="constant"))
-        rate_hz = self.noise.floor_hz if self.noise.rate_hz is None else self.noise.rate_hz
-        return around > poisson.ppf(1 - FALSE_ALARMS, 9 * rate_hz * (end - start) * 1e-6)
+        expected = 9 * self.noise.background_hz * (end - start) * 1e-6
+        return around > poisson.ppf(1 - FALSE_ALARMS, expected)
 
     def still_scene(
         self,

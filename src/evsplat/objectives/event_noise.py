@@ -30,7 +30,7 @@ class EventNoise:
             return 0.0, sound
         noise = noise_of(self.events)
         sound[noise.hot_pixels[:, 1], noise.hot_pixels[:, 0]] = 0.0
-        return noise.floor_hz if noise.rate_hz is None else noise.rate_hz, sound
+        return noise.background_hz, sound
 
     @property
     def sound(self) -> Float[Tensor, "H W"]:
