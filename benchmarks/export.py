@@ -64,7 +64,7 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
     frame = next(f for f in capture.frames if f.split == "test")
     camera = capture.camera(frame)
     person, scene = source.splats(camera, [frame.mid_us])
-    ours = render(person, camera, static=scene).image[0, ..., :3]
+    ours = render(person, camera, static=scene, low_pass=source.low_pass).image[0, ..., :3]
     model = source.render(camera, [frame.mid_us]).rgb[0]
 
     site = folder / "site"
@@ -76,7 +76,7 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
         for rules in ("3dgs", "default"):
             shots.append(
                 {"page": "spark.html", "file": f"run.{kind}", "rules": rules, "camera": view,
-                 "picture": f"spark-{kind}-{rules}.png"}
+                 "low_pass": source.low_pass, "picture": f"spark-{kind}-{rules}.png"}
             )  # fmt: skip
     page = site / "avatar.html"
     ev.export_run(arguments.run, "avatar", parts="all", out=page, device="cpu")
@@ -91,7 +91,7 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
     figure = figure_of(at_rest(run, None))
     skinned = figure.gaussians.posed(source.pose([frame.mid_us])[1])
     (alone,) = source.splats(camera, [frame.mid_us], parts="scene")
-    avatar = render(skinned, camera, static=alone).image[0, ..., :3]
+    avatar = render(skinned, camera, static=alone, low_pass=source.low_pass).image[0, ..., :3]
     save(out / "ours.png", ours)
     save(out / "ours-avatar.png", avatar)
 

@@ -21,7 +21,7 @@ from types import SimpleNamespace
 import torch
 
 from evsplat import _native
-from evsplat.render import PinholeCamera, Splats, render
+from evsplat.render import LOW_PASS, PinholeCamera, Splats, render
 from evsplat.render.splats import join
 
 # Floating-point operations per lane of a patch step, a multiply-add as two: constant, per channel.
@@ -123,8 +123,8 @@ def native_job(scene: Scene) -> _native.Render:
     channels = s.channels.shape[-1]
     fields = [s.means, s.quats[None], s.scales[None], s.opacities[None], s.channels, None, None]
     job = _native.Render(
-        camera.width, camera.height, camera.K, camera.world_to_camera, 0.01, fields, [], None,
-        1, torch.get_num_threads(),
+        camera.width, camera.height, camera.K, camera.world_to_camera, 0.01, LOW_PASS, fields, [],
+        None, 1, torch.get_num_threads(),
     )  # fmt: skip
     job.forward(
         torch.empty(1, channels, *size), torch.empty(1, *size),

@@ -15,7 +15,6 @@ namespace {
 
 #include "simd.h"
 
-constexpr float kEps2d = 0.3f;              // low-pass filter, px^2
 constexpr float kMinAlpha = 1.f / 255.f;
 constexpr float kMaxAlpha = 0.999f;
 constexpr float kMinTransmittance = 1e-4f;
@@ -105,12 +104,12 @@ INLINE void project_lanes(const View& view, const Gaussians& g, uint32_t i, uint
     const F xx = m[0][0] * m[0][0] + m[0][1] * m[0][1] + m[0][2] * m[0][2];
     const F yy = m[1][0] * m[1][0] + m[1][1] * m[1][1] + m[1][2] * m[1][2];
     p.cov_xy = m[0][0] * m[1][0] + m[0][1] * m[1][1] + m[0][2] * m[1][2];
-    p.cov_xx = xx + kEps2d, p.cov_yy = yy + kEps2d;
+    p.cov_xx = xx + view.low_pass, p.cov_yy = yy + view.low_pass;
     // det(M M^T + eps I) from the minors of M: xx yy - xy^2 would cancel for long thin Gaussians.
     const F n01 = m[0][0] * m[1][1] - m[0][1] * m[1][0];
     const F n02 = m[0][0] * m[1][2] - m[0][2] * m[1][0];
     const F n12 = m[0][1] * m[1][2] - m[0][2] * m[1][1];
-    p.det = n01 * n01 + n02 * n02 + n12 * n12 + kEps2d * (xx + yy) + kEps2d * kEps2d;
+    p.det = n01 * n01 + n02 * n02 + n12 * n12 + view.low_pass * (xx + yy + view.low_pass);
 }
 
 // Which patches of the tile at (x0, y0) hold a pixel where u^2 + v^2 <= limit; exact up to rounding.

@@ -27,7 +27,7 @@ constexpr int slot_stride(int channels) { return (kMoments + channels + 3) / 4 *
 struct View {
     float r[9], t[3];
     float fx, fy, cx, cy;
-    float near_plane;
+    float near_plane, low_pass;  // metres, px^2
     int width, height, tiles_x, tiles_y;
 };
 

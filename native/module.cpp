@@ -65,8 +65,8 @@ FieldOf<T>& field_of(LayerOf<T>& l, size_t i) {
 
 class Render {
   public:
-    Render(int width, int height, const Camera& k, const Pose& pose, float near_plane, Fields moving, Fields still,
-           std::optional<In> background, int times, int threads)
+    Render(int width, int height, const Camera& k, const Pose& pose, float near_plane, float low_pass, Fields moving,
+           Fields still, std::optional<In> background, int times, int threads)
         : moving_(std::move(moving)), still_(std::move(still)), background_(background), threads_(threads) {
         require(width > 0 && height > 0 && width <= 1 << 16 && height <= 1 << 16 && times > 0, "the image");
         View& v = scene_.view;
@@ -75,7 +75,7 @@ class Render {
             v.t[i] = pose.data()[4 * i + 3];
         }
         v.fx = k.data()[0], v.cx = k.data()[2], v.fy = k.data()[4], v.cy = k.data()[5];
-        v.near_plane = near_plane;
+        v.near_plane = near_plane, v.low_pass = low_pass;
         v.width = width, v.height = height;
         v.tiles_x = (width + kTile - 1) / kTile, v.tiles_y = (height + kTile - 1) / kTile;
         scene_.times = times;
@@ -400,9 +400,10 @@ NB_MODULE(_native, m) {
     m.doc() = "CPU kernels of evsplat.";
     nb::set_leak_warnings(false);  // images alive when the interpreter ends are no leak
     nb::class_<Render>(m, "Render", "One render of T times; keeps what its backward pass needs.")
-        .def(nb::init<int, int, const Camera&, const Pose&, float, Fields, Fields, std::optional<In>, int, int>(),
+        .def(nb::init<int, int, const Camera&, const Pose&, float, float, Fields, Fields, std::optional<In>, int,
+                      int>(),
              nb::arg("width"), nb::arg("height"), nb::arg("K"), nb::arg("world_to_camera"), nb::arg("near"),
-             nb::arg("moving"), nb::arg("still"), nb::arg("background").none(), nb::arg("times"), nb::arg("threads"))
+             nb::arg("low_pass"), nb::arg("moving"), nb::arg("still"), nb::arg("background").none(), nb::arg("times"), nb::arg("threads"))
         .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"),
              nb::arg("still_radii"), nb::arg("keep") = false, nb::arg("earlier").none() = nb::none())
         .def("backward", &Render::backward, nb::arg("image_grad").none(), nb::arg("alpha_grad").none(),

@@ -18,6 +18,7 @@ class Render:
         K: Tensor,
         world_to_camera: Tensor,
         near: float,
+        low_pass: float,
         moving: Fields,
         still: Fields,
         background: Tensor | None,

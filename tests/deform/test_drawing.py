@@ -8,6 +8,7 @@ import torch
 from evsplat.capture import load_capture
 from evsplat.config import override
 from evsplat.deform.drawing import _places, draw
+from evsplat.errors import ConfigError
 from evsplat.methods import compose, method_config
 from evsplat.render import render
 
@@ -23,6 +24,31 @@ def posed(tiny_capture):
     camera = capture.camera(capture.train_frames[0])
     times = [frame.mid_us for frame in capture.train_frames[:2]]
     return model, model.at(times, camera.center()), camera
+
+
+@pytest.mark.parametrize("low_pass", [0.3, 0.1])
+def test_pictures_have_the_low_pass_of_the_model(tiny_capture, low_pass):
+    capture = load_capture(tiny_capture())
+    settings = override({}, ("human.count=150", f"deform.low_pass={low_pass}"))
+    config = method_config("paper", settings, where="test")
+    model = compose(config, capture, 0, fit=False).model
+    frame = capture.train_frames[0]
+    camera = capture.camera(frame)
+    with torch.no_grad():
+        posed = model.at([frame.mid_us], camera.center())
+        drawn = draw(model, posed, camera).output.image
+        layers = posed.moving(), posed.static()
+        wanted, other = (
+            render(layers[0], camera, static=layers[1], low_pass=px2).image
+            for px2 in (low_pass, 0.2)
+        )
+    assert torch.equal(drawn, wanted) and not torch.allclose(drawn, other, atol=1e-3)
+
+
+def test_a_low_pass_wider_than_the_usual_is_refused(tiny_capture):
+    config = method_config("paper", override({}, ("deform.low_pass=0.4",)), where="test")
+    with pytest.raises(ConfigError, match="low_pass is 0.4; it takes px.2 above 0 and up to 0.3"):
+        compose(config, load_capture(tiny_capture()), 0, fit=False)
 
 
 def test_without_any_share_of_the_light_nothing_changes(posed):

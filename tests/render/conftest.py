@@ -3,7 +3,7 @@ from dataclasses import dataclass, fields, replace
 import pytest
 import torch
 
-from evsplat.render import RenderOutput, Splats, render
+from evsplat.render import LOW_PASS, RenderOutput, Splats, render
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,16 @@ def random_scene(
 
 
 def all_gradients(
-    splats, camera, *, backend, dtype, static=None, background=None, seed=0, device="cpu"
+    splats,
+    camera,
+    *,
+    backend,
+    dtype,
+    static=None,
+    background=None,
+    seed=0,
+    device="cpu",
+    low_pass=LOW_PASS,
 ):
     """The render and the gradient of a fixed random projection of it, for every input, on the CPU.
 
@@ -108,6 +117,7 @@ def all_gradients(
         replace(camera, world_to_camera=leaves["pose"]),
         static=still,
         background=leaves.get("background"),
+        low_pass=low_pass,
         backend=backend,
     )
     generator = torch.Generator().manual_seed(seed)

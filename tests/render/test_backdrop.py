@@ -92,6 +92,7 @@ def test_whatever_changes_the_layer_or_the_camera_begins_anew(layers):
     assert_same(at(moving, 2), replace(camera, width=100, height=77), **show)
     assert_same(at(moving, 2), camera, background=torch.rand(3), **show)
     assert_same(at(moving, 2), camera, near=0.5, **show)
+    assert_same(at(moving, 2), camera, low_pass=0.1, **show)
     fewer = Splats(*(None if v is None else v[:, :7] for v in vars(at(moving, 2)).values()))
     assert_same(fewer, camera, **show)
 

@@ -127,18 +127,36 @@ def one_gaussian(opacity=0.7, sigma=0.1):
     )
 
 
+@pytest.mark.parametrize("low_pass", [0.3, 0.1])
 @pytest.mark.parametrize("backend", ["native", "reference"])
-def test_one_gaussian_has_its_closed_form(backend, camera):
-    """sigma 0.1 m at 1 m is 5 px, plus the low-pass of 0.3 px^2; centred on pixel (20, 16)."""
-    out = render(one_gaussian(), camera, backend=backend)
+def test_one_gaussian_has_its_closed_form(backend, low_pass, camera):
+    """sigma 0.02 m at 1 m is 1 px, plus the low-pass; centred on pixel (20, 16)."""
+    out = render(one_gaussian(sigma=0.02), camera, low_pass=low_pass, backend=backend)
     x, y = torch.meshgrid(torch.arange(41.0) - 20, torch.arange(33.0) - 16, indexing="xy")
     # The Jacobian's z column is zero on the axis, so the covariance is isotropic.
-    alpha = 0.7 * torch.exp(-0.5 * (x * x + y * y) / 25.3)
+    alpha = 0.7 * torch.exp(-0.5 * (x * x + y * y) / (1 + low_pass))
     alpha[alpha < 1 / 255] = 0
     torch.testing.assert_close(out.alpha[0], alpha, atol=1e-6, rtol=1e-5)
     torch.testing.assert_close(out.image[0, ..., 0], 2 * alpha, atol=1e-6, rtol=1e-5)
-    # sqrt(2 ln(255 * 0.7)) = 3.22 deviations of 5.03 px
-    assert out.radii.tolist() == [[17]]
+    # sqrt(2 ln(255 * 0.7)) = 3.22 deviations of 1.14 or 1.05 px
+    assert out.radii.tolist() == [[4]]
+
+
+@pytest.mark.parametrize("seed", range(40, 43))
+@pytest.mark.parametrize("low_pass", [0.02, 0.1, 1.0])
+def test_gradients_hold_for_any_low_pass(seed, low_pass, random_scene, all_gradients):
+    splats, camera = random_scene(seed, count=120, width=37, height=35, linear=seed % 2 == 0)
+    gradients, expected = (
+        all_gradients(splats, camera, backend=backend, dtype=dtype, low_pass=low_pass)[1]
+        for backend, dtype in (("native", torch.float32), ("reference", torch.float64))
+    )
+    errors = {name: relative_error(gradients[name], expected[name]) for name in expected}
+    assert max(errors.values()) < BOUND, errors
+
+
+def test_a_low_pass_of_nothing_is_refused(camera):
+    with pytest.raises(BackendError, match=r"low_pass is 0.0, expected px\^2 above 0"):
+        render(one_gaussian(), camera, low_pass=0.0)
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])

@@ -83,7 +83,14 @@ def draw(
     if center_gradients:
         moving, static = _with_centers(moving), _with_centers(static)
     behind = None if background is None else _behind(background, moving)
-    output = render(moving, camera, static=static, background=behind, backdrop=backdrop)
+    output = render(
+        moving,
+        camera,
+        static=static,
+        background=behind,
+        low_pass=posed.low_pass,
+        backdrop=backdrop,
+    )
     if shadow is None:
         rgb, semantic = split_channels(output.image, (3, 1))
     else:
@@ -116,9 +123,10 @@ def draw_depth(
     """
     moving, static = _showing_depth(posed.moving(), camera), _showing_depth(posed.static(), camera)
     if parts == "all":
-        output = render(moving, camera, static=static)
+        output = render(moving, camera, static=static, low_pass=posed.low_pass)
     else:
-        output = render(moving if parts == "human" else static, camera)
+        layer = moving if parts == "human" else static
+        output = render(layer, camera, low_pass=posed.low_pass)
     covered = output.alpha.clamp_min(_LEAST_SCENE)
     return output.image[..., 0] / covered * (output.alpha > _LEAST_SCENE)
 

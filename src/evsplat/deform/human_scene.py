@@ -38,7 +38,7 @@ from evsplat.gaussians import (
     StaticScene,
 )
 from evsplat.gaussians.initialise import COLOUR_LOGITS
-from evsplat.render import PinholeCamera, rows_in_view
+from evsplat.render import LOW_PASS, PinholeCamera, rows_in_view
 
 NORMAL_SAMPLES = 20_000
 """Points of the body's surface among which a Gaussian finds its normal."""
@@ -109,6 +109,8 @@ class DeformConfig:
     pose_correction_start: float | None = None
     """Nominal iteration from which pose residuals are learned; null = never.
     3DGS-Avatar starts at 5000 (A9). Exact poses get worse by it, noisy ones better."""
+    low_pass: float = LOW_PASS
+    """What a pixel integrates over, px^2, at most 0.3, which 3DGS and viewers take."""
     unseen_frames: UnseenFrames = "interpolated"
     """Latent and pose residual of instants that are not the middle of a training frame (A22)."""
 
@@ -145,6 +147,10 @@ class HumanSceneModel(nn.Module):
         super().__init__()
         body = track.body
         joints = len(body.parents)
+        if not 0 < config.low_pass <= LOW_PASS:
+            raise ConfigError(
+                f"deform.low_pass is {config.low_pass}; it takes px^2 above 0 and up to {LOW_PASS}."
+            )
         self.config, self.semantics, self.track = config, semantics, track
         self.gaussians = gaussians
         parents = body.parents.tolist()
@@ -238,6 +244,11 @@ class HumanSceneModel(nn.Module):
     def device(self) -> torch.device:
         """Where the Gaussians are."""
         return self.box_low.device
+
+    @property
+    def low_pass(self) -> float:
+        """What a pixel integrates over, px^2."""
+        return self.config.low_pass
 
     @property
     def sets(self) -> dict[str, GaussianSet]:
@@ -419,6 +430,7 @@ class HumanSceneModel(nn.Module):
             scene_semantics,
             casters=casters,
             copies=copies,
+            low_pass=self.low_pass,
         )
 
     def training_drawing(

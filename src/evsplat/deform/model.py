@@ -59,6 +59,10 @@ class Model(Protocol):
     def lamps(self) -> Lamps | None:
         """Where the light comes from, where a model knows it."""
 
+    @property
+    def low_pass(self) -> float:
+        """What a pixel integrates over, px^2; see `evsplat.render.render`."""
+
     def training_drawing(
         self,
         times_us: Sequence[int],

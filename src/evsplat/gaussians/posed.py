@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.render import Splats
+from evsplat.render import LOW_PASS, Splats
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,8 @@ class PosedGaussians:
     """Points of the body that hide the light; without them there are no shadows."""
     copies: SecondCopies | None = None
     """Drawn besides, after the rows of their layer."""
+    low_pass: float = LOW_PASS
+    """What the pixels of a picture integrate over, px^2; see `evsplat.render.render`."""
 
     @property
     def times(self) -> int:

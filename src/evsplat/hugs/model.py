@@ -20,6 +20,7 @@ from evsplat.devices import send
 from evsplat.gaussians import OneClassRows, PosedGaussians, PosedHuman, StaticScene
 from evsplat.hugs.human import Decoded, TriplaneHuman
 from evsplat.hugs.scene import SphericalScene
+from evsplat.render import LOW_PASS
 
 DEGREE_EVERY = 1_000
 """Nominal iterations after which the scene's colour gets one more degree of harmonics."""
@@ -88,6 +89,11 @@ class HugsModel(nn.Module):
     def device(self) -> torch.device:
         """Where the Gaussians are."""
         return self.frame_times.device
+
+    @property
+    def low_pass(self) -> float:
+        """What a pixel integrates over, px^2."""
+        return LOW_PASS
 
     @property
     def sets(self) -> dict[str, OneClassRows]:

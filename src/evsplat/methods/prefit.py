@@ -83,6 +83,7 @@ def fit_scene(
         drawn = render(
             Splats(scene.means[None], scene.quaternions, scene.scales, opacities, rgb[None]),
             camera,
+            low_pass=model.low_pass,
         )
         (drawn.image[0] - picture).abs().mean().backward()
         adam.step()

@@ -71,6 +71,11 @@ class WithDepth(Protocol):
 class SplatReconstruction(Protocol):
     """A reconstruction that can hand its Gaussians over, for files and viewers of others."""
 
+    @property
+    def low_pass(self) -> float:
+        """What a pixel of its own pictures integrates over, px^2; viewers of others take 0.3."""
+        ...
+
     def splats(
         self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
     ) -> list[Splats]:

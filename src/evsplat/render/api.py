@@ -11,7 +11,7 @@ from evsplat.cuda_support import needs, what_is_missing
 from evsplat.errors import BackendError, ConfigError
 from evsplat.render import cuda, native, reference
 from evsplat.render.backdrop import Backdrop
-from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
+from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats
 
 logger = logging.getLogger(__name__)
 
@@ -29,14 +29,15 @@ def render(
     background: Float[Tensor, "C"] | Float[Tensor, "H W C"] | None = None,
     backend: BackendName = "auto",
     near: float = 0.01,
+    low_pass: float = LOW_PASS,
     backdrop: Backdrop | None = None,
 ) -> RenderOutput:
     """Composite the Gaussians front to back, by the rules of gsplat 1.5 ("classic" mode).
 
-    EWA projection with a low-pass of 0.3 px^2, alpha at most 0.999, contributions under 1/255
-    left out, stop before the transmittance would reach 1e-4. Gaussians nearer than ``near`` metres
-    or with NaN in their geometry are not drawn. Gradients go to every field of ``splats`` and
-    ``static``, to ``background`` and ``camera.world_to_camera``, not to ``camera.K``.
+    EWA projection with a low-pass of ``low_pass`` px^2, alpha at most 0.999, contributions under
+    1/255 left out, stop before the transmittance would reach 1e-4. Gaussians nearer than ``near``
+    metres or with NaN in their geometry are not drawn. Gradients go to every field of ``splats``
+    and ``static``, to ``background`` and ``camera.world_to_camera``, not to ``camera.K``.
 
     ``static`` are more Gaussians of the same picture, the same at all times. The native backend
     projects and sorts them once, and composites tiles that no other Gaussian touches once for all
@@ -60,6 +61,8 @@ def render(
             raise BackendError("render: static Gaussians have no axis of times but 1.")
         _check_alike(splats, static)
     _check_camera(splats, camera, background)
+    if not low_pass > 0:
+        raise BackendError(f"render: low_pass is {low_pass}, expected px^2 above 0.")
     if backdrop is not None and torch.is_grad_enabled():
         raise BackendError("render: a backdrop has no gradients; draw within torch.no_grad().")
 
@@ -72,8 +75,8 @@ def render(
                 "device, or ask for backend='reference', which is slow."
             )
     if chosen == "native":
-        return native.render(splats, static, times, camera, background, near, backdrop)
-    return _BACKENDS[chosen](splats, static, times, camera, background, near)
+        return native.render(splats, static, times, camera, background, near, low_pass, backdrop)
+    return _BACKENDS[chosen](splats, static, times, camera, background, near, low_pass)
 
 
 def _check_splats(splats: Splats, prefix: str) -> int:

@@ -30,10 +30,11 @@ class Backdrop:
         camera: PinholeCamera,
         background: Tensor | None,
         near: float,
+        low_pass: float,
     ) -> None:
         """Forget what does not fit the render that comes next."""
         seen = [
-            *(camera.width, camera.height, near, moving.means.shape[1]),
+            *(camera.width, camera.height, near, low_pass, moving.means.shape[1]),
             *(camera.K, camera.world_to_camera, background),
             *(getattr(static, field.name) for field in fields(Splats)),
         ]

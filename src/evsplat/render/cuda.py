@@ -18,7 +18,7 @@ from torch import Tensor
 from evsplat.cuda_support import what_is_missing
 from evsplat.devices import send
 from evsplat.errors import BackendError
-from evsplat.render.reference import EPS_2D, MAX_PIXEL, rotation_matrices
+from evsplat.render.reference import MAX_PIXEL, rotation_matrices
 from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
 
 logger = logging.getLogger(__name__)
@@ -35,6 +35,7 @@ def render(
     camera: PinholeCamera,
     background: Tensor | None,
     near: float,
+    low_pass: float,
 ) -> RenderOutput:
     """Draw with gsplat; fields have their leading axis of times.
 
@@ -77,11 +78,14 @@ def draw(
     camera: PinholeCamera,
     background: Tensor | None,
     near: float,
+    low_pass: float,
 ) -> RenderOutput:
     """Project each layer, bin all Gaussians of all times into tiles at once, and composite."""
     width, height = camera.width, camera.height
-    moving = _project(gsplat, splats, camera, near)
-    layers = [moving] if static is None else [moving, _project(gsplat, static, camera, near)]
+    moving = _project(gsplat, splats, camera, near, low_pass)
+    layers = (
+        [moving] if static is None else [moving, _project(gsplat, static, camera, near, low_pass)]
+    )
     if sum(layer.radii.shape[1] for layer in layers) == 0:
         image = splats.channels.new_zeros(times, height, width, splats.channels.shape[-1])
         alpha = image[..., 0]
@@ -106,7 +110,9 @@ class _Projected:
     channels: Float[Tensor, "T N C"]
 
 
-def _project(gsplat: Any, splats: Splats, camera: PinholeCamera, near: float) -> _Projected:
+def _project(
+    gsplat: Any, splats: Splats, camera: PinholeCamera, near: float, low_pass: float
+) -> _Projected:
     """A layer on the screen, once for all times where nothing of its geometry moves."""
     geometry = [
         getattr(splats, f.name)
@@ -146,7 +152,7 @@ def _project(gsplat: Any, splats: Splats, camera: PinholeCamera, near: float) ->
         K.expand(times, 1, 3, 3),
         camera.width,
         camera.height,
-        eps2d=EPS_2D,
+        eps2d=low_pass,
         near_plane=near,
         opacities=opacities.detach(),
     )

@@ -20,6 +20,7 @@ def render(
     camera: PinholeCamera,
     background: Tensor | None,
     near: float,
+    low_pass: float,
     backdrop: Backdrop | None,
 ) -> RenderOutput:
     """Draw with the native kernels; fields have their leading axis of times."""
@@ -37,15 +38,17 @@ def render(
     if static is None:
         backdrop = None
     if backdrop is not None and static is not None:
-        backdrop.show(splats, static, camera, background, near)
+        backdrop.show(splats, static, camera, background, near, low_pass)
     image, alpha, radii, static_radii = _Rasterize.apply(
         backdrop, times, camera.width, camera.height, camera.K, near,
-        camera.world_to_camera, background, *_fields(splats), *_fields(static),
+        low_pass, camera.world_to_camera, background, *_fields(splats), *_fields(static),
     )  # fmt: skip
     return RenderOutput(image, alpha, radii, static_radii)
 
 
 _FIELDS = len(fields(Splats))
+_SETTINGS = 7
+"""Inputs of `_Rasterize` before those that may have a gradient."""
 
 
 def _fields(splats: Splats | None) -> list[Tensor | None]:
@@ -68,6 +71,7 @@ class _Rasterize(torch.autograd.Function):
         height: int,
         K: Tensor,
         near: float,
+        low_pass: float,
         *inputs: Any,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         pose, background, *layers = map(_plain, inputs)
@@ -77,8 +81,8 @@ class _Rasterize(torch.autograd.Function):
         still_count = 0 if still[0] is None else still[0].shape[1]
         try:
             job = native.Render(
-                width, height, _plain(K), pose, near, moving, still if still_count else [],
-                background, times, torch.get_num_threads(),
+                width, height, _plain(K), pose, near, low_pass, moving,
+                still if still_count else [], background, times, torch.get_num_threads(),
             )  # fmt: skip
             image = torch.empty(times, channels.shape[2], height, width)
             alpha = torch.empty(times, height, width)
@@ -102,10 +106,10 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> Any:
         # Reading saved_tensors also refuses inputs that were changed in place since.
-        inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[6:]
+        inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[_SETTINGS:]
         image_grad, alpha_grad, *_ = upstream
         if image_grad is None and alpha_grad is None:
-            return (None,) * (6 + len(inputs))
+            return (None,) * (_SETTINGS + len(inputs))
         _, background, *layers = [
             torch.zeros(tensor.shape) if tensor is not None and need else None
             for tensor, need in zip(inputs, needed, strict=True)
@@ -119,4 +123,4 @@ class _Rasterize(torch.autograd.Function):
             pose[:3, :3] = view[:9].view(3, 3)
             pose[:3, 3] = view[9:]
             pose = pose.to(inputs[0].dtype)
-        return *(None,) * 6, pose, background, *layers
+        return *(None,) * _SETTINGS, pose, background, *layers

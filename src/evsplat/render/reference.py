@@ -6,10 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.render.splats import PinholeCamera, RenderOutput, Splats, join
+from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats, join
 
 # The rules of gsplat 1.5.3 (cuda/csrc/ProjectionEWA3DGSFused.cu, RasterizeToPixels3DGSFwd.cu).
-EPS_2D = 0.3
 MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
@@ -28,6 +27,7 @@ def render(
     camera: PinholeCamera,
     background: Tensor | None,
     near: float,
+    low_pass: float,
 ) -> RenderOutput:
     """Draw tile by tile, all pairs of a tile's pixels and Gaussians at once."""
     s = splats if static is None else join(splats, static, times)
@@ -35,7 +35,12 @@ def render(
         s.means, s.quats, s.scales, s.opacities, s.channels, s.linear, s.centers2d_offset
     )  # fmt: skip
     drawn = [
-        _draw([None if f is None else f[t if len(f) > 1 else 0] for f in fields], camera, near)
+        _draw(
+            [None if f is None else f[t if len(f) > 1 else 0] for f in fields],
+            camera,
+            near,
+            low_pass,
+        )
         for t in range(times)
     ]
     images, alphas, radii = zip(*drawn, strict=True)
@@ -47,13 +52,13 @@ def render(
 
 
 def _draw(
-    fields: list[Tensor | None], camera: PinholeCamera, near: float
+    fields: list[Tensor | None], camera: PinholeCamera, near: float, low_pass: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image, alpha and radii of one time, without background."""
     means, quats, scales, opacities, channels, linear, offset = fields
     assert means is not None and quats is not None and scales is not None
     assert opacities is not None and channels is not None
-    centers, covariance, depth = project(means, quats, scales, linear, camera)
+    centers, covariance, depth = project(means, quats, scales, linear, camera, low_pass)
     if offset is not None:
         centers = centers + offset
     reach, visible = _extents(centers, covariance, depth, opacities, camera, near)
@@ -94,6 +99,7 @@ def project(
     scales: Float[Tensor, "N 3"],
     linear: Float[Tensor, "N 3 3"] | None,
     camera: PinholeCamera,
+    low_pass: float = LOW_PASS,
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2 2"], Float[Tensor, "N"]]:
     """EWA splatting: centres in px, covariances in px^2 with the low-pass, depths in metres."""
     view = camera.world_to_camera.to(means)
@@ -116,8 +122,8 @@ def project(
     if linear is not None:
         factor = factor @ linear
     factor = factor @ rotation_matrices(quats) * scales[:, None, :]
-    low_pass = EPS_2D * torch.eye(2, dtype=means.dtype, device=means.device)
-    return centers, factor @ factor.mT + low_pass, local[:, 2]
+    blur = low_pass * torch.eye(2, dtype=means.dtype, device=means.device)
+    return centers, factor @ factor.mT + blur, local[:, 2]
 
 
 def rotation_matrices(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:

@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+LOW_PASS = 0.3
+"""Low-pass filter of 3DGS and most viewers, px^2: see `render`."""
+
 
 class PinholeCamera(Protocol):
     """What rendering reads of a camera (`evsplat.capture.Camera` has it)."""

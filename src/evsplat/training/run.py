@@ -132,7 +132,8 @@ class GaussianReconstruction:
                     alpha=drawing.output.alpha.cpu(),
                     human=_stacked(drawing.semantic).cpu().clamp(0, 1),
                 )
-            output = render(posed.moving() if parts == "human" else posed.static(), camera)
+            layer = posed.moving() if parts == "human" else posed.static()
+            output = render(layer, camera, low_pass=posed.low_pass)
         times = len(times_us)
 
         def all_times(values: torch.Tensor) -> torch.Tensor:
@@ -163,6 +164,11 @@ class GaussianReconstruction:
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
         """The same person doing what ``track`` says; see `Posable`."""
         return GaussianReconstruction(self.name, self.model.following(track))
+
+    @property
+    def low_pass(self) -> float:
+        """See `SplatReconstruction`."""
+        return self.model.low_pass
 
     @torch.no_grad()
     def splats(

@@ -29,7 +29,7 @@ if (avatar.scene) {
 
 let renderer = null;
 try {
-  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.light);
+  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.low_pass_px2, avatar.light);
   find("message").remove();
 } catch (error) {
   find("message").textContent = error.message;

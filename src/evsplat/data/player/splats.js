@@ -1,5 +1,5 @@
 // Draws skinned Gaussians with WebGL 2 by the rules of evsplat's rasteriser: EWA projection with a
-// low-pass of 0.3 px², contributions from 1/255 on, back to front by depth.
+// low-pass of the avatar, contributions from 1/255 on, back to front by depth.
 
 // Of a Gaussian: centre and opacity, covariance (2) and colour with the normal in what is left of
 // both, weights, bones.
@@ -15,6 +15,7 @@ uniform highp sampler2D gaussians, bones;
 uniform mat4 view;         // world to camera: x right, y down, z forward
 uniform vec4 lens;         // focal lengths and principal point, pixels
 uniform vec2 size;         // of the picture, pixels
+uniform float lowPass;     // px²
 uniform bool lit;
 uniform vec4 room;         // middle and radius of the places that the light knows
 uniform vec3 light[36];    // of 1, x, y, z of the place, nine each, in the order of basis below
@@ -74,8 +75,8 @@ void main() {
   mat3 seen = linear * covariance * transpose(linear);
   vec3 right = vec3(focal.x, 0, -focal.x * tangent.x) / local.z;
   vec3 down = vec3(0, focal.y, -focal.y * tangent.y) / local.z;
-  float xx = dot(right, seen * right) + 0.3, xy = dot(right, seen * down);
-  float yy = dot(down, seen * down) + 0.3, determinant = xx * yy - xy * xy;
+  float xx = dot(right, seen * right) + lowPass, xy = dot(right, seen * down);
+  float yy = dot(down, seen * down) + lowPass, determinant = xx * yy - xy * xy;
   if (determinant <= 0.0) return;
 
   conic = vec3(yy, -xy, xx) / determinant;
@@ -114,14 +115,15 @@ void main() { result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 
 
 class SplatRenderer {
   // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with bones, weights and,
-  // where light falls on them, normals. light: center, radius_m,
+  // where light falls on them, normals. lowPass: px². light: center, radius_m,
   // coefficients (4 x 9 x 3), lamps and their intensities (L x 3), or null.
-  constructor(canvas, clouds, boneCount, light) {
+  constructor(canvas, clouds, boneCount, lowPass, light) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2, which drawing Gaussians needs.");
     this.gl = gl;
     this.canvas = canvas;
     this.boneCount = boneCount;
+    this.lowPass = lowPass;
     this.light = light;
     // Sixteen bits per channel where the device can blend them: eight add a rounding per Gaussian.
     this.fine = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
@@ -218,6 +220,7 @@ class SplatRenderer {
     gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "view"), false, view);
     gl.uniform4fv(gl.getUniformLocation(this.program, "lens"), lens);
     gl.uniform2f(gl.getUniformLocation(this.program, "size"), width, height);
+    gl.uniform1f(gl.getUniformLocation(this.program, "lowPass"), this.lowPass);
     gl.uniform1i(gl.getUniformLocation(this.program, "lit"), this.light ? 1 : 0);
     if (this.light) {
       const { center, radius_m, coefficients, lamps, intensities } = this.light;

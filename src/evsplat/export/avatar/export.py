@@ -57,6 +57,7 @@ def export_avatar(
     instant = instant_of(capture, time_s=None, frame=None, camera=camera)
     scene = cloud_at(source, instant, "scene") if parts == "all" else None
     facts = {**facts_of(run), "note": loss.sentence(), "loss_db": asdict(loss)}
+    facts["low_pass_px2"] = source.low_pass
     page = write_avatar(
         path, figure, clips, track=track, camera=instant.camera, scene=scene, facts=facts
     )

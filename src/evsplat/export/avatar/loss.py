@@ -63,8 +63,8 @@ def measure_loss(source: Bakeable, figure: Figure, capture: Capture) -> Loss:
         camera = capture.camera(frame)
         person, scene = source.splats(camera, [frame.mid_us])
         skinned = figure.gaussians.posed(source.pose([frame.mid_us])[1])
-        model, model_share = _draw(person, scene, camera)
-        avatar, avatar_share = _draw(skinned, scene, camera)
+        model, model_share = _draw(person, scene, camera, source.low_pass)
+        avatar, avatar_share = _draw(skinned, scene, camera, source.low_pass)
         mask = capture.mask(frame)
         pixels = torch.maximum(model_share, avatar_share) > 0.5 if mask is None else mask > 0.5
         if not bool(pixels.any()):
@@ -91,11 +91,11 @@ def measure_loss(source: Bakeable, figure: Figure, capture: Capture) -> Loss:
 
 
 def _draw(
-    person: Splats, scene: Splats, camera: Camera
+    person: Splats, scene: Splats, camera: Camera, low_pass: float
 ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
     """Picture and the person's share of it."""
     layers = [_on_cpu(layer) for layer in (person, scene)]
-    image = render(layers[0], camera, static=layers[1]).image[0].clamp(0, 1)
+    image = render(layers[0], camera, static=layers[1], low_pass=low_pass).image[0].clamp(0, 1)
     return image[..., :3], image[..., 3]
 
 
