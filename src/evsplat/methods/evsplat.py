@@ -121,6 +121,7 @@ class EvsplatConfig(PaperConfig):
             shading=True,
             shadow_lights=4,
             self_shadow=True,
+            low_pass=0.1,
         )
     )
     optimisation: OptimisationConfig = field(
