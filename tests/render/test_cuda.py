@@ -82,6 +82,13 @@ def test_pictures_and_gradients_are_those_of_native(
     assert_alike(ours, all_gradients(splats, camera, backend="native", **options), splats)
 
 
+def test_a_low_pass_of_ones_own_is_that_of_native(device, random_scene, all_gradients):
+    splats, camera = random_scene(**CASES["sheared"], needle=MILD)
+    options = dict(dtype=torch.float32, low_pass=0.1)
+    ours = all_gradients(splats, camera, backend="gsplat", device=device, **options)
+    assert_alike(ours, all_gradients(splats, camera, backend="native", **options), splats)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_static_layer_is_drawn_at_every_time(seed, device, random_scene, all_gradients):
     size = dict(width=45, height=37, needle=MILD)

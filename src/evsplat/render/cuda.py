@@ -48,7 +48,7 @@ def render(
             f"The gsplat render backend needs float32 tensors on a CUDA device, not {means.dtype} "
             f"on {means.device}."
         )
-    return draw(load(), splats, static, times, camera, background, near)
+    return draw(load(), splats, static, times, camera, background, near, low_pass)
 
 
 @functools.cache
