@@ -349,6 +349,16 @@ def test_overlapping_exposures_are_a_warning(tiny_capture: Factory) -> None:
     load_capture(path)
 
 
+def test_pictures_that_serve_twice_are_one_warning_with_their_number(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    frames = json.loads((path / "capture.json").read_text())["frames"]
+    for index in range(3):
+        edit_json(path, "frames", index, "image", value=frames[index]["sharp"])
+    finding = the_only(path, "warning")
+    assert "which frames[0].image names too (the first of 3 such pictures)" in finding.found
+    assert finding.field == "frames[0].sharp"
+
+
 def test_capture_without_events_is_a_warning(tiny_capture: Factory) -> None:
     path = tiny_capture()
     edit_json(path, "events", value=...)

@@ -64,6 +64,30 @@ def test_noisy_poses_are_told_and_exact_ones_stay_at_every_key(captures, caplog)
     assert np.array_equal(off.track.poses, load_body_track(noisy).poses)
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("cycles", "jitter", "noisy"),
+    [(0.5, 0.004, True), (5.0, 0.004, False), (2.0, 0.03, True), (0.0, 0.0, False)],
+)
+def test_jitter_counts_against_what_lies_between_the_keys(
+    seed, cycles, jitter, noisy, tiny_capture, caplog
+):
+    """The same jitter is a fit's on a slow motion, and hides nothing in a fast one."""
+    path, rng = tiny_capture(frames=40), np.random.default_rng(seed)
+    body = dict(np.load(path / "body.npz"))
+    count, *joints = body["poses"].shape
+    phase = 2 * np.pi * (np.linspace(0, cycles, count)[:, None, None] + rng.random(joints))
+    poses = 0.3 * np.sin(phase) * (cycles > 0) + jitter * rng.normal(size=(count, *joints))
+    np.savez(path / "body.npz", **body | {"poses": poses.astype(np.float32)})
+    with caplog.at_level(logging.INFO):
+        found = prepare_poses(PoseConfig(), load_capture(path))
+    assert ("are noisy: smoothed in time, corrected in training" in caplog.text) == noisy
+    if noisy:
+        assert found.spline is not None
+        expected = max(0.02, jitter)
+        assert float(found.spline.joint_rad.max()) == pytest.approx(expected, rel=0.3)
+
+
 def test_held_out_frames_move_their_poses_only_and_their_pictures_stay_unseen(
     captures, monkeypatch
 ):

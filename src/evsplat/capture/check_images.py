@@ -95,13 +95,17 @@ def _check_pairing(metadata: Metadata, findings: Findings) -> None:
                     "Pair files by name, not by sort order.",
                 )
     first_use: dict[Path, str] = {}
-    for picture in _pictures(metadata):
-        if picture.path in first_use:
-            findings.warning(
-                metadata.path / "capture.json",
-                picture.field,
-                f"{picture.path.name!r}, which {first_use[picture.path]} names too",
-                "a file of its own",
-                "Check which of the two is right.",
-            )
-        first_use.setdefault(picture.path, picture.field)
+    again = [
+        picture
+        for picture in _pictures(metadata)
+        if first_use.setdefault(picture.path, picture.field) != picture.field
+    ]
+    if again:
+        of_how_many = f" (the first of {len(again)} such pictures)" if len(again) > 1 else ""
+        findings.warning(
+            metadata.path / "capture.json",
+            again[0].field,
+            f"{again[0].path.name!r}, which {first_use[again[0].path]} names too{of_how_many}",
+            "a file of its own",
+            "Check which of the two is right.",
+        )

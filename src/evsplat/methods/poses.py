@@ -17,9 +17,12 @@ from evsplat.methods.config import Weight
 logger = logging.getLogger(__name__)
 
 When = Literal["auto", "always", "never"]
-"""``auto``: where the key poses jitter by `PoseConfig.noisy_rad` or more."""
-LEAST_STD_M = 1e-3
-"""Expected error of the root's place where its course shows no noise."""
+"""``auto``: where the key poses are noisy, see `PoseConfig.noisy_rad`."""
+EXACT_RAD = 1e-3
+"""Poses that jitter by less are taken as exact, whatever the motion."""
+LEAST_STD_RAD, LEAST_STD_M = 0.02, 0.01
+"""Expected errors of noisy poses, however little they jitter: what was fitted to pictures errs by
+more, and that changes slowly."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,11 @@ class PoseConfig:
     refine: When = "auto"
     """Learn a residual of the poses, a cubic B-spline in time, from pictures and events."""
     between: bool = True
-    """Where poses are taken as exact and jitter by less than what a spline misses between them,
-    learn how the person moves there: such a residual that is zero at every key pose."""
+    """Where poses are taken as exact, learn how the person moves between them: such a residual that
+    is zero at every key pose."""
     noisy_rad: float = 0.006
-    """Jitter of key poses, radians per axis, from which poses count as noisy."""
+    """Jitter of key poses, radians per axis, from which poses count as noisy. With less they do if
+    its variance is half or more of what a spline through the poses misses between them."""
     start: float = 1_500
     """Nominal iteration from which the residual is learned."""
     knot_frames: float = 1.0
@@ -42,9 +46,9 @@ class PoseConfig:
     prior: Weight = 1e-3
     """Weight of the residual's mean square in units of the errors expected."""
     std_rad: float | None = None
-    """Error expected of a joint, radians per axis; null = the jitter, at least `noisy_rad`."""
+    """Error expected of a joint, radians per axis; null = the jitter, at least 0.02."""
     std_m: float | None = None
-    """Error expected of the root's place, metres per axis; null = its jitter."""
+    """Error expected of the root's place, metres per axis; null = its jitter, at least 0.01."""
     events_of_held_out: bool = False
     """Let events around held-out frames correct the poses there. The pictures of those frames stay
     unseen and nothing else is learned there, but figures are not those of other rows."""
@@ -64,18 +68,18 @@ class Poses:
 def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) -> Poses:
     """Look at a capture's key poses and do what the settings say; the log can tell what it is."""
     track = load_body_track(capture)
-    noise = motion_noise(track)
-    noisy = noise.rotation_rad >= config.noisy_rad
+    noise, expected = motion_noise(track), between_keys(track)
+    surer = _surer_than_between(noise, expected)
+    noisy = noise.rotation_rad >= (config.noisy_rad if surer else EXACT_RAD)
     smooth, refine = (
         noisy if when == "auto" else when == "always" for when in (config.smooth, config.refine)
     )
-    expected = between_keys(track)
-    between = config.between and not refine and _surer_than_between(noise, expected)
+    between = config.between and not refine and surer
     logger.log(
         logging.INFO if tell else logging.DEBUG,
-        "given poses jitter by %.4f rad per axis (noisy from %g): %s, %s",
+        "given poses jitter by %.4f rad per axis and are %s: %s, %s",
         noise.rotation_rad,
-        config.noisy_rad,
+        "noisy" if noisy else "taken as exact",
         "smoothed in time" if smooth else "taken as they are",
         "corrected in training"
         if refine
@@ -96,7 +100,7 @@ def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) ->
         noise,
         [frame.mid_us for frame in capture.train_frames],
         knot_frames=config.knot_frames,
-        joint_rad=config.std_rad or max(noise.rotation_rad, config.noisy_rad),
+        joint_rad=config.std_rad or max(noise.rotation_rad, LEAST_STD_RAD),
         root_m=config.std_m or max(noise.translation_m, LEAST_STD_M),
         stiff=smooth,
     )
@@ -106,7 +110,8 @@ def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) ->
 def _surer_than_between(noise: MotionNoise, expected: BetweenKeys) -> bool:
     """Whether key poses err by less than half of the variance of what lies between them.
 
-    Otherwise a residual that is held at the keys would bend to make up for them.
+    Where they do not, either is as likely an error of fitting, and a residual that is held at the
+    keys would bend to make up for them.
     """
     between = np.square(expected.rotation_rad[noise.moving])
     return len(between) > 0 and 2 * noise.rotation_rad**2 < float(between.mean())
