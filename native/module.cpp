@@ -403,7 +403,8 @@ NB_MODULE(_native, m) {
         .def(nb::init<int, int, const Camera&, const Pose&, float, float, Fields, Fields, std::optional<In>, int,
                       int>(),
              nb::arg("width"), nb::arg("height"), nb::arg("K"), nb::arg("world_to_camera"), nb::arg("near"),
-             nb::arg("low_pass"), nb::arg("moving"), nb::arg("still"), nb::arg("background").none(), nb::arg("times"), nb::arg("threads"))
+             nb::arg("low_pass"), nb::arg("moving"), nb::arg("still"), nb::arg("background").none(),
+             nb::arg("times"), nb::arg("threads"))
         .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"),
              nb::arg("still_radii"), nb::arg("keep") = false, nb::arg("earlier").none() = nb::none())
         .def("backward", &Render::backward, nb::arg("image_grad").none(), nb::arg("alpha_grad").none(),
