@@ -189,7 +189,9 @@ def _parts(model):
     return {name: gaussians.of_parts(getattr(gaussians, name)) for name in ATTRIBUTES}
 
 
-def test_colours_of_rows_out_of_view_are_not_missed(tiny_capture):
+@pytest.mark.parametrize("seed", range(2))
+def test_colours_of_rows_out_of_view_are_not_missed(seed, tiny_capture):
+    torch.manual_seed(seed)
     path = tiny_capture()
     model, times, center = model_of(path, "scene.kind=random_cube", "scene.cube_count=800")
     activate(model)
@@ -212,5 +214,6 @@ def test_colours_of_rows_out_of_view_are_not_missed(tiny_capture):
         if value is None:
             assert gradients[name] is None
         elif value.numel():
-            bound = 1e-6 * float(value.abs().max())
-            torch.testing.assert_close(gradients[name], value, rtol=1e-4, atol=bound)
+            # Single entries may be what is left of sums that cancel; of a row that was missed the
+            # whole gradient would be.
+            assert (gradients[name] - value).norm() <= 2e-5 * value.norm(), name

@@ -3,9 +3,10 @@
 import json
 
 import h5py
+import numpy as np
 import pytest
 
-from evsplat.calibration import SensorEstimate, ThresholdEstimate
+from evsplat.calibration import ClockEstimate, SensorEstimate, ThresholdEstimate
 from evsplat.capture import load_capture
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods import evsplat as method
@@ -24,6 +25,34 @@ def thresholds(path, *, fit: bool = True) -> list[float]:
     config = method_config("evsplat", SMALL, where="test")
     composition = TRAINABLE["evsplat"][1](config, load_capture(path), 0, fit=fit)
     return composition.model.sensor.logs.exp().tolist()
+
+
+def lag(late_us: float) -> ClockEstimate:
+    return ClockEstimate(late_us, 1_000.0, 0.9, np.zeros(1), np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("choice", "late_us", "start_us"),
+    [
+        ("auto", 7_000.0, 7_000.0),
+        ("auto", -7_000.0, -7_000.0),
+        ("auto", 3_500.0, None),
+        ("always", 3_500.0, 0.0),
+        ("always", None, 0.0),
+        ("never", 7_000.0, None),
+    ],
+)
+def test_a_clock_that_is_late_is_learned_from_there(
+    tiny_capture, monkeypatch, choice, late_us, start_us
+):
+    found = None if late_us is None else SensorEstimate(lag(late_us), None)
+    monkeypatch.setattr(method, "estimate_from_capture", lambda capture, *, frames: found)
+    config = method_config("evsplat", SMALL | {"windows": {"clock": choice}}, where="test")
+    sensor = TRAINABLE["evsplat"][1](config, load_capture(tiny_capture()), 0).model.sensor
+    if start_us is None:
+        assert sensor.offset_us is None
+    else:
+        assert float(sensor.offset_us) == pytest.approx(start_us)
 
 
 def forget(path) -> None:
@@ -45,7 +74,7 @@ def test_without_one_training_frames_and_events_tell_it(tiny_capture, monkeypatc
 
     def estimate(capture, *, frames):
         looked_at.extend(frame.split for frame in frames)
-        return SensorEstimate(None, ThresholdEstimate(0.31, 0.17, 0.1, 500))
+        return SensorEstimate(lag(0.0), ThresholdEstimate(0.31, 0.17, 0.1, 500))
 
     monkeypatch.setattr(method, "estimate_from_capture", estimate)
     assert thresholds(path) == pytest.approx((0.31, 0.17), rel=1e-6)

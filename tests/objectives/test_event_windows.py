@@ -97,6 +97,13 @@ def test_thresholds_are_held_where_they_started():
     resumed = EventSensor(1.0, 1.0)
     resumed.load_state_dict(thresholds.state_dict())
     assert float(resumed.apart()) == pytest.approx(0.05)
+    assert resumed.offset_us is None
+
+
+def test_a_saved_sensor_says_whether_its_clock_is_learned():
+    sensor, resumed = EventSensor(0.2, 0.3, late_us=5_000.0), EventSensor(1.0, 1.0)
+    resumed.load_state_dict(sensor.state_dict())
+    assert float(resumed.offset_us) == pytest.approx(5_000.0)
 
 
 def test_a_time_outside_of_the_exposure_is_asked_for_after_the_start():
@@ -179,7 +186,7 @@ def moving_edge(late_us: int):
 @pytest.mark.parametrize("late_us", [-3_000, 0, 4_000])
 def test_a_clock_that_is_late_is_found(late_us):
     capture, step = moving_edge(late_us)
-    objective = make(capture, 0.02, 0.02, clock=True)
+    objective = make(capture, 0.02, 0.02, late_us=0.0)
     objective.sensor.logs.requires_grad_(False)
     adam = torch.optim.Adam([objective.sensor.offset], lr=0.02)
     for iteration in range(150):

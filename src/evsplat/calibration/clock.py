@@ -16,6 +16,10 @@ LEAST_CORRELATION = 0.3
 _GROUPS = 8
 
 
+MOST_LAG_US = 4_000
+"""Events are late by a few ms by their nature; clocks that differ by more are told."""
+
+
 @dataclass(frozen=True, eq=False)
 class ClockEstimate:
     """How well frames and events agree, by the shift between their clocks."""
@@ -29,6 +33,11 @@ class ClockEstimate:
     lags_us: Float[np.ndarray, "L"]
     correlations: Float[np.ndarray, "L"]
     """At each of ``lags_us``; what a curve of it shows."""
+
+    @property
+    def differs(self) -> bool:
+        """Whether events and frames are surely not on one clock."""
+        return abs(self.lag_us) > max(MOST_LAG_US, 3 * self.spread_us)
 
 
 def estimate_clock(

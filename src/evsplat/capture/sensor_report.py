@@ -4,9 +4,6 @@ from evsplat.calibration import ClockEstimate, SensorEstimate
 from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding, Findings
 
-MOST_LAG_US = 4_000
-"""Clocks that differ by more are worth a warning: events are late by a few ms by their nature."""
-
 
 def sensor_lines(estimate: SensorEstimate | None, clock_offset_us: int) -> list[str]:
     """Clock and contrast in words; ``clock_offset_us`` is what was added to the events' times."""
@@ -17,7 +14,7 @@ def sensor_lines(estimate: SensorEstimate | None, clock_offset_us: int) -> list[
         f"clock      events {_lag_text(clock)} (+-{clock.spread_us / 1000:.1f} ms; correlation "
         f"{clock.correlation:.2f})"
     )
-    if _differs(clock):
+    if clock.differs:
         text += f"; clock_offset_us {_aligning_us(clock, clock_offset_us)} would align them"
     lines = [text]
     if contrast is not None:
@@ -34,10 +31,6 @@ def _lag_text(clock: ClockEstimate) -> str:
     )
 
 
-def _differs(clock: ClockEstimate) -> bool:
-    return abs(clock.lag_us) > max(MOST_LAG_US, 3 * clock.spread_us)
-
-
 def _aligning_us(clock: ClockEstimate, clock_offset_us: int) -> int:
     """A lag is taken back by an offset of the other sign."""
     return 100 * round((clock_offset_us - clock.lag_us) / 100)
@@ -45,7 +38,7 @@ def _aligning_us(clock: ClockEstimate, clock_offset_us: int) -> int:
 
 def clock_findings(capture: Capture, estimate: SensorEstimate | None) -> list[Finding]:
     """A warning where the estimated clock is far from what capture.json says."""
-    if estimate is None or not _differs(estimate.clock):
+    if estimate is None or not estimate.clock.differs:
         return []
     findings = Findings()
     findings.warning(

@@ -11,7 +11,7 @@ from typing import Literal
 
 import torch
 
-from evsplat.calibration import estimate_from_capture
+from evsplat.calibration import SensorEstimate, estimate_from_capture
 from evsplat.capture import Capture
 from evsplat.deform.human_scene import DeformConfig
 from evsplat.methods.build import Build
@@ -72,8 +72,9 @@ class WindowConfig:
     """Weigh differences by the sensor's background noise, and leave hot pixels out."""
     pixel_thresholds: bool = False
     """Each pixel learns a factor on its contrast thresholds."""
-    clock: bool = False
-    """Learn by how much the events' clock is late, on top of the capture's own offset."""
+    clock: Literal["auto", "always", "never"] = "auto"
+    """Learn by how much the events' clock is late, on top of the capture's own offset, starting at
+    what training frames and events tell. ``auto``: where that is 4 ms and three standard errors."""
 
 
 @dataclass(frozen=True)
@@ -219,9 +220,15 @@ def _windows(
     """The event term, and the sensor that the model learns with it."""
     assert capture.events is not None
     # A loaded model brings its own.
-    known = _thresholds(capture) if fit else (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD)
+    known, late_us = (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD), None
+    if fit:
+        estimate = None
+        if capture.contrast_threshold is None or windows.clock != "never":
+            estimate = estimate_from_capture(capture, frames=capture.train_frames)
+        known = _thresholds(capture, estimate)
+        late_us = _late_us(windows, estimate)
     pixels = (capture.events.height, capture.events.width) if windows.pixel_thresholds else None
-    build.model.sensor = EventSensor(*known, pixels=pixels, clock=windows.clock).to(device)
+    build.model.sensor = EventSensor(*known, pixels=pixels, late_us=late_us).to(device)
     if fit and not capture.events.has_polarity:
         logger.warning(
             "%s: its events have no polarity; the size of changes is compared with their number.",
@@ -253,11 +260,21 @@ def _edi(config: EdiConfig, capture: Capture, windows: EventWindows) -> EdiTarge
     )
 
 
-def _thresholds(capture: Capture) -> tuple[float, float]:
+def _late_us(windows: WindowConfig, estimate: SensorEstimate | None) -> float | None:
+    """From where the offset of the events' clock is learned; None: not at all."""
+    if windows.clock == "never":
+        return None
+    if estimate is None or not estimate.clock.differs:
+        return 0.0 if windows.clock == "always" else None
+    late_ms = estimate.clock.lag_us / 1000
+    logger.info("events lag the frames by %.1f ms; the offset of their clock is learned", late_ms)
+    return estimate.clock.lag_us
+
+
+def _thresholds(capture: Capture, estimate: SensorEstimate | None) -> tuple[float, float]:
     """C+ and C-: the capture's, or those at which training frames and events agree best."""
     if capture.contrast_threshold is not None:
         return capture.contrast_threshold
-    estimate = estimate_from_capture(capture, frames=capture.train_frames)
     if estimate is None or estimate.thresholds is None:
         logger.warning(
             "%s: contrast thresholds are neither given nor to be found from frames and events; "

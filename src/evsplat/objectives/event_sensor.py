@@ -18,23 +18,38 @@ class EventSensor(nn.Module):
     start_logs: Tensor
 
     def __init__(
-        self, on: float, off: float, *, pixels: tuple[int, int] | None = None, clock: bool = False
+        self,
+        on: float,
+        off: float,
+        *,
+        pixels: tuple[int, int] | None = None,
+        late_us: float | None = None,
     ) -> None:
         """Thresholds to start from and to stay near, above 0.
 
         With ``pixels`` (height, width) each pixel learns a factor on both of its thresholds, as
-        sensors have it; with ``clock`` the offset of the events' clock is learned, starting at 0.
+        sensors have it; the offset of the events' clock is learned from ``late_us`` on, unless that
+        is None.
         """
         super().__init__()
         self.register_buffer("start_logs", torch.tensor([on, off]).log())
         self.logs = nn.Parameter(self.start_logs.clone())
         self.pixel_logs = None if pixels is None else nn.Parameter(torch.zeros(pixels))
-        self.offset = nn.Parameter(torch.zeros(())) if clock else None
+        self.offset = nn.Parameter(torch.tensor((late_us or 0.0) / _OFFSET_UNIT_US))
+        self.learns_clock = late_us is not None
 
     @property
     def offset_us(self) -> Float[Tensor, ""] | None:
         """How much later events are stamped than the frames' clock says; None: not learned."""
-        return None if self.offset is None else _OFFSET_UNIT_US * self.offset
+        return _OFFSET_UNIT_US * self.offset if self.learns_clock else None
+
+    def get_extra_state(self) -> Tensor:
+        """Whether the clock is learned: a saved run says so itself."""
+        return torch.tensor(self.learns_clock)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take back what `get_extra_state` gave."""
+        self.learns_clock = bool(state)
 
     def apart(self) -> Float[Tensor, ""]:
         """Squared distance of the logarithms from where they started, mean over polarities.
