@@ -2,10 +2,11 @@
 
 Prints forward and forward+backward times on 1 and 2 threads, the stages on one thread, the share of
 one core's peak, the ratio to the torch reference on a smaller scene, what five times of
-one camera cost, and memory. The last line is one JSON object with the same numbers.
+one camera cost, and memory; with ``--run`` also what five times of a trained run's exposure cost.
+The last line is one JSON object with the same numbers.
 """
 
-import evsplat  # noqa: F401 - before torch: it sets how OpenMP's threads wait
+import evsplat  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import argparse
@@ -16,6 +17,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import torch
@@ -180,9 +182,28 @@ def person_over_scene(size_px: int, channels: int, times: int) -> TwoLayers:
     return TwoLayers(replace(person, means=means), static.splats, static.camera, static.image_grad)
 
 
-def many_times(size_px: int, channels: int, repeats: int) -> dict[str, float]:
+def trained_person(path: Path, times: int) -> TwoLayers:
+    """A trained person over its scene at even times of the middle training frame's exposure."""
+    run = evsplat.load_run(path, device="cpu")
+    frame = run.capture.train_frames[len(run.capture.train_frames) // 2]
+    camera, (start, end) = run.capture.camera(frame), frame.exposure_us
+    at = [start + (end - start) * time // (times - 1) for time in range(times)]
+    moving, static = run.reconstruction.splats(camera, at)
+    # One picture has one shadow; what the scene's colours are costs nothing.
+    static = replace(static, channels=static.channels[:1])
+    channels = static.channels.shape[-1]
+    grad = torch.randn(1, channels, camera.height, camera.width).permute(0, 2, 3, 1)
+    alpha = render(moving, camera).alpha[:1, None]
+    touched = torch.nn.functional.max_pool2d(alpha, 16, ceil_mode=True) > 0
+    print(
+        f"  {path}: {camera.width}x{camera.height} px, {moving.means.shape[1]} Gaussians in "
+        f"{touched.float().mean():.0%} of the tiles over {static.means.shape[1]}"
+    )
+    return TwoLayers(moving, static, camera, grad)
+
+
+def many_times(scene: TwoLayers, repeats: int) -> dict[str, float]:
     """Forward+backward of a person over a static scene: one time, five, five without sharing."""
-    scene = person_over_scene(size_px, channels, 5)
 
     def measured(name: str, moving: Splats, fixed: Splats | None) -> tuple[float, int]:
         moving = with_gradient(moving)
@@ -201,7 +222,8 @@ def many_times(size_px: int, channels: int, repeats: int) -> dict[str, float]:
         print(f"  {name}: {timing}, {steps} patch steps")
         return timing.best, steps
 
-    first = replace(scene.moving, means=scene.moving.means[:1])
+    given = vars(scene.moving).items()
+    first = Splats(**{n: v if v is None or v.ndim < 3 else v[:1] for n, v in given})
     single, single_steps = measured("person and scene, 1 time", first, scene.static)
     shared, shared_steps = measured("person and scene, 5 times", scene.moving, scene.static)
     everything = join(scene.moving.with_times(), scene.static.with_times(), 5)
@@ -236,6 +258,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--channels", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=25)
+    parser.add_argument("--run", type=Path, help="a trained run folder")
     args = parser.parse_args()
 
     level = _native.level()
@@ -282,7 +305,10 @@ def main() -> None:
         f"  128x128 px, 1000 Gaussians, forward+backward, 2 threads: native {native}, "
         f"torch reference {reference}: {ratio:.0f} times as fast"
     )
-    result |= many_times(args.size, args.channels, args.repeats)
+    result |= many_times(person_over_scene(args.size, args.channels, 5), args.repeats)
+    if args.run is not None:
+        of_run = many_times(trained_person(args.run, 5), args.repeats)
+        result |= {f"run_{name}": value for name, value in of_run.items()}
     peak_rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result |= {"kept_for_backward_mb": round(job.bytes / 1e6, 2)}
     result |= {"peak_rss_mb": round(peak_rss / 1e3)}
