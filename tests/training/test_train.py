@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from evsplat.capture import load_capture
 from evsplat.errors import BackendError, ConfigError, DataError
@@ -194,6 +195,27 @@ def test_wrong_calls_are_refused_before_anything_is_written(tiny_capture, tmp_pa
     (out / "mine.txt").write_text("keep")
     with pytest.raises(ConfigError, match="not empty"):
         train(capture, out=out)
+
+
+@pytest.mark.parametrize("change", ["lacks", "holds the unknown"])
+def test_a_checkpoint_of_another_version_is_named(tiny_capture, tmp_path, change):
+    capture = tiny_capture(frames=10)
+    out = train(capture, out=tmp_path / "run", iterations=2, overrides=SMALL)
+    path = latest_checkpoint(RunFolder(out).checkpoints)
+    tensors, state = load_checkpoint(path)
+    if change == "lacks":
+        del tensors["model.sensor.offset"]
+    else:
+        tensors["model.sensor.gain"] = torch.zeros(1)
+    save_file(tensors, path, metadata={"state": json.dumps(state)})
+    name = "sensor.offset" if change == "lacks" else "sensor.gain"
+    told = f"{change} {name}, being written by another version"
+    with pytest.raises(DataError, match=told):
+        load_run(out)
+    log = RunFolder(out).log.read_text()
+    with pytest.raises(DataError, match=told):
+        train(capture, out=out, iterations=4, resume=True)
+    assert RunFolder(out).log.read_text() == log
 
 
 def test_a_damaged_checkpoint_is_named(tiny_capture, tmp_path):

@@ -52,6 +52,19 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, state
 
 
+def check_fits(model: Model, tensors: dict[str, Tensor], path: Path) -> None:
+    """Refuse a checkpoint of another version of the method with a `DataError`."""
+    known, found = set(model.state_dict()), set(below("model", tensors))
+    for names, what in ((known - found, "lacks"), (found - known, "holds the unknown")):
+        if names:
+            first, more = min(names), len(names) - 1
+            others = f" and {more} more" if more else ""
+            raise DataError(
+                f"{path}: {what} {first}{others}, being written by another version of evsplat "
+                "(versions.json beside its folder names it); open it with that one, or train again."
+            )
+
+
 def load_model(model: Model, tensors: dict[str, Tensor], human_count: int) -> None:
     """Give a model the parameters of a checkpoint, whatever its number of Gaussians was."""
     entries = below("model", tensors)

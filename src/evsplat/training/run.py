@@ -27,7 +27,7 @@ from evsplat.files import read_json, write_json, write_text
 from evsplat.methods import TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
 from evsplat.render import Backdrop, Splats, choose_device, render
-from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, load_model
+from evsplat.training.checkpoint import check_fits, latest_checkpoint, load_checkpoint, load_model
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
@@ -254,6 +254,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     composition = compose(
         _without_perceptual(method, config), capture, facts["seed"], device=device, fit=False
     )
+    check_fits(composition.model, tensors, path)
     load_model(composition.model, tensors, progress["human_count"])
     return Run(
         path=folder.path,

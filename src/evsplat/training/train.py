@@ -20,7 +20,12 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.methods.config import Weight
 from evsplat.render import choose_device
-from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from evsplat.training.checkpoint import (
+    check_fits,
+    latest_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from evsplat.training.clock import Clock
 from evsplat.training.run import (
     RunFolder,
@@ -124,6 +129,7 @@ def train(
     trainer = Trainer(composition, composition.capture or capture, clock, cache_bytes=cache_bytes)
     if checkpoint is not None:
         tensors, state = load_checkpoint(checkpoint)
+        check_fits(trainer.model, tensors, checkpoint)
         trainer.load_state(tensors, state)
         if iterations is None and max_minutes is None:
             clock.iterations = state["clock"]["iterations"]
