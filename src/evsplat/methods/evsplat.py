@@ -74,7 +74,8 @@ class WindowConfig:
     """Each pixel learns a factor on its contrast thresholds."""
     clock: Literal["auto", "always", "never"] = "auto"
     """Learn by how much the events' clock is late, on top of the capture's own offset, starting at
-    what training frames and events tell. ``auto``: where that is 4 ms and three standard errors."""
+    what training frames and events tell where that is over 4 ms and three standard errors.
+    ``auto``: only there; ``always``: elsewhere from 0."""
 
 
 @dataclass(frozen=True)
