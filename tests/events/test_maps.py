@@ -8,7 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evsplat.errors import DataError
-from evsplat.events import EventStream, count_map, polarity_counts, time_surface, voxel_grid
+from evsplat.events import (
+    EventStream,
+    begun_counts,
+    count_map,
+    polarity_counts,
+    time_surface,
+    voxel_grid,
+)
 
 WIDTH, HEIGHT = 19, 13
 EVENTCV_VOXEL_US = 30_000
@@ -101,11 +108,78 @@ def test_surface_at_an_earlier_time_ignores_what_comes_later() -> None:
     assert torch.equal(early, cut) and early.max() == 1
 
 
+def crossings(level: np.ndarray, times: np.ndarray) -> EventStream:
+    """Events of pixels (times, H, W) whose level, in thresholds, starts at a whole number."""
+    events, reported = [], level[0].round()
+    for now, at in zip(times[1:], level[1:], strict=True):
+        for sign in (1, -1):
+            y, x = np.nonzero(sign * (at - reported) >= 1)
+            reported[y, x] += sign
+            events += [(now, x_, y_, sign) for x_, y_ in zip(x, y, strict=True)]
+    t, x, y, p = np.array(events).T
+    return EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
+
+
+@given(st.integers(0, 10_000))
+def test_counts_with_what_has_begun_follow_a_steady_change_exactly(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.arange(0, 20_001, 10)
+    slopes = rng.uniform(-6, 6, (HEIGHT, WIDTH)) / 20_000
+    level = slopes * times[:, None, None]
+    stream = crossings(level, times)
+    now = int(rng.integers(6_000, 14_000))
+    on, off = (
+        begun_counts(stream, [now], HEIGHT, WIDTH, reach_us=20_000)[0]
+        + polarity_counts(stream.between(0, now), HEIGHT, WIDTH)
+    ).numpy()
+    known = (np.abs(slopes * now) > 1.02) & (np.abs(slopes * (20_000 - now)) > 1.02)
+    # events come up to 10 us after the crossing
+    late = np.abs(slopes) * 20
+    assert (np.abs(on - off - slopes * now) <= late + 1e-5)[known].all()
+    assert (np.minimum(on, off) == 0).all()  # each slope has one polarity
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_has_begun_brings_counts_nearer_to_a_changing_brightness(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.arange(0, 100_001, 50)
+    waves = 2 * np.pi * rng.uniform(10, 40, (3, HEIGHT, WIDTH)) * 1e-6
+    sizes, phases = rng.uniform(0.5, 3, waves.shape), rng.uniform(0, 2 * np.pi, waves.shape)
+    level = sum(
+        size * (np.sin(wave * times[:, None, None] + phase) - np.sin(phase))
+        for wave, size, phase in zip(waves, sizes, phases, strict=True)
+    )
+    stream = crossings(level, times)
+    held, even = [], []
+    for index in range(200, 1_801, 100):
+        now = int(times[index])
+        counts = polarity_counts(stream.between(0, now), HEIGHT, WIDTH)
+        begun = begun_counts(stream, [now], HEIGHT, WIDTH, reach_us=50_000)[0]
+        for errors, (on, off) in ((held, counts), (even, counts + begun)):
+            errors.append(np.abs((on - off).numpy() - level[index]).mean())
+    assert np.mean(even) < 0.8 * np.mean(held)
+
+
+def test_nothing_has_begun_between_opposite_or_distant_events() -> None:
+    t = np.array([0, 0, 0, 1_000, 5_000, 2_000, 9_000])
+    x = np.array([0, 1, 2, 0, 1, 2, 3], dtype=np.uint16)
+    p = np.array([1, 1, -1, -1, 1, -1, 1], dtype=np.int8)
+    order = np.argsort(t, kind="stable")
+    stream = EventStream(t[order], x[order], np.zeros(7, np.uint16), p[order])
+    now, late = begun_counts(stream, [500, 2_000], 1, 4, reach_us=4_000)
+    assert now.tolist() == [[[0, 0, 0, 0]], [[0, 0, 0.25, 0]]]
+    # an event at the instant itself has fully come about
+    assert late.tolist() == [[[0, 0, 0, 0]], [[0, 0, 1, 0]]]
+    (farther,) = begun_counts(stream, [500], 1, 4, reach_us=5_000)
+    assert farther[0, 0].tolist() == pytest.approx([0, 0.1, 0, 0])
+
+
 def test_no_events_make_empty_maps() -> None:
     nothing = random_stream(0, 0)
     assert voxel_grid(nothing, HEIGHT, WIDTH, 5, scaling="standard").abs().sum() == 0
     assert time_surface(nothing, HEIGHT, WIDTH, decay_us=10).abs().sum() == 0
     assert polarity_counts(nothing, HEIGHT, WIDTH).sum() == 0
+    assert begun_counts(nothing, [5, 9], HEIGHT, WIDTH, reach_us=10).sum() == 0
 
 
 def test_what_makes_no_sense_is_refused() -> None:

@@ -54,12 +54,12 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
     return capture, SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0)
 
 
-def make(capture, on: float, off: float, **learned) -> EventWindows:
+def make(capture, on: float, off: float, begun_us: int = 0, **learned) -> EventWindows:
     sensor = EventSensor(on, off, **learned).double()
     generator = torch.Generator().manual_seed(0)
     options = {"start": 750, "eps": EPS, "reach": 0.5}
     noise = EventNoise(capture.events, aware=False)
-    return EventWindows(capture, sensor, generator, noise=noise, **options)
+    return EventWindows(capture, sensor, generator, noise=noise, begun_us=begun_us, **options)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -195,6 +195,33 @@ def test_a_clock_that_is_late_is_found(late_us):
         objective.loss(step)["event"].backward()
         adam.step()
     assert float(objective.sensor.offset_us) == pytest.approx(late_us, abs=300)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steady_change_is_explained_between_its_events_too(seed):
+    rng = np.random.default_rng(seed)
+    on, off, times = 0.37, 0.3, (31_000, 44_500, 63_000)
+    y, x = np.divmod(np.arange(HEIGHT * WIDTH), WIDTH)
+    sign = rng.choice([-1, 1], len(x))
+    period_us = rng.integers(5_000, 20_000, len(x))
+    steps = [np.arange(period, 100_000, period) for period in period_us]
+    t = np.concatenate(steps)
+    order = np.argsort(t, kind="stable")
+    pixel = np.repeat(np.arange(len(x)), [len(each) for each in steps])[order]
+    stream = EventStream(
+        t[order],
+        x[pixel].astype(np.uint16),
+        y[pixel].astype(np.uint16),
+        sign[pixel].astype(np.int8),
+    )
+    frames = [SimpleNamespace(mid_us=mid) for mid in (0, 50_000, 100_000)]
+    capture = SimpleNamespace(events=Recording(stream), frames=frames, train_frames=frames)
+    slope = torch.from_numpy(np.where(sign > 0, on, -off) / period_us)
+    log = slope.view(HEIGHT, WIDTH) * torch.tensor(times).view(-1, 1, 1)
+    linear = (log.exp() - EPS)[..., None].expand(-1, -1, -1, 3)
+    step = SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0)
+    assert float(make(capture, on, off, begun_us=20_000).loss(step)["event"]) < 1e-6
+    assert float(make(capture, on, off).loss(step)["event"]) > 0.05
 
 
 @pytest.mark.parametrize("rate_hz", [0.3, 8.0])

@@ -1,7 +1,7 @@
 """Event streams: recordings of any format, slices, stores on disk, maps, a simulated sensor."""
 
 from evsplat.events.formats.base import RecordedFrame
-from evsplat.events.maps import count_map, polarity_counts, time_surface, voxel_grid
+from evsplat.events.maps import begun_counts, count_map, polarity_counts, time_surface, voxel_grid
 from evsplat.events.recording import EventRecording, open_recording, read_events
 from evsplat.events.simulator import (
     PRESETS,
@@ -22,6 +22,7 @@ __all__ = [
     "RecordedFrame",
     "SensorSettings",
     "SensorSimulator",
+    "begun_counts",
     "count_map",
     "open_recording",
     "polarity_counts",

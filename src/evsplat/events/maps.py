@@ -4,6 +4,7 @@ Every map is float32 on the CPU, polarity first ON then OFF. Where a map needs a
 of times in microseconds; left out, it reaches from the first to the last event.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -27,6 +28,33 @@ def polarity_counts(stream: EventStream, height: int, width: int) -> Float[Tenso
     """Number of ON and of OFF events per pixel."""
     place = event_pixels(stream, height, width) + (stream.p < 0) * (height * width)
     return _sums(place, None, (2, height, width))
+
+
+def begun_counts(
+    stream: EventStream, times_us: Sequence[int], height: int, width: int, *, reach_us: int
+) -> Float[Tensor, "T 2 H W"]:
+    """The share of each pixel's next ON or OFF event that has come about by each time, in 0..1.
+
+    A pixel reports a step when it is complete. Between two events of the same polarity its
+    brightness went from one step to the next, which is taken to be even in time; nothing is known
+    between opposite ones, or where they lie more than ``reach_us`` apart. Events at the time itself
+    are the next ones, as they are for windows that begin there.
+    """
+    place = event_pixels(stream, height, width)
+    shares = np.zeros((len(times_us), 2 * height * width), np.float32)
+    for time, share in zip(times_us, shares, strict=True):
+        first, here, end = np.searchsorted(stream.t, [time - reach_us, time, time + reach_us])
+        last, following = np.full((2, height * width), -1, np.int32)
+        # of several values for one place NumPy keeps the last
+        last[place[first:here]] = np.arange(first, here)
+        following[place[here:end][::-1]] = np.arange(here, end)[::-1]
+        pixels = np.flatnonzero((last >= 0) & (following >= 0))
+        before, after = last[pixels], following[pixels]
+        sign, gap = stream.p[before], stream.t[after] - stream.t[before]
+        known = (sign == stream.p[after]) & (gap <= reach_us)
+        channel = (sign[known] < 0) * (height * width)
+        share[pixels[known] + channel] = (time - stream.t[before[known]]) / gap[known]
+    return torch.from_numpy(shares.reshape(-1, 2, height, width))
 
 
 def voxel_grid(

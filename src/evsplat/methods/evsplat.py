@@ -70,6 +70,9 @@ class WindowConfig:
     """How far before or after an exposure windows reach, in intervals of the training frames."""
     noise_aware: bool = True
     """Weigh differences by the sensor's background noise, and leave hot pixels out."""
+    begun_us: int = 100_000
+    """Between two events of one polarity that lie at most so far apart, brightness is taken to
+    change evenly instead of all at once at the second; 0: all at once."""
     pixel_thresholds: bool = False
     """Each pixel learns a factor on its contrast thresholds."""
     clock: Literal["auto", "always", "never"] = "auto"
@@ -243,6 +246,7 @@ def _windows(
         eps=windows.eps,
         noise=EventNoise(capture.events, aware=windows.noise_aware),
         reach=windows.reach,
+        begun_us=windows.begun_us,
     )
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from evsplat.capture import Capture, Frame
 from evsplat.devices import send
-from evsplat.events import EventStream, polarity_counts
+from evsplat.events import EventStream, begun_counts, polarity_counts
 from evsplat.imaging import luminance
 from evsplat.objectives.base import Stateless, Step
 from evsplat.objectives.event_noise import EventNoise
@@ -43,6 +43,7 @@ class EventWindows(Stateless):
         eps: float,
         noise: EventNoise,
         reach: float = 0.5,
+        begun_us: int = 0,
     ) -> None:
         """``start`` in nominal iterations; ``eps`` is added to linear luminance."""
         assert capture.events is not None
@@ -53,6 +54,7 @@ class EventWindows(Stateless):
         self.reach_us = reach * _median_gap([frame.mid_us for frame in capture.train_frames])
         self.range_us = (min(mids), max(mids))
         self.noise = noise
+        self.begun_us = begun_us
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """One time outside of the exposure."""
@@ -86,12 +88,17 @@ class EventWindows(Stateless):
         shift = 0 if offset is None else round(float(offset))
         late = [time + shift for time in step.times_us]
         brightness = torch.log(luminance(step.linear) + self.eps)
-        stream = self.events.between(late[0] - _RATE_US, late[-1] + _RATE_US)
+        reach = max(_RATE_US, self.begun_us)
+        stream = self.events.between(late[0] - reach, late[-1] + reach)
         windows = list(zip(late, late[1:], strict=False))
         counts = self._counts(stream, windows, brightness.device)
         changes = brightness[1:] - brightness[:-1]
         if not self.events.has_polarity:
             return changes.abs() - self.sensor.path(counts.sum(1))
+        if self.begun_us > 0:
+            size = self.events.height, self.events.width
+            begun = begun_counts(stream, late, *size, reach_us=self.begun_us)
+            counts = counts + send(begun[1:] - begun[:-1], counts.device)
         reported = self.sensor.change(*counts.unbind(1))
         if offset is not None:
             # Events per microsecond at each instant tell what a later clock would have counted.
