@@ -171,6 +171,7 @@ class TwoLayers:
     static: Splats
     camera: PinholeCamera
     image_grad: torch.Tensor
+    low_pass: float = LOW_PASS
 
 
 def person_over_scene(size_px: int, channels: int, times: int) -> TwoLayers:
@@ -193,13 +194,14 @@ def trained_person(path: Path, times: int) -> TwoLayers:
     static = replace(static, channels=static.channels[:1])
     channels = static.channels.shape[-1]
     grad = torch.randn(1, channels, camera.height, camera.width).permute(0, 2, 3, 1)
-    alpha = render(moving, camera).alpha[:1, None]
+    low_pass = run.reconstruction.low_pass
+    alpha = render(moving, camera, low_pass=low_pass).alpha[:1, None]
     touched = torch.nn.functional.max_pool2d(alpha, 16, ceil_mode=True) > 0
     print(
         f"  {path}: {camera.width}x{camera.height} px, {moving.means.shape[1]} Gaussians in "
         f"{touched.float().mean():.0%} of the tiles over {static.means.shape[1]}"
     )
-    return TwoLayers(moving, static, camera, grad)
+    return TwoLayers(moving, static, camera, grad, low_pass)
 
 
 def many_times(scene: TwoLayers, repeats: int) -> dict[str, float]:
@@ -213,11 +215,11 @@ def many_times(scene: TwoLayers, repeats: int) -> dict[str, float]:
         leaves = [v for layer in layers for v in vars(layer).values() if v is not None]
 
         def both() -> None:
-            out = render(moving, scene.camera, static=fixed)
+            out = render(moving, scene.camera, static=fixed, low_pass=scene.low_pass)
             torch.autograd.grad(out.image, leaves, grad)
 
         timing = timed(both, repeats)
-        alpha = render(moving, scene.camera, static=fixed).alpha
+        alpha = render(moving, scene.camera, static=fixed, low_pass=scene.low_pass).alpha
         steps = alpha.grad_fn.job.patch_steps  # type: ignore[union-attr]
         print(f"  {name}: {timing}, {steps} patch steps")
         return timing.best, steps

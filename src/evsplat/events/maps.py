@@ -37,23 +37,31 @@ def begun_counts(
 
     A pixel reports a step when it is complete. Between two events of the same polarity its
     brightness went from one step to the next, which is taken to be even in time; nothing is known
-    between opposite ones, or where they lie more than ``reach_us`` apart. Events at the time itself
-    are the next ones, as they are for windows that begin there.
+    between opposite ones, or where they lie more than ``reach_us`` apart. Times ascend; events at
+    one of them are the next ones, as they are for windows that begin there.
     """
+    pixels = height * width
     place = event_pixels(stream, height, width)
-    shares = np.zeros((len(times_us), 2 * height * width), np.float32)
-    for time, share in zip(times_us, shares, strict=True):
-        first, here, end = np.searchsorted(stream.t, [time - reach_us, time, time + reach_us])
-        last, following = np.full((2, height * width), -1, np.int32)
-        # of several values for one place NumPy keeps the last
-        last[place[first:here]] = np.arange(first, here)
-        following[place[here:end][::-1]] = np.arange(here, end)[::-1]
-        pixels = np.flatnonzero((last >= 0) & (following >= 0))
-        before, after = last[pixels], following[pixels]
+    index = np.arange(len(stream), dtype=np.int32)
+    cuts = np.searchsorted(stream.t, times_us)
+    # of several values for one place NumPy keeps the last
+    following = np.full((len(times_us) + 1, pixels), -1, np.int32)
+    ends = [*cuts[1:], len(stream)]
+    for row in range(len(times_us) - 1, -1, -1):
+        following[row] = following[row + 1]
+        part = slice(cuts[row], ends[row])
+        following[row, place[part][::-1]] = index[part][::-1]
+    last = np.full(pixels, -1, np.int32)
+    shares = np.zeros((len(times_us), 2 * pixels), np.float32)
+    for row, (time, start) in enumerate(zip(times_us, [0, *cuts], strict=False)):
+        part = slice(start, cuts[row])
+        last[place[part]] = index[part]
+        between = np.flatnonzero((last >= 0) & (following[row] >= 0))
+        before, after = last[between], following[row, between]
         sign, gap = stream.p[before], stream.t[after] - stream.t[before]
         known = (sign == stream.p[after]) & (gap <= reach_us)
-        channel = (sign[known] < 0) * (height * width)
-        share[pixels[known] + channel] = (time - stream.t[before[known]]) / gap[known]
+        channel = (sign[known] < 0) * pixels
+        shares[row, between[known] + channel] = (time - stream.t[before[known]]) / gap[known]
     return torch.from_numpy(shares.reshape(-1, 2, height, width))
 
 
