@@ -94,7 +94,9 @@ def accuracy(capture: Capture) -> dict[str, float]:
 
     frames = [(frame, capture.sharp(frame)) for frame in capture.frames]
     logs = [
-        (frame.mid_us, log_brightness(sharp, eps=EPS)) for frame, sharp in frames if sharp is not None
+        (frame.mid_us, log_brightness(sharp, eps=EPS))
+        for frame, sharp in frames
+        if sharp is not None
     ]
     errors: dict[str, list[float]] = {"complete": [], "begun": []}
     for (start, before), (end, after) in pairwise(logs):
