@@ -45,7 +45,11 @@ class EventWindows(Stateless):
         reach: float = 0.5,
         begun_us: int = 0,
     ) -> None:
-        """``start`` in nominal iterations; ``eps`` is added to linear luminance."""
+        """``start`` in nominal iterations; ``eps`` is added to linear luminance.
+
+        Between events of one polarity at most ``begun_us`` apart brightness changes evenly
+        (`begun_counts`); 0: all at once, when the second one tells.
+        """
         assert capture.events is not None
         self.events, self.sensor, self.generator = capture.events, sensor, generator
         self.start, self.eps = start, eps
