@@ -13,6 +13,7 @@ from evsplat.training import load_run
 OUT = Path(__file__).parents[1] / "docs" / "images"
 EXPOSURE = 4
 """Frame through whose exposure the strip goes."""
+GAP_PX = 4
 
 
 def strip(run: Path, name: str, count: int, **film: object) -> list[Image.Image]:
@@ -24,15 +25,20 @@ def strip(run: Path, name: str, count: int, **film: object) -> list[Image.Image]
         return [Image.open(path).convert("RGB") for path in chosen]
 
 
-def save(name: str, pictures: list[Image.Image]) -> None:
-    """Write pictures side by side."""
-    gap, height = 4, pictures[0].height
-    page = Image.new("RGB", (sum(p.width + gap for p in pictures) - gap, height), (255, 255, 255))
+def beside(pictures: list[Image.Image]) -> Image.Image:
+    """Pictures of one height, side by side with a gap."""
+    width, height = sum(p.width + GAP_PX for p in pictures) - GAP_PX, pictures[0].height
+    page = Image.new("RGB", (width, height), (255, 255, 255))
     x = 0
     for picture in pictures:
         page.paste(picture, (x, 0))
-        x += picture.width + gap
-    page.save(OUT / f"{name}.webp", quality=88, method=6)
+        x += picture.width + GAP_PX
+    return page
+
+
+def save(name: str, pictures: list[Image.Image]) -> None:
+    """Write pictures side by side."""
+    beside(pictures).save(OUT / f"{name}.webp", quality=88, method=6)
 
 
 def main(run: Path) -> None:

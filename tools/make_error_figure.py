@@ -8,7 +8,7 @@ white: 64 of 255 levels, as in reports). Frames and truth are those of the first
 import sys
 from pathlib import Path
 
-import numpy as np
+from make_doc_figures import GAP_PX, beside
 from PIL import Image
 
 from evsplat.evaluation.pictures import error_map, to_bytes
@@ -17,14 +17,6 @@ from evsplat.files import atomic_path
 from evsplat.training import load_run
 
 MARGIN = 0.15
-GAP_PX = 4
-
-
-def beside(pictures: list[np.ndarray]) -> np.ndarray:
-    """In a row, with a gap."""
-    gap = np.full((pictures[0].shape[0], GAP_PX, 3), 255, np.uint8)
-    parts = [part for picture in pictures for part in (picture, gap)]
-    return np.concatenate(parts[:-1], axis=1)
 
 
 def main(out: Path, names: list[str], folders: list[Path]) -> None:
@@ -43,14 +35,14 @@ def main(out: Path, names: list[str], folders: list[Path]) -> None:
         ]
         shown = [box.crop(picture) for picture in (capture.image(frame), *drawn, truth)]
         errors = [error_map(picture, shown[-1]) for picture in shown[:-1]]
-        errors.append(np.full_like(errors[0], 255))
-        rows += [beside([to_bytes(picture) for picture in shown]), beside(errors)]
-    width = max(row.shape[1] for row in rows)
-    rows = [
-        np.pad(row, ((0, GAP_PX), (0, width - row.shape[1]), (0, 0)), constant_values=255)
-        for row in rows
-    ]
-    page = Image.fromarray(np.concatenate(rows)[:-GAP_PX])
+        rows += [[to_bytes(picture) for picture in shown], errors]
+    strips = [beside([Image.fromarray(picture) for picture in row]) for row in rows]
+    height = sum(strip.height + GAP_PX for strip in strips) - GAP_PX
+    page = Image.new("RGB", (max(strip.width for strip in strips), height), (255, 255, 255))
+    y = 0
+    for strip in strips:
+        page.paste(strip, (0, y))
+        y += strip.height + GAP_PX
     with atomic_path(out) as temporary:
         page.save(temporary, format=out.suffix[1:], quality=90, method=6)
 
