@@ -127,7 +127,7 @@ def build_on(
         deform=dataclasses.replace(config.deform, precision=precision),
         densify_human=dataclasses.replace(config.densify_human, max_count=human or 10_000),
     )
-    capture = load_capture(path)
+    capture = load_capture(path).for_training(config.policy)
     composition = compose(config, capture, 0, device=device, fit=False)
     composition.objectives.append(MoreTimes(renders))
     composition.weights["more_times"] = 1e-6

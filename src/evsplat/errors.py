@@ -9,6 +9,10 @@ class DataError(EvsplatError):
     """A capture, event file or run folder is not what it should be."""
 
 
+class HeldOutError(EvsplatError):
+    """A training asked for what its policy hides from it."""
+
+
 class ConfigError(EvsplatError):
     """A configuration value or option is unknown or out of range."""
 

@@ -16,7 +16,6 @@ STEP_US = 500
 class Recording:
     pairs: list[FramePair]
     events: EventStream
-    recorded_us: tuple[int, int]
 
 
 def record(
@@ -64,6 +63,7 @@ def record(
         linear = np.mean([np.exp(level(u)) for u in np.linspace(start, end, 21)], axis=0)
         coded = linear ** (1 / 2.2) + frame_noise * rng.standard_normal(linear.shape)
         pictures.append(exposure(torch.from_numpy(coded), (start, end)))
-    pairs = [pair(pictures[i], pictures[j]) for i, j in pair_indices(spans, 60)]
     stream = EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
-    return Recording(pairs, stream, (int(t[0]), int(t[-1]) + 1))
+    recorded = int(t[0]), int(t[-1]) + 1
+    pairs = [pair(pictures[i], pictures[j], recorded) for i, j in pair_indices(spans, 60)]
+    return Recording(pairs, stream)

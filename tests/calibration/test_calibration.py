@@ -17,10 +17,10 @@ from evsplat.calibration import (
     pair,
     pair_indices,
 )
-from evsplat.capture import load_capture
 from evsplat.errors import DataError
-from evsplat.events import EventStream, open_recording
+from evsplat.events import ALWAYS, EventStream, open_recording
 
+from ..seen import seen
 from .synthetic import record
 
 Factory = Callable[..., Path]
@@ -28,7 +28,7 @@ Factory = Callable[..., Path]
 
 def _estimate(seed: int, **options) -> SensorEstimate:
     recording = record(seed, **options)
-    found = estimate_from_pairs(recording.pairs, recording.events, recording.recorded_us)
+    found = estimate_from_pairs(recording.pairs, recording.events)
     assert found is not None and found.thresholds is not None
     return found
 
@@ -66,25 +66,25 @@ def test_long_exposures_are_accounted_for(seed) -> None:
 def test_unrelated_events_give_no_estimate() -> None:
     ours = record(0, plus=0.2, minus=0.2)
     others = record(1, plus=0.2, minus=0.2)
-    assert estimate_from_pairs(ours.pairs, others.events, ours.recorded_us) is None
+    assert estimate_from_pairs(ours.pairs, others.events) is None
 
 
 def test_stillness_gives_no_estimate() -> None:
     ours = record(0, plus=0.2, minus=0.2)
     nothing = EventStream(*(np.zeros(0, dtype=kind) for kind in ("i8", "u2", "u2", "i1")))
-    assert estimate_from_pairs(ours.pairs, nothing, ours.recorded_us) is None
-    assert estimate_from_pairs([], ours.events, ours.recorded_us) is None
+    assert estimate_from_pairs(ours.pairs, nothing) is None
+    assert estimate_from_pairs([], ours.events) is None
 
 
 def test_shifting_the_events_of_a_capture_shifts_the_estimate(tiny_capture: Factory) -> None:
     """``clock_offset_us`` is added to the events' times: a positive one makes them lag."""
     options = {"frames": 20, "width": 96, "height": 72}
     path = tiny_capture(**options)
-    before = estimate_from_capture(load_capture(path))
+    before = estimate_from_capture(seen(path))
     document = json.loads((path / "capture.json").read_text())
     document["events"]["clock_offset_us"] = 9_000
     (path / "capture.json").write_text(json.dumps(document))
-    after = estimate_from_capture(load_capture(path))
+    after = estimate_from_capture(seen(path))
     assert before is not None and after is not None
     assert abs(before.clock.lag_us) < 3_000
     assert after.clock.lag_us - before.clock.lag_us == pytest.approx(9_000, abs=800)
@@ -95,7 +95,7 @@ def test_a_capture_without_events_gives_no_estimate(tiny_capture: Factory) -> No
     document = json.loads((path / "capture.json").read_text())
     del document["events"]
     (path / "capture.json").write_text(json.dumps(document))
-    assert estimate_from_capture(load_capture(path)) is None
+    assert estimate_from_capture(seen(path)) is None
 
 
 def test_pairs_skip_frames_that_follow_each_other_too_fast() -> None:
@@ -114,7 +114,7 @@ def test_pairs_skip_frames_that_follow_each_other_too_fast() -> None:
 def test_frames_of_different_size_are_refused() -> None:
     small, large = (exposure(torch.full((size, 4), 0.5), (0, 10)) for size in (3, 5))
     with pytest.raises(DataError, match="4, 3.*4, 5"):
-        pair(small, large)
+        pair(small, large, ALWAYS)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -172,7 +172,7 @@ def test_the_davis_recording_gives_the_known_figures(recordings_root: Path) -> N
     recording = open_recording(recordings_root / "davis346.aedat4")
     frames = list(recording.frames())
     spans = [frame.exposure_us for frame in frames]
-    seen = [
+    pictures = [
         exposure(
             torch.from_numpy(frame.image.astype(np.float32) / 255),
             frame.exposure_us,
@@ -182,8 +182,8 @@ def test_the_davis_recording_gives_the_known_figures(recordings_root: Path) -> N
     ]
     events = recording.read()
     recorded = int(events.t[0]), int(events.t[-1]) + 1
-    pairs = [pair(seen[i], seen[j]) for i, j in pair_indices(spans, 60)]
-    found = estimate_from_pairs(pairs, events, recorded)
+    pairs = [pair(pictures[i], pictures[j], recorded) for i, j in pair_indices(spans, 60)]
+    found = estimate_from_pairs(pairs, events)
     assert found is not None and found.thresholds is not None
     assert found.clock.correlation >= 0.85
     assert abs(found.clock.lag_us - 5_000) < 2_000
@@ -198,7 +198,7 @@ def test_the_davis_recording_gives_the_known_figures(recordings_root: Path) -> N
 
 @pytest.mark.parametrize("name", ["man_dance_hard_256", "real_beam_256"])
 def test_simulated_events_of_shared_captures_lag_little(captures_root: Path, name: str) -> None:
-    found = estimate_from_capture(load_capture(captures_root / name))
+    found = estimate_from_capture(seen(captures_root / name, use="everything"))
     assert found is not None and found.thresholds is not None
     assert abs(found.clock.lag_us) < 1_500
     assert found.thresholds.plus == pytest.approx(0.2, rel=0.15)

@@ -12,6 +12,8 @@ from evsplat.errors import ConfigError
 from evsplat.methods import compose, method_config
 from evsplat.render import render
 
+from ..seen import seen
+
 SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16", "deform.shadow_lights=2")
 
 
@@ -20,7 +22,7 @@ def posed(tiny_capture):
     """A model with shadows, posed at two times, and the camera."""
     capture = load_capture(tiny_capture())
     config = method_config("paper", override({}, SMALL), where="test")
-    model = compose(config, capture, 0, fit=False).model
+    model = compose(config, seen(capture), 0, fit=False).model
     camera = capture.camera(capture.train_frames[0])
     times = [frame.mid_us for frame in capture.train_frames[:2]]
     return model, model.at(times, camera.center()), camera
@@ -31,7 +33,7 @@ def test_pictures_have_the_low_pass_of_the_model(tiny_capture, low_pass):
     capture = load_capture(tiny_capture())
     settings = override({}, ("human.count=150", f"deform.low_pass={low_pass}"))
     config = method_config("paper", settings, where="test")
-    model = compose(config, capture, 0, fit=False).model
+    model = compose(config, seen(capture), 0, fit=False).model
     frame = capture.train_frames[0]
     camera = capture.camera(frame)
     with torch.no_grad():
@@ -48,7 +50,7 @@ def test_pictures_have_the_low_pass_of_the_model(tiny_capture, low_pass):
 def test_a_low_pass_wider_than_the_usual_is_refused(tiny_capture):
     config = method_config("paper", override({}, ("deform.low_pass=0.4",)), where="test")
     with pytest.raises(ConfigError, match="low_pass is 0.4; it takes px.2 above 0 and up to 0.3"):
-        compose(config, load_capture(tiny_capture()), 0, fit=False)
+        compose(config, seen(tiny_capture()), 0, fit=False)
 
 
 def test_without_any_share_of_the_light_nothing_changes(posed):

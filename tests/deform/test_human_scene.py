@@ -1,15 +1,22 @@
 """The paper's model put together: what moves, what stays, and where gradients reach."""
 
+import numpy as np
 import pytest
 import torch
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
 
-from evsplat.body import skin
+from evsplat.body import BodyTrack, skin
 from evsplat.capture import load_capture
 from evsplat.config import override
 from evsplat.deform.drawing import draw
+from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.deform.pose_spline import PoseSpline
 from evsplat.errors import ConfigError
 from evsplat.gaussians import ATTRIBUTES
 from evsplat.methods import PaperConfig, compose, method_config
+
+from ..seen import seen
 
 SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16")
 
@@ -19,7 +26,7 @@ def model_of(path, *settings: str):
     config = method_config("paper", override({}, (*SMALL, *settings)), where="test")
     assert isinstance(config, PaperConfig)
     capture = load_capture(path)
-    model = compose(config, capture, 0, fit=False).model
+    model = compose(config, seen(capture), 0, fit=False).model
     times = [frame.mid_us for frame in capture.train_frames[:2]]
     return model, times, capture.camera(capture.train_frames[0]).center()
 
@@ -217,3 +224,87 @@ def test_colours_of_rows_out_of_view_are_not_missed(seed, tiny_capture):
             # Single entries may be what is left of sums that cancel; of a row that was missed the
             # whole gradient would be.
             assert (gradients[name] - value).norm() <= 2e-5 * value.norm(), name
+
+
+def corrected(path, seed: int, knot_us: float | None):
+    """A model with random poses and residuals, learned ones as well, that do not commute.
+
+    ``knot_us``: the residuals are a spline's control points. Returned with the number generator.
+    """
+    base, _, _ = model_of(path, "deform.pose_correction_start=0")
+    rng = np.random.default_rng(seed)
+    times, joints = base.frame_times.long().tolist(), len(base.track.body.parents)
+    track = BodyTrack(
+        base.track.body,
+        np.array(times),
+        0.8 * rng.normal(size=(len(times), joints, 3)),
+        rng.normal(size=(len(times), 3)),
+    )
+    spline = None
+    if knot_us is not None:
+        units = torch.tensor(rng.uniform(0.3, 0.9, joints))
+        span = (times[0], times[-1])
+        spline = PoseSpline(span, knot_us, times, joint_rad=units, root_m=0.2)
+    model = HumanSceneModel(base.config, "fixed", track, times, base.gaussians, spline)
+    with torch.no_grad():
+        for residuals in (model.rotation_residuals, model.translation_residuals):
+            values = 0.8 * rng.normal(size=residuals.shape)
+            residuals.copy_(torch.from_numpy(values))
+    return model, times, rng
+
+
+def assert_posed(model, times: list[int], turns: np.ndarray, shifts: np.ndarray) -> None:
+    """Each joint turns by the residual about its own axes, and then as the track says."""
+    given, place = model.track.at(times)
+    matrices = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix().reshape(*turns.shape, 3)
+    expected = given.double().numpy() @ matrices
+    other = matrices @ given.double().numpy()
+    assert np.abs(expected - other).max(axis=(2, 3)).min() > 0.01
+    rotations, bones = model.pose(times)
+    assert np.allclose(rotations.detach(), expected, atol=1e-5)
+    placed = model.track.body.canonical_to_world(
+        torch.from_numpy(expected).float(), place + torch.from_numpy(shifts).float()
+    )
+    assert torch.allclose(bones, placed, atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pose_residuals_of_frames_turn_joints_about_their_own_axes(tiny_capture, seed):
+    model, frames, rng = corrected(tiny_capture(), seed, None)
+    turns = model.rotation_residuals.detach().double().numpy()
+    shifts = model.translation_residuals.detach().double().numpy()
+    # At the middles of the frames the key poses are those of the track itself.
+    poses = Rotation.from_rotvec(model.track.poses.reshape(-1, 3)).as_matrix()
+    given = model.track.at(frames)[0]
+    assert np.allclose(given, poses.reshape(given.shape), atol=1e-5)
+    assert_posed(model, frames, turns, shifts)
+    share = rng.uniform(0.2, 0.8, len(frames) - 1)
+    between = [
+        round(before + part * (after - before))
+        for before, after, part in zip(frames, frames[1:], share, strict=False)
+    ]
+    parts = (np.array(between) - frames[:-1]) / np.diff(frames)
+    mixed = [
+        (1 - weight) * values[:-1] + weight * values[1:]
+        for values, weight in ((turns, parts[:, None, None]), (shifts, parts[:, None]))
+    ]
+    assert_posed(model, between, *mixed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pose_residuals_of_a_spline_turn_joints_about_their_own_axes(tiny_capture, seed):
+    knot_us = [70_000.0, 40_000.0, 110_000.0][seed]
+    model, frames, rng = corrected(tiny_capture(), seed, knot_us)
+    spline = model.pose_spline
+    knots = 1e-6 * (frames[0] + knot_us * np.arange(-3, spline.count + 1))
+    times = rng.integers(frames[0], frames[-1] + 1, size=12).tolist()
+    units = spline.joint_rad.double().numpy()[:, None]
+    found = []
+    for points, unit in (
+        (model.rotation_residuals, units),
+        (model.translation_residuals, spline.root_m),
+    ):
+        curve = BSpline(knots, points.detach().double().numpy(), 3)
+        mean = curve(1e-6 * np.array(frames)).mean(0)
+        found.append(unit * (curve(1e-6 * np.array(times)) - mean))
+    assert_posed(model, times, *found)

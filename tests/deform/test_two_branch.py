@@ -14,6 +14,7 @@ from evsplat.training.checkpoint import load_checkpoint, save_checkpoint
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
+from ..seen import seen
 from ..small_model import SMALL_MODEL
 
 IN_WINDOW = 5_000.0
@@ -25,7 +26,7 @@ def make(path, *settings: str):
     """A composition in the window in which labels are learned, and its capture."""
     capture = load_capture(path)
     given = override({}, (*SMALL_MODEL, "semantics=two_branch", *settings))
-    composition = compose(method_config("paper", given, where="test"), capture, 0, fit=False)
+    composition = compose(method_config("paper", given, where="test"), seen(capture), 0, fit=False)
     composition.model.nominal.fill_(IN_WINDOW)
     return composition, capture
 

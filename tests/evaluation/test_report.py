@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evsplat.capture import load_capture
+from evsplat.capture import Policy, load_capture
+from evsplat.config import to_dict
 from evsplat.errors import DataError
 from evsplat.evaluation import evaluate
+from evsplat.evaluation.protocols import METRICS
 from evsplat.evaluation.report import write_report
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.page import page
@@ -62,11 +64,20 @@ class Page(HTMLParser):
         return sum(name == tag for name, _ in self.elements)
 
 
-def evaluated(path, folder, *, training=True):
-    """An evaluated run of `TruthWithNoise`, as a source for the page."""
+def evaluated(path, folder, *, training=True, alone=False, policy=None, change=None):
+    """An evaluated run of `TruthWithNoise`, as a source for the page.
+
+    ``change`` is applied to the metrics before they are written.
+    """
     capture = load_capture(path)
+    if policy is not None and policy.use == "everything":
+        capture = capture.with_nothing_held_out()
     reconstruction = TruthWithNoise(capture, 0.02)
-    metrics = evaluate(capture, reconstruction, out_dir=folder)
+    metrics = evaluate(capture, reconstruction, out_dir=folder, alone=alone)
+    if policy is not None:
+        metrics["policy"] = to_dict(policy)
+    if change is not None:
+        metrics = change(metrics)
     if training:
         facts = {"iteration": 12345, "train_seconds": 3723.4, "device": "cpu"}
         metrics |= facts | {"gaussians": {"human": 4321, "scene": 20}}
@@ -213,4 +224,63 @@ def test_long_series_are_averaged():
 def test_page_of_a_capture_without_test_frames(tiny_capture, tmp_path):
     path = edit(tiny_capture(), lambda d: [f.update(split="train") for f in d["frames"]])
     text = " ".join(Page(page(evaluated(path, tmp_path))).text)
-    assert "No frame has split" in text
+    assert "No frame has split" in text and "sharp ground truth" not in text
+
+
+def test_page_of_a_training_on_everything_has_novel_views_but_nothing_held_out(
+    tiny_capture, tmp_path
+):
+    source = evaluated(tiny_capture(), tmp_path, policy=Policy(use="everything"))
+    parsed = Page(page(source))
+    text = " ".join(parsed.text)
+    # the headline, the figures and the test frames
+    assert text.lower().count("trained on every frame and every event") == 3
+    assert "Held" not in text and "held-out" not in text and "None" not in text
+    alts = [attributes["alt"] for tag, attributes in parsed.elements if tag == "img"]
+    assert any(alt.startswith("render of side") for alt in alts)
+    assert not any("our render" in alt for alt in alts)
+    assert not any(attributes.get("class") == "card" for _, attributes in parsed.elements)
+
+
+def test_page_of_a_run_without_a_policy_claims_nothing_of_its_training(tiny_capture, tmp_path):
+    path = tiny_capture()
+    text = " ".join(Page(page(evaluated(path, tmp_path / "old"))).text)
+    assert text.count("does not tell what training saw") == 2
+    source = evaluated(path, tmp_path / "new", policy=Policy())
+    text = " ".join(Page(page(source)).text)
+    assert Policy().sentence in text and "no event of the intervals around them" in text
+    assert "does not tell" not in text
+
+
+def without_figures(value):
+    """The same metrics, but nothing could be measured."""
+    if isinstance(value, dict):
+        figures = {*METRICS, "psnr_person_crop", "similarity"}
+        return {
+            key: None if key in figures and not isinstance(entry, dict) else without_figures(entry)
+            for key, entry in value.items()
+        }
+    return [without_figures(entry) for entry in value] if isinstance(value, list) else value
+
+
+def test_page_of_figures_that_are_all_missing(tiny_capture, tmp_path):
+    def change(metrics):
+        metrics["events"]["mean_similarity"] = {"test": None, "train": None}
+        return without_figures(metrics)
+
+    parsed = Page(page(evaluated(tiny_capture(), tmp_path, change=change)))
+    text = " ".join(parsed.text)
+    assert "None" not in text and "cosine of the two maps." in text
+    alts = [attributes["alt"] for tag, attributes in parsed.elements if tag == "img"]
+    assert any(alt.startswith("render of side") for alt in alts)
+    assert any("our render" in alt for alt in alts)
+
+
+def test_page_of_an_evaluation_alone_compares_with_nothing(tiny_capture, tmp_path):
+    source = evaluated(tiny_capture(), tmp_path, alone=True)
+    assert "blurry_input" not in source.metrics
+    parsed = Page(page(source))
+    text = " ".join(parsed.text)
+    assert "trivial" not in text and "above" not in text and "blurry input itself" not in text
+    assert "None: they were not evaluated" in text
+    assert sum(attributes.get("class") == "card" for _, attributes in parsed.elements) == 3

@@ -10,6 +10,8 @@ from evsplat.export import run as exporting
 from evsplat.methods import compose, method_config
 from evsplat.training.run import GaussianReconstruction
 
+from ..seen import seen
+
 SMALL = (
     "human.count=150",
     "deform.width=16",
@@ -22,7 +24,9 @@ SMALL = (
 def reconstruction(tiny_capture):
     capture = load_capture(tiny_capture())
     config = method_config("paper", override({}, (*SMALL, "deform.shadow_lights=2")), where="test")
-    return capture, GaussianReconstruction("paper", compose(config, capture, 0, fit=False).model)
+    return capture, GaussianReconstruction(
+        "paper", compose(config, seen(capture), 0, fit=False).model
+    )
 
 
 @pytest.fixture

@@ -28,7 +28,9 @@ SMALL = {
 
 def composed(path, **settings):
     config = method_config("hugs", SMALL | settings, where="test")
-    return TRAINABLE["hugs"][1](config, load_capture(path), 0, fit=False)
+    return TRAINABLE["hugs"][1](
+        config, load_capture(path).for_training(config.policy), 0, fit=False
+    )
 
 
 def step_of(composition, capture, frame):

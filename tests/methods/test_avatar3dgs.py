@@ -35,7 +35,9 @@ SMALL = (
 
 def composed(path, *settings: str, fit: bool = False):
     config = method_config("avatar3dgs", override({}, (*SMALL, *settings)), where="test")
-    return TRAINABLE["avatar3dgs"][1](config, load_capture(path), 3, fit=fit)
+    return TRAINABLE["avatar3dgs"][1](
+        config, load_capture(path).for_training(config.policy), 3, fit=fit
+    )
 
 
 def trainer_of(path, *settings: str, steps: int = 60) -> Trainer:

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from evsplat.calibration import ClockEstimate, SensorEstimate, ThresholdEstimate
-from evsplat.capture import load_capture
+from evsplat.capture import TrainingCapture, load_capture
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods import evsplat as method
 from evsplat.objectives import EventChange, EventWindows
 from evsplat.training import train
+
+from ..seen import seen
 
 SMALL = {
     "human": {"count": 60},
@@ -23,7 +25,7 @@ SMALL = {
 
 def thresholds(path, *, fit: bool = True) -> list[float]:
     config = method_config("evsplat", SMALL, where="test")
-    composition = TRAINABLE["evsplat"][1](config, load_capture(path), 0, fit=fit)
+    composition = TRAINABLE["evsplat"][1](config, seen(path), 0, fit=fit)
     return composition.model.sensor.logs.exp().tolist()
 
 
@@ -46,9 +48,9 @@ def test_a_clock_that_is_late_is_learned_from_there(
     tiny_capture, monkeypatch, choice, late_us, start_us
 ):
     found = None if late_us is None else SensorEstimate(lag(late_us), None)
-    monkeypatch.setattr(method, "estimate_from_capture", lambda capture, *, frames: found)
+    monkeypatch.setattr(method, "estimate_from_capture", lambda capture: found)
     config = method_config("evsplat", SMALL | {"windows": {"clock": choice}}, where="test")
-    sensor = TRAINABLE["evsplat"][1](config, load_capture(tiny_capture()), 0).model.sensor
+    sensor = TRAINABLE["evsplat"][1](config, seen(tiny_capture()), 0).model.sensor
     if start_us is None:
         assert sensor.offset_us is None
     else:
@@ -72,13 +74,13 @@ def test_without_one_training_frames_and_events_tell_it(tiny_capture, monkeypatc
     forget(path)
     looked_at = []
 
-    def estimate(capture, *, frames):
-        looked_at.extend(frame.split for frame in frames)
+    def estimate(capture):
+        looked_at.append(capture)
         return SensorEstimate(lag(0.0), ThresholdEstimate(0.31, 0.17, 0.1, 500))
 
     monkeypatch.setattr(method, "estimate_from_capture", estimate)
     assert thresholds(path) == pytest.approx((0.31, 0.17), rel=1e-6)
-    assert set(looked_at) == {"train"}  # held-out pictures stay unseen
+    assert isinstance(looked_at[0], TrainingCapture)  # what is held out stays unseen
     looked_at.clear()
     thresholds(path, fit=False)
     assert not looked_at  # a loaded model brings its own
@@ -87,7 +89,7 @@ def test_without_one_training_frames_and_events_tell_it(tiny_capture, monkeypatc
 def test_what_cannot_be_told_is_said(tiny_capture, monkeypatch, caplog):
     path = tiny_capture()
     forget(path)
-    monkeypatch.setattr(method, "estimate_from_capture", lambda capture, *, frames: None)
+    monkeypatch.setattr(method, "estimate_from_capture", lambda capture: None)
     assert thresholds(path) == pytest.approx((0.2, 0.2), rel=1e-6)
     assert "contrast thresholds are neither given nor to be found" in caplog.text
 
@@ -113,7 +115,7 @@ def test_it_trains_on_what_is_there_and_says_so(tiny_capture, tmp_path, caplog, 
 @pytest.mark.parametrize("term", ["windows", "paper"])
 def test_the_event_term_is_chosen(tiny_capture, term):
     config = method_config("evsplat", {**SMALL, "event_term": term}, where="test")
-    objectives = method.compose(config, load_capture(tiny_capture()), 0).objectives
+    objectives = method.compose(config, seen(tiny_capture()), 0).objectives
     assert any(isinstance(one, EventWindows) for one in objectives) == (term == "windows")
     assert any(isinstance(one, EventChange) for one in objectives) == (term == "paper")
 

@@ -15,6 +15,8 @@ from evsplat.methods import compose, method_config
 from evsplat.methods.reconstruction import Posable, WithDepth
 from evsplat.training.run import GaussianReconstruction
 
+from ..seen import seen
+
 SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16")
 
 
@@ -23,7 +25,7 @@ def drawn(tiny_capture):
     """An untrained reconstruction with latents and residuals that matter, its camera and times."""
     capture = load_capture(tiny_capture())
     values = override({}, (*SMALL, "deform.pose_correction_start=0"))
-    model = compose(method_config("paper", values, where="test"), capture, 0, fit=False).model
+    model = compose(method_config("paper", values, where="test"), seen(capture), 0, fit=False).model
     with torch.no_grad():
         model.latents.normal_()
         model.rotation_residuals.normal_(std=0.2)

@@ -15,6 +15,7 @@ from evsplat.methods.poses import PoseConfig, prepare_poses
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
+from ..seen import seen
 from ..small_model import SMALL_MODEL
 
 SMALL = (
@@ -36,30 +37,30 @@ def captures(tiny_capture):
 
 def composed(capture: Capture, *settings: str):
     config = method_config("evsplat", override({}, (*SMALL, *settings)), where="test")
-    return TRAINABLE["evsplat"][1](config, capture, 0)
+    return TRAINABLE["evsplat"][1](config, capture.for_training(config.policy), 0)
 
 
 def test_noisy_poses_are_told_and_exact_ones_stay_at_every_key(captures, caplog):
     exact, noisy = captures
     with caplog.at_level(logging.INFO):
-        untouched = prepare_poses(PoseConfig(), exact)
+        untouched = prepare_poses(PoseConfig(), seen(exact))
     assert "taken as they are, corrected between keys only" in caplog.text
     assert untouched.spline is not None
     keys = untouched.track.times_us.tolist()
     assert untouched.spline.weights(keys).abs().max() < 1e-5
     assert set(untouched.priced_us).isdisjoint(keys)
-    assert prepare_poses(PoseConfig(between=False), exact).spline is None
+    assert prepare_poses(PoseConfig(between=False), seen(exact)).spline is None
     assert np.array_equal(untouched.track.poses, load_body_track(exact).poses)
     caplog.clear()
     with caplog.at_level(logging.INFO):
-        found = prepare_poses(PoseConfig(), noisy)
+        found = prepare_poses(PoseConfig(), seen(noisy))
     assert "smoothed in time, corrected in training" in caplog.text
     truth = load_body_track(exact).poses
     before = np.abs(load_body_track(noisy).poses - truth).mean()
     assert np.abs(found.track.poses - truth).mean() < before
     assert found.spline is not None
     assert float(found.spline.joint_rad.max()) == pytest.approx(0.05, rel=0.5)
-    off = prepare_poses(PoseConfig(smooth="never", refine="never", between=False), noisy)
+    off = prepare_poses(PoseConfig(smooth="never", refine="never", between=False), seen(noisy))
     assert off.spline is None
     assert np.array_equal(off.track.poses, load_body_track(noisy).poses)
 
@@ -80,7 +81,7 @@ def test_jitter_counts_against_what_lies_between_the_keys(
     poses = 0.3 * np.sin(phase) * (cycles > 0) + jitter * rng.normal(size=(count, *joints))
     np.savez(path / "body.npz", **body | {"poses": poses.astype(np.float32)})
     with caplog.at_level(logging.INFO):
-        found = prepare_poses(PoseConfig(), load_capture(path))
+        found = prepare_poses(PoseConfig(), seen(path))
     assert ("are noisy: smoothed in time, corrected in training" in caplog.text) == noisy
     if noisy:
         assert found.spline is not None
@@ -88,22 +89,18 @@ def test_jitter_counts_against_what_lies_between_the_keys(
         assert float(found.spline.joint_rad.max()) == pytest.approx(expected, rel=0.3)
 
 
-def test_held_out_frames_move_their_poses_only_and_their_pictures_stay_unseen(
-    captures, monkeypatch
-):
+INTERPOLATION = ("policy.held_out_events=true", "pose.events_of_held_out=true")
+
+
+def test_held_out_frames_move_their_poses_only(captures):
     noisy = captures[1]
     held_out = {frame.name for frame in noisy.test_frames}
-    read = Capture.image
-
-    def image(self, frame):
-        assert frame.name not in held_out
-        return read(self, frame)
-
-    monkeypatch.setattr(Capture, "image", image)
-    composition = composed(noisy, "pose.events_of_held_out=true")
+    composition = composed(noisy, *INTERPOLATION)
     model, found = composition.model, composition.held_out
     assert found is not None and {frame.name for frame in found.frames} == held_out
-    trainer = Trainer(composition, noisy, Clock(8, None, shrink=False, seconds=0.0))
+    trainer = Trainer(
+        composition, seen(noisy, held_out_events=True), Clock(8, None, shrink=False, seconds=0.0)
+    )
     for _ in range(3):
         assert trainer.step() is not None
         trainer.clock.advance(0.1)
@@ -118,7 +115,12 @@ def test_held_out_frames_move_their_poses_only_and_their_pictures_stay_unseen(
     assert torch.equal(count, trainer.statistics["gaussians"].seen)
 
 
-def test_without_being_asked_held_out_events_teach_nothing(captures):
+def test_events_of_held_out_frames_need_a_policy_that_shows_them(captures):
+    with pytest.raises(ConfigError, match="policy.held_out_events=true as well"):
+        composed(captures[1], "pose.events_of_held_out=true")
+
+
+def test_a_spline_is_learned_where_it_is_asked_for(captures):
     composition = composed(captures[1])
     assert composition.held_out is None
     assert composition.model.pose_spline is not None

@@ -16,6 +16,8 @@ from evsplat.methods import compose, method_config
 from evsplat.objectives import Activity, PackedBounds
 from evsplat.objectives.activity import reached
 
+from ..seen import seen
+
 
 def test_only_what_is_joined_to_the_start_is_reached():
     passable = np.ones((7, 9), dtype=bool)
@@ -72,7 +74,7 @@ def test_no_events_to_tell_are_an_error_that_names_the_setting(tiny_capture):
     given = override({}, ("semantic_activity=true", "human.count=50", "event.weight=0"))
     config = method_config("paper", given, where="test")
     with pytest.raises(ConfigError, match="no events.*semantic_activity=false"):
-        compose(config, load_capture(path), 0, fit=False)
+        compose(config, seen(path), 0, fit=False)
 
 
 @pytest.mark.parametrize("name", ["man_dance_hard_256", "worker_punch_256"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.events import EventStream
+from evsplat.events import ALWAYS, EventStream
 from evsplat.objectives import EventNoise, EventSensor, EventWindows
 
 HEIGHT, WIDTH, EPS = 9, 11, 0.004
@@ -21,9 +21,15 @@ class Recording:
     def __init__(self, stream: EventStream, has_polarity: bool = True) -> None:
         self.stream, self.has_polarity = stream, has_polarity
         self.time_range_us = (int(stream.t[0]), int(stream.t[-1]) + 1)
+        self.stretches_us = (self.time_range_us,)
+        self.open_us = (ALWAYS,)
 
     def between(self, start: int, end: int) -> EventStream:
+        assert any(low <= start and end <= high for low, high in self.open_us)
         return self.stream.between(start, end)
+
+    def open_around(self, time: int) -> tuple[int, int]:
+        return next(span for span in self.open_us if span[0] <= time <= span[1])
 
 
 def scene(seed: int, on: float = 0.3, off: float = 0.2):
@@ -51,7 +57,13 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
     )
     frames = [SimpleNamespace(mid_us=mid) for mid in (0, 10_000, 20_000)]
     capture = SimpleNamespace(events=Recording(stream), frames=frames, train_frames=frames)
-    return capture, SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0)
+    return capture, step_at(times, linear)
+
+
+def step_at(times: tuple[int, ...], linear: torch.Tensor) -> SimpleNamespace:
+    """A step of a frame in the middle of ``times``."""
+    frame = SimpleNamespace(mid_us=(times[0] + times[-1]) // 2)
+    return SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0, frame=frame)
 
 
 def make(capture, on: float, off: float, begun_us: int = 0, **learned) -> EventWindows:
@@ -109,7 +121,7 @@ def test_a_saved_sensor_says_whether_its_clock_is_learned():
 def test_a_time_outside_of_the_exposure_is_asked_for_after_the_start():
     capture, _ = scene(0)
     objective = make(capture, 0.2, 0.2)
-    frame = SimpleNamespace(exposure_us=(9_000, 11_000))
+    frame = SimpleNamespace(exposure_us=(9_000, 11_000), mid_us=10_000)
     assert objective.times(frame, 700) == ()
     drawn = [objective.times(frame, 800)[0] for _ in range(100)]
     assert all(3_999 <= time < 9_000 or 11_000 <= time <= 16_000 for time in drawn)
@@ -175,11 +187,7 @@ def moving_edge(late_us: int):
     )
     frames = [SimpleNamespace(mid_us=mid) for mid in (0, 40_000, 80_000)]
     linear = torch.stack([log(t).exp() - EPS for t in times])
-    step = SimpleNamespace(
-        times_us=times,
-        linear=linear[:, None, :, None].expand(-1, HEIGHT, -1, 3),
-        nominal=5_000.0,
-    )
+    step = step_at(times, linear[:, None, :, None].expand(-1, HEIGHT, -1, 3))
     return SimpleNamespace(events=Recording(stream), frames=frames, train_frames=frames), step
 
 
@@ -219,7 +227,7 @@ def test_steady_change_is_explained_between_its_events_too(seed):
     slope = torch.from_numpy(np.where(sign > 0, on, -off) / period_us)
     log = slope.view(HEIGHT, WIDTH) * torch.tensor(times).view(-1, 1, 1)
     linear = (log.exp() - EPS)[..., None].expand(-1, -1, -1, 3)
-    step = SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0)
+    step = step_at(times, linear)
     assert float(make(capture, on, off, begun_us=20_000).loss(step)["event"]) < 1e-6
     assert float(make(capture, on, off).loss(step)["event"]) > 0.05
 

@@ -52,6 +52,38 @@ def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
     assert float(terms["dssim"]) == pytest.approx(1 - float(ssim(blurry, observed)), rel=1e-9)
 
 
+@pytest.mark.parametrize("before", [0, 1, 3])
+@pytest.mark.parametrize("after", [1, 2, 4])
+@pytest.mark.parametrize("seed", range(3))
+def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, after):
+    generator = torch.Generator().manual_seed(seed)
+
+    def drawn(low: int, high: int, count: int) -> list[int]:
+        return torch.randint(low, high, (count,), generator=generator).tolist()
+
+    early, inside = drawn(-40_000, 1_000, before), drawn(1_000, 31_000, 3)
+    # The shutter is closed at the end itself, where the first window may begin.
+    late = [31_000, *drawn(31_000, 70_000, after - 1)]
+    times = sorted(early + inside + late)
+    pictures = torch.rand(len(times), 16, 16, 3, generator=generator, dtype=torch.float64)
+    linear = (pictures**2.2).requires_grad_()
+    observed = torch.rand(16, 16, 3, generator=generator, dtype=torch.float64)
+    step = SimpleNamespace(
+        nominal=0.0,
+        frame=frame(),
+        times_us=tuple(times),
+        linear=linear,
+        observed=lambda _: observed,
+    )
+    terms = Exposure(None, {"a": 3}, generator).loss(step)
+    seen = torch.tensor([1_000 <= time < 31_000 for time in times])
+    blurry = (pictures[seen] ** 2.2).mean(0) ** (1 / 2.2)
+    assert terms["l1"].item() == pytest.approx(float((blurry - observed).abs().mean()), rel=1e-9)
+    assert terms["dssim"].item() == pytest.approx(1 - float(ssim(blurry, observed)), rel=1e-9)
+    (terms["l1"] + terms["dssim"]).backward()
+    assert torch.equal(linear.grad.flatten(1).abs().sum(1) > 0, seen)
+
+
 def test_a_black_exposure_has_a_finite_gradient():
     pictures = torch.zeros(3, 16, 16, 3, requires_grad=True)
     step = SimpleNamespace(

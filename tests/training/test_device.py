@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from evsplat.capture import load_capture
 from evsplat.errors import DataError
 from evsplat.methods import TRAINABLE, compose, method_config
 from evsplat.render import api, cuda
@@ -14,6 +13,7 @@ from evsplat.training.bad_steps import MAX_BAD_STEPS
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
+from ..seen import seen
 from .foreign_device import NAME, NEEDS_DATA, Descent, ForeignDevice, HostWaits, drawing
 
 SMALL = {
@@ -25,7 +25,7 @@ SMALL = {
 
 def quick(capture_path, **options):
     """A trainer on the CPU in the middle of its schedule, without the fits before it."""
-    capture = load_capture(capture_path)
+    capture = seen(capture_path)
     settings = method_config("paper", SMALL | options, where="test")
     composition = compose(settings, capture, 0, fit=False)
     return Trainer(composition, capture, Clock(100, fraction=0.5))
@@ -141,7 +141,7 @@ def foreign(monkeypatch):
     """The device, and a trainer factory for it with gsplat's functions as shapes."""
 
     def make(capture_path, method="paper", **settings):
-        capture = load_capture(capture_path)
+        capture = seen(capture_path)
         camera = capture.cameras["main"]
         gsplat = drawing(camera.width, camera.height)
         backends = api._BACKENDS | {"gsplat": lambda *inputs: cuda.draw(gsplat, *inputs)}

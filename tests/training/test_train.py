@@ -12,7 +12,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from evsplat.capture import load_capture
 from evsplat.errors import BackendError, ConfigError, DataError
 from evsplat.methods import PaperConfig, compose
 from evsplat.training import load_run, train
@@ -22,6 +21,7 @@ from evsplat.training.clock import Clock
 from evsplat.training.run import RunFolder, read_config
 from evsplat.training.trainer import Trainer
 
+from ..seen import seen
 from ..small_model import SMALL_MODEL
 
 SMALL = (
@@ -158,7 +158,7 @@ def test_hash_grid_and_random_cube_are_selectable(tiny_capture, tmp_path):
 
 
 def test_non_finite_steps_are_skipped_counted_and_finally_stop(tiny_capture, caplog):
-    capture = load_capture(tiny_capture(frames=10))
+    capture = seen(tiny_capture(frames=10))
     config = PaperConfig(skinning_prefit_steps=1)
     composition = compose(config, capture, 0, fit=False)
     trainer = Trainer(composition, capture, Clock(100))

@@ -10,6 +10,8 @@ from evsplat.config import override
 from evsplat.methods import compose, method_config
 from evsplat.view.memory import NETWORKS, Remembering, Turns, remembering, set_rough
 
+from ..seen import seen
+
 SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16")
 
 
@@ -76,7 +78,7 @@ def test_an_exact_answer_has_nothing_of_older_questions():
 def model(tiny_capture):
     capture = load_capture(tiny_capture())
     values = override({}, (*SMALL, "deform.non_rigid_start=0"))
-    composition = compose(method_config("paper", values, where="test"), capture, 0, fit=False)
+    composition = compose(method_config("paper", values, where="test"), seen(capture), 0, fit=False)
     with torch.no_grad():
         for parameter in composition.model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))

@@ -24,6 +24,7 @@ from evsplat.view.subject import Subject  # noqa: E402
 from evsplat.view.wish import Motion  # noqa: E402
 
 from ..export.clouds import read_ply, read_spz  # noqa: E402
+from ..seen import seen  # noqa: E402
 
 SIDE = 48
 
@@ -76,7 +77,7 @@ def _run(tiny_capture):
     capture = load_capture(tiny_capture())
     values = override({}, ("human.count=60", "deform.width=16", "deform.colour_width=16"))
     config = method_config("paper", values, where="test")
-    model = compose(config, capture, 0, fit=False).model
+    model = compose(config, seen(capture), 0, fit=False).model
     counts = {"human": model.gaussians.human_count, "scene": model.gaussians.scene_count}
     made = GaussianReconstruction("paper", model)
     return Run(Path("none"), config, "paper", capture, made, 7, 0.0, "cpu", counts, False)

@@ -15,10 +15,12 @@ import torch
 
 import evsplat
 from evsplat.benching.folder import BenchFolder, exclusive
-from evsplat.capture import Capture, load_capture
+from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
+from evsplat.config import override, to_dict
 from evsplat.errors import EvsplatError
 from evsplat.evaluation.evaluator import evaluate
 from evsplat.files import read_json, write_json
+from evsplat.methods import method_config
 from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
@@ -28,7 +30,7 @@ from evsplat.staging import StageSettings, stage
 
 logger = logging.getLogger(__name__)
 
-UNTRAINED: dict[str, Callable[[Capture], Reconstruction]] = {
+UNTRAINED: dict[str, Callable[[TrainingCapture], Reconstruction]] = {
     "median_background": MedianBackground,
     "nearest_frame": NearestFrame,
 }
@@ -74,10 +76,19 @@ class Cell:
         """Whether the method is one that is trained."""
         return self.method not in UNTRAINED
 
+    @property
+    def policy(self) -> Policy:
+        """What the method may see of what is held out."""
+        if not self.trains:
+            return Policy()
+        values = override({}, self.settings)
+        return method_config(self.method, values, where=f"row {self.row}").policy
+
     def request(self) -> dict[str, Any]:
         """What decides the figures, as JSON; a cell with another request is another cell."""
         asked = {key: value for key, value in asdict(self).items() if key != "capture"}
         return asked | {
+            "policy": to_dict(self.policy),
             "capture": self.capture.name,
             "fingerprint": self.capture.fingerprint,
             "settings": list(self.settings),
@@ -117,6 +128,7 @@ def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) 
     """Figures of the cell against the capture as it was recorded, restored or not."""
     device = choose_device(device)
     recorded = load_capture(_recorded(bench, cell.capture))
+    seen = recorded.for_training(cell.policy)
     trained_on = _restored(bench, recorded, cell)
     run = bench.run_of(cell.id)
     facts: dict[str, Any] = {"iteration": None, "train_seconds": None, "gaussians": None}
@@ -124,12 +136,12 @@ def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) 
     if cell.trains:
         reconstruction, facts = _trained(run, trained_on, cell, threads, device)
     else:
-        reconstruction = UNTRAINED[cell.method](load_capture(trained_on))
+        reconstruction = UNTRAINED[cell.method](load_capture(trained_on).for_training(cell.policy))
     if cell.backdrop:
-        reconstruction = OnMedianBackground(reconstruction, recorded)
+        reconstruction = OnMedianBackground(reconstruction, seen)
     measured = evaluate(recorded, reconstruction, out_dir=run, device=device, alone=True)
     kept = ("frames", "protocols", "per_frame", "reasons", "weights", "protocol_notes")
-    return {**facts, **{key: measured[key] for key in kept}}
+    return {**facts, "policy": to_dict(seen.terms), **{key: measured[key] for key in kept}}
 
 
 def _trained(
@@ -188,11 +200,20 @@ def _restored(bench: BenchFolder, recorded: Capture, cell: Cell) -> Path:
     """Folder of what is trained on: restored once for all rows that want it so."""
     if cell.restore is None:
         return recorded.path
-    path = bench.captures / f"{cell.capture.name}-{cell.restore}"
+    asked = [f"{key}-{value}" for key, value in _restored_by(cell.policy).items()]
+    path = bench.captures / "-".join((cell.capture.name, cell.restore, *asked))
     with exclusive(bench.lock_of(f"captures/{path.name}")):
         if not path.exists():
-            restore_capture(recorded.path, path, method=cell.restore)
+            restore_capture(recorded.path, path, method=cell.restore, policy=cell.policy)
     return path
+
+
+def _restored_by(policy: Policy) -> dict[str, Any]:
+    """Of a policy, what restorers see and is not the default."""
+    strict = Policy()
+    names = ("use", "held_out_events", "thresholds")
+    values = {name: getattr(policy, name) for name in names}
+    return {name: value for name, value in values.items() if value != getattr(strict, name)}
 
 
 def _peak_memory_mb() -> float:

@@ -18,7 +18,7 @@ from evsplat.devices import send
 from evsplat.errors import DataError
 
 if TYPE_CHECKING:
-    from evsplat.capture.capture import Capture
+    from evsplat.capture import Capture, TrainingCapture
 
 
 class BodyTrack:
@@ -89,7 +89,7 @@ class BodyTrack:
         return skin(body.canonical_vertices(), body.weights, self.bones([time_us]))[0][0]
 
 
-def load_body_track(capture: "Capture", *, dense: bool = False) -> BodyTrack:
+def load_body_track(capture: "Capture | TrainingCapture", *, dense: bool = False) -> BodyTrack:
     """The capture's body with its key poses; ``dense`` takes the true poses of body_dense.npz.
 
     The dense poses are for evaluation and ablation, never for training.

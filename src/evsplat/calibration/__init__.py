@@ -17,7 +17,7 @@ from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
 if TYPE_CHECKING:
-    from evsplat.capture import Capture, Frame
+    from evsplat.capture import TrainingCapture
 
 __all__ = [
     "ClockEstimate",
@@ -49,33 +49,32 @@ class SensorEstimate:
     """Fitted at the estimated lag; None where there are too few events of either polarity."""
 
 
-def estimate_from_pairs(
-    pairs: Sequence[FramePair], events: EventSource, recorded_us: tuple[int, int]
-) -> SensorEstimate | None:
+def estimate_from_pairs(pairs: Sequence[FramePair], events: EventSource) -> SensorEstimate | None:
     """Clock lag, then thresholds at that lag; None where frames and events do not correlate."""
-    clock = estimate_clock(pairs, events, recorded_us)
+    clock = estimate_clock(pairs, events)
     if clock is None:
         return None
-    return SensorEstimate(clock, estimate_thresholds(pairs, events, recorded_us, clock.lag_us))
+    return SensorEstimate(clock, estimate_thresholds(pairs, events, clock.lag_us))
 
 
-def estimate_from_capture(
-    capture: "Capture", *, frames: "Sequence[Frame] | None" = None
-) -> SensorEstimate | None:
+def estimate_from_capture(capture: "TrainingCapture") -> SensorEstimate | None:
     """Estimate from at most 60 pairs of consecutive frames; None where that is not possible.
 
-    Events without polarity tell nothing. ``frames`` are those whose pictures may be looked at, in
-    the order of time; without it all.
+    Pairs are of training frames with no held-out one between them. Events without polarity tell
+    nothing.
 
     The lag is what is left after the capture's own ``clock_offset_us``. A moving camera changes
     nothing: both sides see what moves in the picture.
     """
     if capture.events is None or len(capture.events) == 0 or not capture.events.has_polarity:
         return None
-    frames = capture.frames if frames is None else frames
-    indices = pair_indices([frame.exposure_us for frame in frames], MOST_PAIRS)
-    pairs = [
-        pair(*(exposure(capture.image(frames[i]), frames[i].exposure_us) for i in both))
-        for both in indices
-    ]
-    return estimate_from_pairs(pairs, capture.events, capture.events.time_range_us)
+    first, last = capture.events.time_range_us
+    frames = capture.train_frames
+    spans = [frame.exposure_us for frame in frames]
+    stretch = [capture.events.open_around(frame.mid_us) for frame in frames]
+    pairs = []
+    for both in pair_indices(spans, MOST_PAIRS, stretch=stretch):
+        start, end = stretch[both[0]]
+        before, after = (exposure(capture.image(frames[i]), spans[i]) for i in both)
+        pairs.append(pair(before, after, (max(start, first), min(end, last))))
+    return estimate_from_pairs(pairs, capture.events)

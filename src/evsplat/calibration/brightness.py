@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from evsplat.errors import DataError
-from evsplat.events import EventStream
+from evsplat.events import EventStream, Span
 from evsplat.events.maps import event_pixels
 from evsplat.imaging.srgb import Transfer, decode, luminance
 
@@ -53,6 +53,8 @@ class FramePair:
     after_us: tuple[int, int]
     change: Float[np.ndarray, "H W"]
     usable: Bool[np.ndarray, "H W"]
+    recorded_us: Span
+    """Around the pair, when events were recorded and may be read; no others are asked for."""
 
     @property
     def span_us(self) -> tuple[int, int]:
@@ -63,6 +65,11 @@ class FramePair:
     def gap_us(self) -> float:
         """From mid-exposure to mid-exposure."""
         return (sum(self.after_us) - sum(self.before_us)) / 2
+
+    def recorded_at(self, lag_us: float) -> bool:
+        """Whether all events of the pair are there that come ``lag_us`` later than it."""
+        start, end = self.span_us
+        return start + lag_us >= self.recorded_us[0] and end + lag_us <= self.recorded_us[1]
 
 
 def exposure(
@@ -85,22 +92,30 @@ def exposure(
     )
 
 
-def pair(before: Exposure, after: Exposure) -> FramePair:
-    """Two exposures as a pair."""
+def pair(before: Exposure, after: Exposure, recorded_us: Span) -> FramePair:
+    """Two exposures as a pair, and when around them events were recorded and may be read."""
     if before.log_luminance.shape != after.log_luminance.shape:
         raise DataError(
             f"frames of {before.log_luminance.shape[::-1]} and {after.log_luminance.shape[::-1]} "
             "pixels cannot be compared; give frames of one size."
         )
     change = after.log_luminance - before.log_luminance
-    return FramePair(before.span_us, after.span_us, change, before.usable & after.usable)
+    usable = before.usable & after.usable
+    return FramePair(before.span_us, after.span_us, change, usable, recorded_us)
 
 
-def pair_indices(spans_us: Sequence[tuple[int, int]], most: int) -> list[tuple[int, int]]:
-    """Which frames to pair: next to each other but `SHORTEST_GAP_US` apart, evenly spread."""
+def pair_indices(
+    spans_us: Sequence[tuple[int, int]], most: int, *, stretch: Sequence[Span] | None = None
+) -> list[tuple[int, int]]:
+    """Which frames to pair: next to each other but `SHORTEST_GAP_US` apart, evenly spread.
+
+    ``stretch`` says of each frame in which stretch of time it lies; pairs lie in one.
+    """
     middle = np.array([(start + end) / 2 for start, end in spans_us])
     after = np.searchsorted(middle, middle + SHORTEST_GAP_US)
     found = [(i, max(int(j), i + 1)) for i, j in enumerate(after) if j < len(middle)]
+    if stretch is not None:
+        found = [(i, j) for i, j in found if stretch[i] == stretch[j]]
     chosen = np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int))
     return [found[i] for i in chosen]
 
@@ -116,8 +131,9 @@ class PairEvents:
         """Read what ``counts`` needs for lags in the given range."""
         self.pair = pair
         start, end = pair.span_us
-        first = start + math.floor(lags_us[0]) - HISTORY_US
-        near = events.between(first, end + math.ceil(lags_us[1]) + 1)
+        first = max(start + math.floor(lags_us[0]) - HISTORY_US, pair.recorded_us[0])
+        last = min(end + math.ceil(lags_us[1]) + 1, pair.recorded_us[1])
+        near = events.between(first, max(first, last))
         height, width = pair.change.shape
         pixel = event_pixels(near, height, width, "frames and events must share their pixels")
         share = max(1, len(near) // MOST_EVENTS)

@@ -43,7 +43,6 @@ class ClockEstimate:
 def estimate_clock(
     pairs: Sequence[FramePair],
     events: EventSource,
-    recorded_us: tuple[int, int],
     *,
     search_us: int = SEARCH_US,
 ) -> ClockEstimate | None:
@@ -51,19 +50,19 @@ def estimate_clock(
 
     The correlation is taken over the pixels with events, of all pairs together; a parabola through
     its largest values gives the lag between the steps of the search. None where too little moves,
-    or frames and events have nothing to do with each other. ``recorded_us`` is when events were
-    recorded: pairs beyond it are left out.
+    or frames and events have nothing to do with each other. Pairs whose events at a lag were
+    not recorded or may not be read are left out there.
     """
     if not pairs:
         return None
     step = max(500.0, float(np.median([pair.gap_us for pair in pairs])) / 4)
     coarse = np.arange(-round(search_us / step), round(search_us / step) + 1) * step
-    sums = _moments(pairs, events, recorded_us, coarse)
+    sums = _moments(pairs, events, coarse)
     best = _best(_correlation(sums.sum(0)))
     if best is None:
         return None
     fine = coarse[best] + np.linspace(-1, 1, 13) * step
-    fine_sums = _moments(pairs, events, recorded_us, fine)
+    fine_sums = _moments(pairs, events, fine)
     vertex = _vertex(fine, _correlation(fine_sums.sum(0)))
     correlations = _correlation(fine_sums.sum(0))
     if vertex is None or np.nanmax(correlations) < LEAST_CORRELATION:
@@ -84,16 +83,14 @@ def estimate_clock(
 def _moments(
     pairs: Sequence[FramePair],
     events: EventSource,
-    recorded_us: tuple[int, int],
     lags_us: Float[np.ndarray, "L"],
 ) -> Float[np.ndarray, "P L 6"]:
     """Per pair and lag: count, sums of N, D, N^2, D^2 and ND over usable pixels with events."""
     sums = np.zeros((len(pairs), len(lags_us), 6))
     for row, pair in zip(sums, pairs, strict=True):
-        start, end = pair.span_us
         near = PairEvents(pair, events, (lags_us[0], lags_us[-1]))
         for values, lag in zip(row, lags_us, strict=True):
-            if start + lag < recorded_us[0] or end + lag > recorded_us[1]:
+            if not pair.recorded_at(lag):
                 continue
             level, active = near.level_change(lag)
             active &= near.usable

@@ -90,12 +90,12 @@ class NoiseMeter:
 
 
 def noise_of(events: EventStore) -> NoiseEstimate:
-    """Background rate and hot pixels of a whole recording, read a second at a time."""
-    start, end = events.time_range_us
+    """Background rate and hot pixels of all of a recording that may be read, second by second."""
     meter = NoiseMeter(events.width, events.height)
-    for first in range(start, end, _PIECE_US):
-        meter.add(events.between(first, min(first + _PIECE_US, end)))
-    return meter.estimate(end - start)
+    for start, end in events.stretches_us:
+        for first in range(start, end, _PIECE_US):
+            meter.add(events.between(first, min(first + _PIECE_US, end)))
+    return meter.estimate(sum(end - start for start, end in events.stretches_us))
 
 
 def _has_support(chunk: EventStream, width: int, height: int) -> np.ndarray:

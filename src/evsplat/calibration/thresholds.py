@@ -29,7 +29,6 @@ class ThresholdEstimate:
 def estimate_thresholds(
     pairs: Sequence[FramePair],
     events: EventSource,
-    recorded_us: tuple[int, int],
     lag_us: float = 0.0,
 ) -> ThresholdEstimate | None:
     """Fit ``change = C+ n+ - C- n-`` over the pixels with events; None where those are too few.
@@ -41,8 +40,7 @@ def estimate_thresholds(
     """
     counts, changes = [np.zeros((0, 2))], [np.zeros(0)]
     for pair in pairs:
-        start, end = pair.span_us
-        if start + lag_us < recorded_us[0] or end + lag_us > recorded_us[1]:
+        if not pair.recorded_at(lag_us):
             continue
         near = PairEvents(pair, events, (lag_us, lag_us))
         plus, minus = near.counts(lag_us)

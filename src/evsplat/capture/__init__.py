@@ -5,6 +5,8 @@ from evsplat.capture.camera import Camera
 from evsplat.capture.capture import Capture, load_capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame, NovelView
+from evsplat.capture.policy import Policy
+from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import validate_capture
 from evsplat.capture.write import CaptureWriter
 
@@ -16,6 +18,8 @@ __all__ = [
     "Finding",
     "Frame",
     "NovelView",
+    "Policy",
+    "TrainingCapture",
     "load_capture",
     "validate_capture",
 ]

@@ -2,6 +2,8 @@
 
 import functools
 import logging
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,8 @@ from evsplat.capture.images import (
 )
 from evsplat.capture.metadata import Frame, Metadata, NovelView
 from evsplat.capture.points import read_points
+from evsplat.capture.policy import Policy
+from evsplat.capture.training_capture import FindsPeople, TrainingCapture
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStore
@@ -55,6 +59,22 @@ class Capture:
     def __repr__(self) -> str:
         return f"Capture({str(self.path)!r}, {len(self.frames)} frames)"
 
+    def for_training(
+        self,
+        policy: Policy,
+        masker: Callable[[TrainingCapture], FindsPeople] | None = None,
+    ) -> TrainingCapture:
+        """What methods, restorers, maskers and calibration may see: the only thing they are given.
+
+        ``masker`` makes what finds people for ``policy.masks=estimated``.
+        """
+        return TrainingCapture(self, policy, masker)
+
+    def with_nothing_held_out(self) -> "Capture":
+        """The same recording with all frames for training, and so none for a test."""
+        frames = tuple(replace(frame, split="train") for frame in self.frames)
+        return Capture(replace(self._metadata, frames=frames))
+
     @property
     def metadata(self) -> Metadata:
         """All of capture.json; what other parts need is given by the other members."""
@@ -62,7 +82,7 @@ class Capture:
 
     @property
     def train_frames(self) -> tuple[Frame, ...]:
-        """Frames that training may use."""
+        """Frames for training."""
         return tuple(frame for frame in self.frames if frame.split == "train")
 
     @property

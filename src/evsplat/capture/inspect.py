@@ -23,6 +23,7 @@ from evsplat.capture.drawing import (
 )
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame
+from evsplat.capture.policy import Policy
 from evsplat.capture.sensor_report import clock_findings, sensor_lines
 from evsplat.capture.timeline import draw_timeline
 from evsplat.capture.validate import check_capture
@@ -64,7 +65,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     if metadata is None or not report.usable:
         return replace(report, summary=f"{path}\n{_findings_text(report.findings)}")
     capture = Capture(metadata)
-    estimate = estimate_from_capture(capture)
+    estimate = estimate_from_capture(capture.for_training(Policy(use="everything")))
     findings = (*found, *clock_findings(capture, estimate))
     track = load_body_track(capture) if capture.has_body else None
     drawings = {"contact_sheet": _contact_sheet(capture)}

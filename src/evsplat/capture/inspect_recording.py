@@ -224,15 +224,16 @@ def _chosen_frames(
 def _estimate(
     frames: list[tuple[RecordedFrame, RecordedFrame]], totals: _Totals
 ) -> SensorEstimate | None:
-    pairs = [
-        # A DAVIS stores what it measures, without a transfer curve.
-        pair(
-            *(exposure(_unit(frame.image), frame.exposure_us, transfer="linear") for frame in both)
-        )
-        for both in frames
-    ]
     t = totals.sample.t
-    return estimate_from_pairs(pairs, totals.sample, (int(t[0]), int(t[-1]) + 1))
+    recorded_us = int(t[0]), int(t[-1]) + 1
+    pairs = []
+    for both in frames:
+        # A DAVIS stores what it measures, without a transfer curve.
+        before, after = (
+            exposure(_unit(frame.image), frame.exposure_us, transfer="linear") for frame in both
+        )
+        pairs.append(pair(before, after, recorded_us))
+    return estimate_from_pairs(pairs, totals.sample)
 
 
 def _unit(image: np.ndarray) -> torch.Tensor:

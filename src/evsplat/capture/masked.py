@@ -3,38 +3,49 @@
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from evsplat.capture.capture import Capture
 from evsplat.capture.metadata import Frame
-from evsplat.errors import DataError
+from evsplat.capture.training_capture import TrainingCapture
+from evsplat.errors import ConfigError, DataError
 
 PERSON_ABOVE = 0.5
 """Share of a pixel above which it is the person's."""
 
 
-class MaskedCapture(Capture):
+def require_masks(capture: TrainingCapture, method: str) -> None:
+    """A `DataError` where a training frame has no mask, a `ConfigError` where none may be seen."""
+    if capture.policy.masks == "none":
+        raise ConfigError(
+            f"policy.masks is none, and {method} learns the person from masks; pass --set "
+            "policy.masks=given, or estimated."
+        )
+    frames = capture.train_frames
+    without = [frame.name for frame in frames if not capture.has_mask(frame)]
+    if without:
+        raise DataError(
+            f"{capture.path / 'capture.json'}: {len(without)} of {len(frames)} training frames "
+            f"have no mask (the first is {without[0]!r}), and {method} learns the person from "
+            f"masks; make them with: evsplat masks {capture.path}, or pass --set "
+            "policy.masks=estimated."
+        )
+
+
+class MaskedCapture(TrainingCapture):
     """The same capture with pictures that are black where the mask says that nobody is.
 
     The released 3DGS-Avatar cuts pictures hard, so a pixel is taken whole or not at all.
     """
 
-    def __init__(self, capture: Capture) -> None:
-        """A `DataError` where a training frame has no mask."""
-        without = [frame.name for frame in capture.train_frames if frame.mask is None]
-        if without:
-            every = len(without) == len(capture.train_frames)
-            found = "no training frame has a mask" if every else f"frame {without[0]!r} has no mask"
-            raise DataError(
-                f"{capture.path / 'capture.json'}: {found}, and this method learns the person from "
-                f"masked pictures; make masks with: evsplat masks {capture.path}"
-            )
-        super().__init__(capture.metadata)
+    def __init__(self, capture: TrainingCapture, method: str) -> None:
+        """For ``method``; raises as `require_masks`."""
+        require_masks(capture, method)
+        super().__init__(capture._source, capture.policy, capture._masker)
 
     def image(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
-        """The blurry picture, black outside of the person."""
+        """The blurry picture of a training frame, black outside of the person."""
         return super().image(frame) * self.person(frame)[..., None]
 
     def person(self, frame: Frame | str) -> Bool[Tensor, "H W"]:
-        """The person's pixels in a frame that has a mask."""
+        """The person's pixels in a training frame."""
         mask = self.mask(frame)
         assert mask is not None
         return mask > PERSON_ABOVE

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from evsplat.cli.options import CaptureFolder, Flag, option
+from evsplat.cli.options import CaptureFolder, Flag, Use, option
 from evsplat.errors import ConfigError
 
 
@@ -20,6 +20,7 @@ def masks(
     threshold: Annotated[float | None, option("T", default="from the noise")] = None,
     margin: Annotated[float | None, option("PIXELS", default="0")] = None,
     weights: Annotated[Path | None, option("FILE", default="EVSPLAT_RVM, or torch's cache")] = None,
+    use: Use = "training",
 ) -> None:
     """Find the person in each frame: soft masks for baselines and evaluation.
 
@@ -33,7 +34,9 @@ def masks(
         threshold: For background: least difference, 0 to 1.
         margin: For silhouette: widen the body for clothes and hair.
         weights: For rvm: the network's TorchScript file, which you bring.
+        use: What masks of training frames are made from; everything looks at held-out ones too.
     """
+    from evsplat.capture import Policy
     from evsplat.masks import mask_capture
 
     given: dict[str, tuple[str, Any]] = {
@@ -53,4 +56,5 @@ def masks(
     options = {
         renamed.get(name, name): value for name, (_, value) in given.items() if value is not None
     }
-    print(f"written: {mask_capture(capture, target, method=method, **options)}")
+    written = mask_capture(capture, target, method=method, policy=Policy(use=use), **options)
+    print(f"written: {written}")

@@ -16,4 +16,8 @@ RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
 Device = Literal["auto", "cpu", "cuda"]
 NewRunFolder = Annotated[Path | None, option("RUN", default="runs/CAPTURE/METHOD/TIME")]
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+Use = Annotated[
+    Literal["training", "everything"],
+    tyro.conf.arg(help_behavior_hint="(default: training)"),
+]
 Threads = Annotated[int | None, option("N", default="all cores")]

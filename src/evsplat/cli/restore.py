@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from evsplat.cli.options import CaptureFolder, Device, option
+from evsplat.cli.options import CaptureFolder, Device, Use, option
 from evsplat.errors import ConfigError
 
 Method = Literal["edi", "nafnet", "mprnet", "efnet", "d2net", "e2vid", "pienet"]
@@ -22,6 +22,7 @@ def restore(
         Path | None, option("FILE", default="EVSPLAT_NAME, or torch's cache")
     ] = None,
     device: Device = "auto",
+    use: Use = "training",
 ) -> None:
     """Write a new capture whose frames are sharp at mid-exposure.
 
@@ -35,7 +36,9 @@ def restore(
         contrast_threshold: For edi: log-intensity change per brighter and darker event.
         weights: For networks but pienet: the published checkpoint, which you bring.
         device: For networks: where they run.
+        use: What training frames are restored from; everything looks at held-out frames too.
     """
+    from evsplat.capture import Policy
     from evsplat.restore import restore_capture
 
     given: dict[str, tuple[bool, Any]] = {
@@ -50,4 +53,5 @@ def restore(
             )
     options = {name: value for name, (_, value) in given.items() if value is not None}
     target = out or capture.resolve().with_name(f"{capture.resolve().name}-{method}")
-    print(f"written: {restore_capture(capture, target, method=method, **options)}")
+    written = restore_capture(capture, target, method=method, policy=Policy(use=use), **options)
+    print(f"written: {written}")

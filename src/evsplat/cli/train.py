@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from evsplat.cli.evaluate import evaluate_and_report
-from evsplat.cli.options import CaptureFolder, Device, Flag, NewRunFolder, Threads, option
+from evsplat.cli.options import CaptureFolder, Device, Flag, NewRunFolder, Threads, Use, option
 
 
 def train(
@@ -25,6 +25,7 @@ def train(
     threads: Threads = None,
     device_memory_gb: Annotated[float | None, option("GB", default="a quarter of the free")] = None,
     seed: Annotated[int | None, option("S", default="the method's")] = None,
+    use: Annotated[Use | None, option("{training,everything}", default="training")] = None,
     evaluate: Flag = True,
     view: Flag = False,
     port: Annotated[int, option("PORT", default="8080, or the next free one")] = 8080,
@@ -46,6 +47,8 @@ def train(
         threads: CPU threads.
         device_memory_gb: GPU memory for recorded pictures and event maps.
         seed: Seed of every random number.
+        use: everything trains on all frames and events, for the best result of one's own
+            recording; nothing is held out, so there are no test figures.
         evaluate: Skip the evaluation and the report at the end.
         view: Show the run in the browser while it is trained, and afterwards until Ctrl-C.
         port: Where --view listens.
@@ -68,6 +71,7 @@ def train(
             overrides=overrides,
             threads=threads,
             seed=seed,
+            use=use,
             device_memory_gb=device_memory_gb,
             on_start=viewer.start if viewer else None,
         )

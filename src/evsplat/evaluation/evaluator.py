@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.capture import Capture, Frame, NovelView
+from evsplat.capture import Capture, Frame, NovelView, Policy, TrainingCapture
+from evsplat.config import to_dict
 from evsplat.errors import DataError
 from evsplat.evaluation.event_maps import evaluate_event_maps
 from evsplat.evaluation.people import People
@@ -48,6 +49,9 @@ COMPOSITED = "on_median_background"
 """The person of a method without scene, before the median of the training frames."""
 
 Picture = Callable[[Frame], Float[Tensor, "H W 3"]]
+
+_TRIVIAL_SEES = Policy()
+"""Rows without a method see training frames alone, as the methods do."""
 
 
 def evaluate(
@@ -138,6 +142,7 @@ def evaluate_run(
         "device": run.device,
         "gaussians": run.gaussians,
         "evaluate_seconds": round(time.monotonic() - start, 1),
+        "policy": to_dict(run.policy),
         **measured,
     }
     write_json(Path(run.path) / "metrics.json", metrics)
@@ -334,9 +339,11 @@ def _render_view(
         return Absent(str(error))
 
 
-def _picture_of(kind: Callable[[Capture], Reconstruction], capture: Capture) -> Picture | Absent:
+def _picture_of(
+    kind: Callable[[TrainingCapture], Reconstruction], capture: Capture
+) -> Picture | Absent:
     try:
-        return partial(_render, capture, kind(capture))
+        return partial(_render, capture, kind(capture.for_training(_TRIVIAL_SEES)))
     except DataError as error:
         return Absent(str(error))
 

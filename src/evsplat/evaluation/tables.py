@@ -86,16 +86,14 @@ class Table:
 
 
 def tables_of(metrics: dict[str, Any]) -> Iterator[Table]:
-    """One table per protocol, `standard` first."""
+    """One table per protocol, `standard` first; with other rows where they were measured."""
     for protocol, ours in metrics["protocols"].items():
         if protocol == "standard":
-            others = {
-                **composited(metrics),
-                **metrics["trivial"],
-                "blurry_input": metrics["blurry_input"],
-            }
+            others = {**composited(metrics), **metrics.get("trivial", {})}
+            if "blurry_input" in metrics:
+                others["blurry_input"] = metrics["blurry_input"]
         else:
-            others = metrics["compat_rows"][protocol]
+            others = metrics.get("compat_rows", {}).get(protocol, {})
         rows = {metrics["method"]: ours, **others}
         columns = tuple(
             Column(region, metric)

@@ -10,11 +10,12 @@ from evsplat.events.simulator import (
     sensor_settings,
     simulate_events,
 )
-from evsplat.events.store import EventStore
+from evsplat.events.store import ALWAYS, EventStore, Span
 from evsplat.events.stream import EventStream
 from evsplat.events.write import write_events
 
 __all__ = [
+    "ALWAYS",
     "PRESETS",
     "EventRecording",
     "EventStore",
@@ -22,6 +23,7 @@ __all__ = [
     "RecordedFrame",
     "SensorSettings",
     "SensorSimulator",
+    "Span",
     "begun_counts",
     "count_map",
     "open_recording",

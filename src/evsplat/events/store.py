@@ -6,6 +6,7 @@ t >= 1000 m; `t_offset` is added to every t. Times that leave this module are on
 """
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,21 @@ import h5py
 import numpy as np
 from jaxtyping import Float, Int64
 
-from evsplat.errors import DataError
+from evsplat.errors import DataError, HeldOutError
 from evsplat.events.stream import EventStream
+
+Span = tuple[int, int]
+"""Start and end of a stretch of time, microseconds, the end exclusive."""
+ALWAYS: Span = (-(1 << 62), 1 << 62)
+"""All of time."""
 
 # HDF5 keeps decoded chunks per dataset; 4 MiB hold eight chunks of int64 times.
 _CHUNK_CACHE_BYTES = 4 << 20
 _POLARITY_BLOCK = 1 << 16
+_HIDDEN = (
+    ", which this training's policy hides; with --set policy.held_out_events=true it is seen, and "
+    "figures are those of interpolation."
+)
 
 
 class EventStore:
@@ -26,6 +36,9 @@ class EventStore:
 
     ``pixel_lookup`` (H, W, 2), int32, maps a sensor pixel to the (x, y) of the undistorted image,
     -1 where it falls outside; those events are dropped from slices (but counted by ``len``).
+
+    ``open_us`` are the stretches of time that may be read, in order; what lies between them is held
+    out: to ask for it is a `HeldOutError`, and nothing that is told of the recording depends on it.
     """
 
     def __init__(
@@ -35,12 +48,14 @@ class EventStore:
         height: int,
         clock_offset_us: int = 0,
         pixel_lookup: np.ndarray | None = None,
+        open_us: Sequence[Span] = (ALWAYS,),
     ) -> None:
         self.path = Path(path)
         self.width = width
         self.height = height
         self.clock_offset_us = clock_offset_us
         self._pixel_lookup = pixel_lookup
+        self._open_us = tuple(open_us)
         self._file: h5py.File | None = None
         self._owner_pid = -1
         self._shift_us = 0
@@ -50,28 +65,54 @@ class EventStore:
         return {**self.__dict__, "_file": None, "_owner_pid": -1}
 
     def __len__(self) -> int:
-        """Count of recorded events."""
-        return int(self._open()["events/t"].shape[0])
+        """Count of events, without held-out ones."""
+        return sum(last - first for first, last in self._open_rows())
 
     @property
-    def time_range_us(self) -> tuple[int, int]:
-        """First event and one past the last, so that ``between(*time_range_us)`` is everything.
+    def time_range_us(self) -> Span:
+        """First event and one past the last, so that of a recording without held-out intervals
+        ``between(*time_range_us)`` is everything.
 
-        (0, 0) for an empty recording.
+        (0, 0) where there are no events.
         """
-        t = self._open()["events/t"]
-        if len(t) == 0:
+        t: h5py.Dataset = self._open()["events/t"]
+        rows = [pair for pair in self._open_rows() if pair[0] < pair[1]]
+        if not rows:
             return 0, 0
-        return int(t[0]) + self._shift_us, int(t[-1]) + self._shift_us + 1
+        return int(t[rows[0][0]]) + self._shift_us, int(t[rows[-1][1] - 1]) + self._shift_us + 1
+
+    @property
+    def stretches_us(self) -> tuple[Span, ...]:
+        """What of `time_range_us` may be read; one stretch where nothing is held out."""
+        start, end = self.time_range_us
+        within = ((max(first, start), min(last, end)) for first, last in self._open_us)
+        return tuple((first, last) for first, last in within if first < last)
+
+    def open_around(self, time_us: int) -> Span:
+        """The stretch of time that may be read and holds an instant, or ends with it."""
+        for start, end in self._open_us:
+            if start <= time_us <= end:
+                return start, end
+        raise HeldOutError(f"{self.path}: {time_us} us lies in a held-out interval{_HIDDEN}")
+
+    def opened(self, open_us: Sequence[Span]) -> "EventStore":
+        """The same recording as it is seen where only ``open_us`` may be read."""
+        return EventStore(
+            self.path, self.width, self.height, self.clock_offset_us, self._pixel_lookup, open_us
+        )
 
     @property
     def has_polarity(self) -> bool:
         """False where every stored polarity is 0: the sensor did not say, and slices have p = 0."""
         if self._has_polarity is None:
             stored: h5py.Dataset = self._open()["events/p"]
-            blocks = range(0, len(stored), _POLARITY_BLOCK)
-            self._has_polarity = not len(stored) or any(
-                bool(stored[first : first + _POLARITY_BLOCK].any()) for first in blocks
+            blocks = [
+                (start, min(start + _POLARITY_BLOCK, last))
+                for first, last in self._open_rows()
+                for start in range(first, last, _POLARITY_BLOCK)
+            ]
+            self._has_polarity = not blocks or any(
+                bool(stored[start:end].any()) for start, end in blocks
             )
         return self._has_polarity
 
@@ -79,8 +120,10 @@ class EventStore:
         """Events with ``start_us <= t < end_us``, read from disk.
 
         Only the milliseconds that the window touches are read. Raises `DataError` where what was
-        read is out of order or outside of the sensor, so that a bad file is never used silently.
+        read is out of order or outside of the sensor, so that a bad file is never used silently,
+        and `HeldOutError` where the window reaches into a held-out interval.
         """
+        self._check_open(start_us, end_us)
         file = self._open()
         start, end = start_us - self._shift_us, end_us - self._shift_us
         first = self._index_at_ms(start // 1000)
@@ -106,8 +149,10 @@ class EventStore:
         """Edges in camera microseconds and events per second between them, over the recording.
 
         Edges lie on whole milliseconds of the file's clock, so that only the index is read;
-        recordings shorter than ``bins`` milliseconds get fewer bins.
+        recordings shorter than ``bins`` milliseconds get fewer bins. Raises `HeldOutError` where
+        anything is held out.
         """
+        self._check_open(*self.time_range_us)
         start, end = (time - self._shift_us for time in self.time_range_us)
         first_ms, last_ms = start // 1000, max(start // 1000 + 1, -(-end // 1000))
         edges_ms = np.unique(np.linspace(first_ms, last_ms, bins + 1).round().astype(np.int64))
@@ -137,12 +182,36 @@ class EventStore:
                 ) from error
         return self._file
 
+    def _open_rows(self) -> list[tuple[int, int]]:
+        """First row and one past the last of each open stretch, of the file's columns."""
+        if self._open_us == (ALWAYS,):
+            return [(0, int(self._open()["events/t"].shape[0]))]
+        return [(self._row_at(start), self._row_at(end)) for start, end in self._open_us]
+
+    def _row_at(self, time_us: int) -> int:
+        """Row of the first event at or after a time."""
+        file, time = self._open(), time_us - self._shift_us
+        first = self._index_at_ms(time // 1000)
+        near = self._read(file, "events/t", first, self._index_at_ms(-(-time // 1000)))
+        return first + int(np.searchsorted(near, time))
+
+    def _check_open(self, start_us: int, end_us: int) -> None:
+        if start_us >= end_us:
+            return
+        if not any(first <= start_us and end_us <= last for first, last in self._open_us):
+            raise HeldOutError(
+                f"{self.path}: events from {start_us} to {end_us} us lie in a held-out interval, "
+                f"at least in part{_HIDDEN}"
+            )
+
     def _index_at_ms(self, millisecond: int) -> int:
         """Index of the first event at or after a millisecond of the file's clock."""
         index: h5py.Dataset = self._open()["ms_to_idx"]
         if millisecond < 0:
             return 0
-        return int(index[millisecond]) if millisecond < len(index) else len(self)
+        if millisecond < len(index):
+            return int(index[millisecond])
+        return int(self._open()["events/t"].shape[0])
 
     def _read(self, file: h5py.File, key: str, first: int, last: int) -> np.ndarray:
         try:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import DeviceCache, send
 from evsplat.hugs.model import HugsDrawing, HugsModel
 from evsplat.hugs.start import body_weights
@@ -22,7 +22,7 @@ ON_PERSON = 0.9
 """How often such a square is centred on a pixel of the person."""
 
 
-def mask_of(capture: Capture, frame: Frame) -> Float[Tensor, "H W"]:
+def mask_of(capture: TrainingCapture, frame: Frame) -> Float[Tensor, "H W"]:
     """1 where the frame's mask says person, 0 elsewhere."""
     mask = capture.mask(frame)
     assert mask is not None  # the method has looked
@@ -75,7 +75,7 @@ def draw_squares(
 class JointPicture(Stateless):
     """Everything, over the step's random colour, against the recorded picture."""
 
-    def __init__(self, capture: Capture, perceptual: Perceptual | None) -> None:
+    def __init__(self, capture: TrainingCapture, perceptual: Perceptual | None) -> None:
         """Pictures and, for the perceptual squares, masks are the capture's."""
         self.capture, self.perceptual = capture, perceptual
 
@@ -103,7 +103,7 @@ class HumanPicture(Stateless):
     Where the model has no scene, the step's picture shows the person alone already, over black.
     """
 
-    def __init__(self, capture: Capture, perceptual: Perceptual | None) -> None:
+    def __init__(self, capture: TrainingCapture, perceptual: Perceptual | None) -> None:
         """Pictures and masks are the capture's."""
         self.capture, self.perceptual = capture, perceptual
 

@@ -1,6 +1,6 @@
 """The person as what differs from the static background, near the posed body."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy.ndimage import (
 from torch import Tensor
 
 from evsplat.body import load_body_track
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import ConfigError, DataError
 from evsplat.imaging import decode
 from evsplat.masks.silhouette import track_silhouette
@@ -47,7 +47,7 @@ class BackgroundDifference:
 
     name = "background"
 
-    def __init__(self, capture: Capture, *, threshold: float | None = None) -> None:
+    def __init__(self, capture: TrainingCapture, *, threshold: float | None = None) -> None:
         """``threshold``: difference in coded values; without it from the noise of the frames.
 
         Raises:
@@ -67,9 +67,11 @@ class BackgroundDifference:
             THRESHOLD, NOISE_FACTOR * _noise(capture, self._background)
         )
 
-    def masks(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
+    def masks(
+        self, capture: TrainingCapture, frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
         """Each frame in order with a mask whose edge is half a pixel soft."""
-        for frame in capture.frames:
+        for frame in frames:
             differs = difference(capture.image(frame), self._background, self._threshold)
             if self._track is None:
                 person = clean(differs, None)
@@ -126,7 +128,7 @@ def clean(
     return binary_fill_holes(pieces == int(covered.argmax()))
 
 
-def _noise(capture: Capture, background: Float[Tensor, "H W 3"]) -> float:
+def _noise(capture: TrainingCapture, background: Float[Tensor, "H W 3"]) -> float:
     """Standard deviation of a pixel that nothing happens to, from the median of differences."""
     frames = capture.train_frames
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_NOISE_FRAMES, len(frames))).astype(int))

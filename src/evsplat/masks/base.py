@@ -1,24 +1,28 @@
 """What finds the person in a capture's frames, and which ways there are."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.masks.background import BackgroundDifference
 from evsplat.masks.rvm import RobustVideoMatting
 from evsplat.masks.silhouette import PosedBody
 
 
 class Masker(Protocol):
-    """Finds the person from a capture's pictures and poses; never from its truth or its masks."""
+    """Finds the person from a capture's training frames and poses."""
 
     name: str
 
-    def masks(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
-        """Each frame in order with the share of the person per pixel, in [0, 1]."""
+    def masks(
+        self, capture: TrainingCapture, frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
+        """Each of ``frames``, training frames of ``capture`` in its order, with the share of the
+        person per pixel, in [0, 1].
+        """
         ...
 
     def provenance(self) -> dict[str, Any]:

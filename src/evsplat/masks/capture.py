@@ -1,5 +1,6 @@
 """`evsplat masks`: person masks for a capture, in a new one or in itself."""
 
+import itertools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 import evsplat
-from evsplat.capture import Capture, Frame, load_capture
+from evsplat.capture import Capture, Frame, Policy, load_capture
 from evsplat.capture.derive import derived_capture, write_picture
+from evsplat.config import to_dict
 from evsplat.errors import ConfigError, DataError
 from evsplat.files import new_folder, read_json, write_json
 from evsplat.masks.base import MASKERS, Masker
@@ -21,6 +23,7 @@ def mask_capture(
     out: Path | str | None = None,
     *,
     method: str = "background",
+    policy: Policy | None = None,
     **options: Any,
 ) -> Path:
     """Find the person in each frame and write soft masks (0 to 255); gives the capture's folder.
@@ -29,6 +32,10 @@ def mask_capture(
     Without, the masks are added to the capture itself: to a folder of their own, which capture.json
     names as the very last step; masks that were made otherwise are never replaced. How they were
     made is in ``provenance.masks``. ``options`` are those of the masker.
+
+    Masks of training frames are made from what ``policy`` lets training see. Those of held-out
+    frames, which only the evaluation opens, are made from everything, by what the masker learned
+    from the training frames.
 
     Raises:
         ConfigError: No masker has that name.
@@ -40,9 +47,16 @@ def mask_capture(
     capture = load_capture(path)
     if out is None:
         _check_in_place(capture)
-    masker = MASKERS[method](capture, **options)
-    masks = tqdm(masker.masks(capture), "masks", len(capture.frames), unit="frame")
+    seen = capture.for_training(policy or Policy())
+    everything = capture.for_training(Policy(use="everything"))
+    held_out = [everything.frame(frame.name) for frame in seen.held_out_frames]
+    masker = MASKERS[method](seen, **options)
+    found = itertools.chain(
+        masker.masks(seen, seen.train_frames), masker.masks(everything, held_out)
+    )
+    masks = tqdm(found, "masks", len(capture.frames), unit="frame")
     made = {"with": masker.name, **masker.provenance(), "evsplat": evsplat.__version__}
+    made["policy"] = to_dict(seen.policy)
     if out is None:
         _write_in_place(capture, masker, masks, made)
         return capture.path

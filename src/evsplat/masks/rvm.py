@@ -7,7 +7,7 @@ states of one frame go into the next (None before the first).
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import WeightsError
 from evsplat.weights import MissingWeights, home_as_tilde, hub_folder, sha256_of
 
@@ -35,7 +35,7 @@ class RobustVideoMatting:
 
     def __init__(
         self,
-        capture: Capture,
+        capture: TrainingCapture,
         *,
         weights: Path | str | None = None,
         device: torch.device | str = "cpu",
@@ -49,15 +49,22 @@ class RobustVideoMatting:
         self._device = torch.device(device)
         self._model = _load(self._path, self._device)
 
-    def masks(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
-        """Each frame in order; the states begin anew with each camera."""
+    def masks(
+        self, capture: TrainingCapture, frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
+        """The states begin anew with each camera and behind held-out frames."""
+        asked = {frame.name for frame in frames}
         states: dict[str, list[Tensor | None]] = {}
         for frame in capture.frames:
+            if frame.split != "train":
+                states.clear()
+                continue
             picture = capture.image(frame).permute(2, 0, 1)[None].contiguous().to(self._device)
             ratio = min(1.0, SIDE_PX / max(picture.shape[2:]))
             before = states.get(frame.camera, [None] * 4)
             alpha, states[frame.camera] = self._step(picture, before, ratio)
-            yield frame, alpha
+            if frame.name in asked:
+                yield frame, alpha
 
     def provenance(self) -> dict[str, Any]:
         """The file that was used."""

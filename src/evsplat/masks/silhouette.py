@@ -1,6 +1,6 @@
 """The posed body's silhouette as a person mask."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from evsplat.body import BodyTrack, load_body_track, silhouette
-from evsplat.capture import Camera, Capture, Frame
+from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.errors import ConfigError
 
 OVERSAMPLING = 4
@@ -21,7 +21,7 @@ class PosedBody:
 
     name = "silhouette"
 
-    def __init__(self, capture: Capture, *, margin_px: float = 0.0) -> None:
+    def __init__(self, capture: TrainingCapture, *, margin_px: float = 0.0) -> None:
         """``margin_px``: widen the silhouette by this many pixels on all sides.
 
         Raises:
@@ -33,9 +33,11 @@ class PosedBody:
         self._track = load_body_track(capture)
         self._margin_px = margin_px
 
-    def masks(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
+    def masks(
+        self, capture: TrainingCapture, frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
         """Each frame in order with the body's share of each pixel."""
-        for frame in capture.frames:
+        for frame in frames:
             yield (
                 frame,
                 soft_silhouette(

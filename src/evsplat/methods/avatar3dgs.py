@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 
 import torch
 
-from evsplat.capture import Capture
+from evsplat.capture import Policy, TrainingCapture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.deform.human_scene import DeformConfig
 from evsplat.errors import ConfigError
@@ -59,6 +59,7 @@ def avatar_deform() -> DeformConfig:
 class AvatarConfig(PersonConfig):
     """All settings of method `avatar3dgs`."""
 
+    policy: Policy = field(default_factory=lambda: Policy(masks="given"))
     deform: DeformConfig = field(default_factory=avatar_deform)
     loss: AvatarLossConfig = field(default_factory=AvatarLossConfig)
     optimisation: OptimisationConfig = field(
@@ -69,7 +70,7 @@ class AvatarConfig(PersonConfig):
 
 def compose(
     config: AvatarConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
@@ -80,7 +81,7 @@ def compose(
     A `DataError` where the capture has no masks, a `ConfigError` where a setting of a scene is set.
     """
     _refuse_scene(config.deform)
-    masked = MaskedCapture(capture)
+    masked = MaskedCapture(capture, "method avatar3dgs")
     ground = Ground.of(masked, seed)
     person = human_start(config.human, masked, ground.track, ground.generator, SURELY_PERSON)
     gaussians = GaussianSet(person, no_gaussians())

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from evsplat.capture import Capture
+from evsplat.capture import TrainingCapture
 from evsplat.deform.human_scene import DeformConfig
 from evsplat.gaussians import DensifyConfig, GaussianSet
 from evsplat.methods.avatar3dgs import avatar_deform, avatar_rates
@@ -48,7 +48,7 @@ class AvatarSemanticConfig(PaperConfig):
 
 def compose(
     config: AvatarSemanticConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from evsplat.capture import Camera, Capture
+from evsplat.capture import Camera, TrainingCapture
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
 from evsplat.methods.trivial import MedianBackground
 
@@ -15,7 +15,7 @@ class OnMedianBackground:
     for one camera that stands still, and for the view that it recorded; else a `DataError`.
     """
 
-    def __init__(self, person: Reconstruction, capture: Capture) -> None:
+    def __init__(self, person: Reconstruction, capture: TrainingCapture) -> None:
         self._person, self._background = person, MedianBackground(capture)
 
     @property

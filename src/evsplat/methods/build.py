@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import torch
 
 from evsplat.body import BodyTrack, SurfaceSamples, load_body_track
-from evsplat.capture import Capture
+from evsplat.capture import Policy, TrainingCapture
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
 from evsplat.deform.mlp import bfloat16_runs
 from evsplat.deform.pose_spline import PoseSpline
@@ -43,6 +43,8 @@ class PersonLossConfig:
 class PersonConfig:
     """Settings of the person."""
 
+    policy: Policy = field(default_factory=Policy)
+    """What training may see of what is held out."""
     human: HumanStartConfig = field(default_factory=HumanStartConfig)
     deform: DeformConfig = field(default_factory=DeformConfig)
     isometry_refresh: int = 100
@@ -62,7 +64,7 @@ class PersonConfig:
 class Ground:
     """What a model is made from."""
 
-    capture: Capture
+    capture: TrainingCapture
     track: BodyTrack
     """On the CPU, where silhouettes are drawn."""
     surface: SurfaceSamples
@@ -71,7 +73,7 @@ class Ground:
     """All randomness of the run."""
 
     @classmethod
-    def of(cls, capture: Capture, seed: int, track: BodyTrack | None = None) -> "Ground":
+    def of(cls, capture: TrainingCapture, seed: int, track: BodyTrack | None = None) -> "Ground":
         """Read the body, unless its ``track`` is given, and seed everything."""
         generator = torch.Generator().manual_seed(seed)
         torch.manual_seed(seed)
@@ -134,7 +136,7 @@ class Build:
         *,
         weights: dict[str, Weight],
         densify: dict[Part, DensifyConfig],
-        capture: Capture | None = None,
+        capture: TrainingCapture | None = None,
         held_out: HeldOut | None = None,
     ) -> Composition:
         """Everything together.

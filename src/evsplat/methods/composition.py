@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.deform.model import Model
 from evsplat.gaussians import BodyFrames, DensifyConfig, Part
 from evsplat.methods.config import Weight
@@ -42,6 +42,6 @@ class Composition:
     """The body at the training frames, for Gaussians that change class; None where none does."""
     generator: torch.Generator
     """All randomness of the training; part of the checkpoint."""
-    capture: Capture | None = None
+    capture: TrainingCapture | None = None
     """The recording as the method sees it, where that is not all of it (masked pictures)."""
     held_out: HeldOut | None = None

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from evsplat.capture import Policy
+
 Weight = float | tuple[tuple[float, float], ...]
 """A constant, or (nominal iteration, value) pairs: piecewise constant from each iteration on."""
 
@@ -85,6 +87,10 @@ class Iterations(Protocol):
 
 class MethodConfig(Protocol):
     """What every method's configuration has; a frozen dataclass."""
+
+    @property
+    def policy(self) -> Policy:
+        """What training may see of what is held out."""
 
     @property
     def optimisation(self) -> Iterations:

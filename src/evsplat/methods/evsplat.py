@@ -12,8 +12,9 @@ from typing import Literal
 import torch
 
 from evsplat.calibration import SensorEstimate, estimate_from_capture
-from evsplat.capture import Capture
+from evsplat.capture import TrainingCapture
 from evsplat.deform.human_scene import DeformConfig
+from evsplat.errors import ConfigError
 from evsplat.methods.build import Build
 from evsplat.methods.composition import Composition, HeldOut
 from evsplat.methods.config import LearningRates, OptimisationConfig, Weight
@@ -139,7 +140,7 @@ class EvsplatConfig(PaperConfig):
 
 def compose(
     config: EvsplatConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
@@ -161,7 +162,7 @@ def compose(
     )
     renders = {
         frame.name: renders_for(
-            motion_px(capture, build.ground.track, frame),
+            motion_px(capture.camera(frame), build.ground.track, frame),
             config.exposure.px_per_render,
             config.exposure.most_renders,
         )
@@ -197,13 +198,18 @@ def compose(
 
 
 def _held_out(
-    config: EvsplatConfig, capture: Capture, build: Build, windows: EventWindows
+    config: EvsplatConfig, capture: TrainingCapture, build: Build, windows: EventWindows
 ) -> HeldOut | None:
     """What events around held-out frames teach of their poses, where that is asked for."""
     model = build.model
-    frames = [frame for frame in capture.frames if frame.split != "train"]
+    frames = list(capture.held_out_frames)
     if not config.pose.events_of_held_out or model.pose_spline is None or not frames:
         return None
+    if not config.policy.held_out_events:
+        raise ConfigError(
+            "pose.events_of_held_out is true, and policy.held_out_events is false, which hides "
+            "those events; pass --set policy.held_out_events=true as well."
+        )
     return HeldOut(
         frames,
         HeldOutWindows(windows, capture.train_frames),
@@ -215,7 +221,7 @@ def _held_out(
 
 def _windows(
     windows: WindowConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     build: Build,
     *,
     device: torch.device | str,
@@ -228,7 +234,7 @@ def _windows(
     if fit:
         estimate = None
         if capture.contrast_threshold is None or windows.clock != "never":
-            estimate = estimate_from_capture(capture, frames=capture.train_frames)
+            estimate = estimate_from_capture(capture)
         known = _thresholds(capture, estimate)
         late_us = _late_us(windows, estimate)
     pixels = (capture.events.height, capture.events.width) if windows.pixel_thresholds else None
@@ -250,7 +256,7 @@ def _windows(
     )
 
 
-def _edi(config: EdiConfig, capture: Capture, windows: EventWindows) -> EdiTarget | None:
+def _edi(config: EdiConfig, capture: TrainingCapture, windows: EventWindows) -> EdiTarget | None:
     """The frames sharpened by their events, where they are asked for and events have polarity."""
     asked = config.alone_until > 0.0 or config.weight > 0.0
     if not asked or not windows.events.has_polarity:
@@ -276,7 +282,7 @@ def _late_us(windows: WindowConfig, estimate: SensorEstimate | None) -> float | 
     return estimate.clock.lag_us
 
 
-def _thresholds(capture: Capture, estimate: SensorEstimate | None) -> tuple[float, float]:
+def _thresholds(capture: TrainingCapture, estimate: SensorEstimate | None) -> tuple[float, float]:
     """C+ and C-: the capture's, or those at which training frames and events agree best."""
     if capture.contrast_threshold is not None:
         return capture.contrast_threshold

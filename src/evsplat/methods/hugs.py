@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack, load_body_track
-from evsplat.capture import Capture
-from evsplat.capture.masked import MaskedCapture
+from evsplat.capture import Policy, TrainingCapture
+from evsplat.capture.masked import MaskedCapture, require_masks
 from evsplat.errors import DataError
 from evsplat.gaussians import DensifyConfig, Part
 from evsplat.gaussians.initialise import nearest_spacing
@@ -128,6 +128,8 @@ class HugsOptimisation:
 class HugsConfig:
     """All settings of method `hugs`."""
 
+    policy: Policy = field(default_factory=lambda: Policy(masks="given"))
+    """What training may see of what is held out."""
     mode: Literal["human_scene", "human"] = "human_scene"
     """What is reconstructed, in the released code's words. ``human``: the person alone, on black,
     from pictures that are black outside of the mask; the settings of the scene mean nothing."""
@@ -159,7 +161,7 @@ class HugsConfig:
 
 def compose(
     config: HugsConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
@@ -169,10 +171,12 @@ def compose(
 
     A `DataError` where the capture has no masks.
     """
-    _require_masks(capture)
+    if not capture.train_frames:
+        raise DataError(f"{capture.path}: no frame has split 'train'; nothing to learn from.")
+    require_masks(capture, "method hugs")
     alone = config.mode == "human"
     if alone:
-        capture = MaskedCapture(capture)
+        capture = MaskedCapture(capture, "method hugs")
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     track = load_body_track(capture)
@@ -225,21 +229,8 @@ def compose(
     )
 
 
-def _require_masks(capture: Capture) -> None:
-    frames = capture.train_frames
-    if not frames:
-        raise DataError(f"{capture.path}: no frame has split 'train'; nothing to learn from.")
-    without = [frame.name for frame in frames if frame.mask is None]
-    if without:
-        raise DataError(
-            f"{capture.path / 'capture.json'}: {len(without)} of {len(frames)} training frames "
-            f"have no mask (the first is {without[0]!r}), and method hugs learns the person from "
-            f"masks; make them with: evsplat masks {capture.path}"
-        )
-
-
 def _human(
-    config: HugsConfig, capture: Capture, track: BodyTrack, generator: torch.Generator
+    config: HugsConfig, capture: TrainingCapture, track: BodyTrack, generator: torch.Generator
 ) -> tuple[TriplaneHuman, float]:
     """The person at its start, and the mean distance of neighbouring Gaussians, metres."""
     points = human_start(config.human, capture, track, generator, 0.0)["means"]
@@ -258,7 +249,7 @@ def _human(
     return human, float(nearest_spacing(points).mean())
 
 
-def _resolution(capture: Capture, track: BodyTrack, half_side_m: float) -> int:
+def _resolution(capture: TrainingCapture, track: BodyTrack, half_side_m: float) -> int:
     frame = capture.train_frames[len(capture.train_frames) // 2]
     camera = capture.camera(frame)
     depth = float(camera.project(track.vertices(frame.mid_us))[1].median().clamp_min(0.1))
@@ -266,7 +257,7 @@ def _resolution(capture: Capture, track: BodyTrack, half_side_m: float) -> int:
     return min(FINEST, 2 ** max(4, round(math.log2(2 * half_side_m / pixel_m))))
 
 
-def _extent(config: HugsConfig, capture: Capture, track: BodyTrack) -> float:
+def _extent(config: HugsConfig, capture: TrainingCapture, track: BodyTrack) -> float:
     """The scene's size, metres, that its rates and limits are relative to.
 
     The released code takes how far the cameras are from each other, which is 0 for a static one;
@@ -284,7 +275,7 @@ def _extent(config: HugsConfig, capture: Capture, track: BodyTrack) -> float:
 
 
 def _scene(
-    config: HugsConfig, capture: Capture, track: BodyTrack, generator: torch.Generator
+    config: HugsConfig, capture: TrainingCapture, track: BodyTrack, generator: torch.Generator
 ) -> SphericalScene:
     scene = config.scene
     if config.mode == "human":
@@ -297,7 +288,7 @@ def _scene(
     return SphericalScene({k: v[seen] for k, v in values.items()}, colours[seen], degree)
 
 
-def _seen(points: Float[Tensor, "N 3"], capture: Capture) -> Tensor:
+def _seen(points: Float[Tensor, "N 3"], capture: TrainingCapture) -> Tensor:
     """Points in view of a training camera, or near it: no other one would ever learn anything."""
     seen = torch.zeros(len(points), dtype=torch.bool)
     cameras = [capture.camera(frame) for frame in capture.train_frames]

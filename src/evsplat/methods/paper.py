@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import torch
 
 from evsplat.body import BodyTrack, body_box, silhouette
-from evsplat.capture import Capture
+from evsplat.capture import TrainingCapture
 from evsplat.deform.human_scene import Semantics
 from evsplat.deform.pose_spline import PoseSpline
-from evsplat.errors import DataError
+from evsplat.errors import ConfigError, DataError
 from evsplat.gaussians import DensifyConfig, GaussianSet, Part
 from evsplat.methods.build import Build, Ground, PersonConfig, PersonLossConfig
 from evsplat.methods.composition import Composition, HeldOut
@@ -42,7 +42,8 @@ class EventConfig:
     eps: float = 1e-5
     """Added to linear luminance before the logarithm (A11)."""
     across_gaps: bool = False
-    """Also pair training frames with held-out frames between them (A13)."""
+    """Also pair training frames with held-out frames between them (A13); needs
+    ``policy.held_out_events``."""
     weight_by_activity: bool = True
     """Weigh pairs by their share of active pixels, within 0.25 to 4 of the median (A17)."""
     min_active: float = 0.001
@@ -92,7 +93,7 @@ RANDOM_CUBE_DENSIFY = DensifyConfig(
 
 def compose(
     config: PaperConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
@@ -108,7 +109,7 @@ def compose(
 
 def build_model(
     config: PaperConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str,
@@ -178,7 +179,9 @@ def _scene_limits(config: PaperConfig) -> dict[Part, DensifyConfig]:
     return {"scene": RANDOM_CUBE_DENSIFY} if config.scene.kind == "random_cube" else {}
 
 
-def _bounds(config: PaperConfig, capture: Capture, track: BodyTrack) -> dict[int, PackedBounds]:
+def _bounds(
+    config: PaperConfig, capture: TrainingCapture, track: BodyTrack
+) -> dict[int, PackedBounds]:
     """Where the posed body says that the person is, by mid-exposure."""
     bounds = {}
     activity = Activity.of(capture) if config.semantic_activity else None
@@ -192,7 +195,7 @@ def _bounds(config: PaperConfig, capture: Capture, track: BodyTrack) -> dict[int
 
 
 def observed(
-    config: PaperConfig, capture: Capture, track: BodyTrack, device: torch.device | str
+    config: PaperConfig, capture: TrainingCapture, track: BodyTrack, device: torch.device | str
 ) -> tuple[list[Objective], dict[str, Weight]]:
     """The paper's terms: pictures at mid-exposure, events between neighbouring frames.
 
@@ -222,8 +225,13 @@ def observed(
     return objectives, weights
 
 
-def paper_events(config: EventConfig, capture: Capture) -> EventChange:
+def paper_events(config: EventConfig, capture: TrainingCapture) -> EventChange:
     """The paper's event term (eq. 8-9)."""
+    if config.across_gaps and not capture.policy.held_out_events:
+        raise ConfigError(
+            "event.across_gaps is true, and policy.held_out_events is false, which hides the "
+            "events in those gaps; pass --set policy.held_out_events=true as well."
+        )
     return EventChange(
         capture,
         start=config.start,

@@ -10,7 +10,7 @@ import numpy as np
 from evsplat.body import BodyTrack, load_body_track
 from evsplat.body.between_keys import BetweenKeys, between_keys
 from evsplat.body.smoothing import MotionNoise, motion_noise, smoothed
-from evsplat.capture import Capture
+from evsplat.capture import TrainingCapture
 from evsplat.deform.pose_spline import PoseSpline
 from evsplat.methods.config import Weight
 
@@ -50,8 +50,9 @@ class PoseConfig:
     std_m: float | None = None
     """Error expected of the root's place, metres per axis; null = its jitter, at least 0.01."""
     events_of_held_out: bool = False
-    """Let events around held-out frames correct the poses there. The pictures of those frames stay
-    unseen and nothing else is learned there, but figures are not those of other rows."""
+    """Let events around held-out frames correct the poses there; needs
+    ``policy.held_out_events``. The pictures of those frames stay unseen and nothing else is learned
+    there."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Poses:
     """Times at which the residual costs."""
 
 
-def prepare_poses(config: PoseConfig, capture: Capture, *, tell: bool = True) -> Poses:
+def prepare_poses(config: PoseConfig, capture: TrainingCapture, *, tell: bool = True) -> Poses:
     """Look at a capture's key poses and do what the settings say; the log can tell what it is."""
     track = load_body_track(capture)
     noise, expected = motion_noise(track), between_keys(track)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from evsplat.body import BodyTrack, up_axis
-from evsplat.capture import Capture
+from evsplat.capture import TrainingCapture
 from evsplat.errors import ConfigError
 from evsplat.gaussians.flip import carry
 from evsplat.gaussians.initialise import (
@@ -70,7 +70,7 @@ class FittedSceneConfig(SceneStartConfig):
 
 def human_start(
     config: HumanStartConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     track: BodyTrack,
     generator: torch.Generator,
     semantic_logit: float,
@@ -89,7 +89,7 @@ def human_start(
     )
 
 
-def _automatic_count(config: HumanStartConfig, capture: Capture, track: BodyTrack) -> int:
+def _automatic_count(config: HumanStartConfig, capture: TrainingCapture, track: BodyTrack) -> int:
     """Surface samples so that neighbours lie ``spacing_px`` apart at the person's distance."""
     vertices = track.body.canonical_vertices()
     corners = vertices[track.body.faces]
@@ -105,7 +105,7 @@ def _automatic_count(config: HumanStartConfig, capture: Capture, track: BodyTrac
 
 def scene_start(
     start: SceneStartConfig,
-    capture: Capture,
+    capture: TrainingCapture,
     track: BodyTrack,
     generator: torch.Generator,
     semantic_logit: float,

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.capture.camera import Camera
-from evsplat.capture.capture import Capture, Frame
 from evsplat.errors import DataError
 from evsplat.methods.reconstruction import Parts, Rendering
 
@@ -17,7 +17,7 @@ class MedianBackground:
 
     name = "median_background"
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, capture: TrainingCapture) -> None:
         if not capture.is_static_camera:
             raise DataError(
                 f"{capture.path}: the camera moves, so that a pixel's median over time means "
@@ -38,7 +38,7 @@ class NearestFrame:
 
     name = "nearest_frame"
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, capture: TrainingCapture) -> None:
         if not capture.train_frames:
             raise DataError(f"{capture.path}: no frame has split 'train'.")
         self._capture = capture

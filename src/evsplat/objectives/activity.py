@@ -10,7 +10,7 @@ from scipy.stats import poisson
 
 from evsplat.body import BodyTrack
 from evsplat.calibration import NoiseEstimate, noise_of
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import ConfigError
 from evsplat.events import EventStore, polarity_counts
 from evsplat.objectives.semantic import silhouette_bounds
@@ -25,12 +25,12 @@ FALSE_ALARMS = 0.01
 class Activity:
     """Events of a static camera, and what the sensor makes of them without cause."""
 
-    capture: Capture
+    capture: TrainingCapture
     events: EventStore
     noise: NoiseEstimate
 
     @classmethod
-    def of(cls, capture: Capture) -> "Activity":
+    def of(cls, capture: TrainingCapture) -> "Activity":
         """Measure the noise; a `ConfigError` where there are no events or the camera moves."""
         if capture.events is None or not capture.is_static_camera:
             what = "has no events" if capture.events is None else "is of a moving camera"

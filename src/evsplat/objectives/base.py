@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.deform.drawing import Drawing
 from evsplat.deform.model import Model
 from evsplat.devices import DeviceCache
@@ -23,7 +23,7 @@ ModelType = TypeVar("ModelType", bound=Model)
 class Step(Generic[ModelType]):
     """One training step: renders of the union of all times that the objectives asked for."""
 
-    capture: Capture
+    capture: TrainingCapture
     model: ModelType
     frame: Frame
     """The drawn training frame."""
@@ -74,7 +74,7 @@ class Step(Generic[ModelType]):
         return {}
 
 
-def picture(capture: Capture, frame: Frame) -> tuple[Hashable, Callable[[], Tensor]]:
+def picture(capture: TrainingCapture, frame: Frame) -> tuple[Hashable, Callable[[], Tensor]]:
     """Key and source of a frame's recorded picture, as `DeviceCache` takes them."""
     return ("image", frame.name), partial(capture.image, frame)
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import DeviceCache
 from evsplat.imaging import deblur
 from evsplat.objectives.base import Stateless, Step
@@ -36,7 +36,7 @@ class EdiTarget(Stateless):
 
     def __init__(
         self,
-        capture: Capture,
+        capture: TrainingCapture,
         sensor: EventSensor,
         noise: EventNoise,
         *,

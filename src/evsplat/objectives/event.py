@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.compiled import native, runs_native
 from evsplat.devices import DeviceCache
 from evsplat.events import count_map, polarity_counts
@@ -74,7 +74,7 @@ class EventChange(Stateless):
 
     def __init__(
         self,
-        capture: Capture,
+        capture: TrainingCapture,
         *,
         start: float,
         floor: float,

@@ -1,12 +1,13 @@
 """Events at full time resolution: brightness change between any two rendered times."""
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import send
 from evsplat.events import EventStream, begun_counts, polarity_counts
 from evsplat.imaging import luminance
@@ -24,7 +25,9 @@ class EventWindows(Stateless):
     Windows lie between neighbouring rendered times and from the first to the last. Besides the
     times of other objectives one more is asked for, at random before or after the exposure, within
     ``reach`` intervals of the training frames, so that the gaps between exposures teach as well.
-    All pixels count: where there is no event, nothing changed.
+    All pixels count: where there is no event, nothing changed. Nothing is asked of times whose
+    events may not be read (`EventStore.open_around`): there the gap is on one side only, and what
+    is looked at around a window ends with it.
 
     Events that nothing caused are allowed for: differences weigh by the noise of their time
     (`EventNoise`), and hot pixels do not count.
@@ -35,7 +38,7 @@ class EventWindows(Stateless):
 
     def __init__(
         self,
-        capture: Capture,
+        capture: TrainingCapture,
         sensor: EventSensor,
         generator: torch.Generator,
         *,
@@ -61,21 +64,27 @@ class EventWindows(Stateless):
         self.begun_us = begun_us
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """One time outside of the exposure."""
+        """One time outside of the exposure; none where there is no room on either side."""
         if nominal < self.start:
             return ()
         draw = torch.rand(2, generator=self.generator).tolist()
         start, end = frame.exposure_us
-        far = int(draw[0] * self.reach_us)
-        time = start - 1 - far if draw[1] < 0.5 else end + far
-        return (min(max(time, self.range_us[0]), self.range_us[1]),)
+        low, high = self.events.open_around(frame.mid_us)
+        before = min(self.reach_us, start - max(low, self.range_us[0]))
+        after = min(self.reach_us, min(high, self.range_us[1]) - end)
+        if max(before, after) < 1:
+            return ()
+        if after < 1 or (draw[1] < 0.5 and before >= 1):
+            return (start - 1 - int(draw[0] * (before - 1)),)
+        return (end + int(draw[0] * after),)
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``event``: mean over windows, pixels and the whole span; ``contrast``: `apart`."""
-        times = step.times_us
+        kept = self.readable(step)
+        times = step.times_us[kept]
         if step.nominal < self.start or len(times) < 2:
             return {}
-        wrong = self.differences(step)
+        wrong = self.differences(step, kept)
         event = self.mean(
             wrong, [end - start for start, end in zip(times, times[1:], strict=False)]
         )
@@ -83,17 +92,29 @@ class EventWindows(Stateless):
             event = 0.5 * (event + self.mean(wrong.sum(0, keepdim=True), [times[-1] - times[0]]))
         return {"event": event, "contrast": self.sensor.apart()}
 
-    def differences(self, step: Step) -> Float[Tensor, "T-1 H W"]:
-        """Rendered less reported change of log-brightness between neighbouring times.
+    def readable(self, step: Step) -> slice:
+        """Which of a step's times are between events that may be read, by the events' clock."""
+        low, high = self.events.open_around(step.frame.mid_us)
+        late = [time + self._late_us for time in step.times_us]
+        return slice(bisect_left(late, low), bisect_right(late, high))
+
+    @property
+    def _late_us(self) -> int:
+        """By how much events are stamped later than the frames' clock says, as learned so far."""
+        offset = self.sensor.offset_us
+        return 0 if offset is None else round(float(offset))
+
+    def differences(self, step: Step, kept: slice) -> Float[Tensor, "T-1 H W"]:
+        """Rendered less reported change of log-brightness between the neighbouring times kept.
 
         Without polarity: of the change's size.
         """
         offset = self.sensor.offset_us
-        shift = 0 if offset is None else round(float(offset))
-        late = [time + shift for time in step.times_us]
-        brightness = torch.log(luminance(step.linear) + self.eps)
+        late = [time + self._late_us for time in step.times_us[kept]]
+        low, high = self.events.open_around(step.frame.mid_us)
+        brightness = torch.log(luminance(step.linear[kept]) + self.eps)
         reach = max(_RATE_US, self.begun_us)
-        stream = self.events.between(late[0] - reach, late[-1] + reach)
+        stream = self.events.between(max(late[0] - reach, low), min(late[-1] + reach, high))
         windows = list(zip(late, late[1:], strict=False))
         counts = self._counts(stream, windows, brightness.device)
         changes = brightness[1:] - brightness[:-1]
@@ -106,9 +127,10 @@ class EventWindows(Stateless):
         reported = self.sensor.change(*counts.unbind(1))
         if offset is not None:
             # Events per microsecond at each instant tell what a later clock would have counted.
-            around = [(time - _RATE_US, time + _RATE_US) for time in late]
+            around = [(max(time - _RATE_US, low), min(time + _RATE_US, high)) for time in late]
             rates = self.sensor.change(*self._counts(stream, around, brightness.device).unbind(1))
-            rates = rates.detach() / (2 * _RATE_US)
+            lasting = torch.tensor([end - start for start, end in around], dtype=rates.dtype)
+            rates = rates.detach() / send(lasting, rates.device)[:, None, None]
             reported = reported + (offset - offset.detach()) * (rates[1:] - rates[:-1])
         return changes - reported
 

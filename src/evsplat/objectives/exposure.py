@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from evsplat.body import BodyTrack
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.devices import DeviceCache
 from evsplat.imaging import encode
 from evsplat.objectives.base import Stateless, Step, picture
@@ -19,9 +19,8 @@ VERTEX_STRIDE = 13
 """Every so many vertices are enough to know how far the body moves."""
 
 
-def motion_px(capture: Capture, track: BodyTrack, frame: Frame) -> float:
-    """Largest path of a body vertex over a frame's exposure, pixels."""
-    camera = capture.camera(frame)
+def motion_px(camera: Camera, track: BodyTrack, frame: Frame) -> float:
+    """Largest path of a body vertex over a frame's exposure, as its camera sees it, pixels."""
     start, end = frame.exposure_us
     ends = [camera.project(track.vertices(t)[::VERTEX_STRIDE])[0] for t in (start, end)]
     return float((ends[1] - ends[0]).norm(dim=-1).max())
@@ -48,7 +47,7 @@ class Exposure(Stateless):
 
     def __init__(
         self,
-        capture: Capture,
+        capture: TrainingCapture,
         renders: dict[str, int],
         generator: torch.Generator,
         *,

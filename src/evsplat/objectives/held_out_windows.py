@@ -19,7 +19,7 @@ class HeldOutWindows(Stateless):
 
     Windows between neighbouring times say how the person moves; sums of them from a training
     exposure on, where the picture tells the pose, say where the person is. Events without polarity
-    have no such sums.
+    have no such sums. Only for a policy under which the events of held-out intervals are seen.
     """
 
     def __init__(self, windows: EventWindows, train_frames: Sequence[Frame]) -> None:
@@ -44,7 +44,7 @@ class HeldOutWindows(Stateless):
         times = step.times_us
         if len(times) < 2:
             return {}
-        wrong = self.windows.differences(step)
+        wrong = self.windows.differences(step, slice(None))
         lasting = [end - start for start, end in zip(times, times[1:], strict=False)]
         each = self.windows.mean(wrong, lasting)
         if not self.windows.events.has_polarity:

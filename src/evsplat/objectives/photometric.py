@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import DeviceCache
 from evsplat.objectives.base import Stateless, Step, picture
 from evsplat.similarity.perceptual import PerceptualMetric
@@ -22,7 +22,7 @@ class Photometric(Stateless):
 
     def __init__(
         self,
-        capture: Capture,
+        capture: TrainingCapture,
         boxes: dict[str, tuple[int, int, int, int]],
         *,
         dssim: bool,

@@ -1,12 +1,12 @@
 """What a restorer is, and which there are."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.restore.d2net import D2Net
 from evsplat.restore.e2vid import FILE, E2Vid
 from evsplat.restore.edi import Edi
@@ -22,8 +22,12 @@ class Restorer(Protocol):
 
     name: str
 
-    def restore(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
-        """Each frame in order with its sharp picture at mid-exposure, sRGB-coded in [0, 1]."""
+    def restore(
+        self, capture: TrainingCapture, frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
+        """Each of ``frames``, training frames of ``capture`` in order of time, with its sharp
+        picture at mid-exposure, sRGB-coded in [0, 1].
+        """
         ...
 
     def provenance(self) -> dict[str, Any]:

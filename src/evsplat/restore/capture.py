@@ -1,25 +1,37 @@
 """`evsplat restore`: a capture with sharp pictures in place of the blurry ones."""
 
+import itertools
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 import evsplat
-from evsplat.capture import load_capture
+from evsplat.capture import Frame, Policy, load_capture
 from evsplat.capture.derive import derived_capture
+from evsplat.config import to_dict
 from evsplat.errors import ConfigError
 from evsplat.restore.base import RESTORERS
 
 
 def restore_capture(
-    path: Path | str, out: Path | str, *, method: str = "edi", **options: Any
+    path: Path | str,
+    out: Path | str,
+    *,
+    method: str = "edi",
+    policy: Policy | None = None,
+    **options: Any,
 ) -> Path:
     """Write a capture with restored pictures to ``out``, whole or not at all; gives ``out``.
 
     Everything but the pictures is that of the capture at ``path``. The pictures are sharp at
     mid-exposure, so their exposures shrink to one microsecond there; what was done, and the
     exposures as recorded, is in ``provenance.restored``. ``options`` are those of the restorer.
+
+    Training frames are restored from what ``policy`` lets training see, so that nothing held out
+    gets into them. Held-out frames, which no training opens, are restored after them from
+    everything, but with what the restorer took from the training frames (thresholds).
 
     Raises:
         ConfigError: No restorer has that name.
@@ -28,9 +40,15 @@ def restore_capture(
     if method not in RESTORERS:
         raise ConfigError(f"no restorer is named {method!r}, expected {' or '.join(RESTORERS)}.")
     capture = load_capture(path)
-    restorer = RESTORERS[method](capture, **options)
+    seen = capture.for_training(policy or Policy())
+    everything = capture.for_training(Policy(use="everything"))
+    held_out = [everything.frame(frame.name) for frame in seen.held_out_frames]
+    restorer = RESTORERS[method](seen, **options)
     with derived_capture(capture, out, without=("image",)) as making:
-        pictures = restorer.restore(capture)
+        pictures = itertools.chain(
+            restorer.restore(seen, _in_time(seen.train_frames)),
+            restorer.restore(everything, _in_time(held_out)),
+        )
         for frame, picture in tqdm(pictures, "restore", len(capture.frames), unit="frame"):
             making.set_picture(frame, "image", picture)
             making.entry(frame)["exposure_us"] = [frame.mid_us, frame.mid_us + 1]
@@ -39,6 +57,7 @@ def restore_capture(
             "restored": {
                 "from": capture.name,
                 "with": restorer.name,
+                "policy": to_dict(seen.policy),
                 **restorer.provenance(),
                 "recorded_exposure_us": {
                     frame.name: list(frame.exposure_us) for frame in capture.frames
@@ -47,3 +66,7 @@ def restore_capture(
             },
         }
     return Path(out)
+
+
+def _in_time(frames: Iterable[Frame]) -> list[Frame]:
+    return sorted(frames, key=lambda frame: frame.mid_us)

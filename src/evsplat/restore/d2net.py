@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.events import EventStream
 from evsplat.events.maps import polarity_counts
@@ -49,18 +49,21 @@ class D2Net(NetworkRestorer):
         """The network with events."""
         return fill(TwoIterations(), state_under(path, ()), path, what="D2Net with events")
 
-    def inputs(self, capture: Capture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
-        """Five pictures and three stacks of events; beyond the ends, frames come back reversed."""
+    def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
+        """Five pictures and three stacks of events.
+
+        Beyond the first and last frame before a held-out one, frames come back reversed.
+        """
         assert capture.events is not None
-        if len(capture.frames) < FRAMES // 2 + 1:
+        if len(capture.train_frames) < FRAMES // 2 + 1:
             raise DataError(
-                f"{capture.path}: has {len(capture.frames)} frames, expected at least "
+                f"{capture.path}: has {len(capture.train_frames)} frames, expected at least "
                 f"{FRAMES // 2 + 1}, which {self.name} looks at together; use --with edi."
             )
-        last = len(capture.frames) - 1
-        near = []
-        for index in range(frame.index - FRAMES // 2, frame.index + FRAMES // 2 + 1):
-            near.append(capture.frames[last - abs(last - abs(index))])
+        run = capture.neighbours(frame)
+        middle = next(place for place, other in enumerate(run) if other.name == frame.name)
+        places = range(middle - FRAMES // 2, middle + FRAMES // 2 + 1)
+        near = [run[_reflected(place, len(run))] for place in places]
         pictures = torch.cat([as_input(capture.image(one)) for one in near], 1)
         height, width = pictures.shape[-2:]
         stacks = [
@@ -68,6 +71,12 @@ class D2Net(NetworkRestorer):
             for one in near[1:-1]
         ]
         return [pictures, torch.cat(stacks)[None]]
+
+
+def _reflected(place: int, count: int) -> int:
+    """The place in 0..count-1 where a step beyond the ends turns back."""
+    last = count - 1
+    return abs((place + last) % (2 * last) - last) if last else 0
 
 
 def event_stack(events: EventStream, height: int, width: int) -> Float[Tensor, "40 H W"]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import Capture
+from evsplat.capture import TrainingCapture
 from evsplat.devices import network_device
 from evsplat.errors import WeightsError
 from evsplat.events import EventStream
@@ -44,7 +44,7 @@ class E2Vid(FromEvents):
     name = "e2vid"
 
     def __init__(
-        self, capture: Capture, *, weights: Path | str | None = None, device: str = "auto"
+        self, capture: TrainingCapture, *, weights: Path | str | None = None, device: str = "auto"
     ) -> None:
         """Raises `WeightsError` without its weights, `DataError` as its base."""
         super().__init__(capture, E2VidNetwork(weights, device))

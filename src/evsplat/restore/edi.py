@@ -1,13 +1,13 @@
 """Event double integral as a restorer (`evsplat.imaging.edi`)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.calibration import estimate_from_capture
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import ConfigError, DataError
 from evsplat.imaging import Transfer, deblur
 from evsplat.restore.needs import require_signed_events
@@ -20,7 +20,7 @@ class Edi:
 
     def __init__(
         self,
-        capture: Capture,
+        capture: TrainingCapture,
         *,
         contrast_threshold: tuple[float, float] | None = None,
         transfer: Transfer = "power",
@@ -45,10 +45,12 @@ class Edi:
             contrast_threshold, self._origin = _estimated(capture), "estimated from the capture"
         self.contrast_threshold = contrast_threshold
 
-    def restore(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
-        """Each frame in order with its sharp picture at mid-exposure."""
+    def restore(
+        self, capture: TrainingCapture, frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
+        """See `Restorer`."""
         assert capture.events is not None
-        for frame in capture.frames:
+        for frame in frames:
             yield (
                 frame,
                 deblur(
@@ -70,11 +72,11 @@ class Edi:
         }
 
 
-def _estimated(capture: Capture) -> tuple[float, float]:
+def _estimated(capture: TrainingCapture) -> tuple[float, float]:
     estimate = estimate_from_capture(capture)
     if estimate is None or estimate.thresholds is None:
         raise DataError(
             f"{capture.path}: its contrast thresholds are unknown and cannot be estimated from its "
-            "frames and events; give them with --contrast-threshold C+ C-."
+            "training frames and events; give them with --contrast-threshold C+ C-."
         )
     return estimate.thresholds.plus, estimate.thresholds.minus

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.events import EventStream
 from evsplat.events.maps import count_map
 from evsplat.restore.network import NetworkRestorer, as_input
@@ -48,7 +48,7 @@ class EfNet(NetworkRestorer):
         what = f"{self.file.name} or another checkpoint of EFNet"
         return fill(TwoStages(), state_under(path, ("params_ema", "params")), path, what=what)
 
-    def inputs(self, capture: Capture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
+    def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
         """The blurry picture, the normalised event maps and where there were events."""
         assert capture.events is not None
         picture = capture.image(frame)

@@ -5,7 +5,7 @@ contrast and unknown where nothing has moved yet. A static camera sees no events
 the frames of a capture keep their own pixels there, and elsewhere their colour.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.events import EventStream
 from evsplat.events.maps import polarity_counts
 from evsplat.imaging.srgb import REC709
@@ -49,31 +49,38 @@ class FromEvents:
     """Each frame at mid-exposure, its brightness from events and its colour from the blurry frame.
 
     The events between the mid-exposures of neighbouring frames are one window; the first begins
-    one such interval early, as far as there are events.
+    one such interval early, as far as there are events. Where events may not be read the network
+    forgets what it saw, and begins anew behind the gap.
     """
 
     name: str
 
-    def __init__(self, capture: Capture, network: IntensityNetwork) -> None:
+    def __init__(self, capture: TrainingCapture, network: IntensityNetwork) -> None:
         """Raises `DataError` where the capture has no events, or they have no polarity."""
         require_signed_events(capture, self.name)
         self._network = network
 
-    def restore(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
-        """Each frame in order of time with its picture at mid-exposure."""
+    def restore(
+        self, capture: TrainingCapture, frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
+        """See `Restorer`."""
         assert capture.events is not None
-        frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
-        interval = frames[1].mid_us - frames[0].mid_us if len(frames) > 1 else frames[0].mid_us
-        before = frames[0].mid_us - interval
-        self._network.reset()
-        for frame in frames:
-            blurry = capture.image(frame)
-            height, width = blurry.shape[:2]
+        asked = {frame.name for frame in frames}
+        times = sorted(frame.mid_us for frame in capture.frames)
+        interval = times[1] - times[0] if len(times) > 1 else times[0]
+        stretch, before = None, 0
+        for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us):
+            if stretch != (stretch := capture.events.open_around(frame.mid_us)):
+                self._network.reset()
+                before = max(frame.mid_us - interval, stretch[0])
+            camera = capture.camera(frame)
+            height, width = camera.height, camera.width
             window = capture.events.between(before, frame.mid_us)
             intensity = self._network.step(window, height, width).cpu()
-            moved = polarity_counts(capture.events.between(*frame.exposure_us), height, width)
-            yield frame, with_brightness(blurry, intensity, moved.sum(0) > 0)
             before = frame.mid_us
+            if frame.name in asked:
+                moved = polarity_counts(capture.events.between(*frame.exposure_us), height, width)
+                yield frame, with_brightness(capture.image(frame), intensity, moved.sum(0) > 0)
 
     def provenance(self) -> dict[str, Any]:
         """The network's, and how its pictures became frames."""

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.restore.network import NetworkRestorer, as_input
 from evsplat.weights import WeightFile, fill, state_under
 
@@ -44,7 +44,7 @@ class MprNet(NetworkRestorer):
         """The network for deblurring."""
         return fill(ThreeStages(), state_under(path, ("state_dict",)), path, what=self.file.name)
 
-    def inputs(self, capture: Capture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
+    def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
         """The blurry picture."""
         return [as_input(capture.image(frame))]
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import WeightsError
 from evsplat.restore.network import NetworkRestorer, as_input
 from evsplat.weights import WeightFile, fill, state_under
@@ -53,7 +53,7 @@ class NafNet(NetworkRestorer):
         up = [_count(state, rf"decoders\.{level}\.(\d+)\.") for level in range(levels)]
         return fill(NafUNet(width, down, middle, up), state, path, what=what)
 
-    def inputs(self, capture: Capture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
+    def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
         """The blurry picture."""
         return [as_input(capture.image(frame))]
 

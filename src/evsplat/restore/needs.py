@@ -1,10 +1,10 @@
 """What restorers that look at events ask of a capture."""
 
-from evsplat.capture import Capture
+from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
 
 
-def require_signed_events(capture: Capture, restorer: str) -> None:
+def require_signed_events(capture: TrainingCapture, restorer: str) -> None:
     """Raises `DataError` where the capture has no events, or they have no polarity."""
     if capture.events is None:
         raise DataError(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import network_device
 from evsplat.errors import BackendError
 from evsplat.restore.needs import require_signed_events
@@ -31,7 +31,7 @@ class NetworkRestorer(ABC):
     needs_events: ClassVar[bool]
 
     def __init__(
-        self, capture: Capture, *, weights: Path | str | None = None, device: str = "auto"
+        self, capture: TrainingCapture, *, weights: Path | str | None = None, device: str = "auto"
     ) -> None:
         """``weights``: the file; else looked for as `WeightFile.find` says.
 
@@ -50,12 +50,14 @@ class NetworkRestorer(ABC):
         """The network with the weights of ``path``."""
 
     @abstractmethod
-    def inputs(self, capture: Capture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
+    def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
         """What the network takes for a frame."""
 
-    def restore(self, capture: Capture) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
-        """Each frame in order with its sharp picture."""
-        for frame in capture.frames:
+    def restore(
+        self, capture: TrainingCapture, frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
+        """See `Restorer`."""
+        for frame in frames:
             inputs = [part.to(self.device) for part in self.inputs(capture, frame)]
             height, width = inputs[0].shape[-2:]
             with torch.inference_mode(), enough_memory(self.name, height, width, self.device):

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from evsplat.capture import Capture
+from evsplat.capture import TrainingCapture
 from evsplat.devices import network_device
 from evsplat.errors import DataError, WeightsError
 from evsplat.events import EventStream
@@ -36,7 +36,7 @@ class PieNet(FromEvents):
 
     name = "pienet"
 
-    def __init__(self, capture: Capture, *, device: str = "auto") -> None:
+    def __init__(self, capture: TrainingCapture, *, device: str = "auto") -> None:
         """Raises `MissingWeights` where the package is not installed, `DataError` as its base."""
         super().__init__(capture, PieNetwork(device))
 

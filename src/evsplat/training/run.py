@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack
-from evsplat.capture import Camera, Capture, load_capture
+from evsplat.capture import Camera, Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.config import load_yaml, to_dict
 from evsplat.deform.at_rest import Skinned, mean_at_rest
@@ -24,7 +24,8 @@ from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.devices import hardware
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
-from evsplat.methods import TRAINABLE, MethodConfig, method_config
+from evsplat.masks import MASKERS
+from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import check_fits, latest_checkpoint, load_checkpoint, load_model
@@ -212,7 +213,10 @@ class Run:
     path: Path
     config: MethodConfig
     method: str
+    policy: Policy
+    """What training saw, as the capture could meet it."""
     capture: Capture
+    """All of it, for evaluation and looking; without test frames where everything trained."""
     reconstruction: Reconstruction
     iteration: int
     train_seconds: float
@@ -228,8 +232,15 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     if not folder.config.exists():
         raise DataError(f"{folder.path}: not a run folder, config.yaml is missing.")
     values = load_yaml(folder.config)
-    method = values.pop("method", "paper")
+    method = values.pop("method", DEFAULT_METHOD)
+    # Before there was a policy, events of held-out intervals were open to every method.
+    values.setdefault("policy", {"held_out_events": True})
     return method, method_config(method, values, where=str(folder.config)), read_json(folder.facts)
+
+
+def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:
+    """What a method with this configuration is given of a capture."""
+    return capture.for_training(config.policy, MASKERS["background"])
 
 
 def config_values(method: str, config: MethodConfig) -> dict[str, Any]:
@@ -250,9 +261,12 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         raise DataError(f"{folder.checkpoints}: no checkpoint; train the run first.")
     tensors, progress = load_checkpoint(path)
     capture = load_capture(Path(facts["capture"]))
+    if config.policy.use == "everything":
+        capture = capture.with_nothing_held_out()
+    seen = seen_by_training(capture, config)
     compose = TRAINABLE[method][1]
     composition = compose(
-        _without_perceptual(method, config), capture, facts["seed"], device=device, fit=False
+        _without_perceptual(method, config), seen, facts["seed"], device=device, fit=False
     )
     check_fits(composition.model, tensors, path)
     load_model(composition.model, tensors, progress["human_count"])
@@ -260,6 +274,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         path=folder.path,
         config=config,
         method=method,
+        policy=seen.terms,
         capture=capture,
         reconstruction=GaussianReconstruction(method, composition.model),
         device=facts["device"],

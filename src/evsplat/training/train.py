@@ -15,6 +15,7 @@ import torch
 from tqdm import tqdm
 
 from evsplat.capture import load_capture
+from evsplat.capture.policy import Use
 from evsplat.config import load_yaml, override, save_yaml
 from evsplat.errors import ConfigError, DataError
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
@@ -32,6 +33,7 @@ from evsplat.training.run import (
     config_values,
     new_run_folder,
     read_config,
+    seen_by_training,
     write_facts,
 )
 from evsplat.training.trainer import StepReport, Trainer
@@ -63,6 +65,7 @@ def train(
     resume: bool = False,
     config: Path | str | None = None,
     overrides: Sequence[str] = (),
+    use: Use | None = None,
     threads: int | None = None,
     seed: int | None = None,
     device_memory_gb: float | None = None,
@@ -75,7 +78,8 @@ def train(
     it also shortens the schedule so that it is finished in time. The cheap fits before the first
     step count as training. ``resume`` goes on from the last
     checkpoint in ``out``. ``config`` is a run's config.yaml; ``overrides`` are ``key=value``
-    settings over it. ``device_memory_gb`` bounds the pictures and event maps kept on a GPU (a
+    settings over it; ``use="everything"`` is short for ``policy.use=everything``: all frames train
+    and none is held out. ``device_memory_gb`` bounds the pictures and event maps kept on a GPU (a
     quarter of its free memory by default); the rest is copied ahead of its use. ``on_start`` is
     called with the run folder before the first step. Raises `Stopped` on Ctrl-C after saving.
     """
@@ -94,9 +98,10 @@ def train(
     if resume:
         if out is None:
             raise ConfigError("--resume needs --out RUN, the run to go on with.")
-        if config is not None or overrides or seed is not None:
+        if config is not None or overrides or seed is not None or use is not None:
             raise ConfigError(
-                "--resume takes the run's own settings; leave out --config and --set."
+                "--resume takes the run's own settings; leave out --config, --set, --seed and "
+                "--use."
             )
         folder = RunFolder(Path(out))
         method, settings, facts = read_config(folder)
@@ -112,13 +117,17 @@ def train(
                 f"{folder.path}: the folder is not empty; pass --resume to go on with that run, "
                 "or another --out."
             )
-        settings = method_config(method, override(values, overrides), where=where)
+        values = override(values, overrides)
+        if use is not None:
+            values.setdefault("policy", {})["use"] = use
+        settings = method_config(method, values, where=where)
         seed = 0 if seed is None else seed
 
     checkpoint = latest_checkpoint(folder.checkpoints) if resume else None
     compose = TRAINABLE[method][1]
     started = time.perf_counter()
-    composition = compose(settings, capture, seed, device=device, fit=checkpoint is None)
+    seen = seen_by_training(capture, settings)
+    composition = compose(settings, seen, seed, device=device, fit=checkpoint is None)
     clock = Clock(
         iterations or settings.optimisation.iterations,
         None if max_minutes is None else 60 * max_minutes,
@@ -126,7 +135,7 @@ def train(
         seconds=time.perf_counter() - started,
     )
     cache_bytes = None if device_memory_gb is None else int(1e9 * device_memory_gb)
-    trainer = Trainer(composition, composition.capture or capture, clock, cache_bytes=cache_bytes)
+    trainer = Trainer(composition, composition.capture or seen, clock, cache_bytes=cache_bytes)
     if checkpoint is not None:
         tensors, state = load_checkpoint(checkpoint)
         check_fits(trainer.model, tensors, checkpoint)
@@ -139,6 +148,7 @@ def train(
         save_yaml(folder.config, config_values(method, settings))
         write_facts(folder, capture, method, device, seed)
         logger.info("%s", schedule_table(settings, composition.weights))
+        logger.info("%s", seen.terms.sentence)
     if on_start is not None:
         on_start(folder.path)
     _loop(trainer, folder)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.deform.drawing import Drawing
 from evsplat.devices import DeviceCache, default_cache_bytes
 from evsplat.gaussians import GaussianSet, Part, Rows, ScreenStatistics, densify, flip_labels
@@ -72,7 +72,7 @@ class Trainer:
     def __init__(
         self,
         composition: Composition,
-        capture: Capture,
+        capture: TrainingCapture,
         clock: Clock,
         *,
         cache_bytes: int | None = None,

@@ -1,7 +1,9 @@
 """The figures: large cards, one table per protocol, and what could not be measured."""
 
 from html import escape
+from typing import Any
 
+from evsplat.capture.policy import policy_of
 from evsplat.evaluation.report.html import folded, section
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.tables import (
@@ -12,53 +14,96 @@ from evsplat.evaluation.tables import (
     tables_of,
 )
 
+_REFERENCES = {"trivial": "the best trivial row", "camera": "the camera’s own blurry picture"}
+
 
 def figures(source: Source) -> str:
     """The section with all means."""
-    first, *others = tables_of(source.metrics)
+    metrics = source.metrics
+    why = no_test_figures(metrics)
+    if why is not None:
+        return section("Figures", why[0].upper() + why[1:], "")
+    first, *others = tables_of(metrics)
     compat = "".join(folded(f"Protocol {table.protocol}", _table(table)) for table in others)
-    missing = "".join(f"<li>{escape(reason)}</li>" for reason in missing_networks(source.metrics))
-    against = source.metrics["blurry_ground_truth"]["full"]["psnr"]
+    missing = "".join(f"<li>{escape(reason)}</li>" for reason in missing_networks(metrics))
+    against = metrics.get("blurry_ground_truth", {}).get("full", {}).get("psnr")
     blurry = (
         f"<li>Against the blurry pictures instead of the sharp truth (no measure of deblurring): "
         f"{against:.2f} dB full frame.</li>"
         if against is not None
         else ""
     )
+    count = metrics["frames"]["test"]
+    measured = (
+        f"Means over {count} held-out frames against the sharp picture at mid-exposure."
+        if first.columns
+        else f"{count} frames were held out, and none has a sharp picture to be compared with."
+    )
+    policy = policy_of(metrics)
+    seen = "The run does not tell what training saw." if policy is None else policy.sentence
     return section(
         "Figures",
-        f"Means over {source.metrics['frames']['test']} held-out frames against the sharp picture "
-        "at mid-exposure.",
-        f'{_cards(first)}{_table(first)}{compat}<ul class="note">{blurry}{missing}</ul>',
+        f"{measured} <b>{escape(seen)}</b>",
+        f'{_cards(metrics)}{_table(first)}{compat}<ul class="note">{blurry}{missing}</ul>',
     )
 
 
-def _cards(table: Table) -> str:
-    """Large PSNR figures with the distance to the better trivial row."""
-    cards = []
-    for column in table.columns:
-        value = table.value(table.method, column)
-        if column.metric != "psnr" or value is None:
-            continue
-        trivial = [
-            other
-            for row in table.rows
-            if row not in (table.method, "on_median_background", "blurry_input")
-            and (other := table.value(row, column)) is not None
-        ]
-        gain = ""
-        if trivial:
-            difference = value - max(trivial)
-            kind, word = ("up", "above") if difference >= 0 else ("down", "below")
-            gain = f'<p class="{kind}">{abs(difference):.2f} dB {word} the best trivial row</p>'
-        cards.append(
-            f'<div class="card"><p>PSNR, {REGION_TITLES[column.region]}</p>'
-            f'<p class="big">{value:.2f}<small> dB</small></p>{gain}</div>'
+def no_test_figures(metrics: dict[str, Any]) -> str | None:
+    """Why there is no frame to test with, as HTML that continues a sentence; None where one is."""
+    policy = policy_of(metrics)
+    if policy is not None and policy.use == "everything":
+        return (
+            "trained on every frame and every event (<code>--use everything</code>): nothing was "
+            "held out, so there are no test figures."
         )
-    return f'<div class="cards">{"".join(cards)}</div>'
+    if not metrics["per_frame"]:
+        return "no frame has split “test”, so there are no test figures."
+    return None
+
+
+def references(metrics: dict[str, Any], region: str) -> dict[str, float]:
+    """PSNR in one region of what a method is held against, as far as it is known.
+
+    ``trivial``: the best of the rows that need no method; ``camera``: the camera's own blurry
+    picture, which no method sees.
+    """
+    rows = metrics.get("trivial", {}).values()
+    trivial = [value for row in rows if (value := row[region]["psnr"]) is not None]
+    camera = metrics.get("blurry_input", {}).get(region, {}).get("psnr")
+    known = {"trivial": max(trivial, default=None), "camera": camera}
+    return {name: value for name, value in known.items() if value is not None}
+
+
+def distance(ours: float, theirs: float, decimals: int) -> str:
+    """How far a PSNR lies above or below another, in words that a name of the other follows."""
+    apart = f"{abs(ours - theirs):.{decimals}f}"
+    if float(apart) == 0:
+        return "level with"
+    return f"{apart} dB {'above' if ours > theirs else 'below'}"
+
+
+def _cards(metrics: dict[str, Any]) -> str:
+    """Large PSNR figures, each with the distance to what needs no method in the same region."""
+    cards = []
+    for region, title in REGION_TITLES.items():
+        value = metrics["protocols"]["standard"][region]["psnr"]
+        if value is None:
+            continue
+        lines = "".join(
+            f'<p class="{"up" if value >= theirs else "down"}">'
+            f"{distance(value, theirs, 2)} {_REFERENCES[name]}</p>"
+            for name, theirs in references(metrics, region).items()
+        )
+        cards.append(
+            f'<div class="card"><p>PSNR, {title}</p>'
+            f'<p class="big">{value:.2f}<small> dB</small></p>{lines}</div>'
+        )
+    return f'<div class="cards">{"".join(cards)}</div>' if cards else ""
 
 
 def _table(table: Table) -> str:
+    if not table.columns:
+        return ""
     groups = "".join(
         f'<th colspan="{span}" scope="colgroup">{title}</th>'
         for region, title in REGION_TITLES.items()

@@ -21,9 +21,10 @@ def frame_by_frame(source: Source) -> str:
     rows: dict[str, dict[str, float]] = {}
     if region is not None:
         rows[source.metrics["method"]] = _known(entries, lambda e: _ours(e, region))
-        rows["blurry input itself"] = _known(
-            entries, lambda e: e["others"]["blurry_input"][region]["psnr"]
-        )
+        compared = [entry for entry in entries if "blurry_input" in entry.get("others", {})]
+        camera = _known(compared, lambda e: e["others"]["blurry_input"][region]["psnr"])
+        if camera:
+            rows["blurry input itself"] = camera
     times = {entry["frame"]: entry["time_us"] / 1e6 for entry in entries}
     charts = []
     if region is not None:
@@ -57,12 +58,13 @@ def frame_by_frame(source: Source) -> str:
     shown = "".join(charts)
     if not shown:
         return ""
-    return section(
-        "Frame by frame",
-        "Held-out frames. The faster the person, the more of a frame is smeared: a picture of the "
-        "camera falls with the speed, a reconstruction should not.",
-        f'<div class="charts">{shown}</div>',
+    intro = (
+        "How far the body moves while the shutter is open."
+        if region is None
+        else "Held-out frames. The faster the person, the more of a frame is smeared: a picture of "
+        "the camera falls with the speed, a reconstruction should not."
     )
+    return section("Frame by frame", intro, f'<div class="charts">{shown}</div>')
 
 
 def _ours(entry: dict[str, Any], region: str) -> float | None:
@@ -88,4 +90,4 @@ def _speeds(source: Source) -> dict[str, float]:
     test = {entry["frame"] for entry in source.metrics["per_frame"]}
     step = -(-len(capture.frames) // _MOST_FRAMES)
     frames = [f for i, f in enumerate(capture.frames) if i % step == 0 or f.name in test]
-    return {frame.name: motion_px(capture, track, frame) for frame in frames}
+    return {frame.name: motion_px(capture.camera(frame), track, frame) for frame in frames}

@@ -10,7 +10,7 @@ from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
 from evsplat.evaluation.report.configuration import configuration, duration, made_with
 from evsplat.evaluation.report.embed import Embedder, data_uri
-from evsplat.evaluation.report.figures import figures
+from evsplat.evaluation.report.figures import distance, figures, no_test_figures, references
 from evsplat.evaluation.report.frames import frame_by_frame
 from evsplat.evaluation.report.html import (
     figure,
@@ -30,6 +30,16 @@ _PAIRS_MOST = 24
 """Event map pairs on the page in all, evenly spread."""
 _NOVEL_SHOWN = 4
 """Novel views shown per camera, evenly spread over time."""
+_HEADLINE = {
+    "full": "on held-out frames",
+    "person_crop": "on the person’s crop",
+    "person_mask": "on the person’s mask",
+}
+_REFERENCES = {
+    "trivial": ("the best picture that needs no method", "the best without a method"),
+    "camera": ("the camera’s own blurry picture", "the camera’s own"),
+}
+"""What the headline holds figures against: in full, and after that in short."""
 
 
 def page(source: Source) -> str:
@@ -82,22 +92,24 @@ def _header(source: Source) -> str:
 
 
 def _summary(metrics: dict[str, Any]) -> str:
-    """One sentence: how good, and how much better than doing nothing."""
-    ours = metrics["protocols"]["standard"]
-    full, crop = ours["full"]["psnr"], ours["person_crop"]["psnr"]
+    """How good, and how much better or worse than doing nothing: whole frame and person apart."""
     method = f"<b>{escape(metrics['method'])}</b>"
-    if full is None:
+    why = no_test_figures(metrics)
+    if why is not None:
+        return f"{method}: {why}"
+    parts: list[str] = []
+    for region, where in _HEADLINE.items():
+        value = metrics["protocols"]["standard"][region]["psnr"]
+        if value is None:
+            continue
+        against = ", ".join(
+            f"{distance(value, theirs, 1)} {_REFERENCES[name][min(len(parts), 1)]}"
+            for name, theirs in references(metrics, region).items()
+        )
+        parts.append(f"<b>{value:.2f}&nbsp;dB</b> {where}" + (f" ({against})" if against else ""))
+    if not parts:
         return f"{method}: no sharp ground truth to compare with, so the pictures must speak."
-    sentence = f"{method} reaches <b>{full:.2f} dB</b> on held-out frames"
-    if crop is not None:
-        sentence += f", <b>{crop:.2f} dB</b> on the person"
-    trivial = [row["full"]["psnr"] for row in metrics["trivial"].values()]
-    known = [value for value in trivial if value is not None]
-    if known:
-        gain = full - max(known)
-        word = "above" if gain >= 0 else "below"
-        sentence += f": {abs(gain):.1f} dB {word} the best picture that needs no method"
-    return sentence + "."
+    return f"{method} reaches {', '.join(parts)}."
 
 
 def _clip(source: Source) -> str:
@@ -117,9 +129,9 @@ def _clip(source: Source) -> str:
 
 
 def _event_maps(source: Source) -> str:
-    events = source.metrics["events"]
+    events = source.metrics.get("events")
     if events is None:
-        reason = source.metrics["reasons"]["events"]
+        reason = source.metrics["reasons"].get("events", "they were not evaluated")
         return section("Event maps", "", f'<p class="note">None: {escape(reason)}.</p>')
     embed = Embedder(lossless=True)
     shown = [
@@ -143,8 +155,8 @@ def _event_maps(source: Source) -> str:
     return section(
         "Event maps",
         f"Given: recorded events between two mid-exposures, summed with their sign. Rendered: "
-        f"{scale}. Both of a pair in the same colours. Similarity is the cosine of the two maps: "
-        f"{means}.",
+        f"{scale}. Both of a pair in the same colours. Similarity is the cosine of the two maps"
+        f"{': ' if means else ''}{means}.",
         legend(css_gradient(signed=True), "darker", "brighter", "events")
         + _event_pairs(source, shown, embed)
         + folded(more(len(others), len(rest), "pairs"), _event_pairs(source, others, embed)),
@@ -173,7 +185,7 @@ def _event_pairs(source: Source, pairs: list[dict[str, Any]], embed: Embedder) -
 
 
 def _novel_views(source: Source) -> str:
-    cameras = source.metrics["novel_views"]
+    cameras = source.metrics.get("novel_views")
     if not cameras:
         return ""
     camera_pixels = sum(
@@ -189,11 +201,10 @@ def _novel_views(source: Source) -> str:
             render = source.picture(entry["pictures"]["render"])
             truth = to_bytes(source.capture.novel_image(views[entry["index"]]))
             label = f"{name}, frame {entry['frame']}"
+            reached = "" if entry["psnr"] is None else f" · {entry['psnr']:.2f} dB"
             pairs.append(
                 '<article class="pair"><div class="grid n2">'
-                + figure(
-                    embed.image(render, f"render of {label}"), f"render · {entry['psnr']:.2f} dB"
-                )
+                + figure(embed.image(render, f"render of {label}"), f"render{reached}")
                 + figure(embed.image(truth, f"truth of {label}"), f"truth · frame {entry['frame']}")
                 + "</div></article>"
             )

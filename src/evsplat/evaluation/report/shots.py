@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from evsplat.capture import Frame
+from evsplat.capture import Frame, Policy
+from evsplat.capture.policy import policy_of
 from evsplat.evaluation.pictures import ERROR_FULL_SCALE, css_gradient, to_bytes
 from evsplat.evaluation.regions import Box
 from evsplat.evaluation.report.embed import Embedder
+from evsplat.evaluation.report.figures import no_test_figures
 from evsplat.evaluation.report.html import (
     compare,
     figure,
@@ -37,9 +39,10 @@ Pictures = dict[str, UInt8[np.ndarray, "H W 3"]]
 
 def test_frames(source: Source) -> str:
     """The section with all test frames."""
+    why = no_test_figures(source.metrics)
+    if why is not None:
+        return section("Test frames", "", f'<p class="note">{why[0].upper()}{why[1:]}</p>')
     entries = source.metrics["per_frame"]
-    if not entries:
-        return section("Test frames", "", '<p class="note">No frame has split “test”.</p>')
     # Per frame four pictures and crops of about a third of their area.
     camera = source.capture.camera(entries[0]["frame"])
     pixels_each = camera.width * camera.height * 16 // 3
@@ -54,10 +57,29 @@ def test_frames(source: Source) -> str:
     )
     return section(
         "Test frames",
-        "Held out: the training saw the body's pose at these times, but neither picture nor mask.",
+        _shown_to_training(policy_of(source.metrics)),
         (scale if any("error" in shot.pictures for shot in shots) else "")
         + "".join(_test_frame(shot, embed) for shot in shown)
         + folded(more(len(others), len(entries) - len(shown), "test frames"), folds),
+    )
+
+
+def _shown_to_training(policy: Policy | None) -> str:
+    """What training could know of the intervals in which the test frames lie."""
+    if policy is None:
+        return "Held out; the run does not tell what training saw of these times."
+    events = (
+        "but the events of the intervals around them"
+        if policy.held_out_events
+        else "and no event of the intervals around them"
+    )
+    poses = {
+        "given": "given",
+        "interpolated": "interpolated from those of training frames",
+    }[policy.held_out_poses]
+    return (
+        f"Held out: training saw neither picture nor mask of these times, {events}. The body’s "
+        f"poses there were {poses}."
     )
 
 
@@ -71,8 +93,8 @@ def _worth_showing(entries: list[dict[str, Any]], most: int) -> list[dict[str, A
 
 def _known_psnr(entry: dict[str, Any], otherwise: float) -> float:
     """PSNR of the blurry input on the person, or on the full frame: how hard the frame is."""
-    blurry = entry["others"]["blurry_input"]
-    known = [blurry[region]["psnr"] for region in ("person_mask", "person_crop", "full")]
+    blurry = entry.get("others", {}).get("blurry_input", {})
+    known = [blurry[region]["psnr"] for region in ("person_mask", "person_crop", "full") if blurry]
     return next((value for value in known if value is not None), otherwise)
 
 

@@ -1,0 +1,80 @@
+"""What a training may know of what is held out from it: data that stands beside every figure."""
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+Use = Literal["training", "everything"]
+Masks = Literal["given", "estimated", "none"]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What a method may see; written to config.yaml, metrics.json, reports and tables.
+
+    A held-out interval runs from the end of the last training exposure before a held-out frame to
+    the start of the next training exposure after it. Of it nothing is seen but the frame's camera,
+    its time and, with ``held_out_poses=given``, its key pose.
+    """
+
+    use: Use = "training"
+    """``everything``: all frames train, whatever their split, and nothing is held out, so that
+    there are no test figures (`evsplat train --use everything`)."""
+    held_out_events: bool = False
+    """Events inside held-out intervals are seen as well: interpolation between frames by events,
+    a task of its own."""
+    thresholds: Literal["given", "estimated"] = "given"
+    """``given``: the capture's contrast thresholds, where it has any. ``estimated``: none, a method
+    finds them from training frames and events."""
+    masks: Masks = "none"
+    """``given``: the capture's masks of training frames. ``estimated``: `evsplat masks` finds them
+    by what differs from the static background. ``none``: no mask is seen."""
+    held_out_poses: Literal["given", "interpolated"] = "given"
+    """``interpolated``: key poses inside held-out intervals are not seen either, and the person's
+    pose there is interpolated from those of training frames."""
+
+    @property
+    def departures(self) -> tuple[str, ...]:
+        """What differs from the strict terms of all tables, in words; masks are named anyway."""
+        said = {
+            "use": "trained on everything",
+            "held_out_events": "events of held-out intervals",
+            "thresholds": "estimated contrast thresholds",
+            "held_out_poses": "interpolated poses at test times",
+        }
+        strict = Policy()
+        found = [said[f.name] for f in fields(self) if f.name in said
+                 and getattr(self, f.name) != getattr(strict, f.name)]  # fmt: skip
+        return tuple(found)
+
+    @property
+    def sentence(self) -> str:
+        """All of it for a reader of figures."""
+        if self.use == "everything":
+            return "Every frame and every event trained; nothing was held out."
+        events = (
+            "events of held-out intervals were seen"
+            if self.held_out_events
+            else "no event of a held-out interval was seen"
+        )
+        thresholds = {
+            "given": "contrast thresholds as the capture gives them",
+            "estimated": "contrast thresholds estimated from training frames",
+        }[self.thresholds]
+        masks = {
+            "given": "masks of training frames given",
+            "estimated": "masks of training frames estimated",
+            "none": "no masks",
+        }[self.masks]
+        poses = {
+            "given": "poses at test times given",
+            "interpolated": "poses at test times interpolated",
+        }[self.held_out_poses]
+        return f"Held-out pictures were hidden from training, {events}; {thresholds}, {masks}, " + (
+            f"{poses}."
+        )
+
+
+def policy_of(metrics: dict[str, Any]) -> Policy | None:
+    """The policy that a metrics.json or a bench record tells; None where it tells none."""
+    values = metrics.get("policy")
+    return None if values is None else Policy(**values)

@@ -1,0 +1,240 @@
+"""`TrainingCapture`: of a recording, what a training may see; everything else raises."""
+
+import functools
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.capture.body_file import BodyFile
+from evsplat.capture.camera import Camera
+from evsplat.capture.metadata import Frame, NovelView
+from evsplat.capture.policy import Policy
+from evsplat.capture.spans import held_out_spans, open_spans
+from evsplat.errors import DataError, HeldOutError
+from evsplat.events import ALWAYS, EventStore
+
+if TYPE_CHECKING:
+    from evsplat.capture.capture import Capture
+
+_KEPT_MASKS = 64
+"""Estimated masks kept in memory; the least recently used one goes first."""
+
+
+class FindsPeople(Protocol):
+    """What finds the person in frames (`evsplat.masks.Masker`)."""
+
+    def masks(
+        self, capture: "TrainingCapture", frames: Sequence[Frame]
+    ) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
+        """Each of ``frames`` with the person's share per pixel, in [0, 1]."""
+        ...
+
+
+class TrainingCapture:
+    """What methods, restorers, maskers and calibration see of a capture, by a `Policy`.
+
+    Of a held-out frame that is its camera, its time and (by the policy) its key pose. Truth, dense
+    poses and novel views are seen of no frame. To ask for anything hidden is a `HeldOutError`;
+    nothing is left out silently, so that whoever reads events chooses windows within `open_around`.
+    """
+
+    def __init__(
+        self,
+        source: "Capture",
+        policy: Policy,
+        masker: "Callable[[TrainingCapture], FindsPeople] | None" = None,
+    ) -> None:
+        """See `Capture.for_training`."""
+        self._source = source.with_nothing_held_out() if policy.use == "everything" else source
+        self._masker = masker
+        self._masks: OrderedDict[str, Tensor] = OrderedDict()
+        self.policy = policy
+        self.path: Path = source.path
+        self.name: str = source.name
+        self.frames: tuple[Frame, ...] = tuple(self._redacted(f) for f in self._source.frames)
+        """All frames in order; of those held out only name, camera and times mean anything."""
+        self._by_name = {frame.name: frame for frame in self.frames}
+
+    def __repr__(self) -> str:
+        return f"TrainingCapture({str(self.path)!r}, {self.policy})"
+
+    @property
+    def train_frames(self) -> tuple[Frame, ...]:
+        """Frames whose pictures are seen."""
+        return tuple(frame for frame in self.frames if frame.split == "train")
+
+    @property
+    def held_out_frames(self) -> tuple[Frame, ...]:
+        """Frames of which camera and time alone are known."""
+        return tuple(frame for frame in self.frames if frame.split != "train")
+
+    @property
+    def terms(self) -> Policy:
+        """The policy as this recording meets it: what it does not give is estimated."""
+        policy, source = self.policy, self._source
+        if source.contrast_threshold is None:
+            policy = replace(policy, thresholds="estimated")
+        if policy.masks == "given" and "masks" in source.provenance:
+            policy = replace(policy, masks="estimated")
+        return policy
+
+    def frame(self, name: str) -> Frame:
+        """The frame of that name."""
+        if name not in self._by_name:
+            raise DataError(f"{self.path}: no frame is named {name!r}.")
+        return self._by_name[name]
+
+    def neighbours(self, frame: Frame) -> tuple[Frame, ...]:
+        """The frames in order of time about a training frame, up to the next held-out ones."""
+        ordered = sorted(self.frames, key=lambda other: other.mid_us)
+        run: list[Frame] = []
+        for other in ordered:
+            if other.split != "train":
+                if any(seen.name == frame.name for seen in run):
+                    break
+                run = []
+            else:
+                run.append(other)
+        return tuple(run)
+
+    def camera(self, frame: Frame | str) -> Camera:
+        """See `Capture.camera`."""
+        return self._source.camera(self._name(frame))
+
+    @property
+    def is_static_camera(self) -> bool:
+        """See `Capture.is_static_camera`."""
+        return self._source.is_static_camera
+
+    def image(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
+        """The blurry picture of a training frame."""
+        return self._source.image(self._seen(frame, "picture"))
+
+    def has_mask(self, frame: Frame | str) -> bool:
+        """Whether `mask` gives one; False where the policy shows none."""
+        if self._name(frame) not in {seen.name for seen in self.train_frames}:
+            return False
+        if self.policy.masks == "estimated":
+            return True
+        return self.frame(self._name(frame)).mask is not None
+
+    def mask(self, frame: Frame | str) -> Float[Tensor, "H W"] | None:
+        """Share of the person per pixel in a training frame, in [0, 1]; None where it has none."""
+        name = self._seen(frame, "mask")
+        if self.policy.masks == "none":
+            raise HeldOutError(
+                f"{self.path}: the mask of frame {name!r} was asked for, and this training sees "
+                "none; pass --set policy.masks=given, or estimated."
+            )
+        return self._source.mask(name) if self.policy.masks == "given" else self._estimated(name)
+
+    def median_background(self) -> Float[Tensor, "H W 3"]:
+        """Per-pixel temporal median of the training frames (`Capture.median_background`)."""
+        return self._source.median_background()
+
+    @functools.cached_property
+    def events(self) -> EventStore | None:
+        """The events that are seen, on the camera's clock; None where the capture has none."""
+        events = self._source.events
+        return None if events is None else events.opened(self._open_us)
+
+    @property
+    def contrast_threshold(self) -> tuple[float, float] | None:
+        """C+ and C-; None where the capture or the policy does not give them."""
+        return self._source.contrast_threshold if self.policy.thresholds == "given" else None
+
+    @property
+    def has_body(self) -> bool:
+        """See `Capture.has_body`."""
+        return self._source.has_body
+
+    @functools.cached_property
+    def body_file(self) -> BodyFile:
+        """The body with the key poses that are seen.
+
+        Inside a held-out interval that is a frame's own key pose, or the two on either side of its
+        mid-exposure; with ``held_out_poses=interpolated`` none.
+        """
+        file = self._source.body_file
+        kept = self._kept_keys(file.times_us)
+        if kept.all():
+            return file
+        if not kept.any():
+            raise DataError(
+                f"{file.path}: every key pose lies in a held-out interval, so that training sees "
+                "none; give poses of the training frames."
+            )
+        return replace(
+            file, times_us=file.times_us[kept], poses=file.poses[kept], transl=file.transl[kept]
+        )
+
+    @property
+    def dense_body_file(self) -> BodyFile | None:
+        """Raises: true poses between the keys are for evaluation."""
+        raise HeldOutError(f"{self.path}: body_dense.npz is for evaluation only.")
+
+    def sharp(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
+        """Raises: the truth is for evaluation."""
+        raise HeldOutError(
+            f"{self.path}: the sharp picture of frame {self._name(frame)!r} is for evaluation only."
+        )
+
+    @property
+    def novel_views(self) -> tuple[NovelView, ...]:
+        """Raises: pictures of other cameras are for evaluation."""
+        raise HeldOutError(f"{self.path}: novel views are for evaluation only.")
+
+    def _redacted(self, frame: Frame) -> Frame:
+        given = frame.split == "train" and self.policy.masks == "given"
+        return replace(frame, sharp=None, mask=frame.mask if given else None)
+
+    def _name(self, frame: Frame | str) -> str:
+        return frame if isinstance(frame, str) else frame.name
+
+    def _seen(self, frame: Frame | str, what: str) -> str:
+        """The name of a frame that trains; else a `HeldOutError`."""
+        name = self._name(frame)
+        if self.frame(name).split != "train":
+            raise HeldOutError(
+                f"{self.path}: the {what} of frame {name!r} was asked for, which is held out from "
+                "training; evaluation alone sees it."
+            )
+        return name
+
+    def _estimated(self, name: str) -> Tensor:
+        if self._masker is None:
+            raise HeldOutError(f"{self.path}: nothing was given that estimates masks.")
+        if name not in self._masks:
+            ((_, mask),) = self._finder.masks(self, [self.frame(name)])
+            self._masks[name] = mask
+            if len(self._masks) > _KEPT_MASKS:
+                self._masks.popitem(last=False)
+        self._masks.move_to_end(name)
+        return self._masks[name]
+
+    @functools.cached_property
+    def _finder(self) -> FindsPeople:
+        assert self._masker is not None
+        return self._masker(self)
+
+    @property
+    def _open_us(self) -> tuple[tuple[int, int], ...]:
+        return (ALWAYS,) if self.policy.held_out_events else open_spans(self.frames)
+
+    def _kept_keys(self, times_us: np.ndarray) -> np.ndarray:
+        kept = np.ones(len(times_us), dtype=bool)
+        for start, end in held_out_spans(self.frames):
+            kept &= (times_us < start) | (times_us >= end)
+        if self.policy.held_out_poses == "given":
+            for frame in self.held_out_frames:
+                # the key at mid-exposure, or the nearest one before and the nearest one after
+                before = int(np.searchsorted(times_us, frame.mid_us, side="right")) - 1
+                after = int(np.searchsorted(times_us, frame.mid_us, side="left"))
+                kept[[i for i in (before, after) if 0 <= i < len(times_us)]] = True
+        return kept
