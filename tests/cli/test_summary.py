@@ -1,5 +1,8 @@
 """The table printed after an evaluation."""
 
+from dataclasses import asdict
+
+from evsplat.capture import Policy
 from evsplat.cli.summary import summary_table
 
 
@@ -10,26 +13,35 @@ def _regions(psnr):
     }
 
 
-def test_table_has_the_run_above_the_trivial_rows():
+def test_table_has_the_run_above_the_trivial_rows_and_the_cameras_own_picture():
     metrics = {
         "method": "paper",
+        "frames": {"test": 2},
+        "policy": asdict(Policy(held_out_events=True)),
+        "blurry_input": _regions(31.0),
         "protocols": {"standard": _regions(30.0)},
         "trivial": {"median_background": _regions(20.0), "nearest_frame": _regions(25.125)},
     }
     lines = summary_table(metrics).splitlines()
     assert "standard" in lines[0]
-    assert [line.split()[0] for line in lines[2:]] == [
+    assert [line.split()[0] for line in lines[2:-1]] == [
         "paper",
         "median_background",
         "nearest_frame",
+        "own",
     ]
     assert "30.00 / 0.900" in lines[2]
     assert "26.12 / 0.900" in lines[4] or "26.13 / 0.900" in lines[4]
-    assert len({len(line) for line in lines[1:]}) == 1
+    assert len({len(line) for line in lines[1:-1]}) == 1
+    assert lines[-1] == Policy(held_out_events=True).sentence
+    metrics |= {"frames": {"test": 0}, "policy": asdict(Policy(use="everything"))}
+    assert summary_table(metrics).startswith("No test figures. Every frame and every event trained")
 
 
 def test_what_was_not_measured_is_a_dash():
     regions = _regions(30.0)
     regions["person_mask"] = {"psnr": None, "ssim": None}
     metrics = {"method": "paper", "protocols": {"standard": regions}, "trivial": {}}
-    assert summary_table(metrics).splitlines()[-1].endswith("- / -")
+    metrics |= {"frames": {"test": 2}, "blurry_input": regions}
+    lines = summary_table(metrics).splitlines()
+    assert lines[-2].endswith("- / -") and "does not tell what training saw" in lines[-1]

@@ -227,9 +227,9 @@ def test_colours_of_rows_out_of_view_are_not_missed(seed, tiny_capture):
 
 
 def corrected(path, seed: int, knot_us: float | None):
-    """A model with random poses and residuals, learned ones as well, that do not commute.
+    """A model with large random poses and residuals, its frame times, and the number generator.
 
-    ``knot_us``: the residuals are a spline's control points. Returned with the number generator.
+    ``knot_us``: the residuals are the control points of a spline with such knots.
     """
     base, _, _ = model_of(path, "deform.pose_correction_start=0")
     rng = np.random.default_rng(seed)
@@ -248,8 +248,7 @@ def corrected(path, seed: int, knot_us: float | None):
     model = HumanSceneModel(base.config, "fixed", track, times, base.gaussians, spline)
     with torch.no_grad():
         for residuals in (model.rotation_residuals, model.translation_residuals):
-            values = 0.8 * rng.normal(size=residuals.shape)
-            residuals.copy_(torch.from_numpy(values))
+            residuals.copy_(torch.from_numpy(0.8 * rng.normal(size=residuals.shape)))
     return model, times, rng
 
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
-from evsplat.capture import load_capture
+from evsplat.capture import Policy, load_capture
+from evsplat.capture.policy import policy_of
 from evsplat.evaluation import evaluate, evaluate_run
 from evsplat.evaluation.event_maps import chosen_pairs
 from evsplat.evaluation.pictures import error_map, file_stem, signed_map
@@ -194,6 +195,7 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
         human_only=False,
         device="cpu",
         gaussians={"human": 10, "scene": 20},
+        policy=Policy(held_out_events=True),
     )
     module = ModuleType("evsplat.training.run")
     module.load_run = lambda path, **_: trained
@@ -202,6 +204,7 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
     assert json.loads((out / "metrics.json").read_text()) == metrics
     facts = ["capture", "method", "iteration", "train_seconds", "device", "gaussians"]
     assert list(metrics)[:6] == facts and metrics["iteration"] == 1200
+    assert policy_of(metrics) == Policy(held_out_events=True)
     psnr = f"{metrics['protocols']['standard']['full']['psnr']:.2f}"
     for name in ("metrics.md", "metrics.tex"):
         text = (out / name).read_text()

@@ -12,6 +12,8 @@ from evsplat.errors import WeightsError
 from evsplat.masks import mask_capture
 from evsplat.masks.rvm import FILE, RobustVideoMatting, find_weights
 
+from ..seen import seen
+
 Factory = Callable[..., Path]
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")
 
@@ -52,29 +54,33 @@ class OldStyle(nn.Module):
         return src
 
 
-def _save(network: nn.Module, path: Path) -> Path:
+def save_network(network: nn.Module, path: Path) -> Path:
     torch.jit.save(torch.jit.script(network), str(path))
     return path
 
 
 def test_states_of_one_frame_go_into_the_next(tiny_capture: Factory, tmp_path: Path) -> None:
-    capture = load_capture(tiny_capture(frames=10))
-    masker = RobustVideoMatting(capture, weights=_save(Counting(), tmp_path / FILE))
-    for frame, mask in masker.masks(capture):
+    capture = seen(tiny_capture(frames=14))
+    masker = RobustVideoMatting(capture, weights=save_network(Counting(), tmp_path / FILE))
+    found = list(masker.masks(capture, capture.train_frames[2:]))
+    assert [frame.index for frame, _ in found] == [2, 3, 4, 5, 6, 10, 11, 12, 13]
+    for frame, mask in found:
         red = capture.image(frame)[..., 0]
-        torch.testing.assert_close(mask, (frame.index + 1) / 100 + 0.5 * red)
+        # held-out frames are not seen, and the states begin anew behind them
+        number = frame.index + 1 if frame.index < 7 else frame.index - 9
+        torch.testing.assert_close(mask, number / 100 + 0.5 * red)
 
 
 def test_large_pictures_are_downsampled_inside(tiny_capture: Factory, tmp_path: Path) -> None:
-    capture = load_capture(tiny_capture(frames=10, width=1024, height=96))
-    masker = RobustVideoMatting(capture, weights=_save(Counting(), tmp_path / FILE))
-    frame, mask = next(iter(masker.masks(capture)))
+    capture = seen(tiny_capture(frames=10, width=1024, height=96))
+    masker = RobustVideoMatting(capture, weights=save_network(Counting(), tmp_path / FILE))
+    frame, mask = next(iter(masker.masks(capture, capture.train_frames)))
     torch.testing.assert_close(mask, 0.5 / 100 + 0.5 * capture.image(frame)[..., 0])
 
 
 def test_a_capture_gets_its_masks(tiny_capture: Factory, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("EVSPLAT_RVM", str(tmp_path))
-    _save(Counting(), tmp_path / FILE)
+    save_network(Counting(), tmp_path / FILE)
     path = tiny_capture()
     made = load_capture(mask_capture(path, tmp_path / "masked", method="rvm"))
     assert made.provenance["masks"]["weights"] == FILE
@@ -92,7 +98,7 @@ def test_a_missing_file_is_named_with_its_size_and_place(tmp_path: Path, monkeyp
             assert words in str(caught.value)
     cached = tmp_path / "torch" / "hub" / "checkpoints" / FILE
     cached.parent.mkdir(parents=True)
-    assert find_weights(_save(Counting(), cached)) == cached
+    assert find_weights(save_network(Counting(), cached)) == cached
     assert find_weights() == cached
 
 
@@ -101,7 +107,7 @@ def test_other_files_are_refused(tiny_capture: Factory, tmp_path: Path) -> None:
     (tmp_path / "rvm_mobilenetv3.pth").write_bytes(b"PK\x03\x04 weights")
     with pytest.raises(WeightsError, match="not a TorchScript file"):
         mask_capture(path, out, method="rvm", weights=tmp_path / "rvm_mobilenetv3.pth")
-    other = _save(OldStyle(), tmp_path / "other.torchscript")
+    other = save_network(OldStyle(), tmp_path / "other.torchscript")
     with pytest.raises(WeightsError, match="does not compute RobustVideoMatting"):
         mask_capture(path, out, method="rvm", weights=other)
     assert not out.exists()

@@ -100,11 +100,16 @@ def test_missing_masks_are_told_with_what_to_do(tiny_capture):
     forget_masks(path, "0008")
     composed(path)  # a held-out frame needs none
     forget_masks(path, "0002")
-    with pytest.raises(DataError, match="frame '0002' has no mask.*evsplat masks .*tiny"):
+    with pytest.raises(DataError, match="1 of 7 .*'0002'.*evsplat masks .*tiny"):
         composed(path)
     forget_masks(path, *(f"{index:04d}" for index in range(10) if index not in (2, 8)))
-    with pytest.raises(DataError, match="no training frame has a mask.*evsplat masks"):
+    with pytest.raises(DataError, match="7 of 7 training frames have no mask.*evsplat masks"):
         composed(path)
+
+
+def test_masks_that_the_policy_hides_are_not_looked_for(tiny_capture):
+    with pytest.raises(ConfigError, match="policy.masks is none, and method avatar3dgs"):
+        composed(tiny_capture(), "policy.masks=none")
 
 
 def test_settings_of_a_scene_are_refused(tiny_capture):

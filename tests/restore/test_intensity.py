@@ -10,6 +10,8 @@ from evsplat.capture import load_capture
 from evsplat.errors import DataError
 from evsplat.restore.intensity import FromEvents, with_brightness
 
+from ..seen import seen
+
 LUMA = torch.tensor([0.2126, 0.7152, 0.0722])
 
 
@@ -79,9 +81,10 @@ class _Counting:
 
     def __init__(self) -> None:
         self.windows: list[tuple[int, int, int]] = []
+        self.resets = 0
 
     def reset(self) -> None:
-        self.windows.clear()
+        self.resets += 1
 
     def step(self, events, height, width):
         assert (height, width) == (48, 64)
@@ -93,10 +96,10 @@ class _Counting:
 
 
 def test_windows_follow_each_other_from_mid_exposure_to_mid_exposure(tiny_capture) -> None:
-    capture = load_capture(tiny_capture(width=64, height=48))
+    capture = seen(tiny_capture(width=64, height=48), use="everything")
     network = _Counting()
     restorer = Named(capture, network)
-    frames = [frame for frame, _ in restorer.restore(capture)]
+    frames = [frame for frame, _ in restorer.restore(capture, capture.frames)]
     mids = [frame.mid_us for frame in capture.frames]
     assert [frame.mid_us for frame in frames] == mids
     for (first, last, count), start, end in zip(
@@ -104,7 +107,22 @@ def test_windows_follow_each_other_from_mid_exposure_to_mid_exposure(tiny_captur
     ):
         assert start <= first <= last < end
         assert count == len(capture.events.between(start, end))
-    assert restorer.provenance()["sha256"] == "0"
+    assert restorer.provenance()["sha256"] == "0" and network.resets == 1
+
+
+def test_the_network_begins_anew_behind_a_held_out_interval(tiny_capture) -> None:
+    capture = seen(tiny_capture(frames=20, width=64, height=48))
+    network = _Counting()
+    asked = capture.train_frames[4:9]
+    frames = [frame for frame, _ in Named(capture, network).restore(capture, asked)]
+    assert frames == list(asked) and network.resets == 2
+    mids = [frame.mid_us for frame in capture.train_frames]
+    # frame 10 follows three that are held out: its window begins where training goes on
+    begins = [2 * mids[0] - mids[1], *mids[:6], capture.train_frames[7].exposure_us[0], *mids[7:]]
+    assert len(network.windows) == len(mids)
+    for (first, last, count), start, end in zip(network.windows, begins, mids, strict=False):
+        assert start <= first <= last < end
+        assert count == len(capture.events.between(start, end))
 
 
 def test_what_it_cannot_work_with_is_said(tiny_capture) -> None:

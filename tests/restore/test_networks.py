@@ -23,6 +23,8 @@ from evsplat.restore.pwcnet import PwcNet, _costs, warped
 from evsplat.restore.tiles import in_tiles
 from evsplat.weights import MissingWeights
 
+from ..seen import seen
+
 SMALL_NAFNET = {"width": 4, "down": [1, 1, 1, 2], "middle": 1, "up": [1, 1, 1, 1]}
 E2VID_MODEL = {
     "num_bins": 5,
@@ -318,9 +320,16 @@ def test_networks_that_need_events_say_so(tiny_capture) -> None:
 
 
 def test_d2net_sees_neighbours_and_reverses_at_the_ends(tiny_capture) -> None:
-    capture = load_capture(tiny_capture(frames=5))
+    capture = seen(tiny_capture(frames=13))
     restorer = D2Net.__new__(D2Net)
-    for index, near in ((0, (2, 1, 0, 1, 2)), (3, (1, 2, 3, 4, 3)), (4, (2, 3, 4, 3, 2))):
+    # frames 7 to 9 are held out: nothing looks across them
+    for index, near in (
+        (0, (2, 1, 0, 1, 2)),
+        (3, (1, 2, 3, 4, 5)),
+        (6, (4, 5, 6, 5, 4)),
+        (10, (12, 11, 10, 11, 12)),
+        (11, (11, 10, 11, 12, 11)),
+    ):
         frame = capture.frames[index]
         pictures, stacks = restorer.inputs(capture, frame)
         for part, other in zip(pictures.chunk(5, 1), near, strict=True):

@@ -13,6 +13,8 @@ from evsplat.events import EventStream
 from evsplat.restore import pienet
 from evsplat.weights import MissingWeights, sha256_of
 
+from ..seen import seen
+
 needs_package = pytest.mark.skipif(
     importlib.util.find_spec(pienet.PACKAGE) is None, reason=f"needs {pienet.INSTALL}"
 )
@@ -71,8 +73,10 @@ def test_the_command_writes_a_capture_that_says_what_made_it(tiny_capture, tmp_p
 def test_moving_people_get_sharper(captures_root) -> None:
     """A person's edges come back: correlation of fine detail with the truth's, not brightness."""
     capture = load_capture(captures_root / "man_dance_hard_256")
+    training = seen(capture)
+    restored = pienet.PieNet(training).restore(training, training.train_frames)
     gains = []
-    for index, (frame, picture) in enumerate(pienet.PieNet(capture).restore(capture)):
+    for index, (frame, picture) in enumerate(restored):
         mask = capture.mask(frame) > 0.5
         fine = [_fine(p)[mask] for p in (picture, capture.image(frame), capture.sharp(frame))]
         corr = [torch.corrcoef(torch.stack((part, fine[2])))[0, 1] for part in fine[:2]]

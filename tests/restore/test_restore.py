@@ -1,6 +1,5 @@
 """`restore_capture`: sharper frames, everything else as it was, nothing half-written."""
 
-import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,8 @@ from evsplat.capture import Capture, Frame, load_capture, validate_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.imaging import deblur
 from evsplat.restore import RESTORERS, restore_capture
+
+from ..seen import seen
 
 Factory = Callable[..., Path]
 
@@ -145,8 +146,8 @@ def test_a_restorer_that_fails_midway_leaves_nothing(
         def __init__(self, capture):
             self.capture = capture
 
-        def restore(self, capture):
-            yield capture.frames[0], capture.image(capture.frames[0])
+        def restore(self, capture, frames):
+            yield frames[0], capture.image(frames[0])
             raise KeyboardInterrupt
 
         def provenance(self):
@@ -162,7 +163,8 @@ def test_a_restorer_that_fails_midway_leaves_nothing(
 def test_edi_is_nearer_to_the_truth_than_the_blurry_frame(demo_capture_path: Path) -> None:
     """Long exposures, limbs lost in the blur: 5.9 dB on average over all frames."""
     capture = load_capture(demo_capture_path)
-    restored = itertools.islice(RESTORERS["edi"](capture).restore(capture), 6)
+    training = seen(capture)
+    restored = RESTORERS["edi"](training).restore(training, training.train_frames[:6])
     gains = [
         _psnr(picture, capture.sharp(frame)) - _psnr(capture.image(frame), capture.sharp(frame))
         for frame, picture in restored

@@ -142,7 +142,7 @@ def foreign(monkeypatch):
 
     def make(capture_path, method="paper", **settings):
         capture = seen(capture_path)
-        camera = capture.cameras["main"]
+        camera = capture.camera(capture.frames[0])
         gsplat = drawing(camera.width, camera.height)
         backends = api._BACKENDS | {"gsplat": lambda *inputs: cuda.draw(gsplat, *inputs)}
         monkeypatch.setattr(api, "_BACKENDS", backends)

@@ -80,7 +80,8 @@ def _run(tiny_capture):
     model = compose(config, seen(capture), 0, fit=False).model
     counts = {"human": model.gaussians.human_count, "scene": model.gaussians.scene_count}
     made = GaussianReconstruction("paper", model)
-    return Run(Path("none"), config, "paper", capture, made, 7, 0.0, "cpu", counts, False)
+    facts = (capture, made, 7, 0.0, "cpu", counts, False)
+    return Run(Path("none"), config, "paper", config.policy, *facts)
 
 
 def in_browser(run, port, act):

@@ -17,7 +17,7 @@ import evsplat
 from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
 from evsplat.config import override, to_dict
-from evsplat.errors import EvsplatError
+from evsplat.errors import ConfigError, EvsplatError
 from evsplat.evaluation.evaluator import evaluate
 from evsplat.files import read_json, write_json
 from evsplat.methods import method_config
@@ -86,9 +86,13 @@ class Cell:
 
     def request(self) -> dict[str, Any]:
         """What decides the figures, as JSON; a cell with another request is another cell."""
+        try:
+            policy = to_dict(self.policy)
+        except ConfigError:
+            policy = None  # such settings do not run, which the record will say
         asked = {key: value for key, value in asdict(self).items() if key != "capture"}
         return asked | {
-            "policy": to_dict(self.policy),
+            "policy": policy,
             "capture": self.capture.name,
             "fingerprint": self.capture.fingerprint,
             "settings": list(self.settings),

@@ -15,8 +15,10 @@ from evsplat.benching.figures import (
     train_minutes,
 )
 from evsplat.benching.suite import PublishedTable, SuiteRow
+from evsplat.capture.policy import STRICT_TERMS, policy_of
 from evsplat.evaluation.protocols import PROTOCOLS
 from evsplat.evaluation.tables import METRIC_TITLES, REGION_TITLES, Column
+from evsplat.methods import NOMINAL_ITERATIONS
 
 Read = Callable[[SuiteRow], Figure | None]
 _PUBLISHED = "published"
@@ -200,7 +202,7 @@ def _table(
             shown[key].append(Shown(_text(figure, column.heading.decimals), rank))
     titled = []
     for row in rows:
-        title_of_row = row.shown
+        title_of_row = "; ".join([row.shown, *_own_terms(records, row, captures)])
         if 0 < complete[row.name] < len(captures):
             title_of_row += f" ({complete[row.name]} of {len(captures)} captures)"
         elif not complete[row.name]:
@@ -208,7 +210,33 @@ def _table(
         titled.append((title_of_row, tuple(shown[row.name])))
     note = next(p.summary for p in PROTOCOLS if p.name == protocol)
     headings = tuple(column.heading for column in columns)
-    return BenchTable(name, title, f"{protocol}: {note}.", headings, tuple(titled))
+    caption = f"{protocol}: {note}. {_terms(records, captures)}"
+    return BenchTable(name, title, caption, headings, tuple(titled))
+
+
+def _terms(records: Records, captures: Sequence[str]) -> str:
+    """What every row was given where its title says nothing else, how long, and on how much."""
+    rows = records.plan.suite.rows
+    found = [record for c in captures for row in rows for record in records.of(c, row.name)]
+    made = sorted({record["iteration"] for record in found if record["iteration"] is not None})
+    counts = [
+        next((r["frames"]["test"] for row in rows for r in records.of(c, row.name)), None)
+        for c in captures
+    ]
+    told = [str(count) for count in counts if count is not None]
+    sentences = [STRICT_TERMS]
+    if made:
+        span = f"{made[0]:,}" if len(made) == 1 else f"{made[0]:,} to {made[-1]:,}"
+        sentences.append(f"{span} training steps, of schedules made for {NOMINAL_ITERATIONS:,}.")
+    if told:
+        sentences.append(f"Test frames: {' + '.join(told)}.")
+    return " ".join(sentences)
+
+
+def _own_terms(records: Records, row: SuiteRow, captures: Sequence[str]) -> list[str]:
+    """What a row was given that others were not, or was not given."""
+    policies = [policy_of(r) for c in captures for r in records.of(c, row.name)]
+    return list(dict.fromkeys(said for p in policies if p for said in p.departures))
 
 
 def _why_empty(records: Records, row: str) -> str:

@@ -215,7 +215,7 @@ class Capture:
         return torch.from_numpy(points), torch.from_numpy(colours)
 
     def _frame(self, frame: Frame | str) -> Frame:
-        return self.frame(frame) if isinstance(frame, str) else frame
+        return self.frame(frame if isinstance(frame, str) else frame.name)
 
     def _picture(self, path: Path, camera: str) -> Tensor:
         return to_unit_range(self._stored(path, camera))

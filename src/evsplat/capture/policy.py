@@ -1,6 +1,6 @@
 """What a training may know of what is held out from it: data that stands beside every figure."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 Use = Literal["training", "everything"]
@@ -34,17 +34,17 @@ class Policy:
 
     @property
     def departures(self) -> tuple[str, ...]:
-        """What differs from the strict terms of all tables, in words; masks are named anyway."""
+        """What differs from `STRICT_TERMS`, in words for the title of a row."""
         said = {
             "use": "trained on everything",
-            "held_out_events": "events of held-out intervals",
-            "thresholds": "estimated contrast thresholds",
-            "held_out_poses": "interpolated poses at test times",
+            "held_out_events": "events of held-out intervals seen",
+            "thresholds": "contrast thresholds estimated",
+            "masks": f"masks {self.masks}",
+            "held_out_poses": "poses at test times interpolated",
         }
         strict = Policy()
-        found = [said[f.name] for f in fields(self) if f.name in said
-                 and getattr(self, f.name) != getattr(strict, f.name)]  # fmt: skip
-        return tuple(found)
+        names = [name for name in said if getattr(self, name) != getattr(strict, name)]
+        return tuple(said[name] for name in names)
 
     @property
     def sentence(self) -> str:
@@ -72,6 +72,13 @@ class Policy:
         return f"Held-out pictures were hidden from training, {events}; {thresholds}, {masks}, " + (
             f"{poses}."
         )
+
+
+STRICT_TERMS = (
+    "Where a row says nothing else, training saw no picture, mask or event of a held-out interval, "
+    "contrast thresholds and poses were given, and no masks."
+)
+"""What all rows of a table share."""
 
 
 def policy_of(metrics: dict[str, Any]) -> Policy | None:

@@ -211,7 +211,8 @@ class TrainingCapture:
         if self._masker is None:
             raise HeldOutError(f"{self.path}: nothing was given that estimates masks.")
         if name not in self._masks:
-            ((_, mask),) = self._finder.masks(self, [self.frame(name)])
+            capture, finder = self._finder
+            ((_, mask),) = finder.masks(capture, [capture.frame(name)])
             self._masks[name] = mask
             if len(self._masks) > _KEPT_MASKS:
                 self._masks.popitem(last=False)
@@ -219,9 +220,11 @@ class TrainingCapture:
         return self._masks[name]
 
     @functools.cached_property
-    def _finder(self) -> FindsPeople:
+    def _finder(self) -> "tuple[TrainingCapture, FindsPeople]":
+        """What finds people, and where: in pictures that no mask has changed."""
         assert self._masker is not None
-        return self._masker(self)
+        capture = TrainingCapture(self._source, replace(self.policy, masks="none"))
+        return capture, self._masker(capture)
 
     @property
     def _open_us(self) -> tuple[tuple[int, int], ...]:

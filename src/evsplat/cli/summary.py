@@ -15,13 +15,19 @@ def print_summary(metrics: dict[str, Any], *, run: Path, report: Path) -> None:
 
 
 def summary_table(metrics: dict[str, Any]) -> str:
-    """Format PSNR (dB) / SSIM of protocol 'standard' per region: the run and the trivial rows."""
-    from evsplat.evaluation.tables import composited
+    """Format PSNR (dB) / SSIM of protocol 'standard' per region: the run and the trivial rows.
 
+    The last row is what the camera itself took at those times, which no method sees.
+    """
+    from evsplat.evaluation.tables import composited, terms
+
+    if metrics["frames"]["test"] == 0:
+        return f"No test figures. {terms(metrics)}"
     rows = {
         metrics["method"]: metrics["protocols"]["standard"],
         **composited(metrics),
         **metrics["trivial"],
+        "own blurry picture": metrics["blurry_input"],
     }
     width = max(map(len, rows))
     head = "".join(f"{region.replace('_', ' '):>18}" for region in _REGIONS)
@@ -29,7 +35,7 @@ def summary_table(metrics: dict[str, Any]) -> str:
     for name, regions in rows.items():
         cells = "".join(f"{_cell(regions[region]):>18}" for region in _REGIONS)
         lines.append(f"{name:{width}}{cells}")
-    return "\n".join(lines)
+    return "\n".join([*lines, terms(metrics)])
 
 
 def _cell(values: dict[str, float | None] | None) -> str:

@@ -47,8 +47,8 @@ def evaluate_event_maps(
 ) -> dict[str, Any] | Absent:
     """Similarity and pictures of frame pairs: one per test frame and a few training pairs.
 
-    The events between two frames are input of the training, also around test frames; the rendered
-    maps show whether the reconstruction explains them.
+    Events between training frames are input of the training, those around test frames only where
+    the policy shows them; the rendered maps show whether the reconstruction explains them.
     """
     absent = _cannot(capture)
     if absent is not None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from evsplat.capture.policy import policy_of
 from evsplat.files import write_text
 
 ROW_TITLES = {
@@ -112,6 +113,12 @@ def composited(metrics: dict[str, Any]) -> dict[str, Any]:
     return {"on_median_background": metrics["composited"]["standard"]}
 
 
+def terms(metrics: dict[str, Any]) -> str:
+    """What training saw, in a sentence."""
+    policy = policy_of(metrics)
+    return "The run does not tell what training saw." if policy is None else policy.sentence
+
+
 def missing_networks(metrics: dict[str, Any]) -> list[str]:
     """One sentence per network distance without weights."""
     return [entry["reason"] for entry in metrics["weights"].values() if entry["sha256"] is None]
@@ -126,8 +133,10 @@ def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
 def markdown(metrics: dict[str, Any]) -> str:
     """All tables as Markdown; the best of each column in bold."""
     lines = [f"# {metrics['method']} on {metrics['capture']}", ""]
-    lines += [f"Means over {metrics['frames']['test']} test frames against the sharp truth.", ""]
-    for table in tables_of(metrics):
+    count = metrics["frames"]["test"]
+    means = f"Means over {count} test frames against the sharp truth. " if count else ""
+    lines += [f"{means}{terms(metrics)}", ""]
+    for table in tables_of(metrics) if count else ():
         lines += [f"## Protocol `{table.protocol}`", "", f"{table.note}.", ""]
         head = [_heading(column) for column in table.columns]
         lines.append("| " + " | ".join(["", *head]) + " |")
@@ -162,8 +171,8 @@ def _novel_markdown(metrics: dict[str, Any]) -> list[str]:
 
 def latex(metrics: dict[str, Any]) -> str:
     """All tables as LaTeX (booktabs)."""
-    lines: list[str] = []
-    for table in tables_of(metrics):
+    lines = [f"% {terms(metrics)}"]
+    for table in tables_of(metrics) if metrics["frames"]["test"] else ():
         spans = {
             region: sum(column.region == region for column in table.columns)
             for region in REGION_TITLES

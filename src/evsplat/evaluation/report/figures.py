@@ -12,6 +12,7 @@ from evsplat.evaluation.tables import (
     Table,
     missing_networks,
     tables_of,
+    terms,
 )
 
 _REFERENCES = {"trivial": "the best trivial row", "camera": "the camera’s own blurry picture"}
@@ -39,11 +40,9 @@ def figures(source: Source) -> str:
         if first.columns
         else f"{count} frames were held out, and none has a sharp picture to be compared with."
     )
-    policy = policy_of(metrics)
-    seen = "The run does not tell what training saw." if policy is None else policy.sentence
     return section(
         "Figures",
-        f"{measured} <b>{escape(seen)}</b>",
+        f"{measured} <b>{escape(terms(metrics))}</b>",
         f'{_cards(metrics)}{_table(first)}{compat}<ul class="note">{blurry}{missing}</ul>',
     )
 
