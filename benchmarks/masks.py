@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from evsplat.capture import Capture, load_capture
+from evsplat.capture import Capture, Policy, load_capture
 from evsplat.capture.drawing import draw_outline, fit, to_picture
 from evsplat.masks import MASKERS
 from evsplat.restore import restore_capture
@@ -26,9 +26,11 @@ def measure(
 ) -> dict[str, float]:
     """Overlap of one method's masks of ``source`` with the masks of ``truth``."""
     overlaps = []
-    for frame, found in MASKERS[method](source, **options).masks(source):
+    masker = MASKERS[method](source.for_training(Policy()), **options)
+    everything = source.for_training(Policy(use="everything"))
+    for frame, found in masker.masks(everything, everything.frames[::every]):
         true = truth.mask(frame.name)
-        if frame.index % every or true is None:
+        if true is None:
             continue
         one, other = found.numpy() > 0.5, true.numpy() > 0.5
         overlaps.append(float((one & other).sum() / max(1, (one | other).sum())))

@@ -31,7 +31,10 @@ ROWS: dict[str, tuple[bool, tuple[str, ...]]] = {
     "smoothed": (True, ("pose.smooth=always", "pose.refine=never")),
     "refined": (True, ("pose.smooth=never", "pose.refine=always")),
     "both": (True, ()),
-    "both_held_out_events": (True, ("pose.events_of_held_out=true",)),
+    "both_held_out_events": (
+        True,
+        ("policy.held_out_events=true", "pose.events_of_held_out=true"),
+    ),
 }
 """Whether poses are noisy, and settings."""
 

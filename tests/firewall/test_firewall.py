@@ -151,7 +151,7 @@ def checkpoint(tmp_path_factory) -> Callable[[str], Path]:
 
 @pytest.mark.parametrize("name", RESTORERS)
 @given(recorded=recordings(has_polarity=True), noise=st.integers(0, 1_000))
-@few(max_examples=3)
+@few(max_examples=2)
 def test_restored_training_frames_know_nothing_of_what_is_held_out(
     name, recorded, noise, checkpoint
 ):
