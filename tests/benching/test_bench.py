@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from evsplat.benching.cell import run_cell
 from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.benching.plan import make_plan
 from evsplat.benching.suite import read_suite
-from evsplat.capture import load_capture
+from evsplat.capture import Policy, load_capture
 from evsplat.cli import main
 from evsplat.errors import ConfigError
 from evsplat.evaluation import evaluate
@@ -157,3 +158,36 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tiny_capture, tmp_path):
     assert "0 of 1 cells are done" in errors and f"evsplat bench {suite}" in errors
     assert latest_checkpoint(run / "checkpoints") is not None
     assert "1 of 1 cells have not been run yet" in (out / "tables.md").read_text()
+
+
+def test_a_cell_is_made_by_its_own_policy_and_says_so(tiny_capture, tmp_path):
+    settings = [*SMALL_MODEL, "event.weight=0"]
+    rows = [
+        {"name": name, "method": "paper", "restore": "edi", "settings": [*settings, *policy]}
+        for name, policy in (
+            ("strict", ()),
+            ("estimated", ("policy.thresholds=estimated",)),
+            ("interpolated", ("policy.held_out_poses=interpolated",)),
+        )
+    ]
+    path = tiny_capture("one", frames=20, width=96, height=72)
+    suite = write_suite(tmp_path / "suite.yaml", {"one": path}, *rows, iterations=2)
+    folder = BenchFolder(tmp_path / "out")
+    cells = make_plan(read_suite(suite), folder).cells
+    found = {}
+    for cell in cells:
+        run_cell(folder.path, cell, threads=1, device="cpu")
+        record = read_json(folder.record_of(cell.id))
+        assert record["status"] == "done", record
+        found[cell.row] = record["policy"]
+        assert record["cell"]["policy"] == found[cell.row]
+    assert found["strict"] == asdict(Policy())
+    assert found["estimated"] == asdict(Policy(thresholds="estimated"))
+    assert found["interpolated"] == asdict(Policy(held_out_poses="interpolated"))
+    # EDI's thresholds are part of what it may see; poses are not
+    names = {restored.name for restored in folder.captures.iterdir() if restored.is_dir()}
+    assert names == {"one-edi", "one-edi-thresholds-estimated"}
+    made = {name: load_capture(folder.captures / name).provenance["restored"] for name in names}
+    origins = {name: restored["contrast_threshold_origin"] for name, restored in made.items()}
+    assert origins["one-edi"] == "from the capture"
+    assert origins["one-edi-thresholds-estimated"] == "estimated from the capture"

@@ -1,7 +1,7 @@
 """Tables of made-up records, against figures computed by hand."""
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from evsplat.benching.plan import Plan
 from evsplat.benching.suite import Published, PublishedTable, Suite, SuiteRow
 from evsplat.benching.tables import make_tables
 from evsplat.benching.writers import html, latex, markdown
+from evsplat.capture import Policy
 from evsplat.evaluation.protocols import METRICS, PROTOCOLS, REGIONS
 
 PSNR = {
@@ -34,6 +35,8 @@ def record(psnr: float, seed: int) -> dict:
         "iteration": 100,
         "train_seconds": 60.0,
         "gaussians": {"human": 3, "scene": 4},
+        "frames": {"train": 7, "test": 3},
+        "policy": asdict(Policy()),
     }
 
 
@@ -137,3 +140,16 @@ def test_markdown_and_html_escape_what_users_write(records):
 
     Balance().feed(page)
     assert open_tags == []
+
+
+def test_the_caption_says_the_terms_and_a_row_where_it_departs_from_them(records):
+    table = make_tables(records)[1]
+    assert "saw no picture, mask or event of a held-out interval" in table.note
+    assert "100 training steps, of schedules made for 15,000. Test frames: 3 + 3." in table.note
+    departing = asdict(Policy(held_out_events=True, masks="given"))
+    for key, record in records.by_cell.items():
+        if key[1] == "poor":
+            record["policy"] = departing
+    titles = [title for title, _ in make_tables(records)[1].rows]
+    assert titles[0] == "Good*"
+    assert titles[1] == "Poor & Sons†; events of held-out intervals seen; masks given"

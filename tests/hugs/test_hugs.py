@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import load_capture
 from evsplat.errors import DataError
 from evsplat.hugs.losses import PATCH_PX, Perceptual, draw_squares
@@ -238,7 +239,11 @@ def test_training_frames_have_their_correction_and_others_the_recorded_pose(tiny
     with torch.no_grad():
         model.shifts[2] += torch.tensor([0.0, 0.5, 0.0])
         model.turns[2] += 0.1 * torch.randn_like(model.turns[2])
-    after = model.pose([recorded, unseen])[1].detach()
+    rotations, after = (part.detach() for part in model.pose([recorded, unseen]))
+    # the correction turns a joint about its own axes
+    given, turn = model.track.at([recorded])[0], six_to_matrix(model.turns[2].detach())
+    torch.testing.assert_close(rotations[:1], given @ turn)
+    assert not torch.allclose(given @ turn, turn @ given, atol=1e-3)
     assert not torch.allclose(after[0, :, :3, :3], before[0, :, :3, :3])
     assert float(after[0, 0, 1, 3] - before[0, 0, 1, 3]) != 0
     torch.testing.assert_close(after[1], before[1])

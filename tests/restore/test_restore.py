@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import h5py
@@ -10,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from evsplat.capture import Capture, Frame, load_capture, validate_capture
+from evsplat.capture import Capture, Frame, Policy, load_capture, validate_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.imaging import deblur
 from evsplat.restore import RESTORERS, restore_capture
@@ -170,3 +171,16 @@ def test_edi_is_nearer_to_the_truth_than_the_blurry_frame(demo_capture_path: Pat
         for frame, picture in restored
     ]
     assert np.mean(gains) > 4 and min(gains) > 2
+
+
+def test_held_out_frames_come_from_everything_and_training_frames_do_not(
+    tiny_capture: Factory, tmp_path: Path
+) -> None:
+    path = tiny_capture(frames=20, width=96, height=72)
+    restored = load_capture(restore_capture(path, tmp_path / "sharp"))
+    assert restored.provenance["restored"]["policy"] == asdict(Policy())
+    assert [f.exposure_us[1] - f.exposure_us[0] for f in restored.frames] == [1] * 20
+    everything = restore_capture(path, tmp_path / "all", policy=Policy(use="everything"))
+    # EDI looks at a frame's own exposure alone: with stated thresholds both are the same
+    for frame in restored.frames:
+        assert torch.equal(restored.image(frame), load_capture(everything).image(frame.name))

@@ -12,7 +12,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from evsplat.capture import Policy
+from evsplat.cli import main
+from evsplat.config import load_yaml, save_yaml
 from evsplat.errors import BackendError, ConfigError, DataError
+from evsplat.files import read_json
 from evsplat.methods import PaperConfig, compose
 from evsplat.training import load_run, train
 from evsplat.training.bad_steps import MAX_BAD_STEPS
@@ -259,3 +263,36 @@ def test_a_run_folder_holds_what_it_was_made_with(tiny_capture, tmp_path):
     assert torch.equal(
         final_tensors(out)["model.gaussians.means"], final_tensors(again)["model.gaussians.means"]
     )
+
+
+def test_everything_trains_where_it_is_asked_for_and_no_figure_is_made(
+    tiny_capture, tmp_path, capsys
+):
+    path, out = tiny_capture(frames=10), tmp_path / "run"
+    settings = [f"--set={setting}" for setting in SMALL]
+    command = ["train", str(path), "--out", str(out), "--iterations", "12", "--method", "paper"]
+    assert main([*command, "--use", "everything", *settings]) == 0
+    assert "No test figures. Every frame and every event trained" in capsys.readouterr().out
+    assert load_yaml(out / "config.yaml")["policy"]["use"] == "everything"
+    run = load_run(out)
+    assert len(run.capture.train_frames) == 10 and run.policy.use == "everything"
+    assert len(run.reconstruction.model.latents) == 10
+    metrics = read_json(out / "metrics.json")
+    assert metrics["per_frame"] == [] and metrics["policy"]["use"] == "everything"
+    assert metrics["protocols"]["standard"]["full"]["psnr"] is None
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "trained on every frame and every event" in page
+    assert main(["train", str(path), "--out", str(out), "--resume", "--use", "training"]) == 2
+    assert "--use" in capsys.readouterr().err
+
+
+def test_a_run_from_before_the_policy_says_that_it_saw_events_of_held_out_frames(
+    tiny_capture, tmp_path
+):
+    out = train(
+        tiny_capture(frames=10), method="paper", out=tmp_path / "run", iterations=2, overrides=SMALL
+    )
+    config = load_yaml(out / "config.yaml")
+    del config["policy"]
+    save_yaml(out / "config.yaml", config)
+    assert load_run(out).policy == Policy(held_out_events=True)

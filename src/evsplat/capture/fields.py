@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from evsplat.capture.finding import Findings, nearest
+from evsplat.names import NAME_RULE, is_name, is_path_of_names, leads_out
 
 MISSING = object()
+RENAME = "Rename it: files may be named after it."
 # Integers up to here are exact as doubles.
 _LARGEST = 2**53
 
@@ -59,10 +61,31 @@ class Fields:
             self.fail(key, brief(value), "a text", "Write it in quotation marks.")
         return value if isinstance(value, str) else ""
 
+    def name(self, key: str) -> str:
+        """A text that may become a file's name, "" after a finding."""
+        text = self.text(key)
+        if not text or is_name(text):
+            return text
+        self.fail(key, brief(text), f"a name: {NAME_RULE}", RENAME)
+        return ""
+
     def path(self, key: str, root: Path, *, required: bool = True) -> Path | None:
-        """A path below ``root``."""
+        """A path below the capture's folder ``root``, which no link leads out of."""
         text = self.text(key) if required else self.text(key, None)
-        return root / text if text else None
+        if not text:
+            return None
+        found = brief(text)
+        if is_path_of_names(text):
+            if not leads_out(root / text, root):
+                return root / text
+            found += ", a link that leads out of it"
+        self.fail(
+            key,
+            found,
+            "a path below the capture's folder, names with '/' between them",
+            "Put the file into the folder and name it from there.",
+        )
+        return None
 
     def integer(self, key: str, default: Any = MISSING, *, minimum: int | None = None) -> int:
         """A whole number, 0 after a finding."""
@@ -108,5 +131,8 @@ def is_whole(value: Any) -> bool:
 
 def brief(value: Any, limit: int = 80) -> str:
     """``repr`` cut to a length that fits a message."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except RecursionError:
+        text = f"a {type(value).__name__} nested too deeply to be shown"
     return text if len(text) <= limit else text[: limit - 1] + "…"

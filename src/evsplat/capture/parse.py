@@ -1,5 +1,6 @@
 """capture.json: from JSON to `Metadata`, every fault noted."""
 
+import os
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,17 +10,20 @@ from torch import Tensor
 
 from evsplat.capture.camera import Camera
 from evsplat.capture.distortion import COEFFICIENT_COUNTS, Distortion
-from evsplat.capture.fields import MISSING, Fields, brief, is_whole
+from evsplat.capture.fields import MISSING, RENAME, Fields, brief, is_whole
 from evsplat.capture.finding import Findings
 from evsplat.capture.metadata import EventsEntry, Frame, Metadata, NovelView
 from evsplat.errors import DataError
 from evsplat.files import read_json
+from evsplat.names import NAME_RULE, is_name
 
 FORMAT = "evsplat-capture"
 VERSION = 1
 BODY_MODELS = ("rig", "default", "smpl", "smplh", "smplx")
 # Rotations written as rounded decimals are accepted down to about five digits.
 _ROTATION_TOLERANCE = 1e-4
+# Training and evaluation compare pictures by SSIM, whose window has this side.
+_SMALLEST_PX = 11
 
 
 def read_metadata(path: Path, findings: Findings) -> Metadata | None:
@@ -28,19 +32,21 @@ def read_metadata(path: Path, findings: Findings) -> Metadata | None:
     None where the file as a whole cannot be used; entries with errors are left out otherwise.
     """
     file = path / "capture.json"
-    if not path.is_dir():
+    if not os.path.isdir(path):
         findings.error(path, "", "no such folder", "a capture folder", "Check the path.")
         return None
     try:
         document = read_json(file)
-    except DataError:
-        broken = file.exists()
+    except DataError as error:
+        reason, _, remedy = str(error).removeprefix(f"{file}: ").rstrip(".").partition("; ")
+        if reason == "file not found":
+            reason, remedy = "no such file", "is this a capture folder?"
         findings.error(
             file,
             "",
-            "not valid JSON" if broken else "no such file",
+            reason,
             "the capture's description as a JSON object",
-            "Repair or write capture.json anew." if broken else "Is this a capture folder?",
+            f"{remedy[0].upper()}{remedy[1:]}",
         )
         return None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
@@ -75,7 +81,7 @@ class _Parser:
         body_file = body.path("file", self.path) if body else None
         return Metadata(
             path=self.path,
-            name=top.text("name"),
+            name=top.name("name"),
             cameras=cameras,
             distortions=distortions,
             frames=frames,
@@ -99,8 +105,11 @@ class _Parser:
             return cameras, distortions
         keys = ("width", "height", "K", "world_to_camera", "distortion")
         for name, value in entries.items():
+            if not is_name(name):
+                top.fail("cameras", brief(name), f"names: {NAME_RULE}", RENAME)
+                continue
             entry = self.fields(f"cameras.{name}", value, keys)
-            width, height = entry.integer("width", minimum=1), entry.integer("height", minimum=1)
+            width, height = self.pixels(entry, "width"), self.pixels(entry, "height")
             K, pose = self.intrinsics(entry), self.rigid(entry, "world_to_camera")
             coefficients = self.distortion(entry)
             if not entry.valid or K is None or pose is None:
@@ -110,6 +119,18 @@ class _Parser:
             if coefficients and any(coefficients):
                 distortions[name] = Distortion(width, height, K, coefficients)
         return cameras, distortions
+
+    def pixels(self, entry: Fields, key: str) -> int:
+        """A side of the camera's pictures."""
+        count = entry.integer(key, minimum=1)
+        if 0 < count < _SMALLEST_PX:
+            entry.fail(
+                key,
+                f"{count} pixels",
+                f"at least {_SMALLEST_PX}, the side of SSIM's window",
+                "Record larger pictures, or shrink them less.",
+            )
+        return count
 
     def intrinsics(self, entry: Fields) -> np.ndarray | None:
         K = entry.numbers("K", (3, 3))
@@ -190,7 +211,7 @@ class _Parser:
     def frame(self, index: int, value: Any, cameras: dict[str, Camera]) -> Frame | None:
         keys = ("name", "camera", "image", "exposure_us", "split", "sharp", "mask")
         entry = self.fields(f"frames[{index}]", value, (*keys, "world_to_camera"))
-        name, camera = entry.text("name"), entry.text("camera")
+        name, camera = entry.name("name"), entry.text("camera")
         self.check_camera(entry, camera, cameras)
         image = entry.path("image", self.path)
         exposure = self.exposure(entry)

@@ -1,0 +1,45 @@
+"""The one rule for names that other people's files give: any of them may become a file's name."""
+
+import os
+import unicodedata
+from pathlib import Path, PurePath
+
+from evsplat.errors import DataError
+
+NAME_RULE = "1 to 200 bytes without '/', '\\' and control characters, and not '.' or '..'"
+_MOST_BYTES = 200
+"""File systems take 255; the rest is for what is put around a name."""
+# Control characters, and those that end a line or a paragraph.
+_CONTROL = ("Cc", "Zl", "Zp")
+
+
+def is_name(text: str) -> bool:
+    """Whether a text obeys `NAME_RULE`: a file of that name lies in the folder it is put into."""
+    try:
+        size = len(text.encode())
+    except UnicodeEncodeError:
+        # JSON can write half of a surrogate pair, which is no character
+        return False
+    return (
+        0 < size <= _MOST_BYTES
+        and text not in (".", "..")
+        and not any(c in "/\\" or unicodedata.category(c) in _CONTROL for c in text)
+    )
+
+
+def checked_name(text: str, what: str) -> str:
+    """``text``; a `DataError` where it is no name for ``what``, such as "a frame"."""
+    if not is_name(text):
+        raise DataError(f"{text[:80]!r} is no name for {what}, expected {NAME_RULE}; rename it.")
+    return text
+
+
+def is_path_of_names(text: str) -> bool:
+    """Whether a text is a relative path whose parts are names, so that it never goes up."""
+    return all(is_name(part) for part in PurePath(text).parts)
+
+
+def leads_out(path: Path, folder: Path) -> bool:
+    """Whether ``path``, all links in it followed, lies elsewhere than below ``folder``."""
+    inside = os.path.join(os.path.realpath(folder), "")
+    return not os.path.realpath(path).startswith(inside)
