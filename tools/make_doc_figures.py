@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from evsplat.capture import Capture
+from evsplat.evaluation.pictures import to_bytes
 from evsplat.export import render_run
+from evsplat.files import read_json
 from evsplat.training import load_run
 
 OUT = Path(__file__).parents[1] / "docs" / "images"
 EXPOSURE = 4
 """Frame through whose exposure the strip goes."""
 GAP_PX = 4
+DEMO_PX = 400
 
 
 def strip(run: Path, name: str, count: int, **film: object) -> list[Image.Image]:
@@ -41,9 +45,26 @@ def save(name: str, pictures: list[Image.Image]) -> None:
     beside(pictures).save(OUT / f"{name}.webp", quality=88, method=6)
 
 
+def demo(run: Path, capture: Capture) -> None:
+    """Blurry input, render and truth of the held-out frame that is blurred most (README)."""
+    metrics = read_json(run / "metrics.json")
+    blurred = [e["others"]["blurry_input"]["person_mask"]["psnr"] for e in metrics["per_frame"]]
+    entry = metrics["per_frame"][int(np.argmin(blurred))]
+    render = Image.open(run / entry["pictures"]["render"]).convert("RGB")
+    pictures = [
+        Image.fromarray(to_bytes(capture.image(entry["frame"]))),
+        render,
+        Image.fromarray(to_bytes(capture.sharp(entry["frame"]))),
+    ]
+    side = (DEMO_PX, DEMO_PX)
+    large = [picture.resize(side, Image.Resampling.LANCZOS) for picture in pictures]
+    beside(large).save(OUT / "demo.png")
+
+
 def main(run: Path) -> None:
     """Write all figures."""
     capture = load_run(run).capture
+    demo(run, capture)
     frame = capture.train_frames[EXPOSURE]
     start, end = frame.exposure_us
     blurry = Image.fromarray((capture.image(frame) * 255).round().byte().numpy())

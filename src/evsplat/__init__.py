@@ -46,6 +46,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 __version__ = "0.1.0"
 
 __all__ = [
+    "Policy",
     "__version__",
     "bench",
     "convert",
@@ -68,6 +69,7 @@ __all__ = [
 ]
 
 _LAZY = {
+    "Policy": "evsplat.capture:Policy",
     "bench": "evsplat.benching.run:bench",
     "convert": "evsplat.events.convert:convert_recording",
     "demo": "evsplat.cli.demo:demo",

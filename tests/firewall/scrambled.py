@@ -72,9 +72,11 @@ def scrambled(path: Path, target: Path, seed: int, *, has_polarity: bool, masks:
             _noise(target / frame[kind], rng)
     for view in document["novel_views"]:
         _noise(target / view["image"], rng)
-    body = dict(np.load(target / "body_dense.npz"))
-    body["poses"] = body["poses"] + rng.normal(size=body["poses"].shape).astype(np.float32)
-    np.savez(target / "body_dense.npz", **body)
+    dense = target / "body_dense.npz"
+    if dense.exists():
+        body = dict(np.load(dense))
+        body["poses"] = body["poses"] + rng.normal(size=body["poses"].shape).astype(np.float32)
+        np.savez(dense, **body)
     _scramble_events(target / "events.h5", document, rng, has_polarity)
     return target
 

@@ -15,6 +15,7 @@ from evsplat.methods.poses import PoseConfig, prepare_poses
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
+from ..firewall.scrambled import scrambled
 from ..seen import seen
 from ..small_model import SMALL_MODEL
 
@@ -113,6 +114,29 @@ def test_held_out_frames_move_their_poses_only(captures):
     }
     assert changed == {"rotation_residuals", "translation_residuals"}
     assert torch.equal(count, trainer.statistics["gaussians"].seen)
+
+
+def test_without_being_asked_held_out_events_teach_nothing(captures, tmp_path):
+    """With other events in held-out intervals the corrected poses are the same to the last bit."""
+    noisy = captures[1]
+    others = scrambled(noisy.path, tmp_path / "others", 0, has_polarity=True, masks=False)
+
+    def learned(capture: Capture, *settings: str) -> dict[str, torch.Tensor]:
+        composition = composed(capture, *settings)
+        policy = {"held_out_events": True} if settings else {}
+        trainer = Trainer(composition, seen(capture, **policy), Clock(100, fraction=0.5))
+        for _ in range(4):
+            assert trainer.step() is not None
+            trainer.clock.advance(0.01)
+        state = composition.model.state_dict()
+        return {name: value.clone() for name, value in state.items() if value.is_floating_point()}
+
+    ours, theirs = learned(noisy), learned(load_capture(others))
+    assert ours["rotation_residuals"].abs().max() > 0
+    assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
+    # where they are asked for they do teach
+    asked = [learned(capture, *INTERPOLATION) for capture in (noisy, load_capture(others))]
+    assert not torch.equal(asked[0]["rotation_residuals"], asked[1]["rotation_residuals"])
 
 
 def test_events_of_held_out_frames_need_a_policy_that_shows_them(captures):
