@@ -1,5 +1,6 @@
 """Configuration: round trips and errors that help."""
 
+import time
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -93,3 +94,45 @@ def test_a_section_given_in_part_keeps_what_its_owner_set():
 def test_a_method_keeps_its_parts_when_one_setting_of_them_changes():
     config = method_config("evsplat", {"deform": {"width": 16}}, where="test")
     assert config.deform == replace(EvsplatConfig().deform, width=16)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[" * 5_000, "nested more than 50 deep"),
+        ("{" * 5_000, "nested more than 50 deep"),
+        ("- " * 5_000, "nested more than 50 deep"),
+        ("a:\n" + "".join(" " * i + "- \n" for i in range(1_000)), "nested more than 50 deep"),
+        ("a: 2001-99-99", "month must be in 1..12"),
+        ("a: " + "1" * 5_000, "value has 5000 digits)"),
+        ("a: !!bool 3", "a tag that its value does not fit"),
+        ("a: !!timestamp x", "a tag that its value does not fit"),
+        ('a: !!int ""', "a tag that its value does not fit"),
+    ],
+)
+def test_yaml_without_a_value_is_refused_quickly(tmp_path, text, said):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    start = time.process_time()
+    with pytest.raises(ConfigError, match="a.yaml: not valid YAML") as error:
+        load_yaml(path)
+    assert said in str(error.value)
+    with pytest.raises(ConfigError, match="is not a YAML value"):
+        override({}, [f"a={text}"])
+    # PyYAML alone takes many times as long for the first
+    assert time.process_time() - start < 3
+
+
+def test_settings_may_be_nested_as_deep_as_anyone_needs(tmp_path):
+    (tmp_path / "a.yaml").write_text("a: " + "[" * 40 + "]" * 40)
+    assert "a" in load_yaml(tmp_path / "a.yaml")
+
+
+def test_a_configuration_that_is_no_text_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="a folder, expected a file"):
+        load_yaml(tmp_path)
+    with pytest.raises(ConfigError, match="no.yaml: file not found"):
+        load_yaml(tmp_path / "no.yaml")
+    (tmp_path / "a.yaml").write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="not a text in UTF-8"):
+        load_yaml(tmp_path / "a.yaml")

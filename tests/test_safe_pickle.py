@@ -1,11 +1,15 @@
 """Pickles of arrays come out as Python's own reader gives them; anything else never runs."""
 
 import collections
+import io
 import os
 import pickle
 import struct
 import subprocess
+import tracemalloc
 import warnings
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import joblib
@@ -221,3 +225,116 @@ def test_damaged_numpy_files_are_one_sentence(tmp_path: Path) -> None:
                     read(file)
                 except DataError as error:
                     assert str(error).startswith(f"{file}: ") and "\n" not in str(error)
+
+
+OBJECTS = pickle.dumps(np.array([{}, {}], dtype=object), protocol=2)
+NUMBERS = pickle.dumps(np.zeros((2, 3), np.float32), protocol=2)
+TOO_MUCH = {
+    # the shape (2,) of an object array of two becomes (127,): numpy reads on behind the list
+    "more objects than there are": OBJECTS.replace(b"K\x02\x85", b"K\x7f\x85"),
+    "fewer objects than there are": OBJECTS.replace(b"K\x02\x85", b"K\x01\x85"),
+    "negative count of objects": OBJECTS.replace(b"K\x02\x85", b"J\xfe\xff\xff\xff\x85"),
+    # 2^32 x 2^32 and two objects: NumPy's product of that is 0
+    "product that overflows": OBJECTS.replace(
+        b"K\x02\x85", b"\x8a\x05\0\0\0\0\x01\x8a\x05\0\0\0\0\x01\x86"
+    ),
+    "more numbers than there are": NUMBERS.replace(b"K\x02K\x03", b"K\x7fK\x7f"),
+    "numbers of no bytes": ARRAY
+    + b"(I1\n(I999999999999\ntcnumpy\ndtype\n(S'S0'\nI0\nI1\ntR(I3\nS'|'\nNNNI0\nI1\nI0\ntb"
+    + b"I00\nS''\ntb.",
+    "bytearray of a number": b"\x80\x02cbuiltins\nbytearray\nJ\x00\x00\x00\x40\x85R.",
+    "bytes of a number": b"\x80\x02cbuiltins\nbytes\nJ\x00\x00\x00\x40\x85R.",
+    "bytearray of Python 2": b"\x80\x02c__builtin__\nbytearray\nJ\x00\x00\x00\x40\x85R.",
+    "bytearray of a list": b"\x80\x02cbuiltins\nbytearray\n]K\x01a\x85R.",
+    "bytearray by length": b"\x80\x05\x96" + struct.pack("<Q", 1 << 30) + b"abc.",
+    "numbers of an array of objects": b"\x80\x05cnumpy.core.numeric\n_frombuffer\n("
+    + OBJECTS[2:-1]
+    + b"cnumpy\ndtype\nX\x02\x00\x00\x00i8\x85RK\x02\x85X\x01\x00\x00\x00CtR.",
+    # its values again, after it was filled: a second BUILD
+    "array filled twice": OBJECTS[:-1] + OBJECTS[OBJECTS.rindex(b"(K\x01") : -1] + b".",
+}
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """At most a megabyte is taken in the test."""
+    tracemalloc.start()
+    yield
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("kind", TOO_MUCH)
+def test_what_a_pickle_promises_beyond_its_bytes_is_refused(tmp_path: Path, kind: str) -> None:
+    file = tmp_path / "x.pkl"
+    file.write_bytes(TOO_MUCH[kind])
+    with pytest.raises(DataError, match=r"x\.pkl: not a readable pickle"):
+        read_pickle(file)
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("shape", [(10**12,), (1 << 32, 1 << 32), (-1,), (1 << 70,)])
+@pytest.mark.parametrize("packed", [False, True])
+def test_what_a_header_promises_beyond_the_file_is_refused(
+    tmp_path: Path, shape: tuple[int, ...], packed: bool
+) -> None:
+    file = tmp_path / ("x.npz" if packed else "x.npy")
+    stream = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(stream, header)
+    stream.write(bytes(80))
+    if packed:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("a.npy", stream.getvalue())
+    else:
+        file.write_bytes(stream.getvalue())
+    with pytest.raises(DataError, match=r"x\.np.: not a readable np"):
+        (read_npz if packed else read_npy)(file)
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_object_arrays_of_every_shape_are_read(tmp_path: Path, protocol: int) -> None:
+    rows = np.empty((2, 3), dtype=object)
+    rows[:] = [[1, "a", None], [(2, 3), [4], {"b": 5}]]
+    nested = np.empty(2, dtype=object)
+    nested[:] = [rows, np.arange(3)]
+    scalar = np.empty(1, dtype=object)
+    scalar[0] = np.array(2.5)
+    tree = {
+        "rows": rows,
+        "by columns": np.asfortranarray(rows),
+        "turned": rows.T,
+        "nested": nested,
+        "of one array": scalar,
+        "none": np.empty((0, 4), dtype=object),
+        "single": np.array({"a": 1}, dtype=object),
+    }
+    tree["shared"] = [rows, rows]
+    file = tmp_path / "tree.pkl"
+    file.write_bytes(pickle.dumps(tree, protocol=protocol))
+    read = read_pickle(file)
+    assert_same(read, tree)
+    # one array that several name stays one
+    assert read["shared"][0] is read["shared"][1] is read["rows"] is read["nested"][0]
+
+
+def test_an_object_array_may_hold_itself(tmp_path: Path) -> None:
+    circle = np.empty(2, dtype=object)
+    circle[0] = circle
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(circle))
+    read = read_pickle(tmp_path / "x.pkl")
+    assert read[0] is read and read[1] is None
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_bytes_of_every_kind_are_read(tmp_path: Path, protocol: int) -> None:
+    tree = [b"", b"a\xff", bytearray(), bytearray(b"a\xff"), bytearray(70_000)]
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(tree, protocol=protocol))
+    assert_same(read_pickle(tmp_path / "x.pkl"), tree)
+    # as Python 2 writes a bytearray
+    (tmp_path / "x.pkl").write_bytes(
+        b"\x80\x02c__builtin__\nbytearray\nX\x02\x00\x00\x00abX\x07\x00\x00\x00latin-1\x86R."
+    )
+    assert read_pickle(tmp_path / "x.pkl") == bytearray(b"ab")

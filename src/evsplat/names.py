@@ -36,7 +36,8 @@ def checked_name(text: str, what: str) -> str:
 
 def is_path_of_names(text: str) -> bool:
     """Whether a text is a relative path whose parts are names, so that it never goes up."""
-    return all(is_name(part) for part in PurePath(text).parts)
+    parts = PurePath(text).parts
+    return bool(parts) and all(map(is_name, parts))
 
 
 def leads_out(path: Path, folder: Path) -> bool:

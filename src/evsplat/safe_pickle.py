@@ -9,6 +9,9 @@ import bz2
 import gzip
 import io
 import lzma
+import math
+import operator
+import os
 import pickle
 import struct
 import tokenize
@@ -68,7 +71,7 @@ def read_npy(path: Path, *, what: str = "npy file", stand_ins: StandIns | None =
 
     def read() -> Any:
         with path.open("rb") as stream:
-            return _read_array(stream, stand_ins)
+            return _read_array(stream, os.fstat(stream.fileno()).st_size, stand_ins)
 
     return _guarded(path, what, read)
 
@@ -89,7 +92,8 @@ def read_npz(
             for key, name in found.items():
                 if keys is None or key in keys:
                     with archive.open(name) as stream:
-                        members[key] = _read_array(stream, stand_ins)
+                        size = archive.getinfo(name).file_size
+                        members[key] = _read_array(stream, size, stand_ins)
             return members
 
     return _guarded(path, what, read)
@@ -115,8 +119,8 @@ class _ForbiddenType(Exception):
     """A name in a pickle that is not on the list."""
 
 
-def _read_array(stream: IO[bytes], stand_ins: StandIns | None) -> Any:
-    """One array in npy format; an object array is a pickle after the header."""
+def _read_array(stream: IO[bytes], size: int, stand_ins: StandIns | None) -> Any:
+    """One array in npy format, in ``size`` bytes; an object array is a pickle after the header."""
     version = np.lib.format.read_magic(stream)
     readers = {
         (1, 0): np.lib.format.read_array_header_1_0,
@@ -129,10 +133,21 @@ def _read_array(stream: IO[bytes], stand_ins: StandIns | None) -> Any:
         value = _Unpickler(stream, stand_ins).load()
         is_wrapped = isinstance(value, np.ndarray) and value.shape == ()
         return value.item() if is_wrapped else value
-    count = int(np.prod(shape, dtype=np.int64))
+    count = _count(shape)
+    if count * dtype.itemsize > size:
+        # before memory is taken for them
+        raise ValueError(f"an array of shape {shape} in {size} bytes")
     data = stream.read(count * dtype.itemsize)
     array = np.frombuffer(data, dtype, count).copy()
     return array.reshape(shape, order="F" if fortran_order else "C")
+
+
+def _count(shape: Any) -> int:
+    """How many values an array has; exact, where NumPy's product of a forged shape overflows."""
+    lengths = [operator.index(length) for length in shape]
+    if any(length < 0 for length in lengths):
+        raise ValueError(f"an array of shape {tuple(lengths)}")
+    return math.prod(lengths)
 
 
 class _DType:
@@ -159,13 +174,14 @@ class _JoblibArray:
     def read(self, read: Callable[[int], bytes]) -> np.ndarray:
         if self.aligned:
             read(read(1)[0])
-        count = int(np.prod(self.shape, dtype=np.int64))
+        count = _count(self.shape)
         array = np.frombuffer(read(count * self.dtype.itemsize), self.dtype, count).copy()
         return array.reshape(self.shape, order="F" if self.order == "F" else "C")
 
 
 def _new_array(kind: Any, shape: Any, code: Any) -> np.ndarray:
-    return np.empty(0)
+    """An array that `_fill` gives its shape and values."""
+    return np.empty(0, object)
 
 
 def _new_scalar(kind: _DType, data: bytes | str) -> Any:
@@ -173,7 +189,7 @@ def _new_scalar(kind: _DType, data: bytes | str) -> Any:
 
 
 def _from_buffer(data: bytes, kind: _DType, shape: tuple[int, ...], order: str) -> np.ndarray:
-    flat = np.frombuffer(data, kind.dtype).copy()
+    flat = np.frombuffer(_bytes(data), kind.dtype).copy()
     return flat.reshape(shape, order="F" if order == "F" else "C")
 
 
@@ -187,9 +203,20 @@ def _new_object(kind: type, base: Any, state: Any) -> Any:
     return object.__new__(kind)
 
 
-def _bytes(data: bytes | str) -> bytes:
+def _new_bytes(data: Any = b"", encoding: str = "latin1") -> bytes:
+    """Never of a number, which would take as many bytes of memory."""
+    return _bytes(data)
+
+
+def _new_bytearray(data: Any = b"", encoding: str = "latin1") -> bytearray:
+    return bytearray(_bytes(data))
+
+
+def _bytes(data: Any) -> bytes:
     """Bytes of Python 2 come as text."""
-    return data.encode("latin1") if isinstance(data, str) else data
+    if not isinstance(data, bytes | bytearray | str):
+        raise ValueError(f"bytes made of {type(data).__name__}")
+    return data.encode("latin1") if isinstance(data, str) else bytes(data)
 
 
 _NO_CALL = object()
@@ -206,9 +233,8 @@ for _core in ("numpy.core", "numpy._core"):
     _NAMES[f"{_core}.numeric", "_frombuffer"] = _from_buffer
 for _builtins in ("builtins", "__builtin__"):
     _NAMES[_builtins, "object"] = _NO_CALL
-    _NAMES |= {
-        (_builtins, kind.__name__): kind for kind in (set, frozenset, bytes, bytearray, complex)
-    }
+    _NAMES |= {(_builtins, kind.__name__): kind for kind in (set, frozenset, complex)}
+    _NAMES |= {(_builtins, "bytes"): _new_bytes, (_builtins, "bytearray"): _new_bytearray}
 for _copyreg in ("copyreg", "copy_reg"):
     _NAMES[_copyreg, "_reconstructor"] = _new_object
 
@@ -221,6 +247,8 @@ class _Unpickler(pickle._Unpickler):
 
     dispatch = dict(pickle._Unpickler.dispatch)
     stack: list[Any]
+    read: Callable[[int], bytes]
+    append: Callable[[Any], None]
     _file_read: Callable[[int], bytes]
 
     def __init__(self, stream: IO[bytes], stand_ins: StandIns | None) -> None:
@@ -257,12 +285,31 @@ class _Unpickler(pickle._Unpickler):
 
     dispatch[pickle.BUILD[0]] = load_build  # type: ignore[assignment]
 
+    def load_bytearray8(self) -> None:
+        """Put a bytearray of as many bytes as there are; Python's reader takes the memory first."""
+        (size,) = struct.unpack("<Q", self.read(8))
+        self.append(bytearray(self.read(size)))
+
+    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8  # type: ignore[assignment]
+
 
 def _fill(array: np.ndarray, state: tuple) -> None:
-    """Give an array its pickled shape and values; objects come as a list, numbers as bytes."""
+    """Give an array of `_new_array` its pickled shape and values, in place since others name it.
+
+    Objects come as a list, numbers as bytes. numpy's own ``__setstate__`` gets numbers only: it
+    would follow a shape beyond the end of a list of objects.
+    """
     _, shape, kind, fortran_order, values = state
-    values = values if kind.dtype.hasobject else _bytes(values)
-    if kind.dtype.hasobject and not isinstance(values, list):
-        raise ValueError("an object array without a list of objects")
-    state = (1, tuple(shape), kind.dtype, bool(fortran_order), values)
-    array.__setstate__(state)  # type: ignore[arg-type]
+    dtype, shape, count = kind.dtype, tuple(shape), _count(shape)
+    if array.dtype != object or array.size:
+        raise ValueError("an array that is filled twice")
+    if dtype.hasobject:
+        if not isinstance(values, list) or len(values) != count:
+            raise ValueError(f"an object array of shape {shape} without as many objects")
+        array.resize(shape, refcheck=False)
+        array.reshape(count)[:] = np.fromiter(values, object, count)
+        return
+    values = _bytes(values)
+    if len(values) != count * dtype.itemsize or (count and not dtype.itemsize):
+        raise ValueError(f"an array of shape {shape} of {dtype} in {len(values)} bytes")
+    array.__setstate__((1, shape, dtype, bool(fortran_order), values))  # type: ignore[arg-type]

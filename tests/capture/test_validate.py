@@ -1,6 +1,8 @@
 """The validator: one test per kind of fault; good captures have no findings."""
 
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -413,6 +415,43 @@ def test_damaged_pixels_are_found_by_the_deep_check(tiny_capture: Factory) -> No
     assert "images/0006.png" in refuses_to_load(path)
 
 
+def test_a_picture_too_large_to_be_decoded_is_refused(tiny_capture: Factory) -> None:
+    """A PNG of a few bytes that says it has 900 million pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    path = tiny_capture()
+    header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
+    parts = [chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"")), chunk(b"IEND", b"")]
+    (path / "images/0006.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    for deep in (True, False):
+        finding = the_only(path, deep=deep)
+        place, field = path / "images/0006.png", "frames[6].image"
+        check(finding, place, field, "900000000 pixels", "a readable picture")
+        assert finding.remedy == "Make it smaller."
+    assert "images/0006.png" in refuses_to_load(path)
+
+
+def test_files_that_may_not_be_read_are_not_to_be_written_anew(
+    tiny_capture: Factory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(*_: Any, **__: Any) -> Any:
+        # as the system does, which lets root read everything
+        raise PermissionError(13, "Permission denied")
+
+    path = tiny_capture()
+    for reader in ("PIL.Image.open", "numpy.load", "h5py.File"):
+        with monkeypatch.context() as patch:
+            patch.setattr(reader, denied)
+            findings = validate_capture(path, deep=False)
+        assert findings and all(finding.severity == "error" for finding in findings)
+        for finding in findings:
+            assert finding.remedy == "Give yourself the permission to read it.", reader
+
+
 def test_pairing_by_sort_order_is_noticed(tiny_capture: Factory) -> None:
     path = tiny_capture()
     edit_json(path, "frames", 5, "mask", value="masks/0004.png")
@@ -551,6 +590,27 @@ def test_fault_of_the_events(
     check(the_only(path), path / "events.h5", field, found, expected)
     if quick:
         assert "events.h5" in refuses_to_load(path)
+
+
+@pytest.mark.parametrize("name", ["events/p", "events", "ms_to_idx", "t_offset"])
+@pytest.mark.parametrize("kind", ["to itself", "to nothing", "empty"])
+def test_links_in_the_event_file_that_lead_nowhere_are_no_data_sets(
+    tiny_capture: Factory, name: str, kind: str
+) -> None:
+    path = tiny_capture()
+    with h5py.File(path / "events.h5", "r+") as file:
+        del file[name]
+        if kind == "empty":
+            file[name] = h5py.Empty("i8")
+        else:
+            file[name] = h5py.SoftLink(f"/{name}" if kind == "to itself" else "/nowhere")
+    findings = validate_capture(path, deep=False)
+    assert len(findings) == (4 if name == "events" else 1)
+    for finding in findings:
+        assert finding.severity == "error" and finding.field.startswith(name)
+        found = "what HDF5 cannot open" if kind == "to itself" else "nothing"
+        assert finding.found.startswith(found) and finding.expected == "a data set"
+    assert "events.h5" in refuses_to_load(path)
 
 
 def test_index_must_reach_the_last_event_and_hold_beyond_it(tiny_capture: Factory) -> None:

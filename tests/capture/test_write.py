@@ -225,6 +225,10 @@ BAD_CALLS = {
         r"'../a' is no name for a frame",
     ),
     "camera name": (lambda writer: writer.add_camera("a/b", 1, 1, K), "no name for a camera"),
+    "long name": (
+        lambda writer: writer.add_frame("a" * 201, "main", np.zeros((HEIGHT, WIDTH)), (0, 1)),
+        "is no name for a frame, expected 1 to 200 bytes",
+    ),
     "picture format": (
         lambda writer: writer.add_frame("a", "main", tif_picture(writer), (0, 1)),
         "one.tif: expected a PNG, JPEG or WebP picture",
@@ -239,3 +243,20 @@ def test_what_does_not_fit_is_named(tmp_path: Path, fault: str) -> None:
         writer.add_camera("main", WIDTH, HEIGHT, K)
         call(writer)
     assert list(tmp_path.glob(".*")) == [] and not (tmp_path / "one").exists()
+
+
+def test_a_folder_whose_name_is_none_for_a_capture_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is no name for a capture"):
+        CaptureWriter(tmp_path / "a\\b")
+    with pytest.raises(DataError, match="is no name for a capture"):
+        CaptureWriter(tmp_path / "one", "../../one")
+    write_small(tmp_path / "a\\b", name="a b")
+    assert load_capture(tmp_path / "a\\b").name == "a b"
+
+
+def test_names_may_have_spaces_and_letters_of_any_script(tmp_path: Path) -> None:
+    with CaptureWriter(tmp_path / "one") as writer:
+        writer.add_camera("Kamera 1", WIDTH, HEIGHT, K)
+        writer.add_frame("Bild ä", "Kamera 1", np.zeros((HEIGHT, WIDTH)), (0, 30_000))
+        add_body(writer, 1)
+    assert load_capture(tmp_path / "one").frames[0].name == "Bild ä"

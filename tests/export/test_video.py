@@ -99,3 +99,11 @@ def test_no_picture_and_impossible_rates_are_refused(tmp_path):
         with pytest.raises(ConfigError, match="--fps"):
             write_video(tmp_path / "a.mp4", _flat_pictures(1, 8, 8), fps=fps)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["../a", "/tmp/evsplat-a", "a/b", "a\\b", "..", "", "a" * 201])
+def test_pictures_are_written_into_their_folder_only(tmp_path, name):
+    picture = _flat_pictures(1, 16, 16)[0]
+    with pytest.raises(DataError, match="is no name for a picture"):
+        write_pictures(tmp_path / "in" / "out", [("a", picture), (name, picture)])
+    assert [path.name for path in tmp_path.rglob("*")] == ["in"]

@@ -12,7 +12,8 @@ from evsplat.capture import load_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import open_recording
 from evsplat.export import render_run, rendering, write_animation
-from evsplat.film import Film, scene
+from evsplat.film import Film, kept, scene
+from evsplat.film.looks import Look
 from evsplat.methods.reconstruction import Rendering
 
 LAST_US = 9 * 40_000
@@ -232,3 +233,12 @@ def test_the_camera_turns_about_the_vertical_of_the_recording_whatever_the_motio
     shots = scene.Scene.of(film, capture, _Dancer(recorded)).shots
     heights = torch.stack([shot.camera.center() for shot in shots]).double() @ up.double()
     assert len(shots) > 5 and float(heights.max() - heights.min()) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["../a", "/tmp/evsplat-a", "a/b"])
+def test_pictures_are_kept_in_their_folder_only(lamp, tmp_path, name):
+    pictures = kept.KeptPictures(tmp_path / "kept", "plan")
+    shot = kept.Shot(name, 0, 0, lamp.capture.cameras["main"])
+    with pytest.raises(DataError, match="is no name for a picture"):
+        pictures.fill(lamp.lamp, Look(), [shot])
+    assert lamp.lamp.drawn == []

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int64
 
 from evsplat.errors import DataError
+from evsplat.files import why_not_read
 from evsplat.safe_pickle import BROKEN
 
 
@@ -51,8 +52,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {key: archive[key] for key in archive.files}
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found.") from None
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise DataError(f"{path}: {why_not_read(error)}.") from None
     except ValueError as error:
         if "pickle" not in str(error).lower():
             raise DataError(f"{path}: not a readable npz ({error}); write it anew.") from error

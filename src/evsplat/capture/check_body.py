@@ -1,11 +1,12 @@
 """Checks of body.npz and body_dense.npz."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 
 from evsplat.capture.body_file import read_arrays
-from evsplat.capture.finding import Findings
+from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import Metadata
 from evsplat.errors import DataError
 
@@ -41,16 +42,15 @@ def check_body(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
 
 
 def _read(path: Path, findings: Findings) -> dict[str, np.ndarray] | None:
-    if not path.exists():
+    if not os.path.exists(path):
         findings.error(path, "", "no such file", "the body and its poses", "Restore the file.")
         return None
     try:
         return read_arrays(path)
     except DataError as error:
-        reason = str(error).removeprefix(f"{path}: ").split(";")[0].split(", expected")[0]
-        findings.error(
-            path, "", reason, "an npz of plain arrays", "Write it anew without pickled objects."
-        )
+        reason, remedy = reason_and_remedy(error, path)
+        reason = reason.split(", expected")[0]
+        findings.error(path, "", reason, "an npz of plain arrays", remedy)
         return None
 
 

@@ -1,5 +1,6 @@
 """Checks of the event file; the deep ones read it in pieces."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,7 +21,7 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
     if entry is None:
         return
     _check_sensor(metadata, entry, findings)
-    if not entry.file.is_file():
+    if not os.path.isfile(entry.file):
         findings.error(entry.file, "", "no such file", "the event recording", "Restore the file.")
         return
     try:
@@ -31,8 +32,13 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
             if deep:
                 _Scan(entry, file, findings).run()
     except OSError as error:
+        denied = isinstance(error, PermissionError)
         findings.error(
-            entry.file, "", f"a file that HDF5 cannot read ({error})", "a whole HDF5 file", _REPAIR
+            entry.file,
+            "",
+            f"a file that HDF5 cannot read ({error})",
+            "a whole HDF5 file",
+            "Give yourself the permission to read it." if denied else _REPAIR,
         )
 
 
@@ -64,8 +70,9 @@ def _check_layout(path: Path, file: h5py.File, findings: Findings) -> bool:
     before = findings.error_count()
     names = [f"events/{column}" for column in _COLUMNS]
     for name in [*names, "ms_to_idx", "t_offset"]:
-        if not isinstance(file.get(name), h5py.Dataset):
-            findings.error(path, name, "nothing", "a data set", "Write the file anew.")
+        found = _what_is(file, name)
+        if found:
+            findings.error(path, name, found, "a data set", "Write the file anew.")
     if findings.error_count() > before:
         return False
     lengths = {name: file[name].shape for name in names}
@@ -95,6 +102,16 @@ def _check_layout(path: Path, file: h5py.File, findings: Findings) -> bool:
     for name in names:
         _check_filters(path, name, file[name], findings)
     return findings.error_count() == before
+
+
+def _what_is(file: h5py.File, name: str) -> str:
+    """What is there in words, "" where it is a data set as it should be."""
+    try:
+        found = file.get(name)
+        return "" if isinstance(found, h5py.Dataset) and found.shape is not None else "nothing"
+    except (RuntimeError, OSError) as error:
+        # such as a link to itself
+        return f"what HDF5 cannot open ({error})"
 
 
 def _check_filters(path: Path, name: str, data: h5py.Dataset, findings: Findings) -> None:

@@ -1,9 +1,10 @@
 """Checks of the pictures that capture.json names."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from evsplat.capture.finding import Findings
+from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.images import image_size, read_image
 from evsplat.capture.metadata import Metadata
 from evsplat.errors import DataError
@@ -24,7 +25,7 @@ class _Picture:
 def check_images(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
     """Existence and size of every picture; ``deep`` decodes them and opens the sharp ones too."""
     for picture in _pictures(metadata):
-        if not picture.path.is_file():
+        if not os.path.isfile(picture.path):
             findings.error(
                 picture.path,
                 picture.field,
@@ -66,7 +67,7 @@ def _check_picture(
             picture.field,
             f"a {picture.kind} of {picture.owner} that cannot be decoded ({error.__cause__})",
             "a readable picture",
-            "Save it again as PNG.",
+            reason_and_remedy(error, picture.path)[1],
         )
         return
     if (width, height) != (camera.width, camera.height):

@@ -97,11 +97,6 @@ def _copy_files(making: Derivation) -> None:
     names |= {view["image"] for view in document.get("novel_views", [])}
     names |= {document[key]["file"] for key in ("body", "events") if document.get(key)}
     for name in sorted(names):
-        if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise DataError(
-                f"{root / 'capture.json'}: names {name!r}, expected paths below the capture "
-                "folder; move the file there."
-            )
         target = making.folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         _link(root / name, target)

@@ -82,7 +82,7 @@ class Fields:
         self.fail(
             key,
             found,
-            "a path below the capture's folder, names with '/' between them",
+            "a path below the capture's folder: names of at most 200 bytes with '/' between",
             "Put the file into the folder and name it from there.",
         )
         return None

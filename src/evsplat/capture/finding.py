@@ -5,6 +5,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
 
+from evsplat.errors import DataError
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -41,6 +43,14 @@ class Findings:
     def error_count(self) -> int:
         """How many errors were noted so far."""
         return sum(item.severity == "error" for item in self.items)
+
+
+def reason_and_remedy(error: DataError, file: Path) -> tuple[str, str]:
+    """The parts of what a reader says of a file, ``FILE: reason; remedy.``; "" for no remedy."""
+    reason, mark, remedy = str(error).removeprefix(f"{file}: ").rpartition("; ")
+    if not mark:
+        return remedy, ""
+    return reason, f"{remedy[0].upper()}{remedy[1:]}"
 
 
 def nearest(key: str, known: tuple[str, ...]) -> str:

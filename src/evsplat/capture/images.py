@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from evsplat.errors import DataError
+from evsplat.files import why_not_read
 
 
 @contextmanager
@@ -24,8 +25,10 @@ def opened_picture(
     try:
         with Image.open(path) as image:
             yield image
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found.") from None
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise DataError(f"{path}: {why_not_read(error)}.") from error
+    except Image.DecompressionBombError as error:
+        raise DataError(f"{path}: {problem} ({error}); make it smaller.") from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: {problem} ({error}); save it again as PNG.") from error
 

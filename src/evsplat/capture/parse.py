@@ -11,7 +11,7 @@ from torch import Tensor
 from evsplat.capture.camera import Camera
 from evsplat.capture.distortion import COEFFICIENT_COUNTS, Distortion
 from evsplat.capture.fields import MISSING, RENAME, Fields, brief, is_whole
-from evsplat.capture.finding import Findings
+from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Frame, Metadata, NovelView
 from evsplat.errors import DataError
 from evsplat.files import read_json
@@ -38,16 +38,11 @@ def read_metadata(path: Path, findings: Findings) -> Metadata | None:
     try:
         document = read_json(file)
     except DataError as error:
-        reason, _, remedy = str(error).removeprefix(f"{file}: ").rstrip(".").partition("; ")
-        if reason == "file not found":
-            reason, remedy = "no such file", "is this a capture folder?"
-        findings.error(
-            file,
-            "",
-            reason,
-            "the capture's description as a JSON object",
-            f"{remedy[0].upper()}{remedy[1:]}",
-        )
+        reason, remedy = reason_and_remedy(error, file)
+        if not remedy:
+            reason, remedy = "no such file", "Is this a capture folder?"
+        expected = "the capture's description as a JSON object"
+        findings.error(file, "", reason, expected, remedy)
         return None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         found = repr(document.get("format")) if isinstance(document, dict) else "no JSON object"

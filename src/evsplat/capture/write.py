@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,9 +21,9 @@ from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
 from evsplat.files import write_json
+from evsplat.names import checked_name
 
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-_SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
 
 
 class CaptureWriter:
@@ -51,7 +50,7 @@ class CaptureWriter:
         self, path: Path | str, name: str | None = None, *, overwrite: bool = False
     ) -> None:
         self.path = Path(path)
-        self.name = name or self.path.resolve().name
+        self.name = checked_name(name or self.path.resolve().name, "a capture")
         self.provenance: dict[str, Any] = {}
         self._cameras: dict[str, dict[str, Any]] = {}
         self._frames: list[dict[str, Any]] = []
@@ -95,7 +94,7 @@ class CaptureWriter:
 
         ``distortion`` holds OpenCV's k1, k2, p1, p2 (k3 (k4, k5, k6)) of the pictures as given.
         """
-        _check_name("camera", name)
+        checked_name(name, "a camera")
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         lens = None
         if distortion is not None and any(distortion):
@@ -127,7 +126,7 @@ class CaptureWriter:
         is (H, W), the share of the person; booleans will do. Without ``split``, frames whose index
         modulo 10 is 7, 8 or 9 are test.
         """
-        _check_name("frame", name)
+        checked_name(name, "a frame")
         index = len(self._frames)
         start, end = exposure_us
         entry: dict[str, Any] = {"name": name, "camera": camera}
@@ -295,14 +294,6 @@ class CaptureWriter:
             shutil.rmtree(replaced)
         else:
             self._root.rename(self.path)
-
-
-def _check_name(kind: str, name: str) -> None:
-    if not _SAFE_NAME.fullmatch(name):
-        raise DataError(
-            f"{name!r} is no name for a {kind}: it names files, so letters, digits, '_', '-' and "
-            "'.' only."
-        )
 
 
 def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:

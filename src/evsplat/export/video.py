@@ -12,6 +12,7 @@ from PIL import Image
 
 from evsplat.errors import BackendError, ConfigError, DataError
 from evsplat.files import atomic_path
+from evsplat.names import checked_name
 
 _BT709 = 1
 _LIMITED_RANGE = 1
@@ -163,7 +164,8 @@ def write_pictures(
     try:
         count = 0
         for name, picture in pictures:
-            Image.fromarray(picture).save(temporary / f"{name}.png")
+            file = temporary / f"{checked_name(name, 'a picture')}.png"
+            Image.fromarray(picture).save(file)
             count += 1
         if not count:
             raise DataError(f"{folder}: there is no picture to write.")

@@ -18,6 +18,7 @@ from evsplat.errors import DataError
 from evsplat.files import atomic_path, write_json
 from evsplat.film.looks import Exposure, Look
 from evsplat.methods.reconstruction import Reconstruction
+from evsplat.names import checked_name
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ class KeptPictures:
 
     def file(self, shot: Shot) -> Path:
         """Where the picture of a shot is or will be."""
-        return self.path / f"{shot.name}.png"
+        return self.path / f"{checked_name(shot.name, 'a picture')}.png"
 
     def read(self, shot: Shot) -> Exposure:
         """A kept picture."""

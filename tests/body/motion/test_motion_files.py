@@ -175,11 +175,22 @@ def test_deepmimic_joints_by_hand(tmp_path):
     assert motion.times_us.tolist() == [0, 33300, 66600]
 
 
+def bvh_of(channels: str, frames: str = "1") -> str:
+    head = f"HIERARCHY ROOT a {{ OFFSET 0 0 0 CHANNELS {len(channels.split())} {channels} }}"
+    return f"{head} MOTION Frames: {frames} Frame Time: 0.1 " + "0 " * len(channels.split())
+
+
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
         ("a.txt", '{"Frames": [[1, 2, 3]]}', "expected (T, 44)"),
         ("a.txt", "{}", "not a DeepMimic motion"),
+        ("a.txt", "[" * 5_000, "not a DeepMimic motion (nested too deeply)"),
+        ("a.txt", '{"Frames": [[1' + "0" * 400 + "]]}", "not a DeepMimic motion"),
+        ("a.bvh", bvh_of("Wrotation"), "a channel 'Wrotation', expected Xposition to Zrotation"),
+        ("a.bvh", bvh_of("Wposition"), "a channel 'Wposition'"),
+        ("a.bvh", bvh_of(""), "holds no joints, no frames"),
+        ("a.bvh", bvh_of("", frames="9" * 30), "not a readable BVH file"),
         ("a.bvh", "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 3 Xrotation", "ends too early"),
         ("a.bvh", "MOTION Frames: 1 Frame Time: 0.1", "holds no joints"),
         ("1_1.amc", "1\nroot 0 0 0 0 0 0", "1.asf is not beside it"),

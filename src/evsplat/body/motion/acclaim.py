@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.motion.world import down_the_tree, read_text
+from evsplat.body.motion.world import down_the_tree
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.errors import DataError
+from evsplat.files import read_text
 
 FRAME_RATE_HZ = 120.0
 """CMU's; the files do not say."""

@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.motion.world import down_the_tree, read_text, upright_world
+from evsplat.body.motion.world import down_the_tree, upright_world
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.errors import DataError
+from evsplat.files import read_text
+
+_CHANNELS = [f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz"]
 
 
 @dataclass
@@ -18,6 +21,7 @@ class _Joint:
     parent: int
     offset: tuple[float, ...] = (0.0, 0.0, 0.0)
     channels: list[str] = field(default_factory=list)
+    """Out of `_CHANNELS`."""
 
 
 def read_bvh(path: Path) -> SkeletonMotion:
@@ -31,9 +35,9 @@ def read_bvh(path: Path) -> SkeletonMotion:
         joints, frame_time, values = _read(words)
     except StopIteration:
         raise DataError(f"{path}: ends too early; copy it again.") from None
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise DataError(f"{path}: not a readable BVH file ({error}).") from None
-    if not joints or len(values) == 0 or not np.isfinite(values).all() or frame_time <= 0:
+    if not joints or values.size == 0 or not np.isfinite(values).all() or frame_time <= 0:
         raise DataError(f"{path}: holds no joints, no frames or no frame time above zero.")
     parents = [joint.parent for joint in joints]
     local = np.tile(np.eye(3), (len(values), len(joints), 1, 1))
@@ -45,8 +49,8 @@ def read_bvh(path: Path) -> SkeletonMotion:
         if joint.parent >= 0:
             zero[index] += zero[joint.parent]
         for channel in joint.channels:
-            axis = channel[0].lower()
-            if channel.lower().endswith("rotation"):
+            axis = channel[0]
+            if channel.endswith("rotation"):
                 turn = Rotation.from_euler(
                     axis, values[:, column : column + 1], degrees=True
                 ).as_matrix()
@@ -85,7 +89,7 @@ def _read(words: Iterator[str]) -> tuple[list[_Joint], float, np.ndarray]:
             if not ends:
                 joints[-1].offset = offset
         elif word == "CHANNELS":
-            joints[-1].channels = [next(words) for _ in range(int(next(words)))]
+            joints[-1].channels = [_channel(next(words)) for _ in range(int(next(words)))]
         elif word == "}":
             if ends:
                 ends -= 1
@@ -101,3 +105,9 @@ def _read(words: Iterator[str]) -> tuple[list[_Joint], float, np.ndarray]:
     if values.size != count * channels:
         raise ValueError(f"{values.size} numbers, expected {count} frames of {channels}")
     return joints, float(header[4]), values.reshape(count, channels)
+
+
+def _channel(word: str) -> str:
+    if word.lower() not in _CHANNELS:
+        raise ValueError(f"a channel {word!r}, expected Xposition to Zrotation")
+    return word.lower()

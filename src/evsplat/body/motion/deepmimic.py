@@ -1,14 +1,14 @@
 """DeepMimic's motion files (Peng et al. 2018; github.com/xbpeng/DeepMimic)."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.motion.world import down_the_tree, read_text
+from evsplat.body.motion.world import down_the_tree
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.errors import DataError
+from evsplat.files import parse_json, read_text
 
 # name, parent, offset from the parent (metres; x forward, y up, z right), numbers per frame:
 # 4 = quaternion (w, x, y, z), 1 = angle about z, 0 = none.
@@ -37,9 +37,9 @@ _WORLD = np.array([[0, 0, -1.0], [-1, 0, 0], [0, 1, 0]])
 def read_deepmimic(path: Path) -> SkeletonMotion:
     """``humanoid3d_*.txt``: JSON whose ``Frames`` hold duration, root position and rotations."""
     try:
-        document = json.loads(read_text(path))
+        document = parse_json(read_text(path))
         frames = np.array(document["Frames"], dtype=np.float64)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise DataError(f"{path}: not a DeepMimic motion ({error}); it needs Frames.") from None
     if frames.ndim != 2 or frames.shape[1] != _NUMBERS or len(frames) == 0:
         raise DataError(

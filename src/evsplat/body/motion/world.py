@@ -1,7 +1,6 @@
-"""What motion readers share: composing rotations down a tree, and text files."""
+"""What motion readers share: composing rotations down a tree, and the way up."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +8,6 @@ from jaxtyping import Float
 from evsplat.body.adapters import default_body
 from evsplat.body.retarget import rest_from_zero
 from evsplat.body.skeleton import find_skeleton
-from evsplat.errors import DataError
 
 
 def down_the_tree(
@@ -34,13 +32,3 @@ def upright_world(
     taker = find_skeleton(body.parents.tolist(), body.joint_names)
     mover = find_skeleton(parents, joint_names, source)
     return rest_from_zero(mover, zero_joints, taker, body.rest_joints.double().numpy())
-
-
-def read_text(path: Path) -> str:
-    """The file's text; a `DataError` names a file that is missing or no text."""
-    try:
-        return path.read_text(encoding="utf-8", errors="strict")
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not a readable text file ({error}).") from None
