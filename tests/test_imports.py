@@ -1,185 +1,133 @@
-"""Who imports whom: the layers of ARCHITECTURE.md, read from the source without running it."""
+"""Who imports whom: the layers of ARCHITECTURE.md, read from the source without running it.
+
+Imports count wherever they stand: at the top, in functions, and for types alone.
+"""
 
 import ast
-from collections.abc import Iterator
+import re
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
-SOURCE = Path(__file__).parents[1] / "src" / "evsplat"
-ROOT = "evsplat"
-
-# From low to high: a folder imports from itself and from lines above its own, not from its line.
-LAYERS = """
-    _native cuda_support errors
-    compiled devices files names safe_pickle shipped weights
-    config neighbours
-    imaging render similarity
-    events
-    body calibration
-    capture
-    footage gaussians masks restore staging
-    deform synthesis
-    capture.importers objectives
-    hugs
-    methods
-    training
-    evaluation
-    benching film
-    export
-    view
-    cli
-    evsplat __main__
-"""
-RANK = {name: rank for rank, line in enumerate(LAYERS.split("\n")) for name in line.split()}
-
-# Imports of a higher layer that are left; take a line away with its import.
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "evsplat"
+# Rows of the table "Folders, and who imports whom": a layer and what is in it.
+ROWS = re.findall(r"^\| (\d+) \| (`.+?`) \|", (ROOT / "ARCHITECTURE.md").read_text("utf-8"), re.M)
+RANK = {name: int(layer) for layer, names in ROWS for name in re.findall("`(.+?)`", names)}
+# Imports of a higher layer that are left; a line goes with its import.
 EXCEPTIONS = {
-    ("body.adapters", "capture.body_file"),  # its type alone
-    ("body.silhouette", "capture.camera"),  # its type alone
-    ("body.track", "capture"),  # types alone: `load_body_track` takes a capture
-    ("calibration", "capture"),  # its type alone: `estimate_from_capture` takes a capture
-    ("imaging.edi", "events.maps"),  # a deblurring by events, in a folder of arithmetic on light
+    ("body.adapters", "capture.body_file"),  # for its type alone
+    ("body.silhouette", "capture.camera"),  # for its type alone
+    ("body.track", "capture"),  # for types alone, of what `load_body_track` takes
+    ("calibration", "capture"),  # for its type alone, of what `estimate_from_capture` takes
+    ("imaging.edi", "events.maps"),  # deblurring by events, in a folder of arithmetic on light
     ("imaging.edi", "events.stream"),
-    ("evaluation.report.clip", "export.video"),  # inside a function: the clip is a video
+    ("evaluation.report.clip", "export.video"),  # in a function: the report's clip is a video
 }
-# Files that need each other, as soon as they are imported and later; these too may only shrink.
-KNOTS = [{"events", "events.simulator", "events.simulator.sensor", "imaging", "imaging.edi"}]
-LATER_KNOTS = [
+# Files that import each other in a circle: one at import time, the rest in functions or for types.
+CIRCLES = [
+    {"events", "events.simulator", "events.simulator.sensor", "imaging", "imaging.edi"},
     {"body.adapters", "body.smpl"},
     {"capture.capture", "capture.training_capture"},
     {"cli.demo", "cli.main", "cli.train", "cli.viewer_process"},
     {"footage.folder", "footage.footage", "footage.video"},
     {"view.panel", "view.pose_panel", "view.save_panel"},
 ]
-# What sees all of a recording: `Capture` hides nothing of what is held out from training.
-SEE_EVERYTHING = set("benching capture evaluation export film synthesis view".split()) | {
-    "masks.capture",  # these four open a capture and give `for_training` of it to the rest
-    "restore.capture",
-    "training.run",
-    "training.train",
-    "body.track",  # the type alone, for evaluation with dense poses
-    ROOT,
-}
-SEE_TRAINING_ALONE = set("calibration deform gaussians hugs methods objectives".split())
+# `Capture` shows what is held out as well: these need it, or make a `TrainingCapture` of it.
+SEE_EVERYTHING = set("capture synthesis evaluation benching film export view evsplat".split())
+SEE_EVERYTHING |= {"masks.capture", "restore.capture", "training.run", "training.train"}
+SEE_EVERYTHING |= {"body.track"}  # for the type alone: `load_body_track` takes either capture
+SEE_TRAINING_ALONE = set("calibration gaussians deform objectives hugs methods".split())
 
 
-class Import(NamedTuple):
-    module: str
-    target: str
-    name: str
-    now: bool  # when the module is imported; not in a function, not for types alone
+def imports_of(module: str, tree: ast.Module) -> Iterator[tuple[str, str, str]]:
+    """The module, one that it imports, and the name that it takes of that."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [entry.name for entry in node.names if entry.name.startswith("evsplat")]
+            assert set(names) <= {"evsplat"}, f"{module}: write from ... import"
+            yield from ((module, name, "") for name in names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: a relative import"
+            package, _, target = f"{node.module}".partition(".")
+            for name in (entry.name for entry in node.names if package == "evsplat"):
+                inner = f"{target}.{name}".lstrip(".")
+                yield module, inner if inner in FILES else target or "evsplat", name
 
 
-def _named(path: Path) -> str:
-    parts = path.relative_to(SOURCE).with_suffix("").parts
-    return ".".join(part for part in parts if part != "__init__") or ROOT
-
-
-FILES = {_named(path): path for path in (*SOURCE.rglob("*.py"), *SOURCE.rglob("*.pyi"))}
-TREES = {module: ast.parse(path.read_text("utf-8")) for module, path in FILES.items()}
-
-
-def _imports(module: str, node: ast.AST, now: bool = True) -> Iterator[Import]:
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.Import):
-            for full, name in ((f"{entry.name}.", "") for entry in child.names):
-                if full.startswith(f"{ROOT}."):
-                    yield Import(module, full[len(ROOT) + 1 : -1] or ROOT, name, now)
-        elif isinstance(child, ast.ImportFrom):
-            assert child.level == 0, f"{module}: a relative import"
-            package, _, inside = f"{child.module}".partition(".")
-            for name in (entry.name for entry in child.names if package == ROOT):
-                whole = f"{inside}.{name}".lstrip(".")
-                yield Import(module, whole if whole in FILES else inside or ROOT, name, now)
-        else:
-            function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-            types = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
-            yield from _imports(module, child, now and not function and not types)
-
-
-IMPORTS = [found for module, tree in TREES.items() for found in _imports(module, tree)]
-
-
-def _within(module: str, folders: set[str]) -> str | None:
-    """The innermost of ``folders`` that the module is in, or is."""
+def packages(module: str) -> list[str]:
+    """The module and the packages around it, the innermost first."""
     parts = module.split(".")
-    tried = (".".join(parts[:count]) for count in range(len(parts), 0, -1))
-    return next((name for name in tried if name in folders), None)
+    return [".".join(parts[:count]) for count in range(len(parts), 0, -1)]
 
 
-def _upward() -> set[tuple[str, str]]:
-    places = {module: _within(module, set(RANK)) for module in FILES}
-    return {
-        (found.module, found.target)
-        for found in IMPORTS
-        if found.target != ROOT and places[found.module] != places[found.target]
-        if RANK[places[found.module]] <= RANK[places[found.target]]
-    }
+def place(module: str, places: Collection[str]) -> str:
+    """The innermost of ``places`` that the module is in; itself where it is in none."""
+    return next((name for name in packages(module) if name in places), module)
 
 
-def _knots(*, now: bool) -> list[set[str]]:
-    runs = {module: set() for module in FILES}
-    for found in IMPORTS:
-        parts = found.target.split(".")  # importing a.b runs a as well, but where it is running
-        packages = {".".join(parts[:count]) for count in range(1, len(parts) + 1)}
-        above = {name for name in packages if f"{found.module}.".startswith(f"{name}.")}
-        runs[found.module] |= packages - above - {ROOT} if found.now or not now else set()
-    reached = {}
-    for module in FILES:
-        reached[module], waiting = set(), [module]
+FILES = {
+    ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix("__init__").rstrip(".")
+    or "evsplat": ast.parse(path.read_text("utf-8"))
+    for path in (*SOURCE.rglob("*.py"), SOURCE / "_native.pyi")
+}
+IMPORTS = [found for module, tree in FILES.items() for found in imports_of(module, tree)]
+UPWARD = {
+    (module, target)
+    for module, target, _ in IMPORTS
+    if target != "evsplat" and place(module, RANK) != place(target, RANK)
+    if RANK[place(module, RANK)] <= RANK[place(target, RANK)]
+}
+SEERS = {
+    module
+    for module, target, name in IMPORTS
+    if name in ("Capture", "load_capture", "capture") or target == "capture.capture"
+}
+
+
+def circles() -> list[set[str]]:
+    runs: dict[str, set[str]] = {module: set() for module in FILES}
+    for module, target, _ in IMPORTS:
+        if target != "evsplat":
+            # Python runs the packages around a module before it.
+            runs[module] |= {target} | set(packages(target)) - set(packages(module))
+    reached: dict[str, set[str]] = {module: set() for module in FILES}
+    for module, seen in reached.items():
+        waiting = [module]
         while waiting:
-            new = runs[waiting.pop()] - reached[module]
-            reached[module] |= new
+            new = runs[waiting.pop()] - seen
+            seen |= new
             waiting += new
-    knots = ({b for b in reached[a] if a in reached[b]} for a in FILES)
-    return sorted({frozenset(knot) for knot in knots if knot}, key=sorted)
+    found = {frozenset(b for b in reached[a] if a in reached[b]) for a in FILES}
+    return [set(circle) for circle in found if circle]
 
 
 def test_every_folder_has_a_layer_and_every_layer_a_folder():
-    assert {_within(module, set(RANK)) for module in FILES} == set(RANK)
+    assert {place(module, RANK) for module in FILES} == set(RANK)
 
 
 def test_folders_import_from_lower_layers_alone():
-    assert _upward() - EXCEPTIONS == set()
+    assert UPWARD - EXCEPTIONS == set()
 
 
 def test_every_exception_is_still_needed():
-    assert EXCEPTIONS - _upward() == set()
+    assert EXCEPTIONS - UPWARD == set()
 
 
 def test_files_that_import_each_other_are_the_ones_we_know():
-    assert _knots(now=True) == KNOTS
-    assert _knots(now=False) == sorted(KNOTS + LATER_KNOTS, key=sorted)
+    assert sorted(circles(), key=sorted) == sorted(CIRCLES, key=sorted)
 
 
-def test_the_package_takes_nothing_of_its_own_top_but_the_version():
-    taken = {found.name for found in IMPORTS if found.target == ROOT} - {""}
-    for node in (node for tree in TREES.values() for node in ast.walk(tree)):
-        if isinstance(node, ast.Attribute) and ast.unparse(node.value) == ROOT:
-            taken.add(node.attr)
+def test_modules_take_nothing_of_the_package_itself_but_its_version():
+    nodes = [node for tree in FILES.values() for node in ast.walk(tree)]
+    used = [node for node in nodes if isinstance(node, ast.Attribute)]
+    taken = {node.attr for node in used if getattr(node.value, "id", "") == "evsplat"}
+    taken |= {name for _, target, name in IMPORTS if target == "evsplat" and name}
     assert taken == {"__version__"}
 
 
-def _seers() -> set[str]:
-    """Modules that import what sees all of a recording."""
-    return {
-        found.module
-        for found in IMPORTS
-        if found.name in ("Capture", "load_capture") or found.target == "capture.capture"
-    }
-
-
 def test_what_training_is_made_of_never_imports_the_whole_capture():
-    assert not {module for module in _seers() if _within(module, SEE_TRAINING_ALONE)}
+    assert [name for name in SEERS if place(name, SEE_TRAINING_ALONE) in SEE_TRAINING_ALONE] == []
 
 
 def test_the_whole_capture_is_imported_where_it_is_needed_and_nowhere_else():
-    assert {_within(module, SEE_EVERYTHING) or module for module in _seers()} == SEE_EVERYTHING
-
-
-def test_nobody_reaches_behind_a_training_capture():
-    for module, tree in TREES.items():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Attribute) and node.attr in ("_source", "_masker"):
-                inside = _within(module, {"capture"}) or ast.unparse(node.value) == "self"
-                assert inside, f"{module}: {ast.unparse(node)}"
+    assert {place(module, SEE_EVERYTHING) for module in SEERS} == SEE_EVERYTHING
