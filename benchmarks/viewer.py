@@ -51,7 +51,8 @@ def untrained_run(gaussians: int, method: str) -> Run:
     human = gaussians // 5
     values = override({}, (f"human.count={human}", "deform.non_rigid_start=0"))
     config = method_config(method, values, where="benchmark")
-    model = TRAINABLE[method][1](config, capture, 0, fit=False).model
+    seen = capture.for_training(config.policy)
+    model = TRAINABLE[method][1](config, seen, 0, fit=False).model
     rows = model.gaussians
     more = gaussians - len(rows)
     own = torch.randint(rows.human_count, len(rows), (max(more, 0),))
@@ -65,7 +66,8 @@ def untrained_run(gaussians: int, method: str) -> Run:
     rows.set_rows(grown, rows.human_count)
     counts = {"human": rows.human_count, "scene": rows.scene_count}
     made = GaussianReconstruction(method, model)
-    return Run(Path("none"), config, method, capture, made, 0, 0.0, "cpu", counts, False)
+    facts = (capture, made, 0, 0.0, "cpu", counts, False)
+    return Run(Path("none"), config, method, config.policy, *facts)
 
 
 async def pictures(port: int, seconds: float, change, viewer: Viewer) -> list[tuple[float, int]]:

@@ -112,7 +112,8 @@ def test_a_model_without_pose_dependence_is_its_avatar(tiny_capture, method):
     if method == "evsplat":  # the person's own shadow is of its pose
         values = override(values, ("deform.self_shadow=false",))
     config = method_config(method, values, where="test")
-    model = TRAINABLE[method][1](config, capture, 0, fit=False).model
+    seen = capture.for_training(config.policy)
+    model = TRAINABLE[method][1](config, seen, 0, fit=False).model
     if method == "evsplat":
         with torch.no_grad():
             model.shading.coefficients.normal_(std=0.1)

@@ -30,7 +30,8 @@ def _run(tiny_capture, request):
     torch.manual_seed(int(np.random.default_rng().integers(1 << 31)))
     method, capture = request.param, load_capture(tiny_capture())
     config = method_config(method, override({}, SMALL[method]), where="test")
-    model = TRAINABLE[method][1](config, capture, 0, fit=False).model
+    seen = capture.for_training(config.policy)
+    model = TRAINABLE[method][1](config, seen, 0, fit=False).model
     with torch.no_grad():
         for name, parameter in model.named_parameters():
             if "logits" not in name:
@@ -41,7 +42,8 @@ def _run(tiny_capture, request):
         "scene": sum(part.scene_count for part in rows),
     }
     made = GaussianReconstruction(method, model)
-    return Run(Path("none"), config, method, capture, made, 0, 0.0, "cpu", counts, False)
+    facts = (capture, made, 0, 0.0, "cpu", counts, False)
+    return Run(Path("none"), config, method, config.policy, *facts)
 
 
 def _views(run):

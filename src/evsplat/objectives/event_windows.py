@@ -102,7 +102,7 @@ class EventWindows(Stateless):
     def _late_us(self) -> int:
         """By how much events are stamped later than the frames' clock says, as learned so far."""
         offset = self.sensor.offset_us
-        return 0 if offset is None else round(float(offset))
+        return 0 if offset is None else round(float(offset.detach()))
 
     def differences(self, step: Step, kept: slice) -> Float[Tensor, "T-1 H W"]:
         """Rendered less reported change of log-brightness between the neighbouring times kept.
