@@ -3,7 +3,8 @@
 import json
 import os
 import shutil
-from collections.abc import Callable
+import tracemalloc
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
@@ -20,6 +21,16 @@ hypothesis.settings.load_profile("evsplat")
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONTRAST = 0.2
 PERIOD_US, EXPOSURE_US, SUBFRAMES = 40_000, 30_000, 8
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """At most a megabyte is taken in the test."""
+    tracemalloc.start()
+    yield
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
 
 
 @pytest.fixture(scope="session")

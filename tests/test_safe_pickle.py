@@ -6,10 +6,8 @@ import os
 import pickle
 import struct
 import subprocess
-import tracemalloc
 import warnings
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import joblib
@@ -253,16 +251,6 @@ TOO_MUCH = {
     # its values again, after it was filled: a second BUILD
     "array filled twice": OBJECTS[:-1] + OBJECTS[OBJECTS.rindex(b"(K\x01") : -1] + b".",
 }
-
-
-@pytest.fixture
-def little_memory() -> Iterator[None]:
-    """At most a megabyte is taken in the test."""
-    tracemalloc.start()
-    yield
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 1 << 20
 
 
 @pytest.mark.usefixtures("little_memory")

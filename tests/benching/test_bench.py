@@ -191,3 +191,13 @@ def test_a_cell_is_made_by_its_own_policy_and_says_so(tiny_capture, tmp_path):
     origins = {name: restored["contrast_threshold_origin"] for name, restored in made.items()}
     assert origins["one-edi"] == "from the capture"
     assert origins["one-edi-thresholds-estimated"] == "estimated from the capture"
+
+
+def test_a_row_that_trained_on_everything_is_not_measured(tiny_capture, tmp_path):
+    row = {"name": "all", "method": "paper", "settings": ["policy.use=everything"]}
+    suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, row)
+    folder = BenchFolder(tmp_path / "out")
+    (cell,) = make_plan(read_suite(suite), folder).cells
+    run_cell(folder.path, cell, threads=1, device="cpu")
+    record = read_json(folder.record_of(cell.id))
+    assert record["status"] == "failed" and "nothing to measure" in record["reason"]

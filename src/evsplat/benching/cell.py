@@ -130,6 +130,11 @@ def run_cell(folder: Path, cell: Cell, *, threads: int | None, device: str) -> N
 
 def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) -> dict[str, Any]:
     """Figures of the cell against the capture as it was recorded, restored or not."""
+    if cell.policy.use == "everything":
+        raise ConfigError(
+            f"row {cell.row}: policy.use is everything, so that nothing is held out and there is "
+            "nothing to measure; leave it out."
+        )
     device = choose_device(device)
     recorded = load_capture(_recorded(bench, cell.capture))
     seen = recorded.for_training(cell.policy)
@@ -215,7 +220,7 @@ def _restored(bench: BenchFolder, recorded: Capture, cell: Cell) -> Path:
 def _restored_by(policy: Policy) -> dict[str, Any]:
     """Of a policy, what restorers see and is not the default."""
     strict = Policy()
-    names = ("use", "held_out_events", "thresholds")
+    names = ("held_out_events", "thresholds")
     values = {name: getattr(policy, name) for name in names}
     return {name: value for name, value in values.items() if value != getattr(strict, name)}
 

@@ -91,11 +91,11 @@ class NoiseMeter:
 
 def noise_of(events: EventStore) -> NoiseEstimate:
     """Background rate and hot pixels of all of a recording that may be read, second by second."""
-    meter = NoiseMeter(events.width, events.height)
-    for start, end in events.stretches_us:
+    meter, stretches = NoiseMeter(events.width, events.height), events.stretches_us
+    for start, end in stretches:
         for first in range(start, end, _PIECE_US):
             meter.add(events.between(first, min(first + _PIECE_US, end)))
-    return meter.estimate(sum(end - start for start, end in events.stretches_us))
+    return meter.estimate(sum(end - start for start, end in stretches))
 
 
 def _has_support(chunk: EventStream, width: int, height: int) -> np.ndarray:

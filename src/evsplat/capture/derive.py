@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,15 @@ from torch import Tensor
 from evsplat.capture.capture import Capture
 from evsplat.capture.encode import write_image
 from evsplat.capture.metadata import Frame
+from evsplat.capture.policy import Policy
+from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
 from evsplat.files import new_folder, read_json, write_json
+
+Frames = Sequence[Frame]
+Made = Iterator[tuple[Frame, Float[Tensor, "..."]]]
 
 _PICTURES = ("image", "sharp", "mask")
 _FOLDERS = {"image": "images", "sharp": "sharp", "mask": "masks"}
@@ -73,6 +78,18 @@ def derived_capture(
             if finding.severity == "error":
                 place = path / finding.file.relative_to(folder)
                 raise DataError(f"{dataclasses.replace(finding, file=place)}")
+
+
+def training_frames_first(
+    capture: Capture, seen: TrainingCapture, make: Callable[[TrainingCapture, Frames], Made]
+) -> Made:
+    """What ``make`` gives of all frames: of training frames from what they may know, ``seen``.
+
+    Held-out frames, which no training opens, come after them and from everything.
+    """
+    yield from make(seen, seen.train_frames)
+    everything = capture.for_training(Policy(use="everything"))
+    yield from make(everything, [everything.frame(f.name) for f in seen.held_out_frames])
 
 
 def write_picture(path: Path, picture: Float[Tensor, "..."]) -> None:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from evsplat.errors import ConfigError
+
 Use = Literal["training", "everything"]
 Masks = Literal["given", "estimated", "none"]
 
@@ -31,6 +33,14 @@ class Policy:
     held_out_poses: Literal["given", "interpolated"] = "given"
     """``interpolated``: key poses inside held-out intervals are not seen either, and the person's
     pose there is interpolated from those of training frames."""
+
+    def require_held_out_events(self, setting: str) -> None:
+        """A `ConfigError` where a ``setting`` that wants them is on and they are hidden."""
+        if not self.held_out_events:
+            raise ConfigError(
+                f"{setting} is true, and policy.held_out_events is false, which hides the events "
+                "that it wants; pass --set policy.held_out_events=true as well."
+            )
 
     @property
     def departures(self) -> tuple[str, ...]:

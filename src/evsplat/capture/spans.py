@@ -1,6 +1,8 @@
 """When a recording is open to training: all of its time but the held-out intervals."""
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from itertools import accumulate
 
 from evsplat.capture.metadata import Frame
 from evsplat.events import ALWAYS, Span
@@ -14,14 +16,18 @@ def held_out_spans(frames: Sequence[Frame]) -> tuple[Span, ...]:
     overlap. Without a training frame on a side it has no end there. No training exposure reaches
     into one, so that of overlapping exposures the training one is seen whole.
     """
-    train = [frame for frame in frames if frame.split == "train"]
+    train = sorted((f for f in frames if f.split == "train"), key=lambda frame: frame.mid_us)
+    mids = [frame.mid_us for frame in train]
+    # Latest end of the first i training exposures, and earliest start of the others.
+    ends = list(accumulate((f.exposure_us[1] for f in train), max, initial=ALWAYS[0]))
+    starts = list(accumulate((f.exposure_us[0] for f in reversed(train)), min, initial=ALWAYS[1]))
+    starts.reverse()
     spans = []
     for frame in frames:
         if frame.split == "train":
             continue
-        before = [other.exposure_us[1] for other in train if other.mid_us <= frame.mid_us]
-        after = [other.exposure_us[0] for other in train if other.mid_us >= frame.mid_us]
-        start, end = max(before, default=ALWAYS[0]), min(after, default=ALWAYS[1])
+        start = ends[bisect_right(mids, frame.mid_us)]
+        end = starts[bisect_left(mids, frame.mid_us)]
         if start < end:
             spans.append((start, end))
     merged: list[Span] = []

@@ -1,6 +1,7 @@
 """`TrainingCapture`: of a recording, what a training may see; everything else raises."""
 
 import functools
+import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -64,12 +65,12 @@ class TrainingCapture:
     def __repr__(self) -> str:
         return f"TrainingCapture({str(self.path)!r}, {self.policy})"
 
-    @property
+    @functools.cached_property
     def train_frames(self) -> tuple[Frame, ...]:
         """Frames whose pictures are seen."""
         return tuple(frame for frame in self.frames if frame.split == "train")
 
-    @property
+    @functools.cached_property
     def held_out_frames(self) -> tuple[Frame, ...]:
         """Frames of which camera and time alone are known."""
         return tuple(frame for frame in self.frames if frame.split != "train")
@@ -92,16 +93,17 @@ class TrainingCapture:
 
     def neighbours(self, frame: Frame) -> tuple[Frame, ...]:
         """The frames in order of time about a training frame, up to the next held-out ones."""
-        ordered = sorted(self.frames, key=lambda other: other.mid_us)
-        run: list[Frame] = []
-        for other in ordered:
-            if other.split != "train":
-                if any(seen.name == frame.name for seen in run):
-                    break
-                run = []
-            else:
-                run.append(other)
-        return tuple(run)
+        return self._runs[self._seen(frame, "neighbours")]
+
+    @functools.cached_property
+    def _runs(self) -> dict[str, tuple[Frame, ...]]:
+        """By the name of each training frame, those about it up to the next held-out ones."""
+        ordered = sorted(self.frames, key=lambda frame: frame.mid_us)
+        runs: dict[str, tuple[Frame, ...]] = {}
+        for split, group in itertools.groupby(ordered, key=lambda frame: frame.split):
+            run = tuple(group)
+            runs |= {frame.name: run for frame in run if split == "train"}
+        return runs
 
     def camera(self, frame: Frame | str) -> Camera:
         """See `Capture.camera`."""
@@ -118,11 +120,10 @@ class TrainingCapture:
 
     def has_mask(self, frame: Frame | str) -> bool:
         """Whether `mask` gives one; False where the policy shows none."""
-        if self._name(frame) not in {seen.name for seen in self.train_frames}:
-            return False
+        own = self.frame(self._name(frame))
         if self.policy.masks == "estimated":
-            return True
-        return self.frame(self._name(frame)).mask is not None
+            return own.split == "train"
+        return own.mask is not None  # redacted where it is not seen
 
     def mask(self, frame: Frame | str) -> Float[Tensor, "H W"] | None:
         """Share of the person per pixel in a training frame, in [0, 1]; None where it has none."""
@@ -231,13 +232,13 @@ class TrainingCapture:
         return (ALWAYS,) if self.policy.held_out_events else open_spans(self.frames)
 
     def _kept_keys(self, times_us: np.ndarray) -> np.ndarray:
-        kept = np.ones(len(times_us), dtype=bool)
-        for start, end in held_out_spans(self.frames):
-            kept &= (times_us < start) | (times_us >= end)
+        edges = np.array(held_out_spans(self.frames), dtype=np.int64).reshape(-1)
+        kept: np.ndarray = np.searchsorted(edges, times_us, side="right") % 2 == 0
         if self.policy.held_out_poses == "given":
-            for frame in self.held_out_frames:
-                # the key at mid-exposure, or the nearest one before and the nearest one after
-                before = int(np.searchsorted(times_us, frame.mid_us, side="right")) - 1
-                after = int(np.searchsorted(times_us, frame.mid_us, side="left"))
-                kept[[i for i in (before, after) if 0 <= i < len(times_us)]] = True
+            mids = np.array([frame.mid_us for frame in self.held_out_frames], dtype=np.int64)
+            # the key at mid-exposure, or the nearest one before and the nearest one after
+            near = np.concatenate(
+                [np.searchsorted(times_us, mids, "right") - 1, np.searchsorted(times_us, mids)]
+            )
+            kept[near[(near >= 0) & (near < len(times_us))]] = True
         return kept

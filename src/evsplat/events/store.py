@@ -5,7 +5,9 @@ t >= 1000 m; `t_offset` is added to every t. Times that leave this module are on
 ``t + t_offset + clock_offset_us``.
 """
 
+import functools
 import os
+from bisect import bisect_right
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -66,7 +68,7 @@ class EventStore:
 
     def __len__(self) -> int:
         """Count of events, without held-out ones."""
-        return sum(last - first for first, last in self._open_rows())
+        return sum(last - first for first, last in self._open_rows)
 
     @property
     def time_range_us(self) -> Span:
@@ -76,7 +78,7 @@ class EventStore:
         (0, 0) where there are no events.
         """
         t: h5py.Dataset = self._open()["events/t"]
-        rows = [pair for pair in self._open_rows() if pair[0] < pair[1]]
+        rows = [pair for pair in self._open_rows if pair[0] < pair[1]]
         if not rows:
             return 0, 0
         return int(t[rows[0][0]]) + self._shift_us, int(t[rows[-1][1] - 1]) + self._shift_us + 1
@@ -90,10 +92,10 @@ class EventStore:
 
     def open_around(self, time_us: int) -> Span:
         """The stretch of time that may be read and holds an instant, or ends with it."""
-        for start, end in self._open_us:
-            if start <= time_us <= end:
-                return start, end
-        raise HeldOutError(f"{self.path}: {time_us} us lies in a held-out interval{_HIDDEN}")
+        span = self._open_from(time_us)
+        if span is None or time_us > span[1]:
+            raise HeldOutError(f"{self.path}: {time_us} us lies in a held-out interval{_HIDDEN}")
+        return span
 
     def opened(self, open_us: Sequence[Span]) -> "EventStore":
         """The same recording as it is seen where only ``open_us`` may be read."""
@@ -108,7 +110,7 @@ class EventStore:
             stored: h5py.Dataset = self._open()["events/p"]
             blocks = [
                 (start, min(start + _POLARITY_BLOCK, last))
-                for first, last in self._open_rows()
+                for first, last in self._open_rows
                 for start in range(first, last, _POLARITY_BLOCK)
             ]
             self._has_polarity = not blocks or any(
@@ -182,6 +184,7 @@ class EventStore:
                 ) from error
         return self._file
 
+    @functools.cached_property
     def _open_rows(self) -> list[tuple[int, int]]:
         """First row and one past the last of each open stretch, of the file's columns."""
         if self._open_us == (ALWAYS,):
@@ -195,10 +198,16 @@ class EventStore:
         near = self._read(file, "events/t", first, self._index_at_ms(-(-time // 1000)))
         return first + int(np.searchsorted(near, time))
 
+    def _open_from(self, time_us: int) -> Span | None:
+        """The last open stretch that begins at or before a time."""
+        after = bisect_right(self._open_us, time_us, key=lambda span: span[0])
+        return self._open_us[after - 1] if after else None
+
     def _check_open(self, start_us: int, end_us: int) -> None:
         if start_us >= end_us:
             return
-        if not any(first <= start_us and end_us <= last for first, last in self._open_us):
+        span = self._open_from(start_us)
+        if span is None or end_us > span[1]:
             raise HeldOutError(
                 f"{self.path}: events from {start_us} to {end_us} us lie in a held-out interval, "
                 f"at least in part{_HIDDEN}"

@@ -1,6 +1,5 @@
 """`evsplat masks`: person masks for a capture, in a new one or in itself."""
 
-import itertools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from tqdm import tqdm
 
 import evsplat
 from evsplat.capture import Capture, Frame, Policy, load_capture
-from evsplat.capture.derive import derived_capture, write_picture
+from evsplat.capture.derive import derived_capture, training_frames_first, write_picture
 from evsplat.config import to_dict
 from evsplat.errors import ConfigError, DataError
 from evsplat.files import new_folder, read_json, write_json
@@ -48,12 +47,8 @@ def mask_capture(
     if out is None:
         _check_in_place(capture)
     seen = capture.for_training(policy or Policy())
-    everything = capture.for_training(Policy(use="everything"))
-    held_out = [everything.frame(frame.name) for frame in seen.held_out_frames]
     masker = MASKERS[method](seen, **options)
-    found = itertools.chain(
-        masker.masks(seen, seen.train_frames), masker.masks(everything, held_out)
-    )
+    found = training_frames_first(capture, seen, masker.masks)
     masks = tqdm(found, "masks", len(capture.frames), unit="frame")
     made = {"with": masker.name, **masker.provenance(), "evsplat": evsplat.__version__}
     made["policy"] = to_dict(seen.policy)

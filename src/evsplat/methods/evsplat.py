@@ -14,7 +14,6 @@ import torch
 from evsplat.calibration import SensorEstimate, estimate_from_capture
 from evsplat.capture import TrainingCapture
 from evsplat.deform.human_scene import DeformConfig
-from evsplat.errors import ConfigError
 from evsplat.methods.build import Build
 from evsplat.methods.composition import Composition, HeldOut
 from evsplat.methods.config import LearningRates, OptimisationConfig, Weight
@@ -205,11 +204,7 @@ def _held_out(
     frames = list(capture.held_out_frames)
     if not config.pose.events_of_held_out or model.pose_spline is None or not frames:
         return None
-    if not config.policy.held_out_events:
-        raise ConfigError(
-            "pose.events_of_held_out is true, and policy.held_out_events is false, which hides "
-            "those events; pass --set policy.held_out_events=true as well."
-        )
+    config.policy.require_held_out_events("pose.events_of_held_out")
     return HeldOut(
         frames,
         HeldOutWindows(windows, capture.train_frames),

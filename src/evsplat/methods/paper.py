@@ -11,7 +11,7 @@ from evsplat.body import BodyTrack, body_box, silhouette
 from evsplat.capture import TrainingCapture
 from evsplat.deform.human_scene import Semantics
 from evsplat.deform.pose_spline import PoseSpline
-from evsplat.errors import ConfigError, DataError
+from evsplat.errors import DataError
 from evsplat.gaussians import DensifyConfig, GaussianSet, Part
 from evsplat.methods.build import Build, Ground, PersonConfig, PersonLossConfig
 from evsplat.methods.composition import Composition, HeldOut
@@ -227,11 +227,8 @@ def observed(
 
 def paper_events(config: EventConfig, capture: TrainingCapture) -> EventChange:
     """The paper's event term (eq. 8-9)."""
-    if config.across_gaps and not capture.policy.held_out_events:
-        raise ConfigError(
-            "event.across_gaps is true, and policy.held_out_events is false, which hides the "
-            "events in those gaps; pass --set policy.held_out_events=true as well."
-        )
+    if config.across_gaps:
+        capture.policy.require_held_out_events("event.across_gaps")
     return EventChange(
         capture,
         start=config.start,

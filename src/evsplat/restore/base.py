@@ -25,8 +25,8 @@ class Restorer(Protocol):
     def restore(
         self, capture: TrainingCapture, frames: Sequence[Frame]
     ) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
-        """Each of ``frames``, training frames of ``capture`` in order of time, with its sharp
-        picture at mid-exposure, sRGB-coded in [0, 1].
+        """Each of ``frames``, training frames of ``capture``, with its sharp picture at
+        mid-exposure, sRGB-coded in [0, 1].
         """
         ...
 

@@ -1,15 +1,13 @@
 """`evsplat restore`: a capture with sharp pictures in place of the blurry ones."""
 
-import itertools
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 import evsplat
-from evsplat.capture import Frame, Policy, load_capture
-from evsplat.capture.derive import derived_capture
+from evsplat.capture import Policy, load_capture
+from evsplat.capture.derive import derived_capture, training_frames_first
 from evsplat.config import to_dict
 from evsplat.errors import ConfigError
 from evsplat.restore.base import RESTORERS
@@ -41,14 +39,9 @@ def restore_capture(
         raise ConfigError(f"no restorer is named {method!r}, expected {' or '.join(RESTORERS)}.")
     capture = load_capture(path)
     seen = capture.for_training(policy or Policy())
-    everything = capture.for_training(Policy(use="everything"))
-    held_out = [everything.frame(frame.name) for frame in seen.held_out_frames]
     restorer = RESTORERS[method](seen, **options)
     with derived_capture(capture, out, without=("image",)) as making:
-        pictures = itertools.chain(
-            restorer.restore(seen, _in_time(seen.train_frames)),
-            restorer.restore(everything, _in_time(held_out)),
-        )
+        pictures = training_frames_first(capture, seen, restorer.restore)
         for frame, picture in tqdm(pictures, "restore", len(capture.frames), unit="frame"):
             making.set_picture(frame, "image", picture)
             making.entry(frame)["exposure_us"] = [frame.mid_us, frame.mid_us + 1]
@@ -66,7 +59,3 @@ def restore_capture(
             },
         }
     return Path(out)
-
-
-def _in_time(frames: Iterable[Frame]) -> list[Frame]:
-    return sorted(frames, key=lambda frame: frame.mid_us)

@@ -88,11 +88,11 @@ def _cards(metrics: dict[str, Any]) -> str:
         value = metrics["protocols"]["standard"][region]["psnr"]
         if value is None:
             continue
-        lines = "".join(
-            f'<p class="{"up" if value >= theirs else "down"}">'
-            f"{distance(value, theirs, 2)} {_REFERENCES[name]}</p>"
-            for name, theirs in references(metrics, region).items()
-        )
+        lines = ""
+        for name, theirs in references(metrics, region).items():
+            apart = distance(value, theirs, 2)
+            kind = "down" if apart.endswith("below") else "up"
+            lines += f'<p class="{kind}">{apart} {_REFERENCES[name]}</p>'
         cards.append(
             f'<div class="card"><p>PSNR, {title}</p>'
             f'<p class="big">{value:.2f}<small> dB</small></p>{lines}</div>'
