@@ -1,9 +1,8 @@
 """The Gaussian set: parameters, semantic attribute, start, densification."""
 
-from evsplat.gaussians.densify import DensifyConfig, Edit, ScreenStatistics, densify
+from evsplat.gaussians.densify import DensifyLimits, Edit, ScreenStatistics, densify
 from evsplat.gaussians.flip import BodyFrames, flip_labels
 from evsplat.gaussians.gaussian_set import (
-    ATTRIBUTES,
     FEATURE_DIM,
     GaussianSet,
     OneClassRows,
@@ -11,26 +10,20 @@ from evsplat.gaussians.gaussian_set import (
     Rows,
     Shape,
 )
-from evsplat.gaussians.posed import PosedGaussians, PosedHuman, SecondCopies, StaticScene
 from evsplat.gaussians.row_adam import RowAdam
 
 __all__ = [
-    "ATTRIBUTES",
     "FEATURE_DIM",
     "BodyFrames",
-    "DensifyConfig",
+    "DensifyLimits",
     "Edit",
     "GaussianSet",
     "OneClassRows",
     "Part",
-    "PosedGaussians",
-    "PosedHuman",
     "RowAdam",
     "Rows",
     "ScreenStatistics",
-    "SecondCopies",
     "Shape",
-    "StaticScene",
     "densify",
     "flip_labels",
 ]

@@ -1,6 +1,6 @@
 """Densification: where Gaussians are cloned, split and pruned, each class by its own limits."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,12 +9,11 @@ from torch import Tensor
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.devices import send
 from evsplat.gaussians.gaussian_set import Part, Rows, Shape, person_first
-from evsplat.gaussians.initialise import logit
 from evsplat.gaussians.row_adam import RowAdam
 
 
 @dataclass(frozen=True)
-class DensifyConfig:
+class DensifyLimits:
     """Limits of one class, in nominal iterations (of 15,000) and metres; reference 1.11, A20."""
 
     start: float = 1_000
@@ -32,19 +31,16 @@ class DensifyConfig:
     prune_after: float = 3_000
     """Nominal iteration from which the two size limits below hold."""
     prune_screen_px: float | None = 20
-    """Largest 3-sigma radius on the screen, pixels; null = no limit (scene)."""
+    """Largest 3-sigma radius on the screen, pixels; None = no limit (scene)."""
     prune_scale_m: float | None = 0.35
-    """Largest standard deviation, metres; null = no limit (scene)."""
-    opacity_reset: tuple[float, ...] = ()
-    """Nominal iterations at which opacities are lowered to 0.01. 3DGS-Avatar resets at 3000, 6000
-    and 9000; a static camera recovers badly from it, so none by default (A20)."""
+    """Largest standard deviation, metres; None = no limit (scene)."""
     max_count: int = 60_000
     """No clone or split beyond this number of Gaussians."""
 
 
 @dataclass
 class ScreenStatistics:
-    """What densification needs to know about the renders since the last edit, one row each."""
+    """Sizes and gradients on the screen since the last edit, one row per Gaussian."""
 
     gradient_sum: Float[Tensor, " N"]
     """Sum of the norms of the gradients of the 2-D centres, NDC units."""
@@ -92,20 +88,18 @@ class ScreenStatistics:
 
 @dataclass(frozen=True)
 class Edit:
-    """What one densification did, for the log."""
+    """Numbers of Gaussians that one densification changed."""
 
     cloned: int = 0
     split: int = 0
     pruned: int = 0
-    flipped: int = 0
-    details: dict[str, int] = field(default_factory=dict)
 
 
 def densify(
     gaussians: Rows,
     optimiser: RowAdam,
     statistics: ScreenStatistics,
-    limits: dict[Part, DensifyConfig],
+    limits: dict[Part, DensifyLimits],
     nominal: float,
     generator: torch.Generator,
 ) -> Edit:
@@ -161,18 +155,11 @@ def rebuild(
     optimiser.move_rows(parameters, source[order], fresh[order])
 
 
-def reset_opacities(gaussians: Rows, optimiser: RowAdam, rows: slice) -> None:
-    """Lower the opacities of ``rows`` to at most 0.01 and forget their moments."""
-    with torch.no_grad():
-        gaussians.get_parameter("opacity_logits")[rows].clamp_max_(logit(0.01))
-    optimiser.forget("opacity_logits", rows)
-
-
 def _decide(
     shape: Shape,
     statistics: ScreenStatistics,
     rows: slice,
-    limit: DensifyConfig,
+    limit: DensifyLimits,
     nominal: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Which rows of one class are kept, cloned and split."""

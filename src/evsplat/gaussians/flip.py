@@ -9,7 +9,7 @@ from torch import Tensor
 from evsplat.body import Body, skin
 from evsplat.body.rotations import matrix_to_quaternion, quaternion_multiply
 from evsplat.gaussians.densify import rebuild
-from evsplat.gaussians.gaussian_set import ATTRIBUTES, GaussianSet
+from evsplat.gaussians.gaussian_set import GaussianSet
 from evsplat.gaussians.row_adam import RowAdam
 from evsplat.neighbours import nearest
 
@@ -31,8 +31,8 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames) 
 
     Person to scene: see `to_world`. Scene to person: see `to_canonical`; beyond `REACH_M` the row
     stays in the scene and its logit returns to the boundary. The two classes have separate colour
-    networks, to which the other's features mean nothing: a moved row takes those of the nearest row
-    of its new class.
+    networks, to which the other's features mean nothing, or a different light in their colours: a
+    moved row takes the colour of the nearest row of its new class.
     """
     wants_human = gaussians.semantic_logits.detach() > 0
     human = gaussians.human_mask()
@@ -40,17 +40,17 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames) 
     joining = torch.nonzero(~human & wants_human)[:, 0]
     if len(leaving) + len(joining) == 0:
         return 0
-    values = {name: getattr(gaussians, name).detach().clone() for name in ATTRIBUTES}
+    values = {name: getattr(gaussians, name).detach().clone() for name in gaussians.attributes}
 
     if len(leaving):
         carry(values, leaving, to_world(frames, values["means"][leaving]))
-        _take_features(values, leaving, torch.nonzero(~human)[:, 0])
+        _take_colour(gaussians.colour, values, leaving, torch.nonzero(~human)[:, 0])
     if len(joining):
         near, transforms, _ = to_canonical(frames, values["means"][joining])
         values["semantic_logits"][joining[~near]] = 0.0
         joining = joining[near]
         carry(values, joining, transforms)
-        _take_features(values, joining, torch.nonzero(human)[:, 0])
+        _take_colour(gaussians.colour, values, joining, torch.nonzero(human)[:, 0])
 
     moved = torch.zeros_like(human)
     moved[leaving] = True
@@ -106,11 +106,11 @@ def to_canonical(
     return near, transforms, frames.body.weights[vertex]
 
 
-def _take_features(values: dict[str, Tensor], rows: Tensor, others: Tensor) -> None:
-    """Copy the colour features of the nearest of ``others`` to ``rows``, in place."""
+def _take_colour(name: str, values: dict[str, Tensor], rows: Tensor, others: Tensor) -> None:
+    """Copy attribute ``name`` of the nearest of ``others`` to ``rows``, in place."""
     if len(others):
         source = nearest_row(values["means"][others], values["means"][rows])[1]
-        values["features"][rows] = values["features"][others[source]]
+        values[name][rows] = values[name][others[source]]
 
 
 def _blend(

@@ -8,15 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-ATTRIBUTES = (
-    "means",
-    "scales_log",
-    "quaternions",
-    "opacity_logits",
-    "features",
-    "semantic_logits",
-)
 FEATURE_DIM = 32
+"""Inputs of the colour networks per Gaussian."""
+COLOURS = ("features", "colour_logits")
+"""Names of the attribute of colour: input of a network, or the colour itself."""
 
 Part = Literal["human", "scene"]
 """The two classes."""
@@ -116,7 +111,9 @@ class OneClassRows(Rows):
 class GaussianSet(Rows):
     """Person and scene in one set.
 
-    The person's Gaussians live in canonical metres, those of the scene in world metres (A6).
+    The person's Gaussians live in canonical metres, those of the scene in world metres (A6). Beside
+    the attributes below there is one of colour, see `COLOURS`: (N, 32) inputs of colour networks,
+    or (N, 3) sRGB before the sigmoid.
     """
 
     scales_log: nn.Parameter
@@ -125,15 +122,18 @@ class GaussianSet(Rows):
     """(N, 4) rotation (w, x, y, z), normalised where it is used."""
     opacity_logits: nn.Parameter
     """(N,) opacity before the sigmoid."""
-    features: nn.Parameter
-    """(N, 32) input of the colour networks."""
     semantic_logits: nn.Parameter
     """(N,) l in ``m = sigmoid(l)``, the probability of "person" (paper eq. 4-5, A1)."""
 
     def __init__(self, human: Mapping[str, Tensor], scene: Mapping[str, Tensor]) -> None:
-        """Join the two starts; every mapping holds all of `ATTRIBUTES`."""
-        joined = {name: torch.cat([human[name], scene[name]]) for name in ATTRIBUTES}
+        """Join the two starts, which have the same attributes; see `gaussians_at`."""
+        joined = {name: torch.cat([human[name], scene[name]]) for name in human}
         super().__init__(joined, len(human["means"]))
+
+    @property
+    def colour(self) -> str:
+        """Name of the attribute of colour."""
+        return next(name for name in self.attributes if name in COLOURS)
 
     def of_parts(self, values: Float[Tensor, "N *rest"]) -> tuple[Tensor, Tensor]:
         """Values per row, apart for person and scene.

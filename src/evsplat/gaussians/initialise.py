@@ -10,10 +10,6 @@ from evsplat.capture import Camera
 from evsplat.gaussians.gaussian_set import FEATURE_DIM
 from evsplat.neighbours import nearest
 
-COLOUR_LOGITS = slice(0, 3)
-"""Feature entries that carry the start colour of a scene Gaussian, as logits of sRGB."""
-
-
 def logit(probability: float) -> float:
     """Inverse of the sigmoid."""
     return math.log(probability / (1 - probability))
@@ -34,12 +30,20 @@ def gaussians_at(
     semantic_logit: float,
     quaternions: Float[Tensor, "N 4"] | None = None,
     rgb_srgb: Float[Tensor, "N 3"] | None = None,
+    feature_dim: int | None = FEATURE_DIM,
 ) -> dict[str, Tensor]:
-    """Start values of all attributes; features are zero except for a given colour."""
+    """Start values of all attributes; colours are grey where none is given.
+
+    ``feature_dim`` inputs of a colour network, whose first three are the logits of the colour; None:
+    the logits alone are the colour.
+    """
     count = len(points)
-    features = torch.zeros(count, FEATURE_DIM)
+    logits = torch.zeros(count, 3)
     if rgb_srgb is not None:
-        features[:, COLOUR_LOGITS] = torch.logit(rgb_srgb.float().clamp(0.01, 0.99))
+        logits = torch.logit(rgb_srgb.float().clamp(0.01, 0.99))
+    colour = {"colour_logits": logits}
+    if feature_dim is not None:
+        colour = {"features": torch.nn.functional.pad(logits, (0, feature_dim - 3))}
     if quaternions is None:
         quaternions = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
     return {
@@ -47,7 +51,7 @@ def gaussians_at(
         "scales_log": scales.float().log(),
         "quaternions": quaternions.float(),
         "opacity_logits": torch.full((count,), logit(opacity)),
-        "features": features,
+        **colour,
         "semantic_logits": torch.full((count,), semantic_logit),
     }
 

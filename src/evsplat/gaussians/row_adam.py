@@ -56,11 +56,3 @@ class RowAdam:
                 moved[fresh] = 0
                 state[key] = moved
             self.adam.state[new] = state
-
-    def forget(self, name: str, rows: slice) -> None:
-        """Set the moments of some rows of one attribute to zero."""
-        for group in self.adam.param_groups:
-            state = self.adam.state.get(group["params"][0])
-            if group["name"] == name and state:
-                state["exp_avg"][rows] = 0
-                state["exp_avg_sq"][rows] = 0

@@ -3,123 +3,122 @@
 Numbers of the form 1.5 are sections of the reference that docs/baselines.md quotes.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar
 
 import torch
 
+from evsplat.body import load_body_track
 from evsplat.capture import Policy, TrainingCapture
 from evsplat.capture.masked import MaskedCapture
-from evsplat.deform.human_scene import DeformConfig
-from evsplat.errors import ConfigError
-from evsplat.gaussians import DensifyConfig, GaussianSet
-from evsplat.methods.build import Build, Ground, PersonConfig, PersonLossConfig
-from evsplat.methods.composition import Composition
-from evsplat.methods.config import LearningRates, OptimisationConfig, Weight
-from evsplat.methods.starts import human_start, no_gaussians
-from evsplat.objectives import Alpha, Objective, Photometric
-from evsplat.objectives.perceptual import PerceptualChoice, choose_perceptual
+from evsplat.config import AtLeast
+from evsplat.gaussians import GaussianSet
+from evsplat.methods.avatar_parts import (
+    RELEASED_RATES,
+    SURFACE_SAMPLES,
+    AvatarRates,
+    AvatarTerms,
+    Networks,
+    fitted_avatar,
+    learning_of,
+    picture_terms,
+)
+from evsplat.methods.base import (
+    Composition,
+    Purpose,
+    require_training_frames,
+    start_of_randomness,
+)
+from evsplat.methods.dropped import AVATAR
+from evsplat.methods.settings import NOMINAL_ITERATIONS, Densify, Weight
+from evsplat.methods.starts import HumanStart, Surface, human_start, no_gaussians
+from evsplat.models.paper import RELEASED
+from evsplat.objectives import Alpha
 
 SURELY_PERSON = 20.0
 """Logit whose sigmoid is 1 to the last bit of float32: nothing moves it, and its channel of a
 picture is the alpha picture."""
-SCENE_SETTINGS = ("scene_view_dependent", "scene_direction_dropout", "shadow_lights")
-"""Settings of `DeformConfig` that mean nothing without a scene."""
 
 
 @dataclass(frozen=True)
-class AvatarLossConfig(PersonLossConfig):
-    """Weights of the terms (reference 1.9)."""
-
-    l1: Weight = 1.0
-    dssim: Weight = 0.0
-    perceptual: PerceptualChoice = "available"
-    """``lpips_vgg`` is the released one; ``available`` takes it where its weights are, else
-    ``st_lpips`` where that is installed, and the term has the name of what it is."""
-    alpha: Weight = 0.1
-    """L1 between the alpha picture and the mask."""
-
-
-def avatar_rates() -> LearningRates:
-    """Learning rates of 3DGS-Avatar (reference 1.10)."""
-    return LearningRates(features=1e-3, constant=0.0, gaussians_final=1.0)
-
-
-def avatar_deform() -> DeformConfig:
-    """Networks of 3DGS-Avatar as released (reference 1.3 to 1.8)."""
-    return DeformConfig(
-        non_rigid_last_std=None,
-        skinning_turns=1,
-        view_noise_symmetric=False,
-        pose_correction_start=5_000,
-        unseen_frames="released",
-    )
-
-
-@dataclass(frozen=True)
-class AvatarConfig(PersonConfig):
+class AvatarConfig:
     """All settings of method `avatar3dgs`."""
 
+    DROPPED: ClassVar[dict[str, str]] = AVATAR
+
     policy: Policy = field(default_factory=lambda: Policy(masks="given"))
-    deform: DeformConfig = field(default_factory=avatar_deform)
-    loss: AvatarLossConfig = field(default_factory=AvatarLossConfig)
-    optimisation: OptimisationConfig = field(
-        default_factory=lambda: OptimisationConfig(rates=avatar_rates())
-    )
-    densify_human: DensifyConfig = field(default_factory=DensifyConfig)
+    """Held-out data that training may see."""
+    iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
+    """Training steps; all schedules stretch with it."""
+
+    human: HumanStart = field(default_factory=HumanStart)
+    """Gaussians of the person at the start."""
+    densify: Densify = field(default_factory=lambda: Densify(max_human=60_000))
+    """Growth and pruning."""
+    networks: Networks = field(default_factory=lambda: Networks(pose_start=5_000))
+    """Networks that move and colour the person."""
+
+    l1_weight: Weight = 1.0
+    """Weight of the mean absolute difference to the masked picture, sRGB."""
+    dssim_weight: Weight = 0.0
+    """Weight of 1 - SSIM."""
+    alpha_weight: Weight = 0.1
+    """Weight of the mean absolute difference between the alpha picture and the mask."""
+    terms: AvatarTerms = field(default_factory=lambda: AvatarTerms(perceptual="available"))
+    """Other terms of the loss."""
+
+    rates: AvatarRates = field(default_factory=lambda: RELEASED_RATES)
+    """Learning rates."""
 
 
-def compose(
+def build(
     config: AvatarConfig,
     capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
-    fit: bool = True,
+    purpose: Purpose = "train",
 ) -> Composition:
-    """Put the method together for one capture; see `evsplat.methods.paper.compose`.
-
-    A `DataError` where the capture has no masks, a `ConfigError` where a setting of a scene is set.
-    """
-    _refuse_scene(config.deform)
+    """Put the method together for one capture; a `DataError` where it has no masks."""
+    require_training_frames(capture)
     masked = MaskedCapture(capture, "method avatar3dgs")
-    ground = Ground.of(masked, seed)
-    person = human_start(config.human, masked, ground.track, ground.generator, SURELY_PERSON)
-    gaussians = GaussianSet(person, no_gaussians())
-    build = Build.of(config, ground, gaussians, "fixed", device=device, fit=fit)
-
-    name, perceptual = choose_perceptual(config.loss.perceptual, device=device)
-    dssim = config.loss.dssim != 0.0
-    observed: list[Objective] = [
-        Photometric(
-            masked,
-            _boxes(masked) if perceptual else {},
-            dssim=dssim,
-            perceptual=perceptual,
-            perceptual_term=name,
-        ),
-        Alpha(masked),
-    ]
-    weights: dict[str, Weight] = {"alpha": config.loss.alpha}
-    if perceptual:
-        weights[name] = config.loss.perceptual_weight
-    return build.composition(
-        config,
-        config.loss,
-        observed,
-        weights=weights,
-        densify={},
+    generator = start_of_randomness(seed)
+    track = load_body_track(masked)
+    times_us = [frame.mid_us for frame in masked.train_frames]
+    surface = track.body.sample_surface(SURFACE_SAMPLES, generator)
+    person = human_start(config.human, Surface(), masked, track, generator, SURELY_PERSON)
+    model, prior = fitted_avatar(
+        GaussianSet(person, no_gaussians()),
+        track,
+        times_us,
+        surface,
+        generator,
+        semantics="fixed",
+        networks=config.networks,
+        scene_direction_dropout=0.0,
+        released=RELEASED,
+        skinning_steps=config.terms.skinning_prefit_steps if purpose == "train" else 0,
+        device=device,
+    )
+    pictures, weights = picture_terms(
+        masked,
+        _boxes(masked),
+        config.terms,
+        config.l1_weight,
+        config.dssim_weight,
+        device=device,
+        purpose=purpose,
+    )
+    return Composition(
+        model=model,
+        objectives=[pictures, Alpha(masked), prior, *config.terms.isometry()],
+        weights={**weights, **config.terms.weights(), "alpha": config.alpha_weight},
+        learning=learning_of(model, config.rates),
+        densify=config.densify.limits(),
+        body_frames=None,
+        generator=generator,
         capture=masked,
     )
-
-
-def _refuse_scene(deform: DeformConfig) -> None:
-    defaults = {f.name: f.default for f in fields(DeformConfig)}
-    for name in SCENE_SETTINGS:
-        if getattr(deform, name) != defaults[name]:
-            raise ConfigError(
-                f"deform.{name} is {getattr(deform, name)}, but method avatar3dgs has no scene; "
-                "leave that setting out."
-            )
 
 
 def _boxes(capture: MaskedCapture) -> dict[str, tuple[int, int, int, int]]:

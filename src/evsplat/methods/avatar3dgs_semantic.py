@@ -7,63 +7,152 @@ learned (A1).
 """
 
 from dataclasses import dataclass, field
+from typing import Annotated, ClassVar
 
 import torch
 
-from evsplat.capture import TrainingCapture
-from evsplat.deform.human_scene import DeformConfig
-from evsplat.gaussians import DensifyConfig, GaussianSet
-from evsplat.methods.avatar3dgs import avatar_deform, avatar_rates
-from evsplat.methods.build import Build, Ground
-from evsplat.methods.composition import Composition
-from evsplat.methods.config import OptimisationConfig
-from evsplat.methods.paper import EventConfig, LossConfig, PaperConfig, composition, observed
+from evsplat.body import body_box, load_body_track
+from evsplat.capture import Policy, TrainingCapture
+from evsplat.config import Above, AtLeast
+from evsplat.gaussians import GaussianSet
+from evsplat.methods.avatar_parts import (
+    RELEASED_RATES,
+    SURFACE_SAMPLES,
+    AvatarRates,
+    AvatarTerms,
+    Networks,
+    fitted_avatar,
+    learning_of,
+    picture_terms,
+)
+from evsplat.methods.base import (
+    Composition,
+    Purpose,
+    body_frames,
+    refuse_masks,
+    require_training_frames,
+    semantic_bounds,
+    start_of_randomness,
+)
+from evsplat.methods.dropped import PAPER
+from evsplat.methods.settings import NOMINAL_ITERATIONS, Densify, Share, Weight
 from evsplat.methods.starts import (
-    FittedSceneConfig,
+    HumanStart,
+    SceneStart,
+    Surface,
     as_person,
     human_start,
     no_gaussians,
     scene_start,
 )
+from evsplat.models.paper import RELEASED
+from evsplat.objectives import RenderedSemantics
 
 
 @dataclass(frozen=True)
-class AvatarSemanticConfig(PaperConfig):
-    """All settings of method `avatar3dgs_semantic`: those of `paper`, set as 3DGS-Avatar's."""
+class AvatarSemanticConfig:
+    """All settings of method `avatar3dgs_semantic`."""
+
+    DROPPED: ClassVar[dict[str, str]] = PAPER
+
+    policy: Policy = field(default_factory=Policy)
+    """Held-out data that training may see."""
+    iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
+    """Training steps; all schedules stretch with it."""
+
+    human: HumanStart = field(default_factory=HumanStart)
+    """Gaussians of the person at the start."""
+    scene: SceneStart = field(default_factory=SceneStart)
+    """Places of the scene's Gaussians at the start; nothing is fitted to them before training."""
+    densify: Densify = field(default_factory=lambda: Densify(max_human=60_000))
+    """Growth and pruning."""
+    networks: Networks = field(default_factory=lambda: Networks(pose_start=5_000))
+    """Networks that move and colour the person."""
+    scene_direction_dropout: Share = 0.5
+    """How often a training step hides the view direction from the scene's colour; a static camera
+    cannot teach it (A10)."""
 
     semantic_start: float = 0.5
     """Logit of all Gaussians."""
-    scene: FittedSceneConfig = field(default_factory=lambda: FittedSceneConfig(prefit_steps=0))
-    """Where the scene's points start; nothing is fitted to them before training."""
-    deform: DeformConfig = field(default_factory=avatar_deform)
-    loss: LossConfig = field(
-        default_factory=lambda: LossConfig(l1=1.0, dssim=0.0, perceptual="available")
-    )
-    event: EventConfig = field(default_factory=lambda: EventConfig(weight=0.0))
-    optimisation: OptimisationConfig = field(
-        default_factory=lambda: OptimisationConfig(rates=avatar_rates())
-    )
-    densify_human: DensifyConfig = field(default_factory=DensifyConfig)
+    semantic_band_px_at_256: Annotated[float, Above(0)] = 9.0
+    """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
+
+    l1_weight: Weight = 1.0
+    """Weight of the mean absolute difference to the recorded picture, sRGB."""
+    dssim_weight: Weight = 0.0
+    """Weight of 1 - SSIM."""
+    terms: AvatarTerms = field(default_factory=lambda: AvatarTerms(perceptual="available"))
+    """Other terms of the loss."""
+    semantic_weight: Weight = 0.1
+    """Weight of the rendered attribute's cross-entropy against the posed body's silhouette."""
+    binarise_weight: Weight = ((0, 0.0), (5_000, 0.001), (10_000, 0.01))
+    """Weight of the mean of m (1 - m), which pushes the attribute m to 0 or 1."""
+
+    rates: AvatarRates = field(default_factory=lambda: RELEASED_RATES)
+    """Learning rates."""
 
 
-def compose(
+def build(
     config: AvatarSemanticConfig,
     capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
-    fit: bool = True,
+    purpose: Purpose = "train",
 ) -> Composition:
-    """Put the method together for one capture; see `evsplat.methods.paper.compose`.
+    """Put the method together for one capture.
 
     The scene's points follow the root bone and lie in their place at the middle training frame.
     """
-    ground = Ground.of(capture, seed)
-    label, generator = config.semantic_start, ground.generator
-    person = human_start(config.human, capture, ground.track, generator, label)
-    scene, _ = scene_start(config.scene, capture, ground.track, generator, label)
-    scene = as_person(scene, ground.track, ground.times_us[len(ground.times_us) // 2])
-    all_of_it = {name: torch.cat([person[name], scene[name]]) for name in person}
-    gaussians = GaussianSet(all_of_it, no_gaussians())
-    build = Build.of(config, ground, gaussians, config.semantics, device=device, fit=fit)
-    return composition(config, build, *observed(config, capture, ground.track, device))
+    require_training_frames(capture)
+    refuse_masks(config.policy, "avatar3dgs_semantic")
+    generator, label = start_of_randomness(seed), config.semantic_start
+    track = load_body_track(capture)
+    times_us = [frame.mid_us for frame in capture.train_frames]
+    surface = track.body.sample_surface(SURFACE_SAMPLES, generator)
+    person = human_start(config.human, Surface(), capture, track, generator, label)
+    scene, _ = scene_start(config.scene, capture, track, generator, label)
+    scene = as_person(scene, track, times_us[len(times_us) // 2])
+    everything = {name: torch.cat([person[name], scene[name]]) for name in person}
+    model, prior = fitted_avatar(
+        GaussianSet(everything, no_gaussians()),
+        track,
+        times_us,
+        surface,
+        generator,
+        semantics="rendered",
+        networks=config.networks,
+        scene_direction_dropout=config.scene_direction_dropout,
+        released=RELEASED,
+        skinning_steps=config.terms.skinning_prefit_steps if purpose == "train" else 0,
+        device=device,
+    )
+    boxes = {
+        frame.name: box
+        for frame in capture.train_frames
+        if (box := body_box(track.vertices(frame.mid_us), capture.camera(frame))) is not None
+    }
+    pictures, weights = picture_terms(
+        capture,
+        boxes,
+        config.terms,
+        config.l1_weight,
+        config.dssim_weight,
+        device=device,
+        purpose=purpose,
+    )
+    bounds = semantic_bounds(capture, track, config.semantic_band_px_at_256)
+    return Composition(
+        model=model,
+        objectives=[pictures, RenderedSemantics(bounds), prior, *config.terms.isometry()],
+        weights={
+            **weights,
+            **config.terms.weights(),
+            "semantic": config.semantic_weight,
+            "binarise": config.binarise_weight,
+        },
+        learning=learning_of(model, config.rates),
+        densify=config.densify.limits(cube_max_count=config.scene.growth_limit),
+        body_frames=body_frames(track, times_us),
+        generator=generator,
+    )

@@ -1,34 +1,48 @@
-"""Method `evsplat`: the paper's model seen by a camera that integrates, in light that falls on it.
+"""Method `evsplat`: discs in light, seen by a camera that integrates, beside an event camera.
 
-What it adds to `paper`: the blurry frame is the mean of renders over its exposure; events are
-compared at any time and with their amplitude, by learned contrast thresholds; the person's colour
-depends on how the surface is turned and where it stands; the person casts shadows on the scene.
+Beyond `paper`: the blurry frame is the mean of renders over its exposure; events are compared at
+any time and with their amplitude, by learned contrast thresholds; Gaussians have colours of their
+own, the person's by how the surface is turned and where it stands; the person casts shadows.
 """
 
 import logging
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Literal
 
 import torch
 
+from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate, estimate_from_capture
-from evsplat.capture import TrainingCapture
-from evsplat.deform.human_scene import DeformConfig
-from evsplat.methods.build import Build
-from evsplat.methods.composition import Composition, HeldOut
-from evsplat.methods.config import LearningRates, OptimisationConfig, Weight
-from evsplat.methods.paper import (
-    EventConfig,
-    LossConfig,
-    PaperConfig,
-    build_model,
-    composition,
-    paper_events,
+from evsplat.capture import Policy, TrainingCapture
+from evsplat.config import Above, AtLeast, ReadIf, Within
+from evsplat.gaussians import GaussianSet
+from evsplat.methods.base import (
+    Composition,
+    HeldOut,
+    Purpose,
+    body_frames,
+    refuse_masks,
+    require_training_frames,
+    semantic_bounds,
+    start_of_randomness,
 )
-from evsplat.methods.poses import PoseConfig, prepare_poses
-from evsplat.methods.starts import HumanStartConfig
+from evsplat.methods.dropped import EVSPLAT
+from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
+from evsplat.methods.poses import PoseSettings, prepare_poses
+from evsplat.methods.prefit import fit_scene
+from evsplat.methods.settings import (
+    NOMINAL_ITERATIONS,
+    Densify,
+    Nominal,
+    NotNegative,
+    Positive,
+    Share,
+    Weight,
+)
+from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start, scene_start
+from evsplat.models.discs import DiscModel
 from evsplat.objectives import (
-    EdiTarget,
+    EventChange,
     EventNoise,
     EventSensor,
     EventWindows,
@@ -36,188 +50,281 @@ from evsplat.objectives import (
     HeldOutWindows,
     Objective,
     PosePrior,
+    RenderedSemantics,
     motion_px,
     renders_for,
 )
+from evsplat.render import LOW_PASS
 
 logger = logging.getLogger(__name__)
 
+CLOSED_SURFACE = Surface(opacity=0.88, width=0.8, flatness=0.3)
+"""Flat discs that hide what is behind them from the first step on: light and shadow need that."""
+LABEL = 2.0
+"""Logits of the semantic attribute start at + and - this (A1)."""
 UNKNOWN_THRESHOLD = 0.2
 """Contrast threshold to start from where neither the capture nor its frames tell one."""
+CONSTANT_SHARE = 0.3
+"""Share of the training before learning rates begin to fall."""
+CLIP = 0.1
+"""Largest gradient norm of the networks together."""
+
+_EVENTS = ReadIf("event_weight", "above 0", lambda weight: weight != 0.0)
+_WINDOWS = ReadIf("event_term", "windows", lambda term: term == "windows")
+_LAMPS = ReadIf("lamps", "above 0", lambda lamps: lamps > 0)
+_SHADING = ReadIf("shading", "true", lambda shading: bool(shading))
 
 
 @dataclass(frozen=True)
-class ExposureConfig:
-    """The blur of a frame."""
+class DiscRates:
+    """Adam's learning rates at the start of training."""
 
-    px_per_render: float = 3.0
-    """How far, in pixels, the body moves between neighbouring renders."""
-    most_renders: int = 7
+    means: NotNegative = 3e-4
+    """Centres, metres."""
+    scales_log: NotNegative = 5e-3
+    """Logarithms of the standard deviations."""
+    opacity_logits: NotNegative = 0.05
+    """Opacities before the sigmoid."""
+    colour_logits: NotNegative = 1e-2
+    """Colours before the sigmoid."""
+    non_rigid: NotNegative = 1e-3
+    """Non-rigid network and pose encoder."""
+    pose: NotNegative = 0.1
+    """Pose residuals, units of the errors expected."""
+    shading: Annotated[float, AtLeast(0), _SHADING] = 3e-3
+    """Light on the person."""
+    shadow: Annotated[float, AtLeast(0), _LAMPS] = 1e-2
+    """Places of the lamps and their shadows."""
+    sensor: Annotated[float, AtLeast(0), _EVENTS, _WINDOWS] = 1e-3
+    """Logarithms of the contrast thresholds, and the events' clock."""
+    final: Annotated[float, Above(0), Within(0, 1)] = 0.1
+    """Factor that every rate reaches at the end, exponentially from 0.3 of the training on."""
+
+
+@dataclass(frozen=True)
+class EvsplatConfig:
+    """All settings of method `evsplat`."""
+
+    DROPPED: ClassVar[dict[str, str]] = EVSPLAT
+
+    policy: Policy = field(default_factory=Policy)
+    """Held-out data that training may see."""
+    iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
+    """Training steps; all schedules stretch with it."""
+
+    human: HumanStart = field(default_factory=lambda: HumanStart(spacing_px=0.85))
+    """Discs of the person at the start."""
+    scene: FittedScene = field(default_factory=FittedScene)
+    """Discs of the scene at the start."""
+    densify: Densify = field(default_factory=Densify)
+    """Growth and pruning."""
+
+    width: Annotated[int, AtLeast(1)] = 128
+    """Hidden width of the non-rigid network."""
+    non_rigid_start: Nominal = 3_000
+    """Nominal iteration at which the non-rigid network is switched on (A9)."""
+    pose_noise: NotNegative = 0.1
+    """Standard deviation of the noise on the rotation matrices fed to the pose encoder, in half of
+    the steps."""
+    shading: bool = True
+    """The person's brightness depends on the surface's normal and place in the world."""
+    lamps: Annotated[int, Within(0, 16)] = 4
+    """Lamps at learned places, whose shadows of the person fall on the scene and which, with
+    ``shading``, light the person; 0 = none."""
+    self_shadow: Annotated[bool, _LAMPS, _SHADING] = True
+    """Parts of the person that are nearer to a lamp shade others."""
+    low_pass: Annotated[float, Above(0), Within(0, LOW_PASS)] = 0.1
+    """Variance of the filter of a pixel, px^2; 3DGS and viewers of others take 0.3, the most."""
+
+    px_per_render: Positive = 3.0
+    """Way of the body between neighbouring renders of an exposure, pixels."""
+    most_renders: Annotated[int, AtLeast(1)] = 7
     """Upper bound of renders in an exposure, odd; 1 compares the sharp middle, as `paper` does."""
 
-
-@dataclass(frozen=True)
-class WindowConfig:
-    """Event windows."""
-
-    start: float = 750
-    """First nominal iteration."""
-    eps: float = 0.004
+    event_weight: Weight = 0.2
+    """Weight of the event term; 0 = without events."""
+    event_term: Annotated[Literal["windows", "paper"], _EVENTS] = "windows"
+    """``windows``: changes between any two rendered times, with their amplitude. ``paper``:
+    normalised changes between neighbouring frames' middles (its eq. 8-9)."""
+    event_start: Annotated[Nominal, _EVENTS] = 750
+    """First nominal iteration of the event term."""
+    event_eps: Annotated[float, Above(0), _EVENTS, _WINDOWS] = 0.004
     """Added to linear luminance: darker than this a sensor sees nothing."""
-    contrast_weight: float = 1.0
-    """Weight of the squared distance of the thresholds' logarithms from where they started."""
-    reach: float = 0.5
-    """How far before or after an exposure windows reach, in intervals of the training frames."""
-    noise_aware: bool = True
-    """Weigh differences by the sensor's background noise, and leave hot pixels out."""
-    begun_us: int = 100_000
+    event_reach: Annotated[float, AtLeast(0), _EVENTS, _WINDOWS] = 0.5
+    """Reach of windows before or after an exposure, in intervals of the training frames."""
+    event_ramp_us: Annotated[int, AtLeast(0), _EVENTS, _WINDOWS] = 100_000
     """Between two events of one polarity that lie at most so far apart, brightness is taken to
     change evenly instead of all at once at the second; 0: all at once."""
-    pixel_thresholds: bool = False
-    """Each pixel learns a factor on its contrast thresholds."""
-    clock: Literal["auto", "always", "never"] = "auto"
+    event_noise_aware: Annotated[bool, _EVENTS, _WINDOWS] = True
+    """Weigh differences by the sensor's background noise, and leave hot pixels out."""
+    contrast_weight: Annotated[Weight, _EVENTS, _WINDOWS] = 1.0
+    """Weight of the squared distance of the thresholds' logarithms from where they started."""
+    clock: Annotated[Literal["auto", "always", "never"], _EVENTS, _WINDOWS] = "auto"
     """Learn by how much the events' clock is late, on top of the capture's own offset, starting at
     what training frames and events tell where that is over 4 ms and three standard errors.
     ``auto``: only there; ``always``: elsewhere from 0."""
 
+    pose: PoseSettings = field(default_factory=PoseSettings)
+    """Errors of the given poses."""
 
-@dataclass(frozen=True)
-class EdiConfig:
-    """Frames sharpened by the events of their exposure, as targets at mid-exposure.
+    l1_weight: Weight = 0.8
+    """Weight of the mean absolute difference to the blurry frame, sRGB."""
+    dssim_weight: Weight = 0.2
+    """Weight of 1 - SSIM."""
+    semantic_weight: Weight = 0.1
+    """Weight of the rendered attribute's cross-entropy against the posed body's silhouette."""
+    binarise_weight: Weight = ((0, 0.0), (5_000, 0.001), (10_000, 0.01))
+    """Weight of the mean of m (1 - m), which pushes the attribute m to 0 or 1."""
+    semantic_band_px_at_256: Positive = 9.0
+    """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
 
-    For events with polarity; thresholds are those that the windows start from.
-    """
-
-    alone_until: float = 0.0
-    """Nominal iteration until which they stand in place of the blurry frames, at weight 1: one
-    render a step brings the person into place."""
-    weight: float = 0.0
-    """From then on, beside the blurry frames."""
-    until: float = 8_000.0
-    """Nominal iteration at which they are gone; the weight falls to there in a straight line."""
-
-
-@dataclass(frozen=True)
-class EvsplatConfig(PaperConfig):
-    """All settings of method `evsplat`; those of `paper` that it shares keep their names."""
-
-    loss: LossConfig = field(
-        default_factory=lambda: LossConfig(isometry_centers=0.0, isometry_covariances=0.0)
-    )
-    """Without isometry: discs that hang on the body's own weights stretch with it already."""
-    exposure: ExposureConfig = field(default_factory=ExposureConfig)
-    windows: WindowConfig = field(default_factory=WindowConfig)
-    edi: EdiConfig = field(default_factory=EdiConfig)
-    event_term: Literal["windows", "paper"] = "windows"
-    """``paper`` compares normalised changes between neighbouring frames' middles (its eq. 8-9) in
-    place of windows."""
-    event: EventConfig = field(default_factory=lambda: EventConfig(weight=0.2))
-    human: HumanStartConfig = field(
-        default_factory=lambda: HumanStartConfig(
-            spacing_px=0.85, opacity=0.88, width=0.8, flatness=0.3
-        )
-    )
-    """A closed surface of flat discs from the first step on: light and shadow need one."""
-    deform: DeformConfig = field(
-        default_factory=lambda: DeformConfig(
-            networks_once=True,
-            skinning="surface",
-            human_colour="own",
-            shading=True,
-            shadow_lights=4,
-            self_shadow=True,
-            low_pass=0.1,
-        )
-    )
-    optimisation: OptimisationConfig = field(
-        default_factory=lambda: OptimisationConfig(
-            rates=LearningRates(means=3e-4, features=1e-2, pose_correction=0.1), human_start=0
-        )
-    )
-    pose: PoseConfig = field(default_factory=PoseConfig)
+    rates: DiscRates = field(default_factory=DiscRates)
+    """Learning rates."""
 
 
-def compose(
+def build(
     config: EvsplatConfig,
     capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
-    fit: bool = True,
+    purpose: Purpose = "train",
 ) -> Composition:
-    """Put the method together for one capture; see `evsplat.methods.paper.compose`."""
-    poses = prepare_poses(config.pose, capture, tell=fit)
-    if poses.spline is not None:
-        deform = replace(config.deform, pose_correction_start=config.pose.start)
-        config = replace(config, deform=deform)
-    build = build_model(
-        config,
-        capture,
-        seed,
-        device=device,
-        fit=fit,
-        track=poses.track,
-        pose_spline=poses.spline,
-    )
+    """Put the method together for one capture."""
+    require_training_frames(capture)
+    refuse_masks(config.policy, "evsplat")
+    fit = purpose == "train"
+    generator = start_of_randomness(seed)
+    poses = prepare_poses(config.pose, capture, announce=fit)
+    times_us = [frame.mid_us for frame in capture.train_frames]
+    model = DiscModel(
+        poses.track,
+        times_us,
+        _start(config, capture, poses.track, generator),
+        width=config.width,
+        non_rigid_start=config.non_rigid_start,
+        pose_noise=config.pose_noise,
+        low_pass=config.low_pass,
+        shading=config.shading,
+        lamps=config.lamps,
+        self_shadow=config.self_shadow,
+        residual=poses.spline,
+        residual_start=config.pose.start,
+    ).to(device)
+    if fit and config.scene.kind == "median_backdrop":
+        camera = capture.camera(capture.train_frames[0]).to(device)
+        picture = capture.median_background().to(device)
+        steps = config.scene.prefit_steps
+        fit_scene(model.gaussians, camera, picture, steps, low_pass=config.low_pass)
+
     renders = {
         frame.name: renders_for(
-            motion_px(capture.camera(frame), build.ground.track, frame),
-            config.exposure.px_per_render,
-            config.exposure.most_renders,
+            motion_px(capture.camera(frame), poses.track, frame),
+            config.px_per_render,
+            config.most_renders,
         )
         for frame in capture.train_frames
     }
-    windows = edi = held_out = None
-    if config.event.weight != 0.0 and config.event_term == "windows" and capture.events is not None:
-        windows = _windows(config.windows, capture, build, device=device, fit=fit)
-        edi = _edi(config.edi, capture, windows)
-        held_out = _held_out(config, capture, build, windows)
-    alone_until = 0.0 if edi is None else config.edi.alone_until
-    exposure = Exposure(capture, renders, build.ground.generator, start=alone_until)
-    observed: list[Objective] = [exposure]
-    weights: dict[str, Weight] = {}
+    bounds = semantic_bounds(capture, poses.track, config.semantic_band_px_at_256)
+    objectives: list[Objective] = [
+        Exposure(capture, renders, generator),
+        RenderedSemantics(bounds),
+    ]
     if poses.spline is not None:
-        observed.append(PosePrior(poses.priced_us))
-        weights["pose_prior"] = config.pose.prior
-    if config.event.weight != 0.0:
-        weights["event"] = config.event.weight
-        if capture.events is None:
-            logger.warning(
-                "%s: has no events; the blur of the frames alone tells what moved.", capture.path
-            )
-        elif windows is None:
-            observed.append(paper_events(config.event, capture))
-        else:
-            observed.append(windows)
-            weights["contrast"] = config.windows.contrast_weight
-    if edi is not None:
-        observed.append(edi)
-        weights["edi"] = 1.0
-    return composition(config, build, observed, weights, held_out)
+        objectives.append(PosePrior(poses.priced_us))
+    windows = None
+    if config.event_weight != 0.0 and capture.events is None:
+        logger.warning(
+            "%s: has no events; the blur of the frames alone tells what moved.", capture.path
+        )
+    elif config.event_weight != 0.0 and config.event_term == "paper":
+        objectives.append(EventChange(capture, start=config.event_start))
+    elif config.event_weight != 0.0:
+        windows = _windows(config, capture, model, generator, device=device, fit=fit)
+        objectives.append(windows)
+    return Composition(
+        model=model,
+        objectives=objectives,
+        weights={
+            "l1": config.l1_weight,
+            "dssim": config.dssim_weight,
+            "semantic": config.semantic_weight,
+            "binarise": config.binarise_weight,
+            "pose_prior": config.pose.prior,
+            "event": config.event_weight,
+            "contrast": config.contrast_weight,
+        },
+        learning=_learning(config.rates, model),
+        densify=config.densify.limits(cube_max_count=config.scene.growth_limit),
+        body_frames=body_frames(poses.track, times_us),
+        generator=generator,
+        held_out=None if windows is None else _held_out(config, capture, model, windows),
+    )
+
+
+def _start(
+    config: EvsplatConfig, capture: TrainingCapture, track: BodyTrack, generator: torch.Generator
+) -> GaussianSet:
+    """Discs on the body and behind it, each with a colour of its own."""
+    human = human_start(
+        config.human, CLOSED_SURFACE, capture, track, generator, LABEL, feature_dim=None
+    )
+    scene, _ = scene_start(config.scene, capture, track, generator, -LABEL, feature_dim=None)
+    return GaussianSet(human, scene)
+
+
+def _learning(rates: DiscRates, model: DiscModel) -> Learning:
+    """Rates of discs, network, light, poses and sensor."""
+    rows = row_rates(
+        {
+            "scales_log": rates.scales_log,
+            "quaternions": 1e-3,
+            "opacity_logits": rates.opacity_logits,
+            "colour_logits": rates.colour_logits,
+        },
+        means=rates.means,
+        final=rates.final,
+        means_final=rates.final,
+        constant=CONSTANT_SHARE,
+    )
+    parts = (
+        (model.deformation, rates.non_rigid, True),
+        (model.residual, rates.pose, False),
+        (model.shading, rates.shading, False),
+        (model.shadow, rates.shadow, False),
+        (model.lamps, rates.shadow, False),
+        (model.sensor, rates.sensor, False),
+    )
+    networks = [
+        Network(parameters, Rate(rate, rates.final, CONSTANT_SHARE), clipped=clipped)
+        for part, rate, clipped in parts
+        if (parameters := parameters_of(part))
+    ]
+    return Learning({"gaussians": rows}, networks, CLIP)
 
 
 def _held_out(
-    config: EvsplatConfig, capture: TrainingCapture, build: Build, windows: EventWindows
+    config: EvsplatConfig, capture: TrainingCapture, model: DiscModel, windows: EventWindows
 ) -> HeldOut | None:
-    """What events around held-out frames teach of their poses, where that is asked for."""
-    model = build.model
+    """Poses at held-out frames from the events around them, where that is asked for."""
     frames = list(capture.held_out_frames)
-    if not config.pose.events_of_held_out or model.pose_spline is None or not frames:
+    if not config.pose.events_of_held_out or model.residual is None or not frames:
         return None
     config.policy.require_held_out_events("pose.events_of_held_out")
     return HeldOut(
         frames,
         HeldOutWindows(windows, capture.train_frames),
-        [model.rotation_residuals, model.translation_residuals],
-        start=max(config.pose.start, config.windows.start),
+        list(model.residual.parameters()),
+        start=max(config.pose.start, config.event_start),
         every=max(1, len(capture.train_frames) // len(frames)),
     )
 
 
 def _windows(
-    windows: WindowConfig,
+    config: EvsplatConfig,
     capture: TrainingCapture,
-    build: Build,
+    model: DiscModel,
+    generator: torch.Generator,
     *,
     device: torch.device | str,
     fit: bool,
@@ -228,50 +335,35 @@ def _windows(
     known, late_us = (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD), None
     if fit:
         estimate = None
-        if capture.contrast_threshold is None or windows.clock != "never":
+        if capture.contrast_threshold is None or config.clock != "never":
             estimate = estimate_from_capture(capture)
         known = _thresholds(capture, estimate)
-        late_us = _late_us(windows, estimate)
-    pixels = (capture.events.height, capture.events.width) if windows.pixel_thresholds else None
-    build.model.sensor = EventSensor(*known, pixels=pixels, late_us=late_us).to(device)
-    if fit and not capture.events.has_polarity:
-        logger.warning(
-            "%s: its events have no polarity; the size of changes is compared with their number.",
-            capture.path,
-        )
+        late_us = _late_us(config, estimate)
+        if not capture.events.has_polarity:
+            logger.warning(
+                "%s: its events have no polarity; the size of changes is compared with their "
+                "number.", capture.path,
+            )  # fmt: skip
+    sensor = EventSensor(*known, late_us=late_us).to(device)
+    model.sensor = sensor
     return EventWindows(
         capture,
-        build.model.sensor,
-        build.ground.generator,
-        start=windows.start,
-        eps=windows.eps,
-        noise=EventNoise(capture.events, aware=windows.noise_aware),
-        reach=windows.reach,
-        begun_us=windows.begun_us,
+        sensor,
+        generator,
+        start=config.event_start,
+        eps=config.event_eps,
+        noise=EventNoise(capture.events, aware=config.event_noise_aware),
+        reach=config.event_reach,
+        ramp_us=config.event_ramp_us,
     )
 
 
-def _edi(config: EdiConfig, capture: TrainingCapture, windows: EventWindows) -> EdiTarget | None:
-    """The frames sharpened by their events, where they are asked for and events have polarity."""
-    asked = config.alone_until > 0.0 or config.weight > 0.0
-    if not asked or not windows.events.has_polarity:
-        return None
-    return EdiTarget(
-        capture,
-        windows.sensor,
-        windows.noise,
-        alone_until=config.alone_until,
-        weight=config.weight,
-        end=config.until,
-    )
-
-
-def _late_us(windows: WindowConfig, estimate: SensorEstimate | None) -> float | None:
-    """From where the offset of the events' clock is learned; None: not at all."""
-    if windows.clock == "never":
+def _late_us(config: EvsplatConfig, estimate: SensorEstimate | None) -> float | None:
+    """Start of the learned offset of the events' clock; None: not learned."""
+    if config.clock == "never":
         return None
     if estimate is None or not estimate.clock.differs:
-        return 0.0 if windows.clock == "always" else None
+        return 0.0 if config.clock == "always" else None
     late_ms = estimate.clock.lag_us / 1000
     logger.info("events lag the frames by %.1f ms; the offset of their clock is learned", late_ms)
     return estimate.clock.lag_us

@@ -4,237 +4,198 @@ The numbers A1 to A32 name the open points of the paper's text that a setting de
 """
 
 from dataclasses import dataclass, field
+from typing import Annotated, ClassVar
 
 import torch
 
-from evsplat.body import BodyTrack, body_box, silhouette
-from evsplat.capture import TrainingCapture
-from evsplat.deform.human_scene import Semantics
-from evsplat.deform.pose_spline import PoseSpline
+from evsplat.body import body_box, load_body_track
+from evsplat.capture import Policy, TrainingCapture
+from evsplat.config import Above, AtLeast, ReadIf
 from evsplat.errors import DataError
-from evsplat.gaussians import DensifyConfig, GaussianSet, Part
-from evsplat.methods.build import Build, Ground, PersonConfig, PersonLossConfig
-from evsplat.methods.composition import Composition, HeldOut
-from evsplat.methods.config import Weight
-from evsplat.methods.prefit import fit_scene, fit_scene_colours
-from evsplat.methods.starts import FittedSceneConfig, human_start, scene_start
-from evsplat.objectives import (
-    Activity,
-    EventChange,
-    Objective,
-    PackedBounds,
-    Photometric,
-    RenderedSemantics,
+from evsplat.gaussians import GaussianSet
+from evsplat.methods.avatar_parts import (
+    SURFACE_SAMPLES,
+    AvatarRates,
+    AvatarTerms,
+    Networks,
+    fitted_avatar,
+    learning_of,
+    picture_terms,
 )
-from evsplat.objectives.perceptual import PerceptualChoice, choose_perceptual
+from evsplat.methods.base import (
+    Composition,
+    Purpose,
+    body_frames,
+    refuse_masks,
+    require_training_frames,
+    semantic_bounds,
+    start_of_randomness,
+)
+from evsplat.methods.dropped import PAPER
+from evsplat.methods.prefit import fit_scene, fit_scene_colours
+from evsplat.methods.settings import (
+    NOMINAL_ITERATIONS,
+    Densify,
+    Nominal,
+    Share,
+    Weight,
+)
+from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start, scene_start
+from evsplat.models.paper import Released, Semantics
+from evsplat.objectives import EventChange, Objective, RenderedSemantics
+
+_EVENTS = ReadIf("event_weight", "above 0", lambda weight: weight != 0.0)
+_RENDERED = ReadIf("semantics", "rendered", lambda semantics: semantics == "rendered")
 
 
 @dataclass(frozen=True)
-class EventConfig:
-    """The event term (paper eq. 8-9)."""
-
-    weight: Weight = 0.1
-    """w_ev, for the resolution-independent form ``sum / sqrt(N)`` (A15)."""
-    start: float = 1_000
-    """First nominal iteration; before, both renders show the same unfitted body (A16)."""
-    floor: float = 0.03
-    """Absolute floor of both norms (A16)."""
-    eps: float = 1e-5
-    """Added to linear luminance before the logarithm (A11)."""
-    across_gaps: bool = False
-    """Also pair training frames with held-out frames between them (A13); needs
-    ``policy.held_out_events``."""
-    weight_by_activity: bool = True
-    """Weigh pairs by their share of active pixels, within 0.25 to 4 of the median (A17)."""
-    min_active: float = 0.001
-    """Pairs with a smaller share of active pixels are left out (A16)."""
-
-
-@dataclass(frozen=True)
-class LossConfig(PersonLossConfig):
-    """Weights of all other terms (A18)."""
-
-    perceptual: PerceptualChoice = "none"
-    """``lpips_vgg`` is the paper's and needs its weights (see `evsplat doctor`); ``st_lpips`` runs
-    with the extra `perceptual`; ``available`` takes the first of them that runs. The term has the
-    name of what it is."""
-    semantic: Weight = 0.1
-    binarise: Weight = ((0, 0.0), (5_000, 0.001), (10_000, 0.01))
-
-
-@dataclass(frozen=True)
-class PaperConfig(PersonConfig):
+class PaperConfig:
     """All settings of method `paper`."""
 
+    DROPPED: ClassVar[dict[str, str]] = PAPER
+
+    policy: Policy = field(default_factory=Policy)
+    """Held-out data that training may see."""
+    iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
+    """Training steps; all schedules stretch with it."""
+
+    human: HumanStart = field(default_factory=HumanStart)
+    """Gaussians of the person at the start."""
+    scene: FittedScene = field(default_factory=FittedScene)
+    """Gaussians of the scene at the start."""
+    densify: Densify = field(default_factory=Densify)
+    """Growth and pruning."""
+    networks: Networks = field(default_factory=Networks)
+    """Networks that move and colour the person."""
+    scene_direction_dropout: Share = 0.5
+    """How often a training step hides the view direction from the scene's colour; a static camera
+    cannot teach it (A10)."""
+
     semantics: Semantics = "rendered"
-    """How the attribute learns (A2): ``fixed``; ``ste`` (straight-through); ``rendered``, by the
-    posed body's silhouette; ``two_branch``, by that and by which copy explains the pixels of
-    Gaussians that are drawn both posed and standing still while 0.05 < m < 0.95."""
+    """Teacher of the attribute (A2): ``fixed``, none; ``ste``, straight-through placement;
+    ``rendered``, the posed body's silhouette."""
     semantic_start: float = 2.0
     """Labels start as logits +a and -a (A1)."""
-    semantic_band_px_at_256: float = 9.0
+    semantic_band_px_at_256: Annotated[float, Above(0), _RENDERED] = 9.0
     """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
-    semantic_activity: bool = False
-    """Pixels of that band at which no event tells of anything moving are the scene's, where the
-    body beside them moves; static cameras with events only (A8)."""
-    scene: FittedSceneConfig = field(default_factory=FittedSceneConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
-    event: EventConfig = field(default_factory=EventConfig)
-    densify_scene: DensifyConfig | None = None
-    """Limits of the scene. Null: 3DGS's for a random cube; none for the median backdrop, which has
-    a Gaussian for every 2x2 pixels already and would only grow where the person passes."""
+
+    event_weight: Weight = 0.1
+    """w_ev, for the resolution-independent form ``sum / sqrt(N)`` (A15)."""
+    event_start: Annotated[Nominal, _EVENTS] = 1_000
+    """First nominal iteration; before, both renders show the same unfitted body (A16)."""
+    event_floor: Annotated[float, AtLeast(0), _EVENTS] = 0.03
+    """Absolute floor of both norms (A16)."""
+    event_eps: Annotated[float, Above(0), _EVENTS] = 1e-5
+    """Added to linear luminance before the logarithm (A11)."""
+    event_weight_by_activity: Annotated[bool, _EVENTS] = True
+    """Weigh pairs by their share of active pixels, within 0.25 to 4 of the median (A17)."""
+    event_min_active: Annotated[float, AtLeast(0), _EVENTS] = 0.001
+    """Pairs with a smaller share of active pixels are left out (A16)."""
+
+    l1_weight: Weight = 0.8
+    """Weight of the mean absolute difference to the recorded picture, sRGB (A18)."""
+    dssim_weight: Weight = 0.2
+    """Weight of 1 - SSIM, the better variant of A18; the base method has L1 alone."""
+    terms: AvatarTerms = field(default_factory=AvatarTerms)
+    """Other terms of the loss (A18)."""
+    semantic_weight: Annotated[Weight, _RENDERED] = 0.1
+    """Weight of the rendered attribute's cross-entropy against the posed body's silhouette."""
+    binarise_weight: Annotated[Weight, _RENDERED] = ((0, 0.0), (5_000, 0.001), (10_000, 0.01))
+    """Weight of the mean of m (1 - m), which pushes the attribute m to 0 or 1."""
+
+    rates: AvatarRates = field(default_factory=AvatarRates)
+    """Learning rates."""
 
 
-RANDOM_CUBE_DENSIFY = DensifyConfig(
-    prune_opacity=0.005, prune_screen_px=None, prune_scale_m=None, max_count=150_000
-)
-"""3DGS's limits for a scene (A20): neither the 20-pixel nor the 0.05-opacity rule of a person."""
-
-
-def compose(
+def build(
     config: PaperConfig,
     capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
-    fit: bool = True,
+    purpose: Purpose = "train",
 ) -> Composition:
-    """Model, objectives and limits for one capture.
-
-    ``fit=False`` skips the cheap fits, for a model whose parameters are loaded afterwards.
-    """
-    build = build_model(config, capture, seed, device=device, fit=fit)
-    return composition(config, build, *observed(config, capture, build.ground.track, device))
-
-
-def build_model(
-    config: PaperConfig,
-    capture: TrainingCapture,
-    seed: int,
-    *,
-    device: torch.device | str,
-    fit: bool,
-    track: BodyTrack | None = None,
-    pose_spline: PoseSpline | None = None,
-) -> Build:
-    """Person and scene at their start; with ``fit`` after the cheap fits.
-
-    ``track`` is the motion where it is not the capture's as given.
-    """
-    ground = Ground.of(capture, seed, track)
+    """Put the method together for one capture."""
+    require_training_frames(capture)
+    refuse_masks(config.policy, "paper")
+    fit = purpose == "train"
+    generator = start_of_randomness(seed)
+    track = load_body_track(capture)
+    times_us = [frame.mid_us for frame in capture.train_frames]
     label = config.semantic_start
-    human = human_start(config.human, capture, ground.track, ground.generator, label)
-    scene, colours = scene_start(config.scene, capture, ground.track, ground.generator, -label)
-    gaussians = GaussianSet(human, scene)
-    build = Build.of(
-        config,
-        ground,
-        gaussians,
-        config.semantics,
+    surface = track.body.sample_surface(SURFACE_SAMPLES, generator)
+    human = human_start(config.human, Surface(), capture, track, generator, label)
+    scene, colours = scene_start(config.scene, capture, track, generator, -label)
+    model, prior = fitted_avatar(
+        GaussianSet(human, scene),
+        track,
+        times_us,
+        surface,
+        generator,
+        semantics=config.semantics,
+        networks=config.networks,
+        scene_direction_dropout=config.scene_direction_dropout,
+        released=Released(),
+        skinning_steps=config.terms.skinning_prefit_steps if fit else 0,
         device=device,
-        fit=fit,
-        pose_spline=pose_spline,
     )
     if fit and config.scene.kind == "median_backdrop":
         steps = config.scene.prefit_steps
         camera = capture.camera(capture.train_frames[0]).to(device)
-        fit_scene_colours(build.model, camera, colours.to(device), steps, ground.generator)
-        fit_scene(build.model, camera, capture.median_background().to(device), steps)
-    return build
+        picture = capture.median_background().to(device)
+        gaussians, network = model.gaussians, model.scene_colour
+        fit_scene_colours(network, gaussians, camera, colours.to(device), steps, generator)
+        fit_scene(gaussians, camera, picture, steps, low_pass=model.low_pass, network=network)
 
-
-def composition(
-    config: PaperConfig,
-    build: Build,
-    observed: list[Objective],
-    weights: dict[str, Weight],
-    held_out: HeldOut | None = None,
-) -> Composition:
-    """Everything together.
-
-    ``observed`` are the objectives that compare with recorded data, ``weights`` those of their
-    terms beside ``l1`` and ``dssim``; ``held_out`` is what held-out frames teach.
-    """
-    ground = build.ground
-    if config.semantics in ("rendered", "two_branch"):
-        bounds = _bounds(config, ground.capture, ground.track)
-        observed = [*observed, RenderedSemantics(bounds)]
-    return build.composition(
-        config,
-        config.loss,
-        observed,
-        weights={
-            **weights,
-            "semantic": config.loss.semantic,
-            "binarise": config.loss.binarise,
-        },
-        densify=_scene_limits(config),
-        held_out=held_out,
-    )
-
-
-def _scene_limits(config: PaperConfig) -> dict[Part, DensifyConfig]:
-    if config.densify_scene is not None:
-        return {"scene": config.densify_scene}
-    return {"scene": RANDOM_CUBE_DENSIFY} if config.scene.kind == "random_cube" else {}
-
-
-def _bounds(
-    config: PaperConfig, capture: TrainingCapture, track: BodyTrack
-) -> dict[int, PackedBounds]:
-    """Where the posed body says that the person is, by mid-exposure."""
-    bounds = {}
-    activity = Activity.of(capture) if config.semantic_activity else None
-    for frame in capture.train_frames:
-        camera = capture.camera(frame)
-        mask = silhouette(track.vertices(frame.mid_us), track.body.faces, camera)
-        band = max(1, round(config.semantic_band_px_at_256 * camera.height / 256))
-        still = None if activity is None else activity.still_scene(frame, track, mask.numpy(), band)
-        bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band, still)
-    return bounds
-
-
-def observed(
-    config: PaperConfig, capture: TrainingCapture, track: BodyTrack, device: torch.device | str
-) -> tuple[list[Objective], dict[str, Weight]]:
-    """The paper's terms: pictures at mid-exposure, events between neighbouring frames.
-
-    Weights are those of the terms beside ``l1`` and ``dssim``.
-    """
     boxes = {
         frame.name: box
         for frame in capture.train_frames
         if (box := body_box(track.vertices(frame.mid_us), capture.camera(frame))) is not None
     }
-    name, perceptual = choose_perceptual(config.loss.perceptual, device=device)
-    dssim = config.loss.dssim != 0.0
-    objectives: list[Objective] = [
-        Photometric(capture, boxes, dssim=dssim, perceptual=perceptual, perceptual_term=name)
-    ]
-    weights: dict[str, Weight] = {}
-    if perceptual is not None:
-        weights[name] = config.loss.perceptual_weight
-    if config.event.weight != 0.0:
-        if capture.events is None:
-            raise DataError(
-                f"{capture.path}: method paper needs events, and capture.json names no event file; "
-                "add one, or train without the term: --set event.weight=0."
-            )
-        objectives.append(paper_events(config.event, capture))
-        weights["event"] = config.event.weight
-    return objectives, weights
+    pictures, weights = picture_terms(
+        capture,
+        boxes,
+        config.terms,
+        config.l1_weight,
+        config.dssim_weight,
+        device=device,
+        purpose=purpose,
+    )
+    objectives: list[Objective] = [pictures]
+    if config.event_weight != 0.0:
+        objectives.append(_events(config, capture))
+    if config.semantics == "rendered":
+        bounds = semantic_bounds(capture, track, config.semantic_band_px_at_256)
+        objectives.append(RenderedSemantics(bounds))
+    return Composition(
+        model=model,
+        objectives=[*objectives, prior, *config.terms.isometry()],
+        weights={
+            **weights,
+            **config.terms.weights(),
+            "event": config.event_weight,
+            "semantic": config.semantic_weight,
+            "binarise": config.binarise_weight,
+        },
+        learning=learning_of(model, config.rates),
+        densify=config.densify.limits(cube_max_count=config.scene.growth_limit),
+        body_frames=None if config.semantics == "fixed" else body_frames(track, times_us),
+        generator=generator,
+    )
 
 
-def paper_events(config: EventConfig, capture: TrainingCapture) -> EventChange:
+def _events(config: PaperConfig, capture: TrainingCapture) -> EventChange:
     """The paper's event term (eq. 8-9)."""
-    if config.across_gaps:
-        capture.policy.require_held_out_events("event.across_gaps")
+    if capture.events is None:
+        raise DataError(
+            f"{capture.path}: method paper needs events, and capture.json names no event file; "
+            "add one, or train without the term: --set event_weight=0."
+        )
     return EventChange(
         capture,
-        start=config.start,
-        floor=config.floor,
-        eps=config.eps,
-        across_gaps=config.across_gaps,
-        weight_by_activity=config.weight_by_activity,
-        min_active=config.min_active,
+        start=config.event_start,
+        floor=config.event_floor,
+        eps=config.event_eps,
+        weight_by_activity=config.event_weight_by_activity,
+        min_active=config.event_min_active,
     )

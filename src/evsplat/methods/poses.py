@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -11,13 +11,15 @@ from evsplat.body import BodyTrack, load_body_track
 from evsplat.body.between_keys import BetweenKeys, between_keys
 from evsplat.body.smoothing import MotionNoise, motion_noise, smoothed
 from evsplat.capture import TrainingCapture
-from evsplat.deform.pose_spline import PoseSpline
-from evsplat.methods.config import Weight
+from evsplat.config import Above, ReadIf
+from evsplat.errors import ConfigError
+from evsplat.models.pose_spline import PoseSpline
+from evsplat.methods.settings import Nominal, NotNegative, Weight
 
 logger = logging.getLogger(__name__)
 
 When = Literal["auto", "always", "never"]
-"""``auto``: where the key poses are noisy, see `PoseConfig.noisy_rad`."""
+"""``auto``: where the key poses are noisy, see `PoseSettings.noisy_rad`."""
 EXACT_RAD = 1e-3
 """Poses that jitter by less are taken as exact, whatever the motion."""
 LEAST_STD_RAD, LEAST_STD_M = 0.02, 0.01
@@ -25,8 +27,11 @@ LEAST_STD_RAD, LEAST_STD_M = 0.02, 0.01
 more, and that changes slowly."""
 
 
+_REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "never")
+
+
 @dataclass(frozen=True)
-class PoseConfig:
+class PoseSettings:
     """Errors of the given poses."""
 
     smooth: When = "auto"
@@ -36,18 +41,16 @@ class PoseConfig:
     between: bool = True
     """Where poses are taken as exact, learn how the person moves between them: such a residual that
     is zero at every key pose."""
-    noisy_rad: float = 0.006
+    noisy_rad: NotNegative = 0.006
     """Jitter of key poses, radians per axis, from which poses count as noisy. With less they do if
     its variance is half or more of what a spline through the poses misses between them."""
-    start: float = 1_500
+    start: Nominal = 1_500
     """Nominal iteration from which the residual is learned."""
-    knot_frames: float = 1.0
-    """Time between its knots, in intervals of the key poses."""
     prior: Weight = 1e-3
     """Weight of the residual's mean square in units of the errors expected."""
-    std_rad: float | None = None
+    std_rad: Annotated[float, Above(0), _REFINED] | None = None
     """Error expected of a joint, radians per axis; null = the jitter, at least 0.02."""
-    std_m: float | None = None
+    std_m: Annotated[float, Above(0), _REFINED] | None = None
     """Error expected of the root's place, metres per axis; null = its jitter, at least 0.01."""
     events_of_held_out: bool = False
     """Let events around held-out frames correct the poses there; needs
@@ -57,7 +60,7 @@ class PoseConfig:
 
 @dataclass(frozen=True)
 class Poses:
-    """What a model is to move by."""
+    """Motion of a model."""
 
     track: BodyTrack
     spline: PoseSpline | None = None
@@ -66,8 +69,8 @@ class Poses:
     """Times at which the residual costs."""
 
 
-def prepare_poses(config: PoseConfig, capture: TrainingCapture, *, tell: bool = True) -> Poses:
-    """Look at a capture's key poses and do what the settings say; the log can tell what it is."""
+def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, announce: bool) -> Poses:
+    """Track of a capture by the settings, and the residual to learn; said at level INFO on wish."""
     track = load_body_track(capture)
     noise, expected = motion_noise(track), between_keys(track)
     surer = _surer_than_between(noise, expected)
@@ -75,9 +78,15 @@ def prepare_poses(config: PoseConfig, capture: TrainingCapture, *, tell: bool = 
     smooth, refine = (
         noisy if when == "auto" else when == "always" for when in (config.smooth, config.refine)
     )
+    for name in ("std_rad", "std_m") if not refine else ():
+        if (value := getattr(config, name)) is not None:
+            raise ConfigError(
+                f"pose.{name} is {value}, and nothing reads it: the poses of {capture.path} are "
+                "taken as exact; pass --set pose.refine=always as well, or leave it out."
+            )
     between = config.between and not refine and surer
     logger.log(
-        logging.INFO if tell else logging.DEBUG,
+        logging.INFO if announce else logging.DEBUG,
         "given poses jitter by %.4f rad per axis and are %s: %s, %s",
         noise.rotation_rad,
         "noisy" if noisy else "taken as exact",
@@ -100,7 +109,7 @@ def prepare_poses(config: PoseConfig, capture: TrainingCapture, *, tell: bool = 
         track,
         noise,
         [frame.mid_us for frame in capture.train_frames],
-        knot_frames=config.knot_frames,
+        knot_frames=1.0,
         joint_rad=config.std_rad or max(noise.rotation_rad, LEAST_STD_RAD),
         root_m=config.std_m or max(noise.translation_m, LEAST_STD_M),
         stiff=smooth,

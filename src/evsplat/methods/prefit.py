@@ -1,25 +1,28 @@
 """Cheap fits before training proper: skinning to the body's weights, the sheet to the median."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.capture import Camera
-from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.devices import send
-from evsplat.gaussians import StaticScene
+from evsplat.gaussians import GaussianSet
+from evsplat.models.layers import scene_splats
+from evsplat.models.networks.colour import SceneColour
+from evsplat.models.paper.model import PaperModel
 from evsplat.objectives import SkinningPrior
-from evsplat.render import Splats, render
+from evsplat.render import render
 
 COLOUR_BATCH = 2_048
 """Scene Gaussians per step of teaching their colour network."""
 
 
 def fit_skinning(
-    model: HumanSceneModel, prior: SkinningPrior, steps: int, generator: torch.Generator
+    model: PaperModel, prior: SkinningPrior, steps: int, generator: torch.Generator
 ) -> None:
     """Start the skinning network at the body's weights instead of at random ones."""
-    assert model.skinning is not None
     rate = 5e-3
     adam = torch.optim.Adam(model.skinning.parameters(), lr=rate, fused=True)
     for step in range(steps):
@@ -31,18 +34,18 @@ def fit_skinning(
 
 
 def fit_scene_colours(
-    model: HumanSceneModel,
+    network: SceneColour,
+    gaussians: GaussianSet,
     camera: Camera,
     colours: Float[Tensor, "S 3"],
     steps: int,
     generator: torch.Generator,
 ) -> None:
     """Teach the scene's colour network to read the colour that the features start with."""
-    gaussians = model.gaussians
     rows = gaussians.scene
-    features = gaussians.features.detach()[rows]
-    directions = nn.functional.normalize(gaussians.means.detach()[rows] - camera.center(), dim=-1)
-    adam = torch.optim.Adam(model.scene_colour.parameters(), lr=1e-2)
+    features = gaussians.get_parameter("features").detach()[rows]
+    directions = _directions(gaussians.means.detach()[rows], camera)
+    adam = torch.optim.Adam(network.parameters(), lr=1e-2)
     for step in range(steps):
         for group in adam.param_groups:
             group["lr"] = 1e-2 * 0.1 ** (step / steps)
@@ -50,43 +53,57 @@ def fit_scene_colours(
         some = torch.randint(len(features), (COLOUR_BATCH,), generator=generator)
         some = send(some, colours.device)
         shown = directions[some] * (step % 2)
-        (model.scene_colour(features[some], shown) - colours[some]).square().mean().backward()
+        (network(features[some], shown) - colours[some]).square().mean().backward()
         adam.step()
 
 
 def fit_scene(
-    model: HumanSceneModel, camera: Camera, picture: Float[Tensor, "H W 3"], steps: int
+    gaussians: GaussianSet,
+    camera: Camera,
+    picture: Float[Tensor, "H W 3"],
+    steps: int,
+    *,
+    low_pass: float,
+    network: SceneColour | None = None,
 ) -> None:
-    """Fit the scene's Gaussians alone to a picture without the person."""
-    gaussians = model.gaussians
-    rows = gaussians.scene
-    rates = {"scales_log": 1e-2, "opacity_logits": 3e-2, "features": 2e-2, "quaternions": 2e-3}
+    """Fit the scene's Gaussians alone to a picture without the person.
+
+    Their colours are read by ``network``, and without one they are the Gaussians' own.
+    """
+    rows, colour = gaussians.scene, gaussians.colour
+    rates = {"scales_log": 1e-2, "opacity_logits": 3e-2, colour: 2e-2, "quaternions": 2e-3}
     values = {
         name: getattr(gaussians, name).detach()[rows].clone().requires_grad_() for name in rates
     }
-    adam = torch.optim.Adam(
-        [{"params": [values[name]], "lr": rate, "rate": rate} for name, rate in rates.items()]
-        + [{"params": list(model.scene_colour.parameters()), "lr": 1e-3, "rate": 1e-3}],
-        eps=1e-15,
-        fused=True,
-    )
+    groups = [{"params": [values[name]], "lr": rate, "rate": rate} for name, rate in rates.items()]
     means = gaussians.means.detach()[rows]
-    directions = nn.functional.normalize(means - camera.center(), dim=-1)
+    rgb_at: Callable[[int], Tensor] = lambda step: values[colour].sigmoid()  # noqa: E731
+    if network is not None:
+        groups.append({"params": list(network.parameters()), "lr": 1e-3, "rate": 1e-3})
+        directions = _directions(means, camera)
+        rgb_at = lambda step: network(values[colour], directions * (step % 2))  # noqa: E731
+    adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    no_person = torch.zeros(len(means), device=means.device)
     for step in range(steps):
         for group in adam.param_groups:
             group["lr"] = group["rate"] * 0.1 ** (step / steps)
         adam.zero_grad()
-        shown = directions if step % 2 else torch.zeros_like(directions)
-        rgb = model.scene_colour(values["features"], shown)
-        scene = StaticScene(means, values["quaternions"], values["scales_log"].exp(), rgb)
-        opacities = torch.sigmoid(values["opacity_logits"])
-        drawn = render(
-            Splats(scene.means[None], scene.quaternions, scene.scales, opacities, rgb[None]),
-            camera,
-            low_pass=model.low_pass,
+        scene = scene_splats(
+            means,
+            values["quaternions"],
+            values["scales_log"].exp(),
+            torch.sigmoid(values["opacity_logits"]),
+            rgb_at(step),
+            no_person,
         )
-        (drawn.image[0] - picture).abs().mean().backward()
+        drawn = render(scene, camera, low_pass=low_pass)
+        (drawn.image[0, ..., :3] - picture).abs().mean().backward()
         adam.step()
     with torch.no_grad():
         for name, value in values.items():
             getattr(gaussians, name)[rows] = value
+
+
+def _directions(means: Float[Tensor, "S 3"], camera: Camera) -> Float[Tensor, "S 3"]:
+    """Unit vectors from the camera."""
+    return nn.functional.normalize(means - camera.center(), dim=-1)

@@ -1,14 +1,16 @@
-"""Where the Gaussians of a method start: the person's on the body, the scene's behind it."""
+"""Starts of a method's Gaussians: the person's on the body, the scene's behind it."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
 from evsplat.body import BodyTrack, up_axis
 from evsplat.capture import TrainingCapture
+from evsplat.config import Above, AtLeast, ReadIf
 from evsplat.errors import ConfigError
+from evsplat.gaussians import FEATURE_DIM
 from evsplat.gaussians.flip import carry
 from evsplat.gaussians.initialise import (
     backdrop_depth,
@@ -18,78 +20,99 @@ from evsplat.gaussians.initialise import (
     nearest_spacing,
     random_cube,
 )
+from evsplat.methods.settings import Positive
+
+
+MOST_SAMPLES = 20_000
+"""Upper bound of the automatic number of samples of the person."""
+CUBE_OPACITY, BACKDROP_OPACITY = 0.1, 0.9
+BACKDROP_EDGE_SHARE = 0.18
+"""Share of all pixels, those of strongest gradient, that get a Gaussian of their own."""
+BACKDROP_MARGIN = 0.15
+"""Distance of the wall behind the deepest body point, as a fraction of its depth."""
+
+_CUBE = ReadIf("scene.kind", "random_cube", lambda kind: kind == "random_cube")
+_BACKDROP = ReadIf("scene.kind", "median_backdrop", lambda kind: kind == "median_backdrop")
 
 
 @dataclass(frozen=True)
-class HumanStartConfig:
-    """How the person's Gaussians start (reference 1.2)."""
+class HumanStart:
+    """Number of the person's Gaussians at the start, samples of the body's surface (1.2)."""
 
-    count: int | None = None
+    count: Annotated[int, AtLeast(1)] | None = None
     """Number of surface samples. 3DGS-Avatar takes 50,000; null = as many as ``spacing_px`` asks
-    for, since a person of 4,000 pixels needs no 50,000 Gaussians."""
-    spacing_px: float = 1.5
+    for, at most 20,000, since a person of 4,000 pixels needs no 50,000 Gaussians."""
+    spacing_px: Positive = 1.5
     """Mean distance of neighbouring samples on the screen when ``count`` is null."""
-    max_count: int = 20_000
-    """Upper bound of the automatic count."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Shape of the person's Gaussians at the start; by default round and faint, as 3DGS-Avatar."""
+
     opacity: float = 0.1
-    """Opacity of every sample."""
     width: float = 1.0
     """Standard deviation along the surface as a share of the distance between neighbours."""
     flatness: float = 1.0
-    """That along the surface's normal as a share of the one along the surface."""
+    """Standard deviation along the normal as a share of the one along the surface."""
 
 
 @dataclass(frozen=True)
-class SceneStartConfig:
-    """How the scene's Gaussians start (A21: unsaid in the paper)."""
+class SceneStart:
+    """Start of the scene's Gaussians (A21: unsaid in the paper)."""
 
     kind: Literal["median_backdrop", "random_cube"] = "median_backdrop"
     """``random_cube``: as HUGS in the paper (2.9), needs far more steps. ``median_backdrop``: the
     temporal median of the training frames on a floor and a wall; static cameras only."""
-    cube_count: int = 100_000
+    cube_count: Annotated[int, AtLeast(4), _CUBE] = 100_000
     """Points of the random cube."""
-    cube_half_side_m: float | None = None
+    cube_half_side_m: Annotated[float, Above(0), _CUBE] | None = None
     """Half side of the cube; null = the larger of 2 m and 1.5 times the camera's distance."""
-    cube_opacity: float = 0.1
-    backdrop_stride_px: int = 2
+    cube_max_count: Annotated[int, AtLeast(1), _CUBE] = 150_000
+    """No clone or split of the scene beyond this number of Gaussians; a median backdrop does not
+    grow."""
+    backdrop_stride_px: Annotated[int, AtLeast(1), _BACKDROP] = 2
     """The sheet has one Gaussian per square of this side."""
-    backdrop_edge_share: float = 0.18
-    """Share of all pixels, those of strongest gradient, that get a Gaussian of their own."""
-    backdrop_opacity: float = 0.9
-    backdrop_margin: float = 0.15
-    """How far behind the deepest body point the wall stands, as a fraction of its depth."""
+
+    @property
+    def growth_limit(self) -> int | None:
+        """``cube_max_count`` where there is a cube; None: the scene does not grow."""
+        return self.cube_max_count if self.kind == "random_cube" else None
 
 
 @dataclass(frozen=True)
-class FittedSceneConfig(SceneStartConfig):
-    """A start that is fitted to what it shall show."""
+class FittedScene(SceneStart):
+    """A start that is fitted to the median of the training frames."""
 
-    prefit_steps: int = 300
+    prefit_steps: Annotated[int, AtLeast(0), _BACKDROP] = 300
     """Steps of fitting the sheet to the median before training proper."""
 
 
 def human_start(
-    config: HumanStartConfig,
+    config: HumanStart,
+    surface: Surface,
     capture: TrainingCapture,
     track: BodyTrack,
     generator: torch.Generator,
     semantic_logit: float,
+    feature_dim: int | None = FEATURE_DIM,
 ) -> dict[str, Tensor]:
-    """Start values of the person's Gaussians: samples of the canonical body's surface."""
+    """Start values of the person's Gaussians, see `gaussians_at`."""
     count = config.count or _automatic_count(config, capture, track)
     samples = track.body.sample_surface(count, generator)
-    scales = config.width * nearest_spacing(samples.points)[:, None].repeat(1, 3)
-    scales[:, 2] *= config.flatness
+    scales = surface.width * nearest_spacing(samples.points)[:, None].repeat(1, 3)
+    scales[:, 2] *= surface.flatness
     return gaussians_at(
         samples.points,
         scales,
-        opacity=config.opacity,
-        quaternions=None if config.flatness == 1.0 else facing(samples.normals),
+        opacity=surface.opacity,
+        quaternions=None if surface.flatness == 1.0 else facing(samples.normals),
         semantic_logit=semantic_logit,
+        feature_dim=feature_dim,
     )
 
 
-def _automatic_count(config: HumanStartConfig, capture: TrainingCapture, track: BodyTrack) -> int:
+def _automatic_count(config: HumanStart, capture: TrainingCapture, track: BodyTrack) -> int:
     """Surface samples so that neighbours lie ``spacing_px`` apart at the person's distance."""
     vertices = track.body.canonical_vertices()
     corners = vertices[track.body.faces]
@@ -100,15 +123,16 @@ def _automatic_count(config: HumanStartConfig, capture: TrainingCapture, track: 
     _, depth = camera.project(track.vertices(frame.mid_us))
     pixels_per_metre = float(camera.K[0, 0] / depth.median().clamp_min(0.1))
     count = area_m2 * (pixels_per_metre / config.spacing_px) ** 2
-    return int(min(max(count, 2_000), config.max_count))
+    return int(min(max(count, 2_000), MOST_SAMPLES))
 
 
 def scene_start(
-    start: SceneStartConfig,
+    start: SceneStart,
     capture: TrainingCapture,
     track: BodyTrack,
     generator: torch.Generator,
     semantic_logit: float,
+    feature_dim: int | None = FEATURE_DIM,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Start values of the scene's Gaussians, and the colours they shall show."""
     frames = capture.train_frames
@@ -121,7 +145,7 @@ def scene_start(
         half_side = start.cube_half_side_m or max(2.0, 1.5 * distance)
         points, colours = random_cube(center, half_side, start.cube_count, generator)
         scales = nearest_spacing(points)[:, None].repeat(1, 3)
-        opacity = start.cube_opacity
+        opacity = CUBE_OPACITY
     else:
         if not capture.is_static_camera:
             raise ConfigError(
@@ -129,21 +153,22 @@ def scene_start(
                 "this capture's camera moves. Pass --set scene.kind=random_cube."
             )
         body = torch.cat([track.vertices(frame.mid_us)[::7] for frame in frames])
-        depth = backdrop_depth(camera, body, up=up_axis(track), margin=start.backdrop_margin)
+        depth = backdrop_depth(camera, body, up=up_axis(track), margin=BACKDROP_MARGIN)
         points, scales, colours = median_backdrop(
             camera,
             capture.median_background(),
             depth,
             stride=start.backdrop_stride_px,
-            edge_points=int(start.backdrop_edge_share * camera.width * camera.height),
+            edge_points=int(BACKDROP_EDGE_SHARE * camera.width * camera.height),
         )
-        opacity = start.backdrop_opacity
+        opacity = BACKDROP_OPACITY
     values = gaussians_at(
         points,
         scales,
         opacity=opacity,
         semantic_logit=semantic_logit,
         rgb_srgb=colours,
+        feature_dim=feature_dim,
     )
     return values, colours
 

@@ -28,8 +28,9 @@ residual that changes sign in every key pose pays 160 times its square."""
 class PoseSpline(nn.Module):
     """The residual's course between times: ``w(t) . c`` with uniform knots over the key poses.
 
-    Control points c are in units of what is expected: `joint_rad` for axis-angle vectors, `root_m`
-    for the root's place, so that one learning rate and one prior fit all.
+    Control points c, ``rotations`` (K, J, 3) and ``translations`` (K, 3), are in units of what is
+    expected: `joint_rad` for axis-angle vectors, `root_m` for the root's place, so that one
+    learning rate and one prior fit all. They start at zero.
 
     Where key poses are exact, the residual is zero at each (``held_us``): taken from it is the
     cubic spline through its own values there. What is left is how the person moves from key to key,
@@ -84,6 +85,8 @@ class PoseSpline(nn.Module):
             self.held = torch.from_numpy(through.c.transpose(1, 0, 2).copy())
         else:
             self.mean = self.weights(frame_times_us).mean(0)
+        self.rotations = nn.Parameter(torch.zeros(self.count, len(joint_rad), 3))
+        self.translations = nn.Parameter(torch.zeros(self.count, 3))
 
     @classmethod
     def of(
@@ -164,15 +167,16 @@ class PoseSpline(nn.Module):
             return 6 * c3 * step + 2 * c2
         return ((c3 * step + c2) * step + c1) * step + c0
 
-    def rotation(
-        self, points: Float[Tensor, "K J 3"], times_us: Sequence[int]
-    ) -> Float[Tensor, "T J 3"]:
-        """Axis-angle vectors, radians."""
-        residual = torch.einsum("tk,kjc->tjc", self.weights(times_us), points)
-        return residual * self.joint_rad[:, None]
+    def residual(
+        self, times_us: Sequence[int]
+    ) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T 3"]]:
+        """Axis-angle vectors, radians, and shifts of the root, metres."""
+        weights = self.weights(times_us)
+        turns = torch.einsum("tk,kjc->tjc", weights, self.rotations) * self.joint_rad[:, None]
+        return turns, self.root_m * (weights @ self.translations)
 
-    def translation(
-        self, points: Float[Tensor, "K 3"], times_us: Sequence[int]
-    ) -> Float[Tensor, "T 3"]:
-        """Of the root, metres."""
-        return self.root_m * (self.weights(times_us) @ points)
+    def forget(self) -> None:
+        """Set all control points to zero."""
+        with torch.no_grad():
+            self.rotations.zero_()
+            self.translations.zero_()

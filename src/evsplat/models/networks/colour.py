@@ -10,8 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.compiled import native, runs_native
-from evsplat.deform.mlp import PointMLP
-from evsplat.deform.spherical_harmonics import sh_basis
+from evsplat.models.networks.mlp import PointMLP
+from evsplat.models.networks.spherical_harmonics import sh_basis
 
 _DIRECTION_DIM = 15
 
@@ -54,39 +54,19 @@ class HumanColour(nn.Module):
 class SceneColour(nn.Module):
     """Colour of scene Gaussians (paper eq. 7, A10): feature and view direction, no latent.
 
-    ``view_dependent`` False leaves the direction out. With ``direction_dropout`` p in (0, 1] the
-    directional values of a Gaussian are zeroed with probability p while training: with a static
-    camera the direction is only a hash of the position, which says nothing in a novel view.
+    For a static camera the direction is only a hash of the position, which says nothing in a novel
+    view: training hides it now and then, by directions of zero, whose basis is zero.
     """
 
-    def __init__(
-        self,
-        feature_dim: int = 32,
-        view_dependent: bool = True,
-        direction_dropout: float = 0.0,
-        width: int = 64,
-    ) -> None:
+    def __init__(self, feature_dim: int = 32, width: int = 64) -> None:
         super().__init__()
-        if not 0 <= direction_dropout <= 1:
-            raise ValueError(f"direction_dropout is {direction_dropout}, expected 0..1")
-        self.view_dependent = view_dependent
-        self.direction_dropout = direction_dropout
-        inputs = feature_dim + (_DIRECTION_DIM if view_dependent else 0)
-        self.mlp = PointMLP(inputs, 0, 0, width, depth=2, out=3)
+        self.mlp = PointMLP(feature_dim + _DIRECTION_DIM, 0, 0, width, depth=2, out=3)
 
     def forward(
         self, features: Float[Tensor, "N 32"], directions: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """SRGB in [0, 1]; ``directions`` are unit vectors from the camera in the world."""
-        inputs = features
-        if self.view_dependent:
-            if self.training and self.direction_dropout > 0:
-                # All of the basis is zero at the zero vector.
-                count, device = len(directions), directions.device
-                kept = torch.rand(count, 1, device=device) >= self.direction_dropout
-                directions = directions * kept
-            inputs = beside_basis(directions, features, values_first=True)
-        return self.mlp(inputs)[0].sigmoid()
+        """SRGB in [0, 1]; ``directions`` are unit vectors from the camera in the world, or zero."""
+        return self.mlp(beside_basis(directions, features, values_first=True))[0].sigmoid()
 
 
 def beside_basis(

@@ -1,16 +1,14 @@
 """Pictures of posed Gaussians, with the person's shadow on the scene."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from evsplat.deform.lamps import Lamps
-from evsplat.deform.shadow import BodyShadow
-from evsplat.gaussians import PosedGaussians
+from evsplat.models.layers import Layers
 from evsplat.render import Backdrop, PinholeCamera, RenderOutput, Splats, render, split_channels
 
 SHADOW_STEP_PX = 2
@@ -26,41 +24,23 @@ class Drawing:
     rgb: tuple[Float[Tensor, "H W 3"], ...]
     semantic: tuple[Float[Tensor, "H W"], ...]
     output: RenderOutput
-    posed: PosedGaussians
-    moving: Splats
-    static: Splats
+    layers: Layers
+    """As they were drawn: with a shadow, and with centres that have gradients."""
 
     def center_gradients(self) -> tuple[Float[Tensor, "T H 2"], Float[Tensor, "1 S 2"]]:
-        """Gradients of the projected centres of person and scene, per pixel, after backward.
-
-        Those of the rows themselves, not of second copies.
-        """
-        moving, static = self.moving.centers2d_offset, self.static.centers2d_offset
-        assert moving is not None and moving.grad is not None
-        assert static is not None and static.grad is not None
-        people, things = self._counts()
-        return moving.grad[:, :people], static.grad[:, :things]
+        """Gradients of the projected centres of person and scene, per pixel, after backward."""
+        human, scene = self.layers.human.centers2d_offset, self.layers.scene.centers2d_offset
+        assert human is not None and human.grad is not None
+        assert scene is not None and scene.grad is not None
+        return human.grad, scene.grad
 
     def radii(self) -> tuple[Int[Tensor, "T H"], Int[Tensor, "1 S"]]:
         """Radii on the screen of the same rows, pixels; 0 = not drawn."""
-        people, things = self._counts()
-        return self.output.radii[:, :people], self.output.static_radii[:, :things]
-
-    def _counts(self) -> tuple[int, int]:
-        return len(self.posed.human_opacities), len(self.posed.scene_opacities)
-
-
-class _Drawable(Protocol):
-    @property
-    def shadow(self) -> BodyShadow | None: ...
-
-    @property
-    def lamps(self) -> Lamps | None: ...
+        return self.output.radii, self.output.static_radii
 
 
 def draw(
-    model: _Drawable,
-    posed: PosedGaussians,
+    layers: Layers,
     camera: PinholeCamera,
     *,
     center_gradients: bool = False,
@@ -73,37 +53,34 @@ def draw(
     ``background`` is the sRGB colour behind all of it, black without. ``backdrop`` is what the
     scene looked like to the picture before, see `render`.
 
-    With shadows the person's and the scene's share of each pixel are composited as channels of
+    With a shadow the person's and the scene's share of each pixel are composited as channels of
     their own, in one pass and in the right order of depth, and the scene's is multiplied.
     """
-    moving, static = posed.moving(), posed.static()
-    shadow = model.shadow if posed.casters is not None else None
-    if shadow is not None:
-        moving, static = _in_layers(moving, static, camera)
+    human, scene = layers.human, layers.scene
+    if layers.shadow is not None:
+        human, scene = _apart(human, scene, camera)
     if center_gradients:
-        moving, static = _with_centers(moving), _with_centers(static)
-    behind = None if background is None else _behind(background, moving)
+        human, scene = _with_centers(human), _with_centers(scene)
+    layers = replace(layers, human=human, scene=scene)
     output = render(
-        moving,
+        human,
         camera,
-        static=static,
-        background=behind,
-        low_pass=posed.low_pass,
+        static=scene,
+        background=None if background is None else _behind(background, human),
+        low_pass=layers.low_pass,
         backdrop=backdrop,
     )
-    if shadow is None:
+    if layers.shadow is None:
         rgb, semantic = split_channels(output.image, (3, 1))
     else:
-        person, scene, depth, semantic = split_channels(output.image, (3, 3, 2, 1))
-        assert posed.casters is not None and model.lamps is not None
+        person, room, depth, semantic = split_channels(output.image, (3, 3, 2, 1))
         # What hides the scene hides its shadow as well: the first picture's depth serves all.
-        places = _places(depth[0].detach(), camera, shadow_step_px)
-        factors = shadow(posed.casters, places, model.lamps.places())
+        factors = layers.shadow(_places(depth[0].detach(), camera, shadow_step_px))
         light = _enlarge(factors, camera, shadow_step_px)
         rgb = tuple(
-            a + b * factor[..., None] for a, b, factor in zip(person, scene, light, strict=True)
+            a + b * factor[..., None] for a, b, factor in zip(person, room, light, strict=True)
         )
-    return Drawing(rgb, tuple(s[..., 0] for s in semantic), output, posed, moving, static)
+    return Drawing(rgb, tuple(s[..., 0] for s in semantic), output, layers)
 
 
 def _behind(rgb: Float[Tensor, "3"], layer: Splats) -> Float[Tensor, "C"]:
@@ -115,18 +92,17 @@ def _behind(rgb: Float[Tensor, "3"], layer: Splats) -> Float[Tensor, "C"]:
 
 
 def draw_depth(
-    posed: PosedGaussians, camera: PinholeCamera, *, parts: Literal["all", "human", "scene"] = "all"
+    layers: Layers, camera: PinholeCamera, *, parts: Literal["all", "human", "scene"] = "all"
 ) -> Float[Tensor, "T H W"]:
     """Mean of z in the camera over what each pixel shows, metres; 0 where it shows nothing.
 
     The scene alone is drawn once: T is then 1.
     """
-    moving, static = _showing_depth(posed.moving(), camera), _showing_depth(posed.static(), camera)
+    human, scene = _showing_depth(layers.human, camera), _showing_depth(layers.scene, camera)
     if parts == "all":
-        output = render(moving, camera, static=static, low_pass=posed.low_pass)
+        output = render(human, camera, static=scene, low_pass=layers.low_pass)
     else:
-        layer = moving if parts == "human" else static
-        output = render(layer, camera, low_pass=posed.low_pass)
+        output = render(human if parts == "human" else scene, camera, low_pass=layers.low_pass)
     covered = output.alpha.clamp_min(_LEAST_SCENE)
     return output.image[..., 0] / covered * (output.alpha > _LEAST_SCENE)
 
@@ -136,32 +112,32 @@ def _showing_depth(layer: Splats, camera: PinholeCamera) -> Splats:
     return replace(layer, channels=(layer.means @ pose[2, :3] + pose[2, 3])[..., None])
 
 
-def shadowed_scene(model: _Drawable, posed: PosedGaussians) -> Splats:
+def shadowed_scene(layers: Layers) -> Splats:
     """The scene's Gaussians with the person's shadow in their colours, one set per time.
 
     For files and viewers of others: the shadow is looked up at the centre of each Gaussian instead
-    of at each pixel. Without shadows it is `PosedGaussians.static`.
+    of at each pixel. Without a shadow it is the scene as it is.
     """
-    scene = posed.static()
-    if model.shadow is None or posed.casters is None:
+    scene = layers.scene
+    if layers.shadow is None:
         return scene
-    assert model.lamps is not None
-    light = model.shadow(posed.casters, scene.means, model.lamps.places())[:, 0, :, None]
+    light = layers.shadow(scene.means)[:, 0, :, None]
     rgb, semantic = scene.channels.split((3, 1), -1)
-    channels = [rgb * light, semantic.expand(posed.times, -1, -1)]
+    channels = [rgb * light, semantic.expand(layers.times, -1, -1)]
     return replace(scene, channels=torch.cat(channels, -1))
 
 
-def _in_layers(moving: Splats, static: Splats, camera: PinholeCamera) -> tuple[Splats, Splats]:
+def _apart(human: Splats, scene: Splats, camera: PinholeCamera) -> tuple[Splats, Splats]:
     """Channels person's RGB, scene's RGB, scene's depth and share, semantic attribute."""
-    rgb, semantic = moving.channels.split((3, 1), -1)
+    rgb, semantic = human.channels.split((3, 1), -1)
     nothing = rgb.new_zeros(*rgb.shape[:2], 5)
-    moving = replace(moving, channels=torch.cat([rgb, nothing, semantic], -1))
-    rgb, semantic = static.channels.split((3, 1), -1)
+    human = replace(human, channels=torch.cat([rgb, nothing, semantic], -1))
+    rgb, semantic = scene.channels.split((3, 1), -1)
     pose = camera.world_to_camera
-    depth = (static.means.detach() @ pose[2, :3] + pose[2, 3])[..., None]
+    # Detached: shadows must not be bought by moving the scene.
+    depth = (scene.means.detach() @ pose[2, :3] + pose[2, 3])[..., None]
     parts = [torch.zeros_like(rgb), rgb, depth, torch.ones_like(depth), semantic]
-    return moving, replace(static, channels=torch.cat(parts, -1))
+    return human, replace(scene, channels=torch.cat(parts, -1))
 
 
 def _places(

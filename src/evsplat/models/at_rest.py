@@ -1,7 +1,8 @@
-"""The mean of a person over recorded times, in canonical space, moved by bones alone."""
+"""A person at rest, ready to be moved by a skeleton alone: the mean over recorded times."""
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -9,11 +10,56 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from evsplat.body import BodyTrack
+from evsplat.body import Body, BodyTrack, skin
 from evsplat.capture import Camera
-from evsplat.deform.shading import SurfaceLight
-from evsplat.deform.skinned import SkinnedGaussians
-from evsplat.gaussians import PosedGaussians
+from evsplat.models.discs.shading import SurfaceLight
+from evsplat.models.layers import Layers
+from evsplat.render import Splats
+
+
+@dataclass(frozen=True, eq=False)
+class SkinnedGaussians:
+    """H Gaussians in canonical space with weights of the body's J bones, and the light on them.
+
+    What a pose does to a person beyond that (cloth, muscles, own shadow) is not in it.
+    """
+
+    body: Body
+    means: Float[Tensor, "H 3"]
+    """Centres, canonical metres."""
+    quaternions: Float[Tensor, "H 4"]
+    """Unit, (w, x, y, z)."""
+    scales: Float[Tensor, "H 3"]
+    """Standard deviations, metres."""
+    opacities: Float[Tensor, " H"]
+    rgb: Float[Tensor, "H 3"]
+    """sRGB; without the light, where that is known."""
+    weights: Float[Tensor, "H J"]
+    """Of bones, each row sums to 1."""
+    light: SurfaceLight | None
+    """None: it is in the colours."""
+
+    def at_rest(self) -> Splats:
+        """Splats in the canonical pose, without light; channels as those of `posed`."""
+        identity = torch.eye(4).expand(1, self.weights.shape[1], 4, 4)
+        return replace(self, light=None).posed(identity)
+
+    @torch.no_grad()
+    def posed(self, bones: Float[Tensor, "T J 4 4"]) -> Splats:
+        """Splats for bone transforms canonical to world; channels R, G, B and 1 (a person)."""
+        means, transforms = skin(self.means, self.weights, bones)
+        rgb = self.rgb.expand(len(bones), -1, -1)
+        if self.light is not None:
+            rgb = rgb * self.light.factors(transforms, means)
+        channels = torch.cat([rgb, torch.ones_like(rgb[..., :1])], -1)
+        return Splats(
+            means,
+            self.quaternions,
+            self.scales,
+            self.opacities,
+            channels,
+            transforms[..., :3, :3],
+        )
 
 
 @runtime_checkable
@@ -28,8 +74,8 @@ class Skinned(Protocol):
 
     def at(
         self, times_us: Sequence[int], camera_center: Float[Tensor, "3"], *, hard_semantics: bool
-    ) -> PosedGaussians:
-        """All Gaussians in world space; see `evsplat.deform.model.Model`."""
+    ) -> Layers:
+        """All Gaussians in world space; see `evsplat.models.model.Model`."""
         ...
 
     def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -61,21 +107,21 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
     sums: list[Tensor] = []
     first: Tensor | None = None
     for time_us, camera in views:
-        posed = model.at([time_us], camera.center().to(model.device), hard_semantics=True)
-        person = posed.human
-        transforms = person.transforms[0].double()
+        layers = model.at([time_us], camera.center().to(model.device), hard_semantics=True)
+        person = layers.human
+        transforms = layers.transforms[0].double()
         offset = person.means[0].double() - transforms[:, :3, 3]
         centers = torch.linalg.solve(transforms[:, :3, :3], offset)
-        quaternions = normalize(person.quaternions[0].double(), dim=-1)
+        quaternions = normalize(person.quats[0].double(), dim=-1)
         first = quaternions if first is None else first
         # q and -q are one rotation: only those on one side have a mean.
         quaternions = quaternions * torch.where((quaternions * first).sum(-1) < 0, -1, 1)[:, None]
         # Covariances know no sign of a scale; decoders of HUGS may give either.
         log_scales = person.scales[0].double().abs().log()
-        rgb = person.rgb[0].double()
+        rgb = person.channels[0, :, :3].double()
         factors = torch.ones_like(rgb)
         if light is not None:
-            factors = light.factors(person.transforms, person.means)[0].double()
+            factors = light.factors(layers.transforms, person.means)[0].double()
         values = [centers, log_scales, quaternions, rgb * factors, factors.square()]
         sums = [a + b for a, b in zip(sums, values, strict=True)] if sums else values
     centers, log_scales, quaternions, lit, squares = (
@@ -86,7 +132,7 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
         means=centers,
         quaternions=normalize(quaternions, dim=-1),
         scales=log_scales.exp(),
-        opacities=posed.human_opacities.cpu(),
+        opacities=layers.human.opacities.cpu(),
         # The colour c with the least sum of (c * factor - rgb)^2.
         rgb=lit / squares,
         weights=model.skinning_weights(centers.to(model.device)).cpu(),

@@ -1,0 +1,216 @@
+"""Parts of 3DGS-Avatar that `paper`, `avatar3dgs` and `avatar3dgs_semantic` share.
+
+Numbers of the form 1.5 are sections of the reference that docs/baselines.md quotes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+
+from evsplat.body import BodyTrack, SurfaceSamples
+from evsplat.capture import TrainingCapture
+from evsplat.config import Above, AtLeast, ReadIf, Within
+from evsplat.gaussians import GaussianSet
+from evsplat.methods.base import Purpose
+from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
+from evsplat.methods.prefit import fit_skinning
+from evsplat.methods.settings import Nominal, NotNegative, Share, Weight
+from evsplat.models.paper import PaperModel, Released, Semantics
+from evsplat.objectives import Isometry, Objective, Photometric, SkinningPrior
+from evsplat.objectives.perceptual import PerceptualChoice, choose_perceptual
+
+SURFACE_SAMPLES = 100_000
+"""Body surface points drawn once for the skinning prior."""
+SKINNING_POINTS = 1_024
+"""Surface points per step of the skinning prior (1.6)."""
+ISOMETRY_REFRESH = 100
+"""Steps between neighbour searches."""
+CLIP = 0.1
+"""Largest gradient norm of all networks together."""
+LATENT_WEIGHT_DECAY = 0.05
+HUMAN_START = 1_000.0
+"""Nominal iteration until which the person's Gaussians are frozen while skinning settles."""
+
+_PERCEPTUAL = ReadIf("terms.perceptual", "not none", lambda name: name != "none")
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Networks that move and colour the person (1.4 to 1.8)."""
+
+    width: Annotated[int, AtLeast(1)] = 128
+    """Hidden width of the non-rigid and the skinning network."""
+    colour_width: Annotated[int, AtLeast(1)] = 64
+    """Hidden width of the colour networks (A10)."""
+    non_rigid_start: Nominal = 3_000
+    """Nominal iteration at which the non-rigid network is switched on (A9)."""
+    pose_noise: NotNegative = 0.1
+    """Standard deviation of the noise on the rotation matrices fed to the pose encoder, in half of
+    the steps."""
+    pose_start: Nominal | None = None
+    """Nominal iteration from which pose residuals are learned; null = never. 3DGS-Avatar starts at
+    5000 (A9). Exact poses get worse by it, noisy ones better."""
+
+
+@dataclass(frozen=True)
+class AvatarTerms:
+    """Terms of the loss beside the picture's (1.9)."""
+
+    perceptual: PerceptualChoice = "none"
+    """``lpips_vgg`` is the paper's and needs its weights (see `evsplat doctor`); ``st_lpips`` runs
+    with the extra `perceptual`; ``available`` takes the first of them that runs. The term has the
+    name of what it is."""
+    perceptual_weight: Annotated[Weight, _PERCEPTUAL] = 0.01
+    """Weight of the perceptual distance."""
+    skinning: Weight = ((0, 10.0), (1_000, 0.1))
+    """Weight of the squared error of the skinning network on the body's surface (1.6)."""
+    skinning_prefit_steps: Annotated[int, AtLeast(0)] = 2_000
+    """Steps of fitting the skinning network alone before training proper. 2,000 bring its squared
+    error against the body's weights to 0.03; with 400 it stays near 0.08 for good."""
+    isometry_centers: Weight = 1.0
+    """Weight of neighbours' change of distance when posed."""
+    isometry_covariances: Weight = 100.0
+    """Weight of neighbours' change of covariance when posed."""
+    isometry_samples: Annotated[int, AtLeast(1)] = 1_024
+    """Gaussians whose isometry is looked at per step."""
+
+    def isometry(self) -> list[Objective]:
+        """The objective of isometry, where either weight asks for it."""
+        if self.isometry_centers == 0.0 and self.isometry_covariances == 0.0:
+            return []
+        return [Isometry(refresh=ISOMETRY_REFRESH, samples=self.isometry_samples)]
+
+    def weights(self) -> dict[str, Weight]:
+        """Weights by the names of terms, but the perceptual one's."""
+        return {
+            "skinning": self.skinning,
+            "isometry_centers": self.isometry_centers,
+            "isometry_covariances": self.isometry_covariances,
+        }
+
+
+@dataclass(frozen=True)
+class AvatarRates:
+    """Adam's learning rates at the start of training (1.10)."""
+
+    means: NotNegative = 5.5e-4
+    """Centres, metres (1.6e-4 times 3DGS-Avatar's extent of 3.47)."""
+    scales_log: NotNegative = 5e-3
+    """Logarithms of the standard deviations."""
+    opacity_logits: NotNegative = 0.05
+    """Opacities before the sigmoid."""
+    features: NotNegative = 5e-3
+    """Colour features; 3DGS-Avatar: 1e-3 over all 15,000 steps."""
+    skinning: NotNegative = 1e-4
+    """Skinning network."""
+    non_rigid: NotNegative = 1e-3
+    """Non-rigid network and pose encoder."""
+    colour: NotNegative = 1e-3
+    """Both colour networks."""
+    latents: NotNegative = 1e-3
+    """Latents of frames."""
+    pose: NotNegative = 1e-4
+    """Pose residuals, radians and metres."""
+    final: Annotated[float, Above(0), Within(0, 1)] = 0.1
+    """Factor that rates of centres and networks reach at the end, exponentially."""
+    gaussians_final: Annotated[float, Above(0), Within(0, 1)] = 0.1
+    """The same for the Gaussians' other attributes; 3DGS-Avatar keeps their rates, 1."""
+    constant: Annotated[Share, Within(0, 0.99)] = 0.3
+    """Share of the training before the decay begins; 3DGS-Avatar: none, over 15,000 steps."""
+
+
+RELEASED_RATES = AvatarRates(features=1e-3, constant=0.0, gaussians_final=1.0)
+"""Rates of the released 3DGS-Avatar (1.10)."""
+
+
+def fitted_avatar(
+    gaussians: GaussianSet,
+    track: BodyTrack,
+    times_us: Sequence[int],
+    surface: SurfaceSamples,
+    generator: torch.Generator,
+    *,
+    semantics: Semantics,
+    networks: Networks,
+    scene_direction_dropout: float,
+    released: Released,
+    skinning_steps: int,
+    device: torch.device | str,
+) -> tuple[PaperModel, SkinningPrior]:
+    """The model at its start, skinning brought to the body's weights, and the prior of these.
+
+    ``times_us`` are the mid-exposures of the training frames.
+    """
+    model = PaperModel(
+        track,
+        times_us,
+        gaussians,
+        semantics=semantics,
+        width=networks.width,
+        colour_width=networks.colour_width,
+        non_rigid_start=networks.non_rigid_start,
+        pose_noise=networks.pose_noise,
+        scene_direction_dropout=scene_direction_dropout,
+        pose_start=networks.pose_start,
+        released=released,
+    ).to(device)
+    prior = SkinningPrior(surface.to(device), SKINNING_POINTS)
+    fit_skinning(model, prior, skinning_steps, generator)
+    return model, prior
+
+
+def picture_terms(
+    capture: TrainingCapture,
+    boxes: dict[str, tuple[int, int, int, int]],
+    terms: AvatarTerms,
+    l1: Weight,
+    dssim: Weight,
+    *,
+    device: torch.device | str,
+    purpose: Purpose,
+) -> tuple[Photometric, dict[str, Weight]]:
+    """The terms that compare pictures, perceptual distance in ``boxes``, and their weights."""
+    # Weights of a perceptual network need not be there to draw.
+    choice = "none" if purpose == "draw" else terms.perceptual
+    name, perceptual = choose_perceptual(choice, device=device)
+    objective = Photometric(
+        capture,
+        boxes if perceptual else {},
+        dssim=dssim != 0.0,
+        perceptual=perceptual,
+        perceptual_term=name,
+    )
+    weights: dict[str, Weight] = {"l1": l1, "dssim": dssim}
+    if perceptual is not None:
+        weights[name] = terms.perceptual_weight
+    return objective, weights
+
+
+def learning_of(model: PaperModel, rates: AvatarRates) -> Learning:
+    """Groups of the paper's model."""
+    rows = row_rates(
+        {
+            "scales_log": rates.scales_log,
+            "quaternions": 1e-3,
+            "opacity_logits": rates.opacity_logits,
+            "features": rates.features,
+        },
+        means=rates.means,
+        final=rates.gaussians_final,
+        means_final=rates.final,
+        constant=rates.constant,
+    )
+    parts = (
+        (parameters_of(model.skinning), rates.skinning, 0.0),
+        (parameters_of(model.deformation), rates.non_rigid, 0.0),
+        (parameters_of(model.human_colour, model.scene_colour), rates.colour, 0.0),
+        (parameters_of(model.latents), rates.latents, LATENT_WEIGHT_DECAY),
+        (parameters_of(model.residual), rates.pose, 0.0),
+    )
+    networks = [
+        Network(parameters, Rate(rate, rates.final, rates.constant), decay, clipped=True)
+        for parameters, rate, decay in parts
+    ]
+    return Learning({"gaussians": rows}, networks, CLIP, HUMAN_START)

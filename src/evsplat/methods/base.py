@@ -1,0 +1,108 @@
+"""Contract of a method: a configuration, and what it is put together to for one capture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import torch
+from torch import nn
+
+from evsplat.body import BodyTrack, silhouette
+from evsplat.capture import Frame, Policy, TrainingCapture
+from evsplat.errors import ConfigError, DataError
+from evsplat.gaussians import BodyFrames, DensifyLimits, Part
+from evsplat.methods.learning import Learning
+from evsplat.methods.settings import Weight
+from evsplat.models.model import Model
+from evsplat.objectives import Objective, PackedBounds
+
+Purpose = Literal["train", "resume", "draw"]
+"""``train``: from the start, with the cheap fits before it. ``resume``: a checkpoint brings all that
+was learned. ``draw``: likewise, and no objective is asked."""
+
+
+class MethodConfig(Protocol):
+    """Settings that every method has; a frozen dataclass."""
+
+    @property
+    def policy(self) -> Policy:
+        """Held-out data that training may see."""
+
+    @property
+    def iterations(self) -> int:
+        """Training steps; all schedules stretch with it."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Learning between training steps from frames whose pictures stay unseen."""
+
+    frames: list[Frame]
+    objective: Objective
+    parameters: list[nn.Parameter]
+    """Parameters that these frames alone teach; of the groups in `Learning.networks`."""
+    start: float
+    """First nominal iteration."""
+    every: int
+    """Training steps between two of these."""
+
+
+@dataclass(frozen=True)
+class Composition:
+    """A method put together for one capture; the loop knows nothing else of it."""
+
+    model: Model
+    objectives: list[Objective]
+    weights: dict[str, Weight]
+    """Weight per named term; a term without one is an error of the method."""
+    learning: Learning
+    densify: dict[Part, DensifyLimits]
+    """Limits for ``human`` and ``scene``; classes in one set are edited at the same steps."""
+    body_frames: BodyFrames | None
+    """The body at the training frames, for Gaussians that change class; None where none does."""
+    generator: torch.Generator
+    """All randomness of the training; part of the checkpoint."""
+    capture: TrainingCapture | None = None
+    """The recording as the method sees it, where that is not all of it (masked pictures)."""
+    held_out: HeldOut | None = None
+
+
+def start_of_randomness(seed: int) -> torch.Generator:
+    """Generator of all randomness of a run; networks start from torch's own, seeded alike."""
+    torch.manual_seed(seed)
+    return torch.Generator().manual_seed(seed)
+
+
+def require_training_frames(capture: TrainingCapture) -> None:
+    """A `DataError` where no frame trains."""
+    if not capture.train_frames:
+        raise DataError(f"{capture.path}: no frame has split 'train'; nothing to learn from.")
+
+
+def refuse_masks(policy: Policy, method: str) -> None:
+    """A `ConfigError` where masks are shown to a method that reads none."""
+    if policy.masks != "none":
+        raise ConfigError(
+            f"policy.masks is {policy.masks}, and method {method} reads no masks; leave it out."
+        )
+
+
+def body_frames(track: BodyTrack, times_us: Sequence[int]) -> BodyFrames:
+    """The body as given at the training frames."""
+    return BodyFrames(track.body, track.bones(list(times_us)))
+
+
+def semantic_bounds(
+    capture: TrainingCapture, track: BodyTrack, band_px_at_256: float
+) -> dict[int, PackedBounds]:
+    """Places of the person by the posed body, for each training frame's mid-exposure.
+
+    ``band_px_at_256``: width of the undecided band around it, for a picture 256 pixels high.
+    """
+    bounds = {}
+    for frame in capture.train_frames:
+        camera = capture.camera(frame)
+        mask = silhouette(track.vertices(frame.mid_us), track.body.faces, camera)
+        band = max(1, round(band_px_at_256 * camera.height / 256))
+        bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band)
+    return bounds

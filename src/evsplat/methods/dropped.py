@@ -1,0 +1,93 @@
+"""Settings of earlier versions, and what became of them: for run folders and habits of users."""
+
+_RENAMED = {
+    "optimisation.iterations": "renamed to iterations",
+    "optimisation.rates": "its values are in the section rates",
+    "optimisation": "its parts are iterations and the section rates; the rest is fixed",
+    "densify_human.max_count": "renamed to densify.max_human",
+    "densify_human": "renamed to densify",
+    "densify_scene": "the scene's limit is scene.cube_max_count, the others are 3DGS's",
+    "human.max_count": "fixed at 20,000",
+    "human.opacity": "fixed by the method",
+    "human.width": "fixed by the method",
+    "human.flatness": "fixed by the method",
+    "scene.cube_opacity": "fixed at 0.1",
+    "scene.backdrop_edge_share": "fixed at 0.18",
+    "scene.backdrop_opacity": "fixed at 0.9",
+    "scene.backdrop_margin": "fixed at 0.15",
+    "loss.l1": "renamed to l1_weight",
+    "loss.dssim": "renamed to dssim_weight",
+    "isometry_refresh": "fixed at 100",
+    "skinning_points": "fixed at 1,024",
+}
+
+_EVENTS = {
+    "event.weight": "renamed to event_weight",
+    "event.start": "renamed to event_start",
+    "event.across_gaps": "gone, no run showed a gain (docs/method.md)",
+    "semantic_activity": "gone, no run showed a gain (docs/method.md)",
+}
+
+_NETWORKS = {
+    "deform.encoding": "gone, the encoding is one-blob (docs/method.md)",
+    "deform.precision": "gone, networks compute in float32 (docs/method.md)",
+    "deform.skinning_grid": "gone, evsplat has no skinning network (docs/method.md)",
+    "deform.pose_correction_start": "renamed to networks.pose_start",
+    "deform.width": "renamed to networks.width",
+    "deform.colour_width": "renamed to networks.colour_width",
+    "deform.non_rigid_start": "renamed to networks.non_rigid_start",
+    "deform.pose_noise": "renamed to networks.pose_noise",
+    "deform": "its settings are in the section networks, or fixed by the method",
+    "isometry_samples": "renamed to terms.isometry_samples",
+    "skinning_prefit_steps": "renamed to terms.skinning_prefit_steps",
+    "loss": "its weights are l1_weight, dssim_weight and the section terms",
+}
+
+AVATAR = {**_RENAMED, **_NETWORKS, "loss.alpha": "renamed to alpha_weight"}
+"""Of `avatar3dgs`."""
+
+PAPER = {
+    **_RENAMED,
+    **_EVENTS,
+    **_NETWORKS,
+    "event": "its settings begin with event_, as event_weight",
+    "deform.scene_direction_dropout": "renamed to scene_direction_dropout",
+    "loss.semantic": "renamed to semantic_weight",
+    "loss.binarise": "renamed to binarise_weight",
+}
+"""Of `paper` and `avatar3dgs_semantic`."""
+
+EVSPLAT = {
+    **_RENAMED,
+    **_EVENTS,
+    "deform.width": "renamed to width",
+    "deform.non_rigid_start": "renamed to non_rigid_start",
+    "deform.pose_noise": "renamed to pose_noise",
+    "deform.shading": "renamed to shading",
+    "deform.shadow_lights": "renamed to lamps",
+    "deform.self_shadow": "renamed to self_shadow",
+    "deform.low_pass": "renamed to low_pass",
+    "deform.pose_correction_start": "evsplat reads pose.refine and pose.start instead",
+    "deform": "what evsplat reads of it are width, shading, lamps, self_shadow, low_pass, "
+    "non_rigid_start and pose_noise",
+    "loss.semantic": "renamed to semantic_weight",
+    "loss.binarise": "renamed to binarise_weight",
+    "loss": "its weights are l1_weight, dssim_weight, semantic_weight and binarise_weight",
+    "isometry_samples": "evsplat has no isometry term",
+    "skinning_prefit_steps": "evsplat has no skinning network",
+    "semantics": "evsplat learns the attribute by the posed silhouette only (docs/method.md)",
+    "semantic_start": "fixed at 2",
+    "edi": "gone, sharpened frames as targets lost 0.15 dB (docs/method.md)",
+    "event": "its settings begin with event_, as event_weight",
+    "exposure.px_per_render": "renamed to px_per_render",
+    "exposure.most_renders": "renamed to most_renders",
+    "exposure": "its settings are px_per_render and most_renders",
+    "windows.pixel_thresholds": "gone, no run showed a gain (docs/method.md)",
+    "windows.begun_us": "renamed to event_ramp_us",
+    "windows.clock": "renamed to clock",
+    "windows.contrast_weight": "renamed to contrast_weight",
+    "windows": "its settings are event_start, event_eps, event_reach, event_ramp_us, "
+    "event_noise_aware, contrast_weight and clock",
+    "pose.knot_frames": "fixed at 1",
+}
+"""Of `evsplat`."""

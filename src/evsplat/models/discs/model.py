@@ -1,0 +1,214 @@
+"""A closed surface of flat discs in the light of a room: the model of method `evsplat`.
+
+Each Gaussian has a colour of its own, and the person's hang on the nearest point of the body's
+surface; networks are asked only for what the pose bends beyond that. Light falls on the person from
+lamps, which it hides from the scene and from itself.
+"""
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from evsplat.body import BodyTrack, skin, up_axis
+from evsplat.capture import Camera, Frame
+from evsplat.gaussians import GaussianSet
+from evsplat.models.discs.lamps import Lamps
+from evsplat.models.discs.shading import Shading, SurfaceLight
+from evsplat.models.discs.shadow import BodyShadow
+from evsplat.models.discs.surface import NearestSurface
+from evsplat.models.drawing import Drawing, draw
+from evsplat.models.layers import Layers, SceneShadow, human_splats, scene_splats
+from evsplat.models.model import PosedModel, RowCache
+from evsplat.models.networks.deformation import PoseDeformation, draw_pose_noise
+from evsplat.models.pose_spline import PoseSpline
+
+NORMAL_SAMPLES = 20_000
+"""Points of the body's surface among which a Gaussian finds its normal and its bones."""
+CASTERS = 400
+"""Points of the body that hide lights."""
+
+
+class DiscModel(PosedModel):
+    """Discs of person and scene, the light on them, and the body track."""
+
+    residual: PoseSpline | None
+
+    def __init__(
+        self,
+        track: BodyTrack,
+        frame_times_us: Sequence[int],
+        gaussians: GaussianSet,
+        *,
+        width: int,
+        non_rigid_start: float,
+        pose_noise: float,
+        low_pass: float,
+        shading: bool,
+        lamps: int,
+        self_shadow: bool,
+        residual: PoseSpline | None = None,
+        residual_start: float = 0.0,
+    ) -> None:
+        """Start at ``gaussians``, which have an attribute ``colour_logits``.
+
+        ``frame_times_us``: mid-exposures of the training frames, for where the person goes.
+        ``width`` of the non-rigid network, used from nominal iteration ``non_rigid_start`` on.
+        ``pose_noise``: standard deviation of what training adds to the matrices that it sees.
+        """
+        super().__init__(track)
+        body = track.body
+        self.gaussians = gaussians
+        self.non_rigid_start, self.pose_noise = non_rigid_start, pose_noise
+        self.low_pass = low_pass
+        self.deformation = PoseDeformation(body, width=width, feature_dim=0)
+        self.residual, self.residual_start = residual, residual_start
+        self.sensor: nn.Module | None = None
+        """Learned properties of the event camera, set by a method that learns any."""
+        generator = torch.Generator().manual_seed(0)
+        self.surface = NearestSurface(body.sample_surface(NORMAL_SAMPLES, generator))
+        roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
+        middle = roots.mean(0).float()
+        self.lamps: Lamps | None = None
+        self.shadow: BodyShadow | None = None
+        if lamps:
+            self.lamps = Lamps(middle, up_axis(track), lamps)
+            casters = body.sample_surface(CASTERS, generator)
+            self.shadow = BodyShadow(casters, lamps, on_body=self_shadow and shading)
+        self.shading: Shading | None = None
+        if shading:
+            radius = max(1.0, float((roots - middle).norm(dim=-1).max()))
+            self.shading = Shading(middle, radius, lamps)
+
+    @property
+    def sets(self) -> dict[str, GaussianSet]:
+        """The one set of both classes."""
+        return {"gaussians": self.gaussians}
+
+    @property
+    def row_caches(self) -> dict[str, RowCache]:
+        """The nearest points of the body's surface."""
+        return {"surface": self.surface}
+
+    def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Weights of the bones that `at` draws the person's Gaussians with, for any centres."""
+        return self.surface.weights(self.gaussians.means[self.gaussians.human])
+
+    def surface_light(self) -> SurfaceLight | None:
+        """The light on the person's Gaussians, where it is learned."""
+        if self.shading is None:
+            return None
+        means = self.gaussians.means[self.gaussians.human]
+        lamps = None if self.lamps is None else self.lamps.places()
+        return SurfaceLight(self.shading, self.surface.normals(means), lamps)
+
+    def at(
+        self,
+        times_us: Sequence[int],
+        camera_center: Float[Tensor, "3"],
+        *,
+        hard_semantics: bool = False,
+    ) -> Layers:
+        """All Gaussians in world space; their colours are the same for every camera."""
+        rotations, bones = self.pose(times_us)
+        return self._layers(bones, rotations, slice(None), hard_semantics=hard_semantics)
+
+    def training_drawing(
+        self,
+        times_us: Sequence[int],
+        frame: Frame,
+        camera: Camera,
+        generator: torch.Generator,
+    ) -> Drawing:
+        """Pictures of a training step; see `Model`.
+
+        The times of a step lie within a frame of each other: the non-rigid network sees the pose
+        at the frame's middle alone, and own shadows are looked up at the time nearest to it.
+        """
+        _, bones = self.pose(times_us)
+        rotations, _ = self.pose([frame.mid_us])
+        joints = rotations.shape[1]
+        rotations = rotations + draw_pose_noise(joints, self.pose_noise, generator, self.device)
+        nearest = min(range(len(times_us)), key=lambda t: abs(times_us[t] - frame.mid_us))
+        layers = self._layers(bones, rotations, slice(nearest, nearest + 1), hard_semantics=False)
+        return draw(layers, camera, center_gradients=True)
+
+    def following(self, track: BodyTrack) -> "DiscModel":
+        """The same person doing what ``track`` says, without pose residuals; see `Model`."""
+        model = copy.deepcopy(self)
+        model.track = track.to(self.device)
+        if model.residual is not None:
+            model.residual.forget()
+        return model
+
+    def _layers(
+        self,
+        bones: Float[Tensor, "T J 4 4"],
+        rotations: Float[Tensor, "#T J 3 3"],
+        lit_at: slice,
+        *,
+        hard_semantics: bool,
+    ) -> Layers:
+        """Both classes under ``bones``; the non-rigid network sees ``rotations``.
+
+        ``lit_at``: the times, one or all, at which shadows on the person are looked up.
+        """
+        gaussians = self.gaussians
+        means, scene_means = gaussians.of_parts(gaussians.means)
+        scales_log, scene_scales_log = gaussians.of_parts(gaussians.scales_log)
+        quaternions, scene_quaternions = gaussians.of_parts(gaussians.quaternions)
+        colours, scene_colours = gaussians.of_parts(gaussians.get_parameter("colour_logits"))
+        opacities, scene_opacities = gaussians.of_parts(gaussians.opacities())
+        labels = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
+        semantics, scene_semantics = gaussians.of_parts(labels)
+
+        if float(self.nominal) >= self.non_rigid_start:
+            centers, scales, turned, _ = self.deformation(
+                means, scales_log, quaternions, rotations
+            )
+        else:
+            centers, scales, turned = means[None], scales_log.exp()[None], quaternions[None]
+        world, transforms = skin(centers, self.surface.weights(means)[None], bones)
+        casters = None if self.shadow is None else self.shadow.place(bones)
+        rgb = colours.sigmoid()[None] * self._light(world, transforms, casters, lit_at)
+        return Layers(
+            human_splats(world, turned, scales, opacities, rgb, semantics, transforms),
+            scene_splats(
+                scene_means,
+                scene_quaternions,
+                scene_scales_log.exp(),
+                scene_opacities,
+                scene_colours.sigmoid(),
+                scene_semantics,
+            ),
+            transforms,
+            self._scene_shadow(casters),
+            self.low_pass,
+        )
+
+    def _light(
+        self,
+        world: Float[Tensor, "T H 3"],
+        transforms: Float[Tensor, "T H 4 4"],
+        casters: Float[Tensor, "T P 3"] | None,
+        lit_at: slice,
+    ) -> Float[Tensor, "T H 3"] | float:
+        """Factors on the person's colours; 1 without shading."""
+        light = self.surface_light()
+        if light is None:
+            return 1.0
+        # Detached: a colour must not be bought by moving or turning the body.
+        places, lit = world.detach(), None
+        if self.shadow is not None and self.shadow.on_body and light.lamps is not None:
+            assert casters is not None
+            lit = self.shadow.lit(casters[lit_at].detach(), places[lit_at], light.lamps)
+        return light.factors(transforms.detach(), places, lit)
+
+    def _scene_shadow(self, casters: Float[Tensor, "T P 3"] | None) -> SceneShadow | None:
+        """The shadow that the body throws on places of the scene."""
+        shadow, lamps = self.shadow, self.lamps
+        if shadow is None or lamps is None or casters is None:
+            return None
+        return lambda places: shadow(casters, places, lamps.places())

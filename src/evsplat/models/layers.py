@@ -1,0 +1,73 @@
+"""Person and scene at given times, in world space: what a model hands to the rasteriser."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.render import LOW_PASS, Splats
+
+SceneShadow = Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "T H W"]]
+"""Factors in 0..1 on the scene's colours at world places, one picture per time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """The person's ``H`` Gaussians at T times and the scene's ``S``, which are the same at all.
+
+    Channels of both are R, G, B (sRGB) and the semantic attribute: the soft m, or the hard label
+    for evaluation.
+    """
+
+    human: Splats
+    """Rotations are those of canonical space; ``linear`` carries them to the world."""
+    scene: Splats
+    """With a leading axis of one time."""
+    transforms: Float[Tensor, "T H 4 4"]
+    """The person's blended bone transforms, canonical to world; not rigid (blending shears)."""
+    shadow: SceneShadow | None = None
+    """The person's shadow on the scene."""
+    low_pass: float = LOW_PASS
+    """Variance of the filter of a pixel, px^2; see `evsplat.render.render`."""
+
+    @property
+    def times(self) -> int:
+        """Number of times T."""
+        return len(self.human.means)
+
+
+def human_splats(
+    means: Float[Tensor, "T H 3"],
+    quaternions: Float[Tensor, "#T H 4"],
+    scales: Float[Tensor, "#T H 3"],
+    opacities: Float[Tensor, " H"],
+    rgb: Float[Tensor, "#T H 3"],
+    semantics: Float[Tensor, " H"],
+    transforms: Float[Tensor, "T H 4 4"],
+) -> Splats:
+    """The person's layer; what is the same at all times may have an axis of one time."""
+    times = (len(means), -1, -1)
+    channels = torch.cat([rgb.expand(times), semantics[None, :, None].expand(times)], -1)
+    return Splats(
+        means,
+        quaternions.expand(times),
+        scales.expand(times),
+        opacities,
+        channels,
+        transforms[..., :3, :3],
+    )
+
+
+def scene_splats(
+    means: Float[Tensor, "S 3"],
+    quaternions: Float[Tensor, "S 4"],
+    scales: Float[Tensor, "S 3"],
+    opacities: Float[Tensor, " S"],
+    rgb: Float[Tensor, "S 3"],
+    semantics: Float[Tensor, " S"],
+) -> Splats:
+    """The scene's layer."""
+    channels = torch.cat([rgb, semantics[:, None]], dim=-1)[None]
+    return Splats(means[None], quaternions, scales, opacities, channels)

@@ -1,0 +1,1 @@
+"""Networks that models share: encodings, pose encoder, deformation, skinning and colour."""

@@ -1,0 +1,287 @@
+"""The paper's model (eq. 1-7): 3DGS-Avatar's networks pose and colour the person, in a scene."""
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from evsplat.body import BodyTrack, skin
+from evsplat.capture import Camera, Frame
+from evsplat.devices import send
+from evsplat.gaussians import GaussianSet
+from evsplat.models.drawing import Drawing, draw
+from evsplat.models.layers import Layers, human_splats, scene_splats
+from evsplat.models.model import PosedModel, RowCache
+from evsplat.models.networks.colour import HumanColour, SceneColour, view_directions, view_jitter
+from evsplat.models.networks.deformation import PoseDeformation, draw_pose_noise
+from evsplat.models.networks.skinning_network import SkinningNetwork
+from evsplat.models.networks.skinning_turns import SkinningTurns
+from evsplat.models.paper.per_frame import FrameLatents, FramePoses, UnseenFrames
+from evsplat.models.paper.placement import ByLabel, Placement, StraightThrough
+from evsplat.render import LOW_PASS, PinholeCamera, rows_in_view
+
+LATENT_DIM = 16
+"""Size of the per-frame latent of the person's colour (1.7)."""
+COLOUR_FEATURE_DIM = 16
+"""Values that the non-rigid network gives to the person's colour (1.5)."""
+
+Semantics = Literal["fixed", "ste", "rendered"]
+"""How the attribute learns: not at all, by straight-through placement, by the rendered attribute."""
+
+
+@dataclass(frozen=True)
+class Released:
+    """Choices in which the released 3DGS-Avatar differs from the better reading of its paper."""
+
+    last_std: float | None = 1e-3
+    """Start of the non-rigid network's last layer; None starts it at random as released, which
+    makes every point jump when the network is switched on (1.5)."""
+    symmetric_view_noise: bool = True
+    """False: the third angle of the view noise is drawn from 0 to 45 degrees only (1.7)."""
+    unseen_frames: UnseenFrames = "interpolated"
+    """Latent and pose residual of instants that are not the middle of a training frame (A22)."""
+    skinning_turns: int = 4
+    """A training step looks up the skinning weights of one row in so many, in turns; released: of
+    all, 1."""
+
+
+RELEASED = Released(None, False, "released", 1)
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """Random perturbations of one training step."""
+
+    rotations: Tensor | float
+    """Added to the matrices that the pose encoder sees."""
+    view_turn: Float[Tensor, "3 3"]
+    """Rotation of canonical view directions."""
+    hide_scene_direction: bool
+
+
+class PaperModel(PosedModel):
+    """Gaussians, networks and the body track; `at` poses them at given times."""
+
+    residual: FramePoses
+
+    def __init__(
+        self,
+        track: BodyTrack,
+        frame_times_us: Sequence[int],
+        gaussians: GaussianSet,
+        *,
+        semantics: Semantics,
+        width: int,
+        colour_width: int,
+        non_rigid_start: float,
+        pose_noise: float,
+        scene_direction_dropout: float,
+        pose_start: float | None,
+        released: Released,
+    ) -> None:
+        """Start at ``gaussians``, which have an attribute ``features``.
+
+        ``frame_times_us`` are the mid-exposures of the training frames, the anchors of latents and
+        pose residuals; these are learned from nominal iteration ``pose_start`` on, None: never.
+        """
+        super().__init__(track)
+        body = track.body
+        self.gaussians, self.semantics, self.released = gaussians, semantics, released
+        self.non_rigid_start, self.pose_noise = non_rigid_start, pose_noise
+        self.scene_direction_dropout = scene_direction_dropout
+        self.placement: Placement = StraightThrough() if semantics == "ste" else ByLabel()
+        self.deformation = PoseDeformation(
+            body, width=width, feature_dim=COLOUR_FEATURE_DIM, last_std=released.last_std
+        )
+        self.skinning = SkinningNetwork(body.parents.tolist(), width=width)
+        self.skinning_turns = SkinningTurns(released.skinning_turns)
+        self.human_colour = HumanColour(
+            nonrigid_dim=COLOUR_FEATURE_DIM, latent_dim=LATENT_DIM, width=colour_width
+        )
+        self.scene_colour = SceneColour(width=colour_width)
+        self.latents = FrameLatents(frame_times_us, LATENT_DIM, released.unseen_frames)
+        self.residual = FramePoses(frame_times_us, len(body.parents), released.unseen_frames)
+        self.residual_start = float("inf") if pose_start is None else pose_start
+
+    @property
+    def low_pass(self) -> float:
+        """Variance of the filter of a pixel, px^2: that of 3DGS."""
+        return LOW_PASS
+
+    @property
+    def sets(self) -> dict[str, GaussianSet]:
+        """The one set of both classes."""
+        return {"gaussians": self.gaussians}
+
+    @property
+    def row_caches(self) -> dict[str, RowCache]:
+        """Skinning weights that are a few steps old."""
+        return {"skinning_turns": self.skinning_turns}
+
+    def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Weights of the bones at canonical centres, metres."""
+        weights: Tensor = self.skinning(self.deformation.normalise(centers))
+        return weights
+
+    def surface_light(self) -> None:
+        """No light is learned apart from the colours."""
+
+    def at(
+        self,
+        times_us: Sequence[int],
+        camera_center: Float[Tensor, "3"],
+        *,
+        hard_semantics: bool = False,
+    ) -> Layers:
+        """All Gaussians in world space, coloured for a camera at that centre; see `Model`."""
+        return self._layers(
+            times_us, camera_center, self.skinning_weights, hard_semantics=hard_semantics
+        )
+
+    def training_drawing(
+        self,
+        times_us: Sequence[int],
+        frame: Frame,
+        camera: Camera,
+        generator: torch.Generator,
+    ) -> Drawing:
+        """Pictures of a training step, with all its noise; see `Model`."""
+        layers = self._layers(
+            times_us,
+            camera.center(),
+            self._shared_weights,
+            noise=self._draw_noise(generator),
+            shown=camera,
+        )
+        return draw(layers, camera, center_gradients=True)
+
+    def following(self, track: BodyTrack) -> "PaperModel":
+        """The same person doing what ``track`` says, see `Model`.
+
+        Pose residuals are left out, and the colour takes the mean of the latents.
+        """
+        model = copy.deepcopy(self)
+        model.track = track.to(self.device)
+        model.latents.take_mean()
+        model.residual.forget()
+        return model
+
+    def _shared_weights(self, centers: Float[Tensor, "T M 3"]) -> Float[Tensor, "1 M J"]:
+        """Skinning weights of a training step: once, at the mean of a Gaussian's places.
+
+        Its neighbouring times differ by less than the weights notice (eq. 2 asks at each).
+        """
+        shared = self.deformation.normalise(centers.mean(0))
+        return self.skinning_turns.weights(self.skinning, shared)[None]
+
+    def _draw_noise(self, generator: torch.Generator) -> _Noise:
+        joints = len(self.track.body.parents)
+        rotations = draw_pose_noise(joints, self.pose_noise, generator, self.device)
+        turn = view_jitter(generator, symmetric=self.released.symmetric_view_noise)
+        hide = float(torch.rand((), generator=generator)) < self.scene_direction_dropout
+        return _Noise(rotations, send(turn, self.device), hide)
+
+    def _layers(
+        self,
+        times_us: Sequence[int],
+        camera_center: Float[Tensor, "3"],
+        weights_at: Callable[[Tensor], Tensor],
+        *,
+        hard_semantics: bool = False,
+        noise: _Noise | None = None,
+        shown: PinholeCamera | None = None,
+    ) -> Layers:
+        """Both classes at given times, with skinning weights by ``weights_at``.
+
+        ``shown``: only this camera's picture is asked for; rows of the scene outside of it may be
+        black.
+        """
+        gaussians = self.gaussians
+        parts = [
+            gaussians.of_parts(values)
+            for values in (gaussians.means, gaussians.scales_log, gaussians.quaternions)
+        ]
+        scene_means, scene_scales_log, scene_quaternions = (scene for _, scene in parts)
+        rotations, bones = self.pose(times_us)
+        rows = self.placement.posed_scene_rows(gaussians, self.deformation)
+        posed = [
+            human if rows is None else torch.cat([human, scene[rows]]) for human, scene in parts
+        ]
+        centers, scales, quaternions, feature = self._deformed(posed, rotations, noise)
+        world, transforms = skin(centers, weights_at(centers), bones)
+        human_means, scene_means = self.placement.places(gaussians, rows, world, scene_means)
+
+        people = slice(0, gaussians.human_count)
+        human_features, scene_features = gaussians.of_parts(gaussians.get_parameter("features"))
+        # Detached as in 3DGS-Avatar: colour must not be bought by moving the body.
+        turn = None if noise is None else noise.view_turn
+        seen_from = view_directions(human_means, camera_center, transforms[:, people], turn)
+        rgb = self.human_colour(
+            human_features, seen_from, feature[:, people], self.latents(times_us)
+        )
+        labels = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
+        semantics, scene_semantics = gaussians.of_parts(labels)
+        opacities, scene_opacities = gaussians.of_parts(gaussians.opacities())
+        scene_scales = scene_scales_log.exp()
+        in_view = None if shown is None else rows_in_view(scene_means, scene_scales, shown)
+        hidden = noise is not None and noise.hide_scene_direction
+        return Layers(
+            human_splats(
+                human_means,
+                quaternions[:, people],
+                scales[:, people],
+                opacities,
+                rgb,
+                semantics,
+                transforms[:, people],
+            ),
+            scene_splats(
+                scene_means,
+                scene_quaternions,
+                scene_scales,
+                scene_opacities,
+                self._scene_rgb(scene_features, scene_means, in_view, camera_center, hidden),
+                scene_semantics,
+            ),
+            transforms[:, people],
+        )
+
+    def _deformed(
+        self, given: list[Tensor], rotations: Float[Tensor, "T J 3 3"], noise: _Noise | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Deformed centres, scales, quaternions and colour feature (eq. 1), time leading.
+
+        ``given`` are centres, log-scales and quaternions. Before the network is switched on all but
+        the feature have a leading axis of 1.
+        """
+        means, scales_log, quaternions = given
+        if float(self.nominal) < self.non_rigid_start:
+            feature = means.new_zeros(len(rotations), len(means), COLOUR_FEATURE_DIM)
+            return means[None], scales_log.exp()[None], quaternions[None], feature
+        seen = rotations if noise is None else rotations + noise.rotations
+        deformed: tuple[Tensor, Tensor, Tensor, Tensor] = self.deformation(
+            means, scales_log, quaternions, seen
+        )
+        return deformed
+
+    def _scene_rgb(
+        self,
+        features: Float[Tensor, "S F"],
+        means: Float[Tensor, "S 3"],
+        rows: Int[Tensor, " V"] | None,
+        camera_center: Float[Tensor, "3"],
+        hide_direction: bool,
+    ) -> Float[Tensor, "S 3"]:
+        """Colours of the scene, of some ``rows`` of it or of all; the others are black."""
+        count = len(means)
+        if rows is not None:
+            features, means = features.index_select(0, rows), means.detach().index_select(0, rows)
+        directions = view_directions(means[None], camera_center)[0]
+        if hide_direction:
+            directions = torch.zeros_like(directions)
+        rgb: Tensor = self.scene_colour(features, directions)
+        return rgb if rows is None else rgb.new_zeros(count, 3).index_copy(0, rows, rgb)
