@@ -1,14 +1,31 @@
 """Configuration: round trips and errors that help."""
 
+import math
 import time
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
-from evsplat.config import from_dict, load_yaml, override, save_yaml, to_dict
+from evsplat.config import (
+    Above,
+    AtLeast,
+    AtMost,
+    ReadIf,
+    Within,
+    check,
+    check_read,
+    from_dict,
+    load_yaml,
+    override,
+    save_yaml,
+    settings,
+    to_dict,
+)
 from evsplat.errors import ConfigError
-from evsplat.methods import PaperConfig, method_config
+from evsplat.methods import TRAINABLE, PaperConfig, method_config
 from evsplat.methods.evsplat import EvsplatConfig
 
 
@@ -31,6 +48,54 @@ class Owner:
     outer: Outer = field(default_factory=lambda: Outer(Inner(rate=0.5), flag=True))
 
 
+Pairs = tuple[tuple[Annotated[int, AtLeast(0)], float], ...]
+
+
+@dataclass(frozen=True)
+class Ranged:
+    opacity: Annotated[float, Within(0, 1)] = 0.5
+    rate: Annotated[float, Above(0)] = 0.1
+    count: Annotated[int, AtLeast(1)] = 3
+    low_pass: Annotated[float, Above(0), AtMost(0.3)] = 0.3
+    limit: Annotated[float, Above(0)] | None = None
+    weight: Annotated[float, AtLeast(0)] | Pairs = 1.0
+    all_of_them: Annotated[float | tuple[float, ...], AtLeast(0)] = 1.0
+
+
+@dataclass(frozen=True)
+class Lamps:
+    lights: Annotated[int, AtLeast(0)] = 0
+    width: Annotated[float, Above(0), ReadIf("lights", "above 0", lambda n: n > 0)] = 0.1
+    colour: Annotated[
+        str,
+        ReadIf("lights", "above 0", lambda n: n > 0),
+        ReadIf("deform.shading", "true", bool),
+    ] = "white"
+    blur: Annotated[float, ReadIf("width", "above 1", lambda w: w > 1)] = 0.0
+
+
+@dataclass(frozen=True)
+class Deform:
+    shading: bool = False
+    lamps: Lamps = field(default_factory=Lamps)
+
+
+@dataclass(frozen=True)
+class Method:
+    DROPPED: ClassVar[dict[str, str]] = {
+        "deform.encoding": "gone: the hash grid earned nothing (docs/method.md)",
+        "edi": "gone: sharpened frames earned nothing",
+        "pose_begin": "renamed to pose_start",
+    }
+
+    pose_start: float = 0.0
+    deform: Deform = field(default_factory=lambda: Deform(lamps=Lamps(width=0.2)))
+    extra: Annotated[Lamps | None, ReadIf("deform.shading", "true", bool)] = None
+    part: Annotated[Lamps, ReadIf("pose_start", "above 0", lambda s: s > 0)] = field(
+        default_factory=lambda: Lamps(lights=2)
+    )
+
+
 def test_every_value_survives_yaml(tmp_path):
     config = Outer(Inner(rate=3e-5, kind="b", pairs=((0.0, 10.0), (1000.0, 0.1)), limit=7), True)
     save_yaml(tmp_path / "c.yaml", config)
@@ -49,7 +114,13 @@ def test_defaults_of_the_paper_method_survive_yaml(tmp_path):
         ({"flagg": True}, "f.yaml: unknown setting flagg. Did you mean flag?"),
         ({"inner": {"kind": "c"}}, "inner.kind is 'c'; expected one of a, b"),
         ({"inner": {"rate": "fast"}}, "inner.rate is 'fast'; expected a number"),
-        ({"inner": {"limit": 1.5}}, "inner.limit is 1.5; expected an integer"),
+        ({"inner": {"limit": 1.5}}, "inner.limit is 1.5; expected an integer or null."),
+        ({"inner": {"pairs": "x"}}, "inner.pairs is 'x'; expected a number or a list of [a number"),
+        ({"inner": {"pairs": [[1, "x"]]}}, "inner.pairs is 'x'; expected a number."),
+        ({"inner": {"pairs": [[1]]}}, "inner.pairs is [1]; expected 2 values."),
+        ({"inner": {"rate": math.inf}}, "inner.rate is inf; expected a finite number."),
+        ({"inner": {"rate": "1e999"}}, "inner.rate is '1e999'; expected a number."),
+        ({"inner": {"rate": True}}, "inner.rate is True; expected a number."),
         ({"inner": 3}, "inner is 3; expected a section with keys"),
         ({"flag": 1}, "flag is 1; expected true or false"),
     ],
@@ -136,3 +207,202 @@ def test_a_configuration_that_is_no_text_is_named(tmp_path):
     (tmp_path / "a.yaml").write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match="not a text in UTF-8"):
         load_yaml(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("opacity", 1.5, "a number within 0 and 1"),
+        ("opacity", math.nan, "a finite number within 0 and 1"),
+        ("rate", 0.0, "a number above 0"),
+        ("count", 0, "an integer of at least 1"),
+        ("low_pass", 0.4, "a number above 0 and of at most 0.3"),
+        ("limit", -1.0, "a number above 0 or null"),
+        ("limit", math.inf, "a finite number above 0 or null"),
+        (
+            "weight",
+            -1.0,
+            "a number of at least 0 or a list of [an integer of at least 0, a number]",
+        ),
+        ("all_of_them", -1.0, "a number of at least 0 or a list of numbers of at least 0"),
+    ],
+)
+def test_values_out_of_range_are_refused_however_they_come(name, value, told):
+    told = f"here: {name} is {value!r}; expected {told}."
+    with pytest.raises(ConfigError) as error:
+        from_dict(Ranged, {name: value}, where="here")
+    assert str(error.value) == told
+    with pytest.raises(ConfigError) as error:
+        check(Ranged(**{name: value}), "here")
+    assert str(error.value) == told
+
+
+@pytest.mark.parametrize("name, value", [("weight", ((-1, 0.0),)), ("all_of_them", (1.0, -1.0))])
+def test_numbers_in_lists_have_ranges_too(name, value):
+    for attempt in (
+        lambda: from_dict(Ranged, {name: value}, where="here"),
+        lambda: check(Ranged(**{name: value}), "here"),
+    ):
+        with pytest.raises(ConfigError, match=f"here: {name} is -1(.0)?; expected .* of at least"):
+            attempt()
+
+
+def test_a_configuration_of_wrong_types_made_in_python_is_refused():
+    with pytest.raises(ConfigError, match="rate is '0.1'; expected a number above 0"):
+        check(Ranged(rate="0.1"), "here")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="deform.lamps.lights is -1; expected"):
+        check(Method(deform=Deform(lamps=Lamps(lights=-1))), "here")
+
+
+NUMBERS = st.one_of(st.floats(), st.sampled_from([0, 1, -0.0, 5e-324, 1 + 2**-52, 0.3, 10**400]))
+
+
+@given(NUMBERS)
+@example(math.nextafter(1, 2))
+@example(math.nextafter(0, -1))
+def test_ranges_end_where_they_say(value):
+    finite = not isinstance(value, float) or math.isfinite(value)
+    for name, fits in (
+        ("opacity", 0 <= value <= 1),
+        ("rate", value > 0),
+        ("low_pass", 0 < value <= 0.3),
+        ("limit", value > 0),
+        ("weight", value >= 0),
+    ):
+        try:
+            config = from_dict(Ranged, {name: value}, where="here")
+        except ConfigError:
+            assert not (fits and finite) or abs(value) > 1e308
+        else:
+            assert fits and finite and getattr(config, name) == value
+            check(config, "here")
+
+
+@given(
+    st.builds(
+        Ranged,
+        opacity=st.floats(0, 1),
+        rate=st.floats(0, exclude_min=True, allow_infinity=False),
+        count=st.integers(1),
+        low_pass=st.floats(0, 0.3, exclude_min=True),
+        limit=st.none() | st.floats(1e-300, 1e300),
+        weight=st.floats(0, 1e300)
+        | st.lists(st.tuples(st.integers(0), st.floats(-1e300, 1e300))).map(tuple),
+    )
+)
+def test_any_configuration_in_range_survives_yaml(tmp_path_factory, config):
+    path = tmp_path_factory.mktemp("yaml") / "c.yaml"
+    check(config, "here")
+    save_yaml(path, config)
+    assert from_dict(Ranged, load_yaml(path), where="here") == config
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (
+            {"deform": {"lamps": {"width": 0.3}}},
+            "deform.lamps.width is 0.3, but nothing reads it unless deform.lamps.lights is above "
+            "0; leave it out or set deform.lamps.lights.",
+        ),
+        (
+            {"deform": {"lamps": {"colour": "red", "lights": 1}}},
+            "deform.lamps.colour is 'red', but nothing reads it unless deform.shading is true; "
+            "leave it out or set deform.shading.",
+        ),
+        (  # read only with a setting that is not read itself
+            {"deform": {"lamps": {"blur": 1.0}}},
+            "deform.lamps.blur is 1.0, but nothing reads it unless deform.lamps.width is above 1; "
+            "leave it out or set deform.lamps.width.",
+        ),
+        (
+            {"extra": {}},
+            "extra is given, but nothing reads it unless deform.shading is true; leave it out or "
+            "set deform.shading.",
+        ),
+        (
+            {"part": {"lights": 3}},
+            "part.lights is 3, but nothing reads it unless pose_start is above 0; leave it out or "
+            "set pose_start.",
+        ),
+    ],
+)
+def test_a_setting_that_nothing_would_read_is_refused(values, told):
+    with pytest.raises(ConfigError) as error:
+        from_dict(Method, values, where="here")
+    assert str(error.value) == f"here: {told}"
+
+
+def test_settings_are_taken_where_they_are_read():
+    values: dict[str, Any] = {
+        "pose_start": 1.0,
+        "deform": {"shading": True, "lamps": {"lights": 1, "width": 2.0, "blur": 0.5}},
+        "extra": {"lights": 1},
+        "part": {"lights": 3},
+    }
+    check_read(from_dict(Method, values, where="here"), "here")
+    values["deform"]["lamps"] = {"width": 0.2}  # the section's default, though not the type's
+    assert from_dict(Method, values, where="here").deform.lamps.width == 0.2
+
+
+def test_a_setting_is_unread_where_what_it_depends_on_is():
+    values = {"deform": {"lamps": {"width": 2.0, "blur": 0.5}}}
+    with pytest.raises(ConfigError, match="nothing reads it unless deform.lamps.lights is above 0"):
+        from_dict(Method, values, where="here")
+
+
+def test_a_whole_configuration_with_unread_settings_loads_again(tmp_path):
+    save_yaml(tmp_path / "c.yaml", Method())
+    assert from_dict(Method, load_yaml(tmp_path / "c.yaml"), where="c") == Method()
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (
+            {"deform": {"encoding": "hashgrid"}},
+            "deform.encoding: gone: the hash grid earned nothing (docs/method.md).",
+        ),
+        ({"edi": {"weight": 0.1}}, "edi: gone: sharpened frames earned nothing."),
+        ({"pose_begin": 3}, "pose_begin: renamed to pose_start."),
+        (
+            {"deform": {"encoding": "x", "lamps": {"light": 1}}, "pose_begin": 3, "?": 0},
+            "deform.encoding: gone: the hash grid earned nothing (docs/method.md); unknown setting "
+            "deform.lamps.light (did you mean deform.lamps.lights?); pose_begin: renamed to "
+            "pose_start; unknown setting ?.",
+        ),
+        (
+            {"extra": {"light": 1}},
+            "unknown setting extra.light. Did you mean extra.lights?",
+        ),
+    ],
+)
+def test_settings_that_are_gone_say_what_became_of_them(values, told):
+    with pytest.raises(ConfigError) as error:
+        from_dict(Method, values, where="old.yaml")
+    assert str(error.value) == f"old.yaml: {told}"
+
+
+@pytest.mark.parametrize("count", [5, 6, 9])
+def test_five_unknown_settings_are_named(count):
+    with pytest.raises(ConfigError) as error:
+        from_dict(Outer, {f"#{number}": 0 for number in range(count)}, where="here")
+    names = "; ".join(f"unknown setting #{number}" for number in range(5))
+    assert str(error.value) == f"here: {names}{f'; and {count - 5} more' if count > 5 else ''}."
+
+
+@pytest.mark.parametrize("method", TRAINABLE)
+def test_defaults_of_every_method_are_in_range_and_survive_yaml(method, tmp_path):
+    kind = TRAINABLE[method][0]
+    check(kind(), method)
+    check_read(kind(), method)
+    save_yaml(tmp_path / "c.yaml", kind())
+    assert method_config(method, load_yaml(tmp_path / "c.yaml"), where="c") == kind()
+
+
+@pytest.mark.parametrize("method", TRAINABLE)
+def test_conditions_name_settings_that_there_are(method):
+    every = {setting.name: setting for setting in settings(TRAINABLE[method][0]())}
+    for setting in every.values():
+        for name, condition in setting.conditions:
+            assert condition.holds(every[name].value) in (True, False), (setting.name, name)

@@ -1,11 +1,18 @@
-"""Configuration as frozen dataclasses: to YAML and back, with errors that name the nearest key."""
+"""Configuration as frozen dataclasses: to YAML and back, with errors that name the nearest key.
+
+Ranges and conditions of settings stand in their annotations, as `Above` and `ReadIf`; numbers are
+always finite. Settings of older versions stand in the class attribute ``DROPPED``: what became of
+them ("renamed to pose.start") by dotted name.
+"""
 
 import dataclasses
 import difflib
+import math
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -17,6 +24,175 @@ _DEEPEST = 50
 """Levels of a YAML text; settings have a handful."""
 _MISFITS = (TypeError, KeyError, IndexError, AttributeError, OverflowError)
 """What PyYAML raises, besides `ValueError` and its own errors, on tags such as ``!!bool 3``."""
+_MOST_NAMED = 5
+"""Unknown settings that one message names."""
+
+
+@dataclass(frozen=True)
+class Above:
+    """Range of numbers above a bound: ``Annotated[float, Above(0)]``."""
+
+    bound: float
+
+    def holds(self, number: float) -> bool:
+        """Whether it is in the range."""
+        return number > self.bound
+
+    def __str__(self) -> str:
+        return f"above {self.bound}"
+
+
+@dataclass(frozen=True)
+class AtLeast:
+    """Range of numbers from a bound on."""
+
+    bound: float
+
+    def holds(self, number: float) -> bool:
+        """Whether it is in the range."""
+        return number >= self.bound
+
+    def __str__(self) -> str:
+        return f"of at least {self.bound}"
+
+
+@dataclass(frozen=True)
+class AtMost:
+    """Range of numbers up to a bound."""
+
+    bound: float
+
+    def holds(self, number: float) -> bool:
+        """Whether it is in the range."""
+        return number <= self.bound
+
+    def __str__(self) -> str:
+        return f"of at most {self.bound}"
+
+
+@dataclass(frozen=True)
+class Within:
+    """Range of numbers between two bounds, both included."""
+
+    low: float
+    high: float
+
+    def holds(self, number: float) -> bool:
+        """Whether it is in the range."""
+        return self.low <= number <= self.high
+
+    def __str__(self) -> str:
+        return f"within {self.low} and {self.high}"
+
+
+Range = Above | AtLeast | AtMost | Within
+
+
+@dataclass(frozen=True)
+class ReadIf:
+    """Condition under which a setting, or all of a section, is read at all."""
+
+    setting: str
+    """Field of the same section, or dotted name from the root of the configuration."""
+    condition: str
+    """Words for it that follow the setting's name and "is": "above 0"."""
+    holds: Callable[[Any], bool]
+    """Whether a value of that setting fulfils it."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A field of a configuration or of one of its sections."""
+
+    name: str
+    """Dotted name from the root."""
+    owner: type[Any]
+    """Class that has the field."""
+    hint: Any
+    """Its annotation."""
+    value: Any
+    default: Any
+    """Value that the section around it gives it where nothing else is said."""
+    conditions: tuple[tuple[str, ReadIf], ...]
+    """Conditions of it and of the sections around it, each with the full name that it asks for."""
+
+    @property
+    def is_section(self) -> bool:
+        """Whether it is a group of settings, by default as well."""
+        return dataclasses.is_dataclass(self.value) and dataclasses.is_dataclass(self.default)
+
+
+def settings(config: Any) -> list[Setting]:
+    """All settings of a configuration in the order of their fields, sections before their parts."""
+    return list(_settings(config, None, "", ()))
+
+
+def _settings(
+    part: Any, start: Any, prefix: str, around: tuple[tuple[str, ReadIf], ...]
+) -> Iterator[Setting]:
+    """Settings of ``part``, whose defaults are ``start``, or those of its type where that is None.
+
+    ``prefix`` and ``around`` are the name and the conditions of the section that it is.
+    """
+    hints = get_type_hints(type(part), include_extras=True)
+    for field in dataclasses.fields(part):
+        name, hint, value = prefix + field.name, hints[field.name], getattr(part, field.name)
+        default = _default(field) if start is None else getattr(start, field.name)
+        marks = [mark for mark in _marks(hint) if isinstance(mark, ReadIf)]
+        asked = [(prefix if m.setting in hints else "") + m.setting for m in marks]
+        conditions = (*around, *zip(asked, marks, strict=True))
+        yield Setting(name, type(part), hint, value, default, conditions)
+        if dataclasses.is_dataclass(value):
+            known = default if dataclasses.is_dataclass(default) else None
+            yield from _settings(value, known, f"{name}.", conditions)
+        elif isinstance(value, tuple):
+            for position, item in enumerate(value):
+                if dataclasses.is_dataclass(item):
+                    yield from _settings(item, None, f"{name}[{position}].", conditions)
+
+
+def _marks(hint: Any) -> Iterator[Any]:
+    """Everything that ``Annotated`` says in a type, wherever in it."""
+    if get_origin(hint) is Annotated:
+        yield from hint.__metadata__
+    for argument in get_args(hint):
+        yield from _marks(argument)
+
+
+def check(config: Any, where: str) -> None:
+    """Raise a `ConfigError` where a configuration made in Python has a value out of its range."""
+    for setting in settings(config):
+        if not dataclasses.is_dataclass(setting.value):
+            plain = to_dict(setting.value)
+            if to_dict(_convert(setting.hint, plain, where, setting.name)) != plain:
+                raise _wrong(where, setting.name, setting.value, expected(setting.hint))
+
+
+def check_read(config: Any, where: str) -> None:
+    """Raise a `ConfigError` where a setting that nothing reads is not at its default."""
+    every = {setting.name: setting for setting in settings(config)}
+    for setting in every.values():
+        if setting.is_section or setting.value == setting.default:
+            continue
+        if missed := _missed(setting, every):
+            name, condition = missed
+            is_section = dataclasses.is_dataclass(setting.value)
+            raise ConfigError(
+                f"{where}: {setting.name} is {'given' if is_section else repr(setting.value)}, but "
+                f"nothing reads it unless {name} is {condition.condition}; leave it out or set "
+                f"{name}."
+            )
+
+
+def _missed(setting: Setting, every: dict[str, Setting]) -> tuple[str, ReadIf] | None:
+    """First condition that fails, of ``setting`` or of a setting that it depends on."""
+    for name, condition in setting.conditions:
+        # What is in a section that is null is not there.
+        if name not in every or not condition.holds(every[name].value):
+            return name, condition
+        if missed := _missed(every[name], every):
+            return missed
+    return None
 
 
 def to_dict(config: Any) -> Any:
@@ -31,9 +207,12 @@ def to_dict(config: Any) -> Any:
 def from_dict(cls: type[Config], values: Any, *, where: str) -> Config:
     """A configuration of type ``cls``; keys left out keep their defaults.
 
-    ``where`` begins the error message: a file name or an option.
+    ``where`` begins the error message: a file name or an option. Besides values of the wrong type
+    or out of range, those that nothing would read are refused, see `ReadIf`.
     """
-    return _convert(cls, values, where, "")
+    config: Config = _convert(cls, values, where, "")
+    check_read(config, where)
+    return config
 
 
 def save_yaml(path: Path | str, config: Any) -> None:
@@ -94,46 +273,100 @@ def _parse_yaml(text: str) -> Any:
         raise ValueError("a tag that its value does not fit") from None
 
 
-def _convert(kind: Any, value: Any, where: str, key: str) -> Any:
-    """``value`` as the annotated type ``kind``, or a `ConfigError` about ``key``."""
-    if dataclasses.is_dataclass(kind):
-        return _convert_dataclass(kind, value, where, key, None)
-    origin, arguments = get_origin(kind), get_args(kind)
+def expected(hint: Any, ranges: Sequence[Range] = (), *, many: bool = False) -> str:
+    """What a setting takes, in words: "a number above 0 or null"."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return expected(arguments[0], (*ranges, *_ranges(hint)), many=many)
     if origin is Literal:
-        if value in arguments:
-            return value
-        choices = ", ".join(str(a) for a in arguments)
-        raise _wrong(where, key, value, f"one of {choices}")
+        return "one of " + ", ".join(str(a) for a in arguments)
     if origin in (Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        kinds = [a for a in arguments if a is not type(None)]
-        for position, candidate in enumerate(kinds):
+        return " or ".join(expected(a, ranges, many=many) for a in arguments)
+    if origin is tuple and arguments[-1] is Ellipsis:
+        return f"a list of {expected(arguments[0], ranges, many=True)}"
+    if origin is tuple:
+        return f"[{', '.join(expected(a, ranges) for a in arguments)}]"
+    if dataclasses.is_dataclass(hint):
+        return "sections with keys" if many else "a section with keys"
+    one, several = {
+        int: ("an integer", "integers"),
+        float: ("a number", "numbers"),
+        bool: ("true or false", "true or false"),
+        str: ("a text", "texts"),
+        type(None): ("null", "null"),
+    }.get(hint, (str(hint), str(hint)))
+    bounds = " and ".join(str(bound) for bound in ranges if hint in (int, float))
+    return f"{several if many else one} {bounds}".rstrip()
+
+
+def _ranges(hint: Any) -> list[Range]:
+    return [mark for mark in hint.__metadata__ if isinstance(mark, Range)]
+
+
+def _convert(
+    kind: Any, value: Any, where: str, key: str, ranges: Sequence[Range] = (), start: Any = None
+) -> Any:
+    """``value`` as the annotated type ``kind``, or a `ConfigError` about ``key``.
+
+    ``ranges`` hold for every number in it. A section that is given in part keeps the rest of
+    ``start``, or the defaults of its type where that is None.
+    """
+    if dataclasses.is_dataclass(kind):
+        return _convert_dataclass(kind, value, where, key, start)
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        bounds = (*ranges, *_ranges(kind))
+        return _convert(arguments[0], value, where, key, bounds, start)
+    if origin in (Union, types.UnionType):
+        inside = None
+        for candidate in arguments:
             try:
-                return _convert(candidate, value, where, key)
-            except ConfigError:
-                if position == len(kinds) - 1:
-                    raise
+                return _convert(candidate, value, where, key, ranges, start)
+            except ConfigError as error:
+                if _is_kin(candidate, value):
+                    inside = error
+        raise inside or _wrong(where, key, value, expected(kind, ranges))
     if origin is tuple:
         if not isinstance(value, list | tuple):
-            raise _wrong(where, key, value, "a list")
+            raise _wrong(where, key, value, expected(kind, ranges))
         if arguments[-1] is Ellipsis:
-            return tuple(_convert(arguments[0], v, where, key) for v in value)
+            return tuple(_convert(arguments[0], v, where, key, ranges) for v in value)
         if len(value) != len(arguments):
             raise _wrong(where, key, value, f"{len(arguments)} values")
-        return tuple(_convert(a, v, where, key) for a, v in zip(arguments, value, strict=True))
-    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    if kind is float and isinstance(value, str):
+        pairs = zip(arguments, value, strict=True)
+        return tuple(_convert(a, v, where, key, ranges) for a, v in pairs)
+    converted = value
+    if origin is Literal:
+        fits = value in arguments
+    elif kind is float:
+        converted = _float(value)
+        fits = converted is not None
+    else:
+        fits = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
+    if not fits or (kind in (int, float) and not all(r.holds(converted) for r in ranges)):
+        raise _wrong(where, key, value, expected(kind, ranges))
+    return converted
+
+
+def _is_kin(hint: Any, value: Any) -> bool:
+    """Whether a list or a section is asked for and ``value`` is one, right inside or not."""
+    if get_origin(hint) is Annotated:
+        return _is_kin(get_args(hint)[0], value)
+    if isinstance(value, dict):
+        return dataclasses.is_dataclass(hint)
+    return isinstance(value, list | tuple) and get_origin(hint) is tuple
+
+
+def _float(value: Any) -> float | None:
+    """A finite number, or None."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return None
+    try:
         # YAML reads 1e-3 (without a dot) as a string.
-        try:
-            return float(value)
-        except ValueError:
-            raise _wrong(where, key, value, "a number") from None
-    if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
-        return value
-    names = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
-    raise _wrong(where, key, value, names.get(kind, str(kind)))
+        number = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _convert_dataclass(kind: Any, value: Any, where: str, key: str, start: Any) -> Any:
@@ -143,29 +376,53 @@ def _convert_dataclass(kind: Any, value: Any, where: str, key: str, start: Any) 
     those of its type.
     """
     if not isinstance(value, dict):
-        raise _wrong(where, key, value, "a section with keys")
-    hints = get_type_hints(kind)
+        raise _wrong(where, key, value, expected(kind))
+    prefix = f"{key}." if key else ""
+    dropped = {} if key else getattr(kind, "DROPPED", {})
+    _refuse(list(_unknown(kind, value, prefix, dropped)), where)
+    hints = get_type_hints(kind, include_extras=True)
     fields = {field.name: field for field in dataclasses.fields(kind)}
-    names = list(fields)
     converted = {}
     for name, item in value.items():
-        full = f"{key}.{name}" if key else str(name)
-        if name not in names:
-            near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.3)
-            section = f"{key}." if key else ""
-            hint = f" Did you mean {section}{near[0]}?" if near else ""
-            raise ConfigError(f"{where}: unknown setting {full}.{hint}")
-        if dataclasses.is_dataclass(hints[name]):
-            inner = _default(fields[name]) if start is None else getattr(start, name)
-            converted[name] = _convert_dataclass(hints[name], item, where, full, inner)
-        else:
-            converted[name] = _convert(hints[name], item, where, full)
+        inner = _default(fields[name]) if start is None else getattr(start, name)
+        inner = inner if dataclasses.is_dataclass(inner) else None
+        converted[name] = _convert(hints[name], item, where, prefix + name, start=inner)
     if start is not None:
         return dataclasses.replace(start, **converted)
     absent = [n for n, field in fields.items() if n not in converted and not _has_default(field)]
     if absent:
         raise ConfigError(f"{where}: {key + ': ' if key else ''}{absent[0]} is missing.")
     return kind(**converted)
+
+
+def _unknown(
+    kind: Any, values: dict[Any, Any], prefix: str, dropped: dict[str, str]
+) -> Iterator[tuple[str, str | None]]:
+    """What is wrong with keys that a section, or one inside it, has not; the name that is near."""
+    hints = get_type_hints(kind)
+    names = [field.name for field in dataclasses.fields(kind)]
+    for name, item in values.items():
+        full = f"{prefix}{name}"
+        if full in dropped:
+            yield f"{full}: {dropped[full]}", None
+        elif name not in names:
+            near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.3)
+            yield f"unknown setting {full}", prefix + near[0] if near else None
+        elif isinstance(item, dict):
+            for section in filter(dataclasses.is_dataclass, (hints[name], *get_args(hints[name]))):
+                yield from _unknown(section, item, f"{full}.", dropped)
+
+
+def _refuse(faults: list[tuple[str, str | None]], where: str) -> None:
+    """Raise a `ConfigError` that names the faults that `_unknown` found, if any."""
+    if len(faults) == 1:
+        fault, near = faults[0]
+        hint = f" Did you mean {near}?" if near else ""
+        raise ConfigError(f"{where}: {fault.removesuffix('.')}.{hint}")
+    if faults:
+        named = [f"{fault} (did you mean {near}?)" if near else fault for fault, near in faults]
+        more = [f"and {len(faults) - _MOST_NAMED} more"] if len(faults) > _MOST_NAMED else []
+        raise ConfigError(f"{where}: {'; '.join(named[:_MOST_NAMED] + more)}.")
 
 
 def _has_default(field: dataclasses.Field[Any]) -> bool:
@@ -181,4 +438,6 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _wrong(where: str, key: str, value: Any, expected: str) -> ConfigError:
+    if isinstance(value, float) and not math.isfinite(value):
+        expected = expected.replace("a number", "a finite number")
     return ConfigError(f"{where}: {key} is {value!r}; expected {expected}.")
