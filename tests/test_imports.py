@@ -33,7 +33,9 @@ CIRCLES = [
     {"view.panel", "view.pose_panel", "view.save_panel"},
 ]
 # `Capture` shows what is held out as well: these need it, or make a `TrainingCapture` of it.
-SEE_EVERYTHING = set("capture synthesis evaluation benching film export view evsplat".split())
+SEE_EVERYTHING = set(
+    "capture inspection synthesis evaluation benching film export view evsplat".split()
+)
 SEE_EVERYTHING |= {"masks.capture", "restore.capture", "training.run", "training.train"}
 SEE_EVERYTHING |= {"body.track"}  # for the type alone: `load_body_track` takes either capture
 SEE_TRAINING_ALONE = set("calibration gaussians deform objectives hugs methods".split())

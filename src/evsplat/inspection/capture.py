@@ -12,7 +12,13 @@ from evsplat.body import BodyTrack, load_body_track, silhouette
 from evsplat.calibration import SensorEstimate, estimate_from_capture
 from evsplat.capture.camera import Camera
 from evsplat.capture.capture import Capture
-from evsplat.capture.drawing import (
+from evsplat.capture.finding import Finding
+from evsplat.capture.metadata import Frame
+from evsplat.capture.policy import Policy
+from evsplat.capture.validate import check_capture
+from evsplat.events import count_map
+from evsplat.files import atomic_path
+from evsplat.inspection.drawing import (
     Tile,
     draw_outline,
     events_over,
@@ -21,14 +27,8 @@ from evsplat.capture.drawing import (
     short_number,
     to_picture,
 )
-from evsplat.capture.finding import Finding
-from evsplat.capture.metadata import Frame
-from evsplat.capture.policy import Policy
-from evsplat.capture.sensor_report import clock_findings, sensor_lines
-from evsplat.capture.timeline import draw_timeline
-from evsplat.capture.validate import check_capture
-from evsplat.events import count_map
-from evsplat.files import atomic_path
+from evsplat.inspection.sensor import clock_findings, sensor_lines
+from evsplat.inspection.timeline import draw_timeline
 
 CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
 SHOWN_FINDINGS = 12
