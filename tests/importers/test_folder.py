@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evsplat.body import load_body_track
 from evsplat.body.smpl import ENVIRONMENT
-from evsplat.capture import Capture, load_capture
+from evsplat.capture import Capture, load_body_track, load_capture
 from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.importers import import_capture
 

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from evsplat.body import BodyTrack, load_body_track, silhouette
-from evsplat.calibration import SensorEstimate, estimate_from_capture
-from evsplat.capture.camera import Camera
+from evsplat.body import BodyTrack, silhouette
+from evsplat.calibration import SensorEstimate
+from evsplat.camera import Camera
+from evsplat.capture import estimate_sensor, load_body_track
 from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame
@@ -65,7 +66,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     if metadata is None or not report.usable:
         return replace(report, summary=f"{path}\n{_findings_text(report.findings)}")
     capture = Capture(metadata)
-    estimate = estimate_from_capture(capture.for_training(Policy(use="everything")))
+    estimate = estimate_sensor(capture.for_training(Policy(use="everything")))
     findings = (*found, *clock_findings(capture, estimate))
     track = load_body_track(capture) if capture.has_body else None
     drawings = {"contact_sheet": _contact_sheet(capture)}

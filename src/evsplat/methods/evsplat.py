@@ -11,8 +11,8 @@ from typing import Literal
 
 import torch
 
-from evsplat.calibration import SensorEstimate, estimate_from_capture
-from evsplat.capture import TrainingCapture
+from evsplat.calibration import SensorEstimate
+from evsplat.capture import TrainingCapture, estimate_sensor
 from evsplat.deform.human_scene import DeformConfig
 from evsplat.methods.build import Build
 from evsplat.methods.composition import Composition, HeldOut
@@ -229,7 +229,7 @@ def _windows(
     if fit:
         estimate = None
         if capture.contrast_threshold is None or windows.clock != "never":
-            estimate = estimate_from_capture(capture)
+            estimate = estimate_sensor(capture)
         known = _thresholds(capture, estimate)
         late_us = _late_us(windows, estimate)
     pixels = (capture.events.height, capture.events.width) if windows.pixel_thresholds else None
