@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from evsplat.calibration import estimate_from_capture
-from evsplat.capture import Capture, Frame, Policy, load_capture
+from evsplat.capture import Capture, Frame, Policy, estimate_sensor, load_capture
 from evsplat.evaluation.pictures import to_bytes
 from evsplat.evaluation.regions import CROP_MARGIN, mask_box
 from evsplat.imaging import deblur
@@ -40,7 +39,7 @@ def measure(path: Path, every: int, pictures: Path | None) -> dict:
     """Mean PSNR of each row over the train frames."""
     capture = load_capture(path)
     assert capture.events is not None and capture.contrast_threshold is not None
-    estimate = estimate_from_capture(capture.for_training(Policy()))
+    estimate = estimate_sensor(capture.for_training(Policy()))
     assert estimate is not None and estimate.thresholds is not None
     given = capture.contrast_threshold
     thresholds = {

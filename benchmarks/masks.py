@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from evsplat.capture import Capture, Policy, load_capture
-from evsplat.capture.drawing import draw_outline, fit, to_picture
+from evsplat.inspection.drawing import draw_outline, fit, to_picture
 from evsplat.masks import MASKERS
 from evsplat.restore import restore_capture
 

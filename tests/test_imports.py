@@ -15,10 +15,6 @@ ROWS = re.findall(r"^\| (\d+) \| (`.+?`) \|", (ROOT / "ARCHITECTURE.md").read_te
 RANK = {name: int(layer) for layer, names in ROWS for name in re.findall("`(.+?)`", names)}
 # Imports of a higher layer that are left; a line goes with its import.
 EXCEPTIONS = {
-    ("body.adapters", "capture.body_file"),  # for its type alone
-    ("body.silhouette", "capture.camera"),  # for its type alone
-    ("body.track", "capture"),  # for types alone, of what `load_body_track` takes
-    ("calibration", "capture"),  # for its type alone, of what `estimate_from_capture` takes
     ("imaging.edi", "events.maps"),  # deblurring by events, in a folder of arithmetic on light
     ("imaging.edi", "events.stream"),
     ("evaluation.report.clip", "export.video"),  # in a function: the report's clip is a video
@@ -26,17 +22,17 @@ EXCEPTIONS = {
 # Files that import each other in a circle: one at import time, the rest in functions or for types.
 CIRCLES = [
     {"events", "events.simulator", "events.simulator.sensor", "imaging", "imaging.edi"},
-    {"body.adapters", "body.smpl"},
     {"capture.capture", "capture.training_capture"},
     {"cli.demo", "cli.main", "cli.train", "cli.viewer_process"},
     {"footage.folder", "footage.footage", "footage.video"},
     {"view.panel", "view.pose_panel", "view.save_panel"},
 ]
 # `Capture` shows what is held out as well: these need it, or make a `TrainingCapture` of it.
-SEE_EVERYTHING = set("capture synthesis evaluation benching film export view evsplat".split())
+SEE_EVERYTHING = set(
+    "capture inspection synthesis evaluation benching film export view evsplat".split()
+)
 SEE_EVERYTHING |= {"masks.capture", "restore.capture", "training.run", "training.train"}
-SEE_EVERYTHING |= {"body.track"}  # for the type alone: `load_body_track` takes either capture
-SEE_TRAINING_ALONE = set("calibration gaussians deform objectives hugs methods".split())
+SEE_TRAINING_ALONE = set("body calibration gaussians deform objectives hugs methods".split())
 
 
 def imports_of(module: str, tree: ast.Module) -> Iterator[tuple[str, str, str]]:

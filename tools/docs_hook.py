@@ -32,7 +32,7 @@ def _commands() -> str:
     for verb in _VERBS:
         parts.append(f"## evsplat {verb}\n\n```text\n{_help(verb)}\n```\n")
         if verb == "import":
-            from evsplat.capture.importers import KINDS
+            from evsplat.importers import KINDS
 
             parts += [f"### evsplat import {k}\n\n```text\n{_help(verb, k)}\n```\n" for k in KINDS]
     return "\n".join(parts)

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from evsplat.benching.run import bench
     from evsplat.capture import load_capture
-    from evsplat.capture.importers import import_capture
-    from evsplat.capture.inspect_recording import inspect
     from evsplat.cli.demo import demo
     from evsplat.evaluation import evaluate_run as evaluate
     from evsplat.evaluation.report import write_report
     from evsplat.events.convert import convert_recording as convert
     from evsplat.export import export_run, render_run
     from evsplat.footage.simulate import simulate
+    from evsplat.importers import import_capture
+    from evsplat.inspection import inspect
     from evsplat.masks import mask_capture
     from evsplat.restore import restore_capture
     from evsplat.staging import stage
@@ -75,8 +75,8 @@ _LAZY = {
     "demo": "evsplat.cli.demo:demo",
     "evaluate": "evsplat.evaluation:evaluate_run",
     "export_run": "evsplat.export:export_run",
-    "import_capture": "evsplat.capture.importers:import_capture",
-    "inspect": "evsplat.capture.inspect_recording:inspect",
+    "import_capture": "evsplat.importers:import_capture",
+    "inspect": "evsplat.inspection:inspect",
     "load_capture": "evsplat.capture:load_capture",
     "load_run": "evsplat.training.run:load_run",
     "mask_capture": "evsplat.masks:mask_capture",

@@ -1,8 +1,5 @@
 """Random rigs and slow float64 references of forward kinematics and skinning."""
 
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -22,13 +19,6 @@ def random_rig(seed, joints=17, vertices=60, shuffled=False):
         "weights": weights / weights.sum(1, keepdims=True),
         "joint_names": tuple(f"bone{joint}" for joint in range(joints)),
     }
-
-
-def body_file(path="body.npz", model="rig", **arrays):
-    """What the capture reader gives, without reading."""
-    names = ("joint_names", "parents", "rest_joints", "rest_vertices", "faces", "weights")
-    empty = dict.fromkeys((*names, "betas", "gender", "times_us", "poses", "transl"))
-    return SimpleNamespace(**{**empty, "path": Path(path), "model": model, **arrays})
 
 
 def reference_bones(parents, rest_joints, poses, transl):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from evsplat.body import body_box, default_body, silhouette
-from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 
 
 def camera(width=48, height=37, focal=40.0, distance=3.0):

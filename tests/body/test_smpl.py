@@ -12,13 +12,11 @@ import torch
 from body_models.smpl.torch import SMPL
 from scipy import sparse
 
-from evsplat.body import axis_angle_to_matrix, load_body, skin
+from evsplat.body import axis_angle_to_matrix, skin
 from evsplat.body.canonical import SMPL_PARENTS
 from evsplat.body.model_files import read_model_file
 from evsplat.body.smpl import ENVIRONMENT, find_model_file, smpl_body
 from evsplat.errors import DataError, WeightsError
-
-from .helpers import body_file
 
 VERTICES = 40
 
@@ -45,8 +43,8 @@ def test_posed_vertices_equal_those_of_body_models(tmp_path, seed):
     np.savez(file, **smpl_like(seed))
     rng = np.random.default_rng(seed)
     betas, poses, transl = rng.normal(size=10), rng.normal(size=(3, 24, 3)), rng.normal(size=(3, 3))
-    body, order = load_body(body_file(model="smpl", betas=betas), body_models=tmp_path)
-    assert order == list(range(24)) and body.joint_names[1] == "left_hip"
+    body = smpl_body("smpl", betas, path=tmp_path)
+    assert body.joint_names[1] == "left_hip"
     rotations = axis_angle_to_matrix(torch.tensor(poses)).float()
     bones = body.bone_transforms(rotations, torch.tensor(transl).float())
     moved, _ = skin(body.rest_vertices, body.weights, bones)

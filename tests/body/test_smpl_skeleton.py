@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from evsplat.body import default_body
-from evsplat.body.adapters import default_betas_for_stature
+from evsplat.body.make import default_betas_for_stature
 from evsplat.body.skeleton import find_skeleton
 from evsplat.body.smpl import ENVIRONMENT
 from evsplat.body.smpl_skeleton import (

@@ -11,12 +11,12 @@ import torch
 from evsplat.calibration import (
     NoiseMeter,
     SensorEstimate,
-    estimate_from_capture,
     estimate_from_pairs,
     exposure,
     pair,
     pair_indices,
 )
+from evsplat.capture import estimate_sensor
 from evsplat.errors import DataError
 from evsplat.events import ALWAYS, EventStream, open_recording
 
@@ -80,11 +80,11 @@ def test_shifting_the_events_of_a_capture_shifts_the_estimate(tiny_capture: Fact
     """``clock_offset_us`` is added to the events' times: a positive one makes them lag."""
     options = {"frames": 20, "width": 96, "height": 72}
     path = tiny_capture(**options)
-    before = estimate_from_capture(seen(path))
+    before = estimate_sensor(seen(path))
     document = json.loads((path / "capture.json").read_text())
     document["events"]["clock_offset_us"] = 9_000
     (path / "capture.json").write_text(json.dumps(document))
-    after = estimate_from_capture(seen(path))
+    after = estimate_sensor(seen(path))
     assert before is not None and after is not None
     assert abs(before.clock.lag_us) < 3_000
     assert after.clock.lag_us - before.clock.lag_us == pytest.approx(9_000, abs=800)
@@ -95,7 +95,7 @@ def test_a_capture_without_events_gives_no_estimate(tiny_capture: Factory) -> No
     document = json.loads((path / "capture.json").read_text())
     del document["events"]
     (path / "capture.json").write_text(json.dumps(document))
-    assert estimate_from_capture(seen(path)) is None
+    assert estimate_sensor(seen(path)) is None
 
 
 def test_pairs_skip_frames_that_follow_each_other_too_fast() -> None:
@@ -198,7 +198,7 @@ def test_the_davis_recording_gives_the_known_figures(recordings_root: Path) -> N
 
 @pytest.mark.parametrize("name", ["man_dance_hard_256", "real_beam_256"])
 def test_simulated_events_of_shared_captures_lag_little(captures_root: Path, name: str) -> None:
-    found = estimate_from_capture(seen(captures_root / name, use="everything"))
+    found = estimate_sensor(seen(captures_root / name, use="everything"))
     assert found is not None and found.thresholds is not None
     assert abs(found.clock.lag_us) < 1_500
     assert found.thresholds.plus == pytest.approx(0.2, rel=0.15)

@@ -9,8 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evsplat.body import load_body_track
-from evsplat.capture import Frame, Policy, load_capture
+from evsplat.capture import Frame, Policy, load_body_track, load_capture
 from evsplat.capture.spans import held_out_spans, open_spans
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from evsplat.body import load_body_track
-from evsplat.capture import load_capture
+from evsplat.capture import load_body_track, load_capture
 from evsplat.config import to_dict
 from evsplat.devices import hardware
 from evsplat.evaluation.report.configuration import _changed, configuration, made_with

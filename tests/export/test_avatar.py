@@ -14,8 +14,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import load_body_track
-from evsplat.capture import load_capture
+from evsplat.capture import load_body_track, load_capture
 from evsplat.config import override
 from evsplat.deform.at_rest import mean_at_rest
 from evsplat.deform.skinned import SkinnedGaussians

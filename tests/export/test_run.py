@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from evsplat.body import up_axis
-from evsplat.body.track import load_body_track
+from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import export_run
 from evsplat.methods.trivial import NearestFrame

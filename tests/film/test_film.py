@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image, ImageSequence
 
-from evsplat.body import BodyTrack, load_body_track, up_axis
-from evsplat.capture import load_capture
+from evsplat.body import BodyTrack, up_axis
+from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import open_recording
 from evsplat.export import render_run, rendering, write_animation

@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from evsplat.calibration import estimate_from_capture, noise_of
-from evsplat.capture import Policy, TrainingCapture, load_capture
+from evsplat.calibration import noise_of
+from evsplat.capture import Policy, TrainingCapture, estimate_sensor, load_capture
 from evsplat.config import override
 from evsplat.errors import DataError
 from evsplat.masks import MASKERS
@@ -120,7 +120,7 @@ def test_events_of_held_out_frames_teach_where_the_policy_shows_them(event_term)
 @few(max_examples=15)
 def test_sensor_estimates_and_trivial_rows_know_nothing_of_what_is_held_out(recorded, noise):
     def found(capture: TrainingCapture) -> list[object]:
-        estimate, measured = estimate_from_capture(capture), noise_of(capture.events)
+        estimate, measured = estimate_sensor(capture), noise_of(capture.events)
         told = None if estimate is None else (estimate.clock.lag_us, estimate.thresholds)
         held_out = capture.held_out_frames[0]
         pictures = [

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from evsplat.body import load_body_track, skin
+from evsplat.body import skin
 from evsplat.body.rotations import matrix_to_six, six_to_matrix
-from evsplat.capture import load_capture
+from evsplat.capture import load_body_track, load_capture
 from evsplat.hugs.human import TriplaneHuman
 from evsplat.hugs.start import START_OPACITY, body_weights, facing, fit_to_body
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.body import load_body_track, silhouette
-from evsplat.capture import Capture, load_capture, validate_capture
+from evsplat.body import silhouette
+from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.masks import MASKERS, mask_capture
 from evsplat.masks.background import clean, difference

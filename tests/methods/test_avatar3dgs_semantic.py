@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from evsplat.body import load_body_track
-from evsplat.capture import load_capture
+from evsplat.capture import load_body_track, load_capture
 from evsplat.config import override
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.starts import SceneStartConfig, as_person, scene_start

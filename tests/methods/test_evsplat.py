@@ -48,7 +48,7 @@ def test_a_clock_that_is_late_is_learned_from_there(
     tiny_capture, monkeypatch, choice, late_us, start_us
 ):
     found = None if late_us is None else SensorEstimate(lag(late_us), None)
-    monkeypatch.setattr(method, "estimate_from_capture", lambda capture: found)
+    monkeypatch.setattr(method, "estimate_sensor", lambda capture: found)
     config = method_config("evsplat", SMALL | {"windows": {"clock": choice}}, where="test")
     sensor = TRAINABLE["evsplat"][1](config, seen(tiny_capture()), 0).model.sensor
     if start_us is None:
@@ -78,7 +78,7 @@ def test_without_one_training_frames_and_events_tell_it(tiny_capture, monkeypatc
         looked_at.append(capture)
         return SensorEstimate(lag(0.0), ThresholdEstimate(0.31, 0.17, 0.1, 500))
 
-    monkeypatch.setattr(method, "estimate_from_capture", estimate)
+    monkeypatch.setattr(method, "estimate_sensor", estimate)
     assert thresholds(path) == pytest.approx((0.31, 0.17), rel=1e-6)
     assert isinstance(looked_at[0], TrainingCapture)  # what is held out stays unseen
     looked_at.clear()
@@ -89,7 +89,7 @@ def test_without_one_training_frames_and_events_tell_it(tiny_capture, monkeypatc
 def test_what_cannot_be_told_is_said(tiny_capture, monkeypatch, caplog):
     path = tiny_capture()
     forget(path)
-    monkeypatch.setattr(method, "estimate_from_capture", lambda capture: None)
+    monkeypatch.setattr(method, "estimate_sensor", lambda capture: None)
     assert thresholds(path) == pytest.approx((0.2, 0.2), rel=1e-6)
     assert "contrast thresholds are neither given nor to be found" in caplog.text
 

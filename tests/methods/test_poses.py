@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.body import load_body_track
-from evsplat.capture import Capture, load_capture
+from evsplat.capture import Capture, load_body_track, load_capture
 from evsplat.config import override
 from evsplat.errors import ConfigError
 from evsplat.methods import TRAINABLE, method_config

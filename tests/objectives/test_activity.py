@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.body import load_body_track, silhouette
+from evsplat.body import silhouette
 from evsplat.calibration import NoiseEstimate
-from evsplat.capture import load_capture
+from evsplat.capture import load_body_track, load_capture
 from evsplat.config import override
 from evsplat.errors import ConfigError
 from evsplat.events import EventStream

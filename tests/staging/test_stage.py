@@ -8,9 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
-from evsplat.body import load_body_track, silhouette
+from evsplat.body import silhouette
 from evsplat.body.motion import load_motion
-from evsplat.capture import load_capture, validate_capture
+from evsplat.capture import load_body_track, load_capture, validate_capture
 from evsplat.cli import main
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import count_map

@@ -1,7 +1,7 @@
 """Body models behind one small interface, body tracks over time, skinning."""
 
-from evsplat.body.adapters import default_body, load_body, make_body
 from evsplat.body.body import Body, bounding_box, skin
+from evsplat.body.make import default_body, make_body
 from evsplat.body.retarget import SkeletonMotion, retarget
 from evsplat.body.rotations import (
     axis_angle_to_matrix,
@@ -11,7 +11,7 @@ from evsplat.body.rotations import (
 )
 from evsplat.body.silhouette import body_box, silhouette
 from evsplat.body.surface import SurfaceSamples
-from evsplat.body.track import BodyTrack, load_body_track
+from evsplat.body.track import BodyTrack
 from evsplat.body.upright import up_axis
 
 __all__ = [
@@ -23,8 +23,6 @@ __all__ = [
     "body_box",
     "bounding_box",
     "default_body",
-    "load_body",
-    "load_body_track",
     "make_body",
     "matrix_to_quaternion",
     "quaternion_multiply",

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from evsplat.body.adapters import default_body
+from evsplat.body.make import default_body
 from evsplat.body.skeleton import Skeleton, find_skeleton
 
 _COEFFICIENTS = 10

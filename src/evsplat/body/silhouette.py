@@ -1,21 +1,18 @@
 """Silhouette and pixel box of a posed body in a camera."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 
 NEAR = 0.01
 """Triangles that come nearer to the camera plane than this (metres) are not drawn."""
 
 
 def silhouette(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: "Camera"
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: Camera
 ) -> Bool[Tensor, "H W"]:
     """Pixels whose centre lies inside a projected triangle of the mesh (world coordinates)."""
     height, width = camera.height, camera.width
@@ -41,7 +38,7 @@ def silhouette(
 
 
 def body_box(
-    vertices: Float[Tensor, "V 3"], camera: "Camera", margin: float = 0.1
+    vertices: Float[Tensor, "V 3"], camera: Camera, margin: float = 0.1
 ) -> tuple[int, int, int, int] | None:
     """Pixel box (x0, y0, x1, y1), ends exclusive, of a posed body, enlarged per side and clipped.
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from evsplat.body.adapters import fit_betas, make_body
 from evsplat.body.body import Body
+from evsplat.body.make import fit_betas, make_body
 from evsplat.body.model_files import read_model_file
 from evsplat.errors import DataError, WeightsError
 

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,14 +10,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from evsplat.body.adapters import load_body
 from evsplat.body.body import Body, skin
 from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.devices import send
 from evsplat.errors import DataError
-
-if TYPE_CHECKING:
-    from evsplat.capture import Capture, TrainingCapture
 
 
 class BodyTrack:
@@ -87,28 +82,6 @@ class BodyTrack:
         """The posed body's vertices in the world at one time."""
         body = self.body
         return skin(body.canonical_vertices(), body.weights, self.bones([time_us]))[0][0]
-
-
-def load_body_track(capture: "Capture | TrainingCapture", *, dense: bool = False) -> BodyTrack:
-    """The capture's body with its key poses; ``dense`` takes the true poses of body_dense.npz.
-
-    The dense poses are for evaluation and ablation, never for training.
-    """
-    body, order = load_body(capture.body_file)
-    file = capture.body_file
-    if dense:
-        if capture.dense_body_file is None:
-            raise DataError(
-                f"{capture.path}: body_dense.npz not found, but dense poses were asked for."
-            )
-        file = capture.dense_body_file
-    poses = np.asarray(file.poses)
-    if poses.ndim != 3 or poses.shape[1] != len(order):
-        raise DataError(
-            f"{file.path}: poses has shape {poses.shape}, expected (P, {len(order)}, 3) "
-            f"for the joints of the body."
-        )
-    return BodyTrack(body, file.times_us, poses[:, order], file.transl, source=str(file.path))
 
 
 def _rotation_polynomials(

@@ -1,11 +1,13 @@
 """What was recorded: the capture on disk, its cameras and frames, and the validator."""
 
+from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
-from evsplat.capture.camera import Camera
+from evsplat.capture.body_track import load_body_track
 from evsplat.capture.capture import Capture, load_capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.policy import Policy
+from evsplat.capture.sensor_estimate import estimate_sensor
 from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import validate_capture
 from evsplat.capture.write import CaptureWriter
@@ -20,6 +22,8 @@ __all__ = [
     "NovelView",
     "Policy",
     "TrainingCapture",
+    "estimate_sensor",
+    "load_body_track",
     "load_capture",
     "validate_capture",
 ]

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
-from evsplat.capture.camera import Camera
 from evsplat.capture.images import (
     ImageCache,
     planar,

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 from evsplat.capture.distortion import Distortion
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 from evsplat.capture.distortion import COEFFICIENT_COUNTS, Distortion
 from evsplat.capture.fields import MISSING, RENAME, Fields, brief, is_whole
 from evsplat.capture.finding import Findings, reason_and_remedy

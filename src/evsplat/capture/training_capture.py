@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
-from evsplat.capture.camera import Camera
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.policy import Policy
 from evsplat.capture.spans import held_out_spans, open_spans

@@ -9,7 +9,7 @@ import tyro
 from evsplat.cli.options import Flag, option
 
 if TYPE_CHECKING:
-    from evsplat.capture.importers import Blur, Importer
+    from evsplat.importers import Blur, Importer
 
 _Source = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
 _Capture = Annotated[Path, tyro.conf.arg(metavar="CAPTURE")]
@@ -36,7 +36,7 @@ def import_() -> None:
 
 def import_with_kinds() -> Callable[..., Any]:
     """`import_` with the kinds as subcommands; loading them takes seconds, so only when asked."""
-    from evsplat.capture.importers import KINDS
+    from evsplat.importers import KINDS
 
     kinds = tuple(
         Annotated[type(name, (_Done,), {}), tyro.conf.subcommand(name, constructor=_verb(kind))]
@@ -85,7 +85,7 @@ def _verb(kind: "type[Importer]") -> Callable[..., _Done]:
         weights: Annotated[Path | None, option("FILE", default="in torch's hub folder")] = None,
         overwrite: Flag = False,
     ) -> _Done:
-        from evsplat.capture.importers import Blur
+        from evsplat.importers import Blur
 
         going_on = Blur(interpolation, weights) if blur else None
         return _run(options, source, out, smpl, overwrite, going_on)
@@ -104,7 +104,7 @@ def _run(
     overwrite: bool,
     blur: "Blur | None",
 ) -> _Done:
-    from evsplat.capture.importers import run_importer
+    from evsplat.importers import run_importer
 
     path = run_importer(importer, source, out, smpl=smpl, overwrite=overwrite, blur=blur)
     print(f"written: {path}\nlook at it with: evsplat inspect {path}")

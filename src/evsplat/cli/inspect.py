@@ -23,7 +23,7 @@ def inspect(
         out: Folder for the pictures.
         repair: Read on where an event file is damaged.
     """
-    from evsplat.capture.inspect_recording import inspect as inspect_path
+    from evsplat.inspection import inspect as inspect_path
 
     name = capture.resolve().name
     report = inspect_path(capture, out or Path("inspect") / name, repair=repair)

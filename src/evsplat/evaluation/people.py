@@ -3,8 +3,8 @@
 from jaxtyping import Bool
 from torch import Tensor
 
-from evsplat.body import BodyTrack, load_body_track
-from evsplat.capture import Camera, Capture, Frame
+from evsplat.body import BodyTrack
+from evsplat.capture import Camera, Capture, Frame, load_body_track
 from evsplat.evaluation.protocols import Absent
 from evsplat.evaluation.regions import Box, body_box, mask_box
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack, skin
 from evsplat.body import body_box as projected_box
-from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 
 CROP_MARGIN = 0.1
 

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from evsplat.body import BodyTrack, load_body_track, up_axis
+from evsplat.body import BodyTrack, up_axis
 from evsplat.body.rotations import quaternion_to_matrix
-from evsplat.capture import Camera
+from evsplat.capture import Camera, load_body_track
 from evsplat.errors import ConfigError
 from evsplat.export.cloud import SplatCloud, cloud_of
 from evsplat.export.gaussians import instant_of, splat_source

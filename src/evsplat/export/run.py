@@ -4,7 +4,7 @@ import logging
 from pathlib import Path
 from typing import Literal
 
-from evsplat.body import load_body_track
+from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.export.avatar import at_rest, export_avatar
 from evsplat.export.clip import export_clip

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from evsplat.body import BodyTrack, load_body_track, up_axis
-from evsplat.capture import Camera, Capture, Frame
+from evsplat.body import BodyTrack, up_axis
+from evsplat.capture import Camera, Capture, Frame, load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.film.camera_path import (
     CameraPath,

@@ -17,8 +17,7 @@ from scipy.ndimage import (
 )
 from torch import Tensor
 
-from evsplat.body import load_body_track
-from evsplat.capture import Frame, TrainingCapture
+from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.imaging import decode
 from evsplat.masks.silhouette import track_silhouette

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from evsplat.body import BodyTrack, load_body_track, silhouette
-from evsplat.capture import Camera, Frame, TrainingCapture
+from evsplat.body import BodyTrack, silhouette
+from evsplat.capture import Camera, Frame, TrainingCapture, load_body_track
 from evsplat.errors import ConfigError
 
 OVERSAMPLING = 4

@@ -8,8 +8,7 @@ from typing import Annotated, ClassVar
 
 import torch
 
-from evsplat.body import load_body_track
-from evsplat.capture import Policy, TrainingCapture
+from evsplat.capture import Policy, TrainingCapture, load_body_track
 from evsplat.capture.masked import MaskedCapture
 from evsplat.config import AtLeast
 from evsplat.gaussians import GaussianSet

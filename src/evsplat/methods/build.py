@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from evsplat.body import BodyTrack, SurfaceSamples, load_body_track
-from evsplat.capture import Policy, TrainingCapture
+from evsplat.body import BodyTrack, SurfaceSamples
+from evsplat.capture import Policy, TrainingCapture, load_body_track
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
 from evsplat.deform.mlp import bfloat16_runs
 from evsplat.deform.pose_spline import PoseSpline

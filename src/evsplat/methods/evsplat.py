@@ -12,8 +12,8 @@ from typing import Annotated, ClassVar, Literal
 import torch
 
 from evsplat.body import BodyTrack
-from evsplat.calibration import SensorEstimate, estimate_from_capture
-from evsplat.capture import Policy, TrainingCapture
+from evsplat.calibration import SensorEstimate
+from evsplat.capture import Policy, TrainingCapture, estimate_sensor
 from evsplat.config import Above, AtLeast, ReadIf, Within
 from evsplat.gaussians import GaussianSet
 from evsplat.methods.base import (
@@ -336,7 +336,7 @@ def _windows(
     if fit:
         estimate = None
         if capture.contrast_threshold is None or config.clock != "never":
-            estimate = estimate_from_capture(capture)
+            estimate = estimate_sensor(capture)
         known = _thresholds(capture, estimate)
         late_us = _late_us(config, estimate)
         if not capture.events.has_polarity:

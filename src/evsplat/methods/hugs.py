@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.body import BodyTrack, load_body_track
-from evsplat.capture import Policy, TrainingCapture
+from evsplat.body import BodyTrack
+from evsplat.capture import Policy, TrainingCapture, load_body_track
 from evsplat.capture.masked import MaskedCapture, require_masks
 from evsplat.errors import DataError
 from evsplat.gaussians import DensifyConfig, Part

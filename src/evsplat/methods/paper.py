@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar
 
 import torch
 
-from evsplat.body import body_box, load_body_track
-from evsplat.capture import Policy, TrainingCapture
+from evsplat.body import body_box
+from evsplat.capture import Policy, TrainingCapture, load_body_track
 from evsplat.config import Above, AtLeast, ReadIf
 from evsplat.errors import DataError
 from evsplat.gaussians import GaussianSet

@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from evsplat.body import BodyTrack, load_body_track
+from evsplat.body import BodyTrack
 from evsplat.body.between_keys import BetweenKeys, between_keys
 from evsplat.body.smoothing import MotionNoise, motion_noise, smoothed
-from evsplat.capture import TrainingCapture
+from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError
 from evsplat.models.pose_spline import PoseSpline

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack
-from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.render import Splats
 

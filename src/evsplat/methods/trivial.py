@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
-from evsplat.capture.camera import Camera
 from evsplat.errors import DataError
 from evsplat.methods.reconstruction import Parts, Rendering
 

@@ -6,8 +6,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.calibration import estimate_from_capture
-from evsplat.capture import Frame, TrainingCapture
+from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import ConfigError, DataError
 from evsplat.imaging import Transfer, deblur
 from evsplat.restore.needs import require_signed_events
@@ -73,7 +72,7 @@ class Edi:
 
 
 def _estimated(capture: TrainingCapture) -> tuple[float, float]:
-    estimate = estimate_from_capture(capture)
+    estimate = estimate_sensor(capture)
     if estimate is None or estimate.thresholds is None:
         raise DataError(
             f"{capture.path}: its contrast thresholds are unknown and cannot be estimated from its "

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from evsplat.body import axis_angle_to_matrix
-from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 
 CameraMotion = Literal["static", "orbit", "handheld"]
 

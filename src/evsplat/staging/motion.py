@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from evsplat.body import Body, BodyTrack, skin
 from evsplat.body.continuity import nearest_axis_angle
 from evsplat.body.retarget import SkeletonMotion, retarget
-from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 from evsplat.staging.character import Character
 
 logger = logging.getLogger(__name__)

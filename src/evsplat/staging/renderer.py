@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32
 from evsplat import compiled
 from evsplat.body import Body
 from evsplat.body.skeleton import find_skeleton
-from evsplat.capture.camera import Camera
+from evsplat.camera import Camera
 from evsplat.errors import BackendError
 from evsplat.staging.character import Character
 from evsplat.staging.lighting import Lighting

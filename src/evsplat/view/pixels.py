@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
-from evsplat.capture.drawing import BRIGHTER, DARKER, font
+from evsplat.inspection.drawing import BRIGHTER, DARKER, font
 from evsplat.view.camera import Box
 
 _FULL_STRENGTH = 3

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from evsplat.body import load_body_track, up_axis
-from evsplat.capture import Capture
+from evsplat.body import up_axis
+from evsplat.capture import Capture, load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.film import camera_at
 from evsplat.training.run import Run

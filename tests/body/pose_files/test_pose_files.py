@@ -13,13 +13,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import BodyTrack, axis_angle_to_matrix, load_body
+from evsplat.body import BodyTrack, axis_angle_to_matrix
 from evsplat.body.pose_files import read_poses, to_default_body
 from evsplat.body.pose_files.sequence import moved
 from evsplat.body.skeleton import find_skeleton
 from evsplat.body.smpl import ENVIRONMENT, smpl_body
 from evsplat.body.smpl_skeleton import NAMES, PARENTS
 from evsplat.capture.body_file import body_from_arrays, read_arrays
+from evsplat.capture.body_track import load_body
 from evsplat.errors import DataError
 
 from . import synthetic

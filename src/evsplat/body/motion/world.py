@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from evsplat.body.adapters import default_body
+from evsplat.body.make import default_body
 from evsplat.body.retarget import rest_from_zero
 from evsplat.body.skeleton import find_skeleton
 

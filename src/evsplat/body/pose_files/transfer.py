@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.adapters import default_betas_for_stature, default_body
 from evsplat.body.body import Body
+from evsplat.body.make import default_betas_for_stature, default_body
 from evsplat.body.pose_files.sequence import PoseSequence
 from evsplat.body.retarget import SkeletonMotion, retarget
 from evsplat.body.smpl_skeleton import NAMES, PARENTS, rest_joints

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from evsplat.body import load_body_track
+from evsplat.capture import load_body_track
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.html import section
 from evsplat.evaluation.report.source import Source

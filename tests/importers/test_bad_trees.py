@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from evsplat.body.smpl import ENVIRONMENT
-from evsplat.capture.importers import KINDS, import_capture
 from evsplat.cli import main
 from evsplat.errors import ConfigError, DataError, EvsplatError
+from evsplat.importers import KINDS, import_capture
 from evsplat.safe_pickle import read_npy, read_npz, read_pickle
 
 from . import trees

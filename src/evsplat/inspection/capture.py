@@ -8,11 +8,18 @@ import numpy as np
 import torch
 from PIL import Image
 
-from evsplat.body import BodyTrack, load_body_track, silhouette
-from evsplat.calibration import SensorEstimate, estimate_from_capture
-from evsplat.capture.camera import Camera
+from evsplat.body import BodyTrack, silhouette
+from evsplat.calibration import SensorEstimate
+from evsplat.camera import Camera
+from evsplat.capture import estimate_sensor, load_body_track
 from evsplat.capture.capture import Capture
-from evsplat.capture.drawing import (
+from evsplat.capture.finding import Finding
+from evsplat.capture.metadata import Frame
+from evsplat.capture.policy import Policy
+from evsplat.capture.validate import check_capture
+from evsplat.events import count_map
+from evsplat.files import atomic_path
+from evsplat.inspection.drawing import (
     Tile,
     draw_outline,
     events_over,
@@ -21,14 +28,8 @@ from evsplat.capture.drawing import (
     short_number,
     to_picture,
 )
-from evsplat.capture.finding import Finding
-from evsplat.capture.metadata import Frame
-from evsplat.capture.policy import Policy
-from evsplat.capture.sensor_report import clock_findings, sensor_lines
-from evsplat.capture.timeline import draw_timeline
-from evsplat.capture.validate import check_capture
-from evsplat.events import count_map
-from evsplat.files import atomic_path
+from evsplat.inspection.sensor import clock_findings, sensor_lines
+from evsplat.inspection.timeline import draw_timeline
 
 CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
 SHOWN_FINDINGS = 12
@@ -65,7 +66,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     if metadata is None or not report.usable:
         return replace(report, summary=f"{path}\n{_findings_text(report.findings)}")
     capture = Capture(metadata)
-    estimate = estimate_from_capture(capture.for_training(Policy(use="everything")))
+    estimate = estimate_sensor(capture.for_training(Policy(use="everything")))
     findings = (*found, *clock_findings(capture, estimate))
     track = load_body_track(capture) if capture.has_body else None
     drawings = {"contact_sheet": _contact_sheet(capture)}

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evsplat.capture.importers.base import GUIDE, SourceCamera, rigid
 from evsplat.errors import DataError
+from evsplat.importers.base import GUIDE, SourceCamera, rigid
 
 # Model -> places of fx, fy, cx, cy and of OpenCV's distortion coefficients among the parameters.
 _MODELS: dict[str, tuple[tuple[int, int, int, int], tuple[int | None, ...]]] = {

@@ -13,7 +13,9 @@ from tqdm import tqdm
 from evsplat.body.pose_files import PoseSequence
 from evsplat.body.pose_files.fields import numbers
 from evsplat.body.pose_files.sequence import make_sequence
-from evsplat.capture.importers.base import (
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import DataError
+from evsplat.importers.base import (
     GUIDE,
     SHARP_EXPOSURE_US,
     Importer,
@@ -26,9 +28,7 @@ from evsplat.capture.importers.base import (
     rigid,
     shrunk,
 )
-from evsplat.capture.importers.smpl import add_body, chosen_poses
-from evsplat.capture.write import CaptureWriter
-from evsplat.errors import DataError
+from evsplat.importers.smpl import add_body, chosen_poses
 from evsplat.safe_pickle import read_pickle
 
 

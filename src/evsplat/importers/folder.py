@@ -10,7 +10,12 @@ from tqdm import tqdm
 
 from evsplat.body.pose_files import PoseSequence, read_poses
 from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
-from evsplat.capture.importers.base import (
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import ConfigError, DataError
+from evsplat.events import open_recording
+from evsplat.files import read_json
+from evsplat.footage import Footage, open_footage
+from evsplat.importers.base import (
     GUIDE,
     Importer,
     check_positive,
@@ -19,12 +24,7 @@ from evsplat.capture.importers.base import (
     person_mask,
     table,
 )
-from evsplat.capture.importers.smpl import add_body, chosen_poses
-from evsplat.capture.write import CaptureWriter
-from evsplat.errors import ConfigError, DataError
-from evsplat.events import open_recording
-from evsplat.files import read_json
-from evsplat.footage import Footage, open_footage
+from evsplat.importers.smpl import add_body, chosen_poses
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 

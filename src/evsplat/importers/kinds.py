@@ -6,15 +6,15 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from evsplat.capture.importers.base import Importer
-from evsplat.capture.importers.folder import Folder
-from evsplat.capture.importers.mmhpsd import Mmhpsd
-from evsplat.capture.importers.neuman import Neuman
-from evsplat.capture.importers.people_snapshot import PeopleSnapshot
-from evsplat.capture.importers.zju_mocap import ZjuMocap
-from evsplat.capture.importers.zju_mocap_blur import ZjuMocapBlur
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
+from evsplat.importers.base import Importer
+from evsplat.importers.folder import Folder
+from evsplat.importers.mmhpsd import Mmhpsd
+from evsplat.importers.neuman import Neuman
+from evsplat.importers.people_snapshot import PeopleSnapshot
+from evsplat.importers.zju_mocap import ZjuMocap
+from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
 
 logger = logging.getLogger(__name__)
 

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evsplat.body import load_body_track
 from evsplat.body.smpl import ENVIRONMENT
-from evsplat.capture import Capture, load_capture
-from evsplat.capture.importers import import_capture
+from evsplat.capture import Capture, load_body_track, load_capture
 from evsplat.errors import ConfigError, DataError, EvsplatError
+from evsplat.importers import import_capture
 
 from . import trees
 from .person import View, save, write_smpl

@@ -14,7 +14,10 @@ from evsplat.body.pose_files.fields import has, numbers
 from evsplat.body.pose_files.sequence import make_sequence, moved
 from evsplat.body.smpl_skeleton import rest_pelvis
 from evsplat.capture.images import image_size
-from evsplat.capture.importers.base import (
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import DataError
+from evsplat.events import EventStream
+from evsplat.importers.base import (
     PICTURES,
     Importer,
     SourceCamera,
@@ -28,10 +31,7 @@ from evsplat.capture.importers.base import (
     rigid,
     table,
 )
-from evsplat.capture.importers.smpl import add_body
-from evsplat.capture.write import CaptureWriter
-from evsplat.errors import DataError
-from evsplat.events import EventStream
+from evsplat.importers.smpl import add_body
 from evsplat.safe_pickle import read_pickle
 
 _EVENTS_PER_PIECE = 1 << 20

@@ -7,12 +7,12 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation
 
-from evsplat.body import BodyTrack, load_body_track, silhouette
+from evsplat.body import BodyTrack, silhouette
 from evsplat.body.smpl import ENVIRONMENT
-from evsplat.capture import Capture, load_capture, validate_capture
+from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
 from evsplat.capture.images import read_image
-from evsplat.capture.importers import import_capture
-from evsplat.capture.importers.base import shrunk
+from evsplat.importers import import_capture
+from evsplat.importers.base import shrunk
 
 from . import trees
 from .person import Person, View, write_smpl

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 
-from evsplat.capture.drawing import (
+from evsplat.inspection.drawing import (
     CURVE,
     FAINT,
     INK,

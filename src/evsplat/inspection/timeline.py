@@ -5,7 +5,7 @@ from collections.abc import Callable
 from PIL import Image, ImageDraw
 
 from evsplat.capture.capture import Capture
-from evsplat.capture.drawing import (
+from evsplat.inspection.drawing import (
     CURVE,
     FAINT,
     INK,

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import smpl_skeleton
-from evsplat.body.adapters import default_body
 from evsplat.body.body import Body
+from evsplat.body.make import default_body
 from evsplat.body.model_files import read_model_file
 from evsplat.body.pose_files import PoseSequence
 from evsplat.body.pose_files.transfer import skeleton_motion

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from evsplat.body.canonical import SMPL_PARENTS
 from evsplat.body.smpl_skeleton import approximate_rest_joints
 
-from ...body.helpers import reference_bones
+from ..body.helpers import reference_bones
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
 _QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

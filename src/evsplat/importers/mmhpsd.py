@@ -12,7 +12,10 @@ from evsplat.body.pose_files import PoseSequence, read_poses
 from evsplat.body.pose_files.fields import axis_angles, numbers
 from evsplat.body.pose_files.sequence import make_sequence
 from evsplat.capture.images import image_size
-from evsplat.capture.importers.base import (
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import DataError
+from evsplat.events import EventStream, open_recording
+from evsplat.importers.base import (
     GUIDE,
     PICTURES,
     SHARP_EXPOSURE_US,
@@ -26,10 +29,7 @@ from evsplat.capture.importers.base import (
     opencv_intrinsics,
     picture,
 )
-from evsplat.capture.importers.smpl import add_body, chosen_poses, unposed
-from evsplat.capture.write import CaptureWriter
-from evsplat.errors import DataError
-from evsplat.events import EventStream, open_recording
+from evsplat.importers.smpl import add_body, chosen_poses, unposed
 from evsplat.safe_pickle import read_npz, read_pickle
 
 _FOCAL_PX, _CENTRE_PX, _CANVAS_PX = 1679.3, 641.0, 1280

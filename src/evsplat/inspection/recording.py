@@ -18,17 +18,17 @@ from evsplat.calibration import (
     pair,
     pair_indices,
 )
-from evsplat.capture.drawing import Tile, events_over, fit, sheet, short_number, to_picture
-from evsplat.capture.inspect import (
+from evsplat.errors import DataError
+from evsplat.events import EventRecording, EventStream, RecordedFrame, count_map, open_recording
+from evsplat.inspection.capture import (
     EVENT_WINDOW_US,
     InspectReport,
     inspect_capture,
     save_drawings,
 )
-from evsplat.capture.plot import draw_curve
-from evsplat.capture.sensor_report import sensor_lines
-from evsplat.errors import DataError
-from evsplat.events import EventRecording, EventStream, RecordedFrame, count_map, open_recording
+from evsplat.inspection.drawing import Tile, events_over, fit, sheet, short_number, to_picture
+from evsplat.inspection.plot import draw_curve
+from evsplat.inspection.sensor import sensor_lines
 
 MOST_EVENTS = 20_000_000
 """Kept in memory to compare with frames and to draw; statistics are of the whole recording."""

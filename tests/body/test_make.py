@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.body import default_body, load_body, make_body
+from evsplat.body import default_body, make_body
 from evsplat.body.tree import joint_depths, tree_levels
 from evsplat.errors import DataError
 
-from .helpers import body_file, random_rig
+from .helpers import random_rig
 
 
 def test_default_body_is_a_person_and_follows_its_shape_directions():
@@ -21,13 +21,6 @@ def test_default_body_is_a_person_and_follows_its_shape_directions():
     middle = 0.5 * (plus.rest_vertices + minus.rest_vertices)
     assert torch.allclose(middle, body.rest_vertices, atol=1e-5)  # linear in betas
     assert torch.allclose(0.5 * (plus.rest_joints + minus.rest_joints), body.rest_joints, atol=1e-5)
-
-
-def test_default_model_of_a_file_is_the_default_body():
-    betas = np.array([0.5, -1.0])
-    body, order = load_body(body_file(model="default", betas=betas))
-    assert torch.equal(body.rest_vertices, default_body(betas).rest_vertices)
-    assert order == list(range(31))
 
 
 def test_too_many_betas_are_refused():
@@ -48,14 +41,12 @@ def test_too_many_betas_are_refused():
         ({"weights": np.ones((60, 3))}, r"weights has shape \(60, 3\), expected \(60, 4\)"),
         ({"rest_joints": np.full((4, 3), np.inf)}, "rest_joints holds values that are not finite"),
         ({"joint_names": ("a", "b")}, "joint_names has shape"),
-        ({"rest_vertices": None}, "rest_vertices is missing"),
-        ({"model": "stickman"}, "model is 'stickman', expected one of"),
     ],
 )
 def test_broken_rigs_are_refused_by_name(change, message):
     rig = {**random_rig(0, joints=4), **change}
     with pytest.raises(DataError, match=message):
-        load_body(body_file(**rig))
+        make_body(**rig)
 
 
 def test_weights_are_brought_to_one():

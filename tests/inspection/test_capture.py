@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evsplat.body import load_body_track
-from evsplat.capture import load_capture
-from evsplat.capture.inspect import body_mask_overlap, inspect_capture
+from evsplat.capture import load_body_track, load_capture
+from evsplat.inspection import body_mask_overlap, inspect_capture
 
 Factory = Callable[..., Path]
 

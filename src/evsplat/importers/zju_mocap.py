@@ -11,7 +11,10 @@ from tqdm import tqdm
 
 from evsplat.body.pose_files import read_poses
 from evsplat.body.pose_files.fields import numbers
-from evsplat.capture.importers.base import (
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import ConfigError, DataError
+from evsplat.files import read_json
+from evsplat.importers.base import (
     GUIDE,
     PICTURES,
     SHARP_EXPOSURE_US,
@@ -28,10 +31,7 @@ from evsplat.capture.importers.base import (
     rigid,
     table,
 )
-from evsplat.capture.importers.smpl import add_body, chosen_poses, unposed
-from evsplat.capture.write import CaptureWriter
-from evsplat.errors import ConfigError, DataError
-from evsplat.files import read_json
+from evsplat.importers.smpl import add_body, chosen_poses, unposed
 from evsplat.safe_pickle import read_npy, read_npz
 
 FRAME_RANGES = {"377": (0, 570), "386": (0, 540), "387": (0, 540), "394": (0, 475)}

@@ -1,9 +1,7 @@
-"""Bodies from a capture's body file: a rig of its own, the shipped body, or the SMPL family."""
+"""Bodies from arrays: a rig, checked and its joints in order, and the shipped parametric body."""
 
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,39 +10,6 @@ from jaxtyping import Float, Int
 from evsplat.body.body import Body
 from evsplat.body.tree import topological_order
 from evsplat.errors import DataError
-
-if TYPE_CHECKING:
-    from evsplat.capture.body_file import BodyFile
-
-
-def load_body(
-    body_file: "BodyFile", *, body_models: Path | str | None = None
-) -> tuple[Body, list[int]]:
-    """The body that a capture names, and the order of the file's joints in it.
-
-    ``body_models`` is where the user's licensed SMPL files lie (default: the environment variable
-    EVSPLAT_BODY_MODELS). ``poses[:, order]`` are the file's poses in the body's joint order.
-    """
-    if body_file.model == "rig":
-        return _rig_body(body_file)
-    if body_file.model == "default":
-        body = default_body(body_file.betas, source=f"{body_file.path}: betas")
-    elif body_file.model in ("smpl", "smplh", "smplx"):
-        from evsplat.body.smpl import smpl_body
-
-        body = smpl_body(
-            body_file.model,
-            body_file.betas,
-            gender=body_file.gender or "neutral",
-            path=body_models,
-            source=f"{body_file.path}: betas",
-        )
-    else:
-        raise DataError(
-            f"{body_file.path}: model is '{body_file.model}', expected one of "
-            "rig, default, smpl, smplh, smplx."
-        )
-    return body, list(range(len(body.parents)))
 
 
 def make_body(
@@ -157,17 +122,3 @@ def _default_arrays() -> dict[str, np.ndarray]:
     resource = files("evsplat") / "data" / "default_body.npz"
     with resource.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         return {key: archive[key] for key in archive.files}
-
-
-def _rig_body(body_file: "BodyFile") -> tuple[Body, list[int]]:
-    rig = {
-        name: getattr(body_file, name)
-        for name in ("rest_vertices", "faces", "weights", "parents", "rest_joints", "joint_names")
-    }
-    missing = [name for name, value in rig.items() if value is None]
-    if missing:
-        raise DataError(
-            f"{body_file.path}: model is 'rig' but {', '.join(missing)} is missing; "
-            "a rig needs all of rest_vertices, faces, weights, parents, rest_joints, joint_names."
-        )
-    return make_body(**rig, source=str(body_file.path))

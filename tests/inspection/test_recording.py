@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evsplat.capture.inspect import inspect_capture
-from evsplat.capture.inspect_recording import inspect, inspect_recording
 from evsplat.errors import DataError
+from evsplat.inspection import inspect, inspect_capture, inspect_recording
 
 Factory = Callable[..., Path]
 
@@ -44,7 +43,7 @@ def test_counts_rate_size_and_polarity_are_right(tmp_path: Path, seed: int) -> N
 def test_a_long_recording_is_summed_up_but_not_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evsplat.capture.inspect_recording.MOST_EVENTS", 1)
+    monkeypatch.setattr("evsplat.inspection.recording.MOST_EVENTS", 1)
     report = inspect_recording(_save(tmp_path / "events.npz"), tmp_path / "out")
     assert "4,000 over 2.000 s" in report.summary
 

@@ -9,7 +9,9 @@ from tqdm import tqdm
 from evsplat.body.pose_files import PoseSequence
 from evsplat.body.pose_files.fields import numbers
 from evsplat.body.pose_files.sequence import make_sequence
-from evsplat.capture.importers.base import (
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import DataError
+from evsplat.importers.base import (
     GUIDE,
     PICTURES,
     SHARP_EXPOSURE_US,
@@ -23,10 +25,8 @@ from evsplat.capture.importers.base import (
     person_mask,
     picture,
 )
-from evsplat.capture.importers.colmap import read_colmap
-from evsplat.capture.importers.smpl import add_body, chosen_poses
-from evsplat.capture.write import CaptureWriter
-from evsplat.errors import DataError
+from evsplat.importers.colmap import read_colmap
+from evsplat.importers.smpl import add_body, chosen_poses
 from evsplat.safe_pickle import read_npz
 
 

@@ -1,0 +1,62 @@
+"""The body of a capture and its pose at any time."""
+
+import numpy as np
+
+from evsplat.body.body import Body
+from evsplat.body.make import default_body, make_body
+from evsplat.body.smpl import smpl_body
+from evsplat.body.track import BodyTrack
+from evsplat.capture.body_file import BodyFile
+from evsplat.capture.capture import Capture
+from evsplat.capture.training_capture import TrainingCapture
+from evsplat.errors import DataError
+
+
+def load_body_track(capture: Capture | TrainingCapture, *, dense: bool = False) -> BodyTrack:
+    """The capture's body with its key poses; ``dense`` takes the true poses of body_dense.npz.
+
+    The dense poses are for evaluation and ablation, never for training.
+    """
+    body, order = load_body(capture.body_file)
+    file = capture.body_file
+    if dense:
+        if capture.dense_body_file is None:
+            raise DataError(
+                f"{capture.path}: body_dense.npz not found, but dense poses were asked for."
+            )
+        file = capture.dense_body_file
+    poses = np.asarray(file.poses)
+    if poses.ndim != 3 or poses.shape[1] != len(order):
+        raise DataError(
+            f"{file.path}: poses has shape {poses.shape}, expected (P, {len(order)}, 3) "
+            f"for the joints of the body."
+        )
+    return BodyTrack(body, file.times_us, poses[:, order], file.transl, source=str(file.path))
+
+
+def load_body(file: BodyFile) -> tuple[Body, list[int]]:
+    """The body that a file names, and the order of the file's joints in it.
+
+    ``poses[:, order]`` are the file's poses in the body's joint order. The SMPL family is read
+    from the user's licensed files in the folder that EVSPLAT_BODY_MODELS names.
+    """
+    rig = file.rig
+    if rig is not None:
+        missing = [name for name, value in rig.items() if value is None]
+        if missing:
+            raise DataError(
+                f"{file.path}: model is 'rig' but {', '.join(missing)} is missing; a rig needs "
+                f"all of {', '.join(rig)}."
+            )
+        return make_body(**rig, source=str(file.path))
+    source = f"{file.path}: betas"
+    if file.model == "default":
+        body = default_body(file.betas, source=source)
+    elif file.model in ("smpl", "smplh", "smplx"):
+        body = smpl_body(file.model, file.betas, gender=file.gender or "neutral", source=source)
+    else:
+        raise DataError(
+            f"{file.path}: model is '{file.model}', expected one of "
+            "rig, default, smpl, smplh, smplx."
+        )
+    return body, list(range(len(body.parents)))
