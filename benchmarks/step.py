@@ -35,7 +35,7 @@ from torch import Tensor
 from evsplat import _native
 from evsplat.capture import Frame, load_capture
 from evsplat.deform import drawing, human_scene
-from evsplat.deform.mlp import Precision
+from evsplat.models.networks.mlp import Precision
 from evsplat.gaussians import ATTRIBUTES, GaussianSet
 from evsplat.methods import PaperConfig, compose
 from evsplat.objectives.base import Stateless, Step

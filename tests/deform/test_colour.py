@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from evsplat.deform import HumanColour, SceneColour, sh_basis, view_jitter
-from evsplat.deform.colour import beside_basis, view_directions
+from evsplat.models.networks.colour import beside_basis, view_directions
 
 
 def unit(*shape, seed=0, dtype=torch.float32):

@@ -7,7 +7,7 @@ import torch
 
 from evsplat.capture import load_capture
 from evsplat.config import override
-from evsplat.deform.drawing import _places, draw
+from evsplat.models.drawing import _places, draw
 from evsplat.errors import ConfigError
 from evsplat.methods import compose, method_config
 from evsplat.render import render

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.deform.frame_weights import interpolated, seen, seen_or_last
+from evsplat.models.paper.per_frame import interpolated, seen, seen_or_last
 
 ANCHORS = torch.tensor([100.0, 200.0, 400.0], dtype=torch.float64)
 

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from evsplat.body import BodyTrack, skin
 from evsplat.capture import load_capture
 from evsplat.config import override
-from evsplat.deform.drawing import draw
+from evsplat.models.drawing import draw
 from evsplat.deform.human_scene import HumanSceneModel
-from evsplat.deform.pose_spline import PoseSpline
+from evsplat.models.pose_spline import PoseSpline
 from evsplat.errors import ConfigError
 from evsplat.gaussians import ATTRIBUTES
 from evsplat.methods import PaperConfig, compose, method_config

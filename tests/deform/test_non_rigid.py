@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from evsplat.deform import HashGridEncoding, NonRigidNetwork, OneBlobEncoding, make_encoding
-from evsplat.deform.non_rigid import NonRigid
+from evsplat.models.networks.non_rigid import NonRigid
 
 
 @pytest.mark.parametrize("kind", ["oneblob", "hashgrid"])

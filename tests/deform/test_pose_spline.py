@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline, CubicSpline
 
 from evsplat.body import BodyTrack, axis_angle_to_matrix, default_body
 from evsplat.body.smoothing import motion_noise
-from evsplat.deform.pose_spline import STIFFEST, PoseSpline
+from evsplat.models.pose_spline import STIFFEST, PoseSpline
 from evsplat.objectives import PosePrior
 
 FRAMES = [40_000, 140_000, 320_000, 700_000, 910_000]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from evsplat.body import SurfaceSamples
-from evsplat.deform.shading import NearestSurface, Shading, SurfaceLight
+from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
 
 
 def sphere(count: int, generator: torch.Generator) -> SurfaceSamples:

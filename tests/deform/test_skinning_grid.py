@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from evsplat.deform.skinning_grid import SkinningGrid
-from evsplat.deform.skinning_network import SkinningNetwork
+from evsplat.models.networks.skinning_network import SkinningNetwork
 
 TREE = (-1, 0, 1, 1, 2, 3)
 

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.capture import load_body_track, load_capture
 from evsplat.config import override
-from evsplat.deform.at_rest import mean_at_rest
-from evsplat.deform.skinned import SkinnedGaussians
+from evsplat.models.at_rest import mean_at_rest
+from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.errors import DataError
 from evsplat.export import export_run
 from evsplat.export.avatar.figure import clip_of, figure_of, recorded_clip

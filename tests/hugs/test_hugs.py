@@ -9,8 +9,8 @@ import torch
 from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import load_capture
 from evsplat.errors import DataError
-from evsplat.hugs.losses import PATCH_PX, Perceptual, draw_squares
-from evsplat.hugs.model import HugsDrawing
+from evsplat.objectives.hugs import PATCH_PX, Perceptual, draw_squares
+from evsplat.models.hugs.model import HugsDrawing
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.render import render
 from evsplat.similarity.psnr_ssim import ssim

@@ -6,8 +6,8 @@ import torch
 from evsplat.body import skin
 from evsplat.body.rotations import matrix_to_six, six_to_matrix
 from evsplat.capture import load_body_track, load_capture
-from evsplat.hugs.human import TriplaneHuman
-from evsplat.hugs.start import START_OPACITY, body_weights, facing, fit_to_body
+from evsplat.models.hugs.human import TriplaneHuman
+from evsplat.models.hugs.start import START_OPACITY, body_weights, facing, fit_to_body
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
-from evsplat.hugs.triplane import Triplane
+from evsplat.models.hugs.triplane import Triplane
 
 
 def sampled(plane: Triplane, positions: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from evsplat.body import BodyTrack
 from evsplat.capture import load_capture
 from evsplat.config import override
-from evsplat.deform.drawing import draw_depth
+from evsplat.models.drawing import draw_depth
 from evsplat.methods import compose, method_config
 from evsplat.methods.reconstruction import Posable, WithDepth
 from evsplat.training.run import GaussianReconstruction

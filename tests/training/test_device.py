@@ -33,14 +33,14 @@ def quick(capture_path, **options):
 
 def without_native(monkeypatch):
     for module in (
-        "evsplat.deform.colour",
-        "evsplat.deform.mlp",
-        "evsplat.deform.non_rigid",
-        "evsplat.deform.skinning_network",
+        "evsplat.models.networks.colour",
+        "evsplat.models.networks.mlp",
+        "evsplat.models.networks.non_rigid",
+        "evsplat.models.networks.skinning_network",
         "evsplat.objectives.event",
         "evsplat.objectives.isometry",
         "evsplat.objectives.semantic",
-        "evsplat.deform.encodings",
+        "evsplat.models.networks.encodings",
         "evsplat.similarity.psnr_ssim",
     ):
         monkeypatch.setattr(f"{module}.runs_native", lambda tensor: False)

@@ -10,6 +10,7 @@ from evsplat.capture import Camera
 from evsplat.gaussians.gaussian_set import FEATURE_DIM
 from evsplat.neighbours import nearest
 
+
 def logit(probability: float) -> float:
     """Inverse of the sigmoid."""
     return math.log(probability / (1 - probability))
@@ -34,8 +35,8 @@ def gaussians_at(
 ) -> dict[str, Tensor]:
     """Start values of all attributes; colours are grey where none is given.
 
-    ``feature_dim`` inputs of a colour network, whose first three are the logits of the colour; None:
-    the logits alone are the colour.
+    ``feature_dim`` inputs of a colour network, whose first three are the logits of the colour;
+    None: the logits alone are the colour.
     """
     count = len(points)
     logits = torch.zeros(count, 3)

@@ -2,33 +2,39 @@
 
 import difflib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from evsplat.config import from_dict
 from evsplat.errors import ConfigError
-from evsplat.methods.avatar3dgs import AvatarConfig
-from evsplat.methods.avatar3dgs import compose as compose_avatar3dgs
-from evsplat.methods.avatar3dgs_semantic import AvatarSemanticConfig
-from evsplat.methods.avatar3dgs_semantic import compose as compose_avatar3dgs_semantic
-from evsplat.methods.composition import Composition
-from evsplat.methods.config import NOMINAL_ITERATIONS, MethodConfig
-from evsplat.methods.evsplat import EvsplatConfig
-from evsplat.methods.evsplat import compose as compose_evsplat
-from evsplat.methods.hugs import HugsConfig
-from evsplat.methods.hugs import compose as compose_hugs
-from evsplat.methods.paper import PaperConfig, compose
+from evsplat.methods import avatar3dgs, avatar3dgs_semantic, evsplat, hugs, paper
+from evsplat.methods.base import Composition, MethodConfig, Purpose
+from evsplat.methods.settings import NOMINAL_ITERATIONS
 
-TRAINABLE: dict[str, tuple[type[Any], Callable[..., Composition]]] = {
-    "avatar3dgs": (AvatarConfig, compose_avatar3dgs),
-    "avatar3dgs_semantic": (AvatarSemanticConfig, compose_avatar3dgs_semantic),
-    "evsplat": (EvsplatConfig, compose_evsplat),
-    "hugs": (HugsConfig, compose_hugs),
-    "paper": (PaperConfig, compose),
+
+@dataclass(frozen=True)
+class Method:
+    """A method that is trained: its file has both."""
+
+    config: type[Any]
+    """Frozen dataclass of all its settings, a `MethodConfig`."""
+    build: Callable[..., Composition]
+    """``build(config, capture, seed, device=, purpose=)``."""
+
+
+TRAINABLE = {
+    "avatar3dgs": Method(avatar3dgs.AvatarConfig, avatar3dgs.build),
+    "avatar3dgs_semantic": Method(
+        avatar3dgs_semantic.AvatarSemanticConfig, avatar3dgs_semantic.build
+    ),
+    "evsplat": Method(evsplat.EvsplatConfig, evsplat.build),
+    "hugs": Method(hugs.HugsConfig, hugs.build),
+    "paper": Method(paper.PaperConfig, paper.build),
 }
-"""Configuration and composition of every method that is trained."""
+"""Every method that is trained, by name."""
 
 DEFAULT_METHOD = "evsplat"
-"""What `train` takes where nothing names a method."""
+"""Method of `train` where nothing names one."""
 
 
 def method_config(method: str, values: dict[str, Any], *, where: str) -> MethodConfig:
@@ -37,7 +43,7 @@ def method_config(method: str, values: dict[str, Any], *, where: str) -> MethodC
         near = difflib.get_close_matches(method, TRAINABLE, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         raise ConfigError(f"--method {method}: unknown; methods are {', '.join(TRAINABLE)}.{hint}")
-    config: MethodConfig = from_dict(TRAINABLE[method][0], values, where=where)
+    config: MethodConfig = from_dict(TRAINABLE[method].config, values, where=where)
     return config
 
 
@@ -46,8 +52,8 @@ __all__ = [
     "NOMINAL_ITERATIONS",
     "TRAINABLE",
     "Composition",
+    "Method",
     "MethodConfig",
-    "PaperConfig",
-    "compose",
+    "Purpose",
     "method_config",
 ]

@@ -17,8 +17,8 @@ from evsplat.models.model import Model
 from evsplat.objectives import Objective, PackedBounds
 
 Purpose = Literal["train", "resume", "draw"]
-"""``train``: from the start, with the cheap fits before it. ``resume``: a checkpoint brings all that
-was learned. ``draw``: likewise, and no objective is asked."""
+"""``train``: from the start, with the cheap fits before it. ``resume``: a checkpoint brings all
+that was learned. ``draw``: likewise, and no objective is asked."""
 
 
 class MethodConfig(Protocol):

@@ -91,3 +91,21 @@ EVSPLAT = {
     "pose.knot_frames": "fixed at 1",
 }
 """Of `evsplat`."""
+
+HUGS = {
+    **_RENAMED,
+    "mode": "gone with the mode human; method avatar3dgs reconstructs a person alone",
+    "release_compatible": "gone, it repeated slips of the released code (docs/baselines.md)",
+    "triplane.channels": "renamed to channels",
+    "triplane.resolution": "renamed to resolution",
+    "triplane": "its settings are channels and resolution",
+    "fit.steps": "renamed to fit_steps",
+    "fit": "its setting is fit_steps",
+    "scene.sh_degree": "renamed to sh_degree",
+    "loss": "its weights are l1_weight, dssim_weight, human_l1_weight, human_dssim_weight, "
+    "skinning_weight, perceptual and perceptual_weight",
+    "skinning_turns": "fixed at 4",
+    "skinning_refresh": "fixed at 50",
+    "optimisation.rates": "rates are the released ones, times rate_scale",
+}
+"""Of `hugs`."""

@@ -36,7 +36,6 @@ from evsplat.methods.settings import (
     Nominal,
     NotNegative,
     Positive,
-    Share,
     Weight,
 )
 from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start, scene_start

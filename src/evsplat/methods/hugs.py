@@ -6,7 +6,7 @@ iterations are nominal ones of 15,000; the released code makes 14,999.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -14,26 +14,23 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Policy, TrainingCapture, load_body_track
-from evsplat.capture.masked import MaskedCapture, require_masks
-from evsplat.errors import DataError
-from evsplat.gaussians import DensifyConfig, Part
+from evsplat.capture.masked import require_masks
+from evsplat.config import AtLeast, ReadIf, Within
+from evsplat.gaussians import DensifyLimits, Part
 from evsplat.gaussians.initialise import nearest_spacing
-from evsplat.hugs.human import TriplaneHuman
-from evsplat.hugs.losses import HumanPicture, JointPicture, Perceptual, SkinningTarget
-from evsplat.hugs.model import HugsModel
-from evsplat.hugs.scene import SphericalScene
-from evsplat.hugs.start import fit_to_body
-from evsplat.methods.composition import Composition
-from evsplat.methods.config import NOMINAL_ITERATIONS, Weight
-from evsplat.methods.rates import Learning, Network, Rate, RowRate
-from evsplat.methods.starts import (
-    HumanStartConfig,
-    SceneStartConfig,
-    human_start,
-    no_gaussians,
-    scene_start,
+from evsplat.methods.base import (
+    Composition,
+    Purpose,
+    require_training_frames,
+    start_of_randomness,
 )
-from evsplat.objectives import Objective
+from evsplat.methods.dropped import HUGS
+from evsplat.methods.learning import Learning, Network, Rate, RowRate
+from evsplat.methods.settings import NOMINAL_ITERATIONS, Densify, Positive, Weight
+from evsplat.methods.starts import HumanStart, SceneStart, Surface, human_start, scene_start
+from evsplat.models.hugs import HugsModel, SphericalScene, TriplaneHuman
+from evsplat.models.hugs.start import fit_to_body
+from evsplat.objectives.hugs import HumanPicture, JointPicture, Perceptual, SkinningTarget
 from evsplat.objectives.perceptual import PerceptualName, make_perceptual
 
 FIT_SAMPLES = 50_000
@@ -41,191 +38,119 @@ FIT_SAMPLES = 50_000
 BACKDROP_SHARE = 0.1
 """Of the rate of scene centres where they start on the median backdrop. One camera sees no depth:
 Adam makes a walk of its noise, and what walks in front of the person hides it."""
+SKINNING_TURNS = 4
+"""A training step decodes the skinning weights of one Gaussian in so many; released: of all."""
+SKINNING_REFRESH = 50
+"""Steps between look-ups of the body's weights; the released code does it at every step."""
+FIT_BATCH = 1_024
+"""Surface points per step of the fit."""
+_PERCEPTUAL = ReadIf("perceptual", "not none", lambda name: name != "none")
 FINEST = 256
 """Texels along a side of the released triplane."""
-
-
-@dataclass(frozen=True)
-class TriplaneConfig:
-    """The person's features."""
-
-    channels: int = 32
-    """Of each of the three planes."""
-    resolution: int | None = None
-    """Texels along a side. Null: the power of two that brings a texel nearest to the size of a
-    pixel at the person's distance, at most 256, which is the released number."""
-    half_side_m: float | None = None
-    """Of the cube that it covers, about the middle of the canonical body. Null: 1 m as released,
-    more for a body that is larger."""
-
-
-@dataclass(frozen=True)
-class FitConfig:
-    """Fit of triplane and decoders to the body before training. Released: 7,000 steps of all."""
-
-    steps: int = 1_000
-    batch: int = 1_024
-    """Surface points per step."""
-
-
-@dataclass(frozen=True)
-class HugsSceneConfig(SceneStartConfig):
-    """The scene's start and colour."""
-
-    kind: Literal["median_backdrop", "random_cube"] = "random_cube"
-    """``random_cube``: as in the paper's comparison (2.9). ``median_backdrop``: the temporal median
-    of the training frames on a floor and a wall; static cameras only, and far fewer steps."""
-    sh_degree: int | None = None
-    """Of the spherical harmonics. Null: 3 as released, but 0 for one static camera, where a
-    Gaussian is seen from one direction and all harmonics say the same."""
-
-
-@dataclass(frozen=True)
-class HugsLossConfig:
-    """Weights of the terms (2.4)."""
-
-    l1: Weight = 0.8
-    dssim: Weight = 0.2
-    human_l1: Weight = 0.8
-    human_dssim: Weight = 0.2
-    skinning: Weight = 1_000.0
-    perceptual: PerceptualName = "none"
-    """``lpips_vgg`` is the released one and needs its weights; see `evsplat doctor`."""
-    perceptual_weight: Weight = 1.0
-    """Of the joint picture and of the person alone."""
-
-
-@dataclass(frozen=True)
-class HugsRates:
-    """Adam's learning rates (2.5)."""
-
-    human_means: float = 3.2e-4
-    """Centres, metres; a tenth of it at the end, as after half of the released 30,000."""
-    triplane: float = 1e-3
-    """The triplane, its appearance and its geometry decoder."""
-    skinning: float = 1e-4
-    pose: float = 1e-4
-    """Per-frame rotations and translations."""
-    scene_means: float = 1.6e-4
-    """Times the scene's extent; a tenth of it at the end."""
-    constant: float = 2.5e-3
-    """Constant spherical harmonic; a twentieth of it for the others."""
-    opacity_logits: float = 0.05
-    scales_log: float = 5e-3
-    quaternions: float = 1e-3
-
-
-@dataclass(frozen=True)
-class HugsOptimisation:
-    """How long and how fast."""
-
-    iterations: int = NOMINAL_ITERATIONS
-    """Training steps; all schedules stretch with it."""
-    rates: HugsRates = field(default_factory=HugsRates)
 
 
 @dataclass(frozen=True)
 class HugsConfig:
     """All settings of method `hugs`."""
 
+    DROPPED: ClassVar[dict[str, str]] = HUGS
+
     policy: Policy = field(default_factory=lambda: Policy(masks="given"))
-    """What training may see of what is held out."""
-    mode: Literal["human_scene", "human"] = "human_scene"
-    """What is reconstructed, in the released code's words. ``human``: the person alone, on black,
-    from pictures that are black outside of the mask; the settings of the scene mean nothing."""
-    release_compatible: bool = False
-    """Repeat the released code's slips (2.7); docs/baselines.md lists them."""
-    human: HumanStartConfig = field(default_factory=HumanStartConfig)
-    triplane: TriplaneConfig = field(default_factory=TriplaneConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
-    scene: HugsSceneConfig = field(default_factory=HugsSceneConfig)
-    loss: HugsLossConfig = field(default_factory=HugsLossConfig)
-    skinning_turns: int = 4
-    """A training step decodes the skinning weights of one Gaussian in so many, in turns; 1 = of
-    all, as released."""
-    skinning_refresh: int = 50
-    """Steps between look-ups of the body's weights; the released code does it at every step."""
-    optimisation: HugsOptimisation = field(default_factory=HugsOptimisation)
-    densify_human: DensifyConfig = field(
-        default_factory=lambda: DensifyConfig(
-            start=3_000, end=15_000, every=600, split_above_m=0.01, prune_opacity=0.005,
-            prune_after=0, prune_screen_px=20, prune_scale_m=0.1, max_count=20_000,
-        )
-    )  # fmt: skip
-    """Released: at most 524,288."""
-    densify_scene: DensifyConfig | None = None
-    """Null: for a random cube 3DGS's, with a hundredth of the scene's extent as the size above
-    which Gaussians are split, and at most 150,000 of them (released: 2,097,152); none for a median
-    backdrop, which would only grow where the person passes, and in front of it."""
+    """Held-out data that training may see."""
+    iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
+    """Training steps; all schedules stretch with it."""
+
+    human: HumanStart = field(default_factory=HumanStart)
+    """Gaussians of the person at the start."""
+    scene: SceneStart = field(default_factory=lambda: SceneStart("random_cube"))
+    """Gaussians of the scene at the start."""
+    densify: Densify = field(
+        default_factory=lambda: Densify(start=3_000, end=15_000, max_human=20_000)
+    )
+    """Growth and pruning; of the scene from iteration 500 on. Released: at most 524,288 Gaussians
+    of the person and 2,097,152 of the scene."""
+
+    channels: Annotated[int, AtLeast(1)] = 32
+    """Channels of each of the triplane's three planes."""
+    resolution: Annotated[int, AtLeast(2)] | None = None
+    """Texels along a side of them. Null: the power of two that brings a texel nearest to the size
+    of a pixel at the person's distance, at most 256, which is the released number."""
+    sh_degree: Annotated[int, Within(0, 3)] | None = None
+    """Degree of the scene's spherical harmonics. Null: 3 as released, but 0 for one static camera,
+    where a Gaussian is seen from one direction and all harmonics say the same."""
+    fit_steps: Annotated[int, AtLeast(0)] = 1_000
+    """Steps of the fit of triplane and decoders to the body before training. Released: 7,000."""
+
+    l1_weight: Weight = 0.8
+    """Weight of the mean absolute difference to the recorded picture, sRGB (2.4)."""
+    dssim_weight: Weight = 0.2
+    """Weight of 1 - SSIM."""
+    human_l1_weight: Weight = 0.8
+    """Weight of the mean absolute difference on the person alone."""
+    human_dssim_weight: Weight = 0.2
+    """Weight of 1 - SSIM on the person alone."""
+    skinning_weight: Weight = 1_000.0
+    """Weight of the squared error of the decoded skinning weights."""
+    perceptual: PerceptualName = "none"
+    """``lpips_vgg`` is the released one and needs its weights; see `evsplat doctor`."""
+    perceptual_weight: Annotated[Weight, _PERCEPTUAL] = 1.0
+    """Weight of the perceptual distance of the joint picture and of the person alone."""
+
+    rate_scale: Positive = 1.0
+    """Factor on all learning rates, which are the released ones (2.5)."""
 
 
-def compose(
+def build(
     config: HugsConfig,
     capture: TrainingCapture,
     seed: int,
     *,
     device: torch.device | str = "cpu",
-    fit: bool = True,
+    purpose: Purpose = "train",
 ) -> Composition:
-    """Put the method together for one capture; see `evsplat.methods.paper.compose`.
-
-    A `DataError` where the capture has no masks.
-    """
-    if not capture.train_frames:
-        raise DataError(f"{capture.path}: no frame has split 'train'; nothing to learn from.")
+    """Put the method together for one capture; a `DataError` where it has no masks."""
+    require_training_frames(capture)
     require_masks(capture, "method hugs")
-    alone = config.mode == "human"
-    if alone:
-        capture = MaskedCapture(capture, "method hugs")
-    generator = torch.Generator().manual_seed(seed)
-    torch.manual_seed(seed)
+    generator = start_of_randomness(seed)
     track = load_body_track(capture)
     human, spacing = _human(config, capture, track, generator)
     extent = _extent(config, capture, track)
     scene = _scene(config, capture, track, generator)
-    model = HugsModel(
-        human,
-        scene,
-        track,
-        [frame.mid_us for frame in capture.train_frames],
-        release_compatible=config.release_compatible,
-    ).to(device)
-    if fit:
+    times_us = [frame.mid_us for frame in capture.train_frames]
+    model = HugsModel(human, scene, track, times_us).to(device)
+    if purpose == "train":
         fit_to_body(
             human,
             track.body.sample_surface(FIT_SAMPLES, generator).to(device),
             spacing,
-            steps=config.fit.steps,
-            batch=config.fit.batch,
+            steps=config.fit_steps,
+            batch=FIT_BATCH,
             generator=generator,
         )
-    metric = make_perceptual(config.loss.perceptual, device=device)
-    rescaled = not config.release_compatible
-    perceptual = None if metric is None else Perceptual(metric, rescaled=rescaled)
-    objectives: list[Objective] = [
-        HumanPicture(capture, perceptual),
-        SkinningTarget(refresh=config.skinning_refresh),
-    ]
-    if not alone:
-        objectives.insert(0, JointPicture(capture, perceptual))
-    loss = config.loss
+    # Weights of a perceptual network need not be there to draw.
+    name: PerceptualName = "none" if purpose == "draw" else config.perceptual
+    metric = make_perceptual(name, device=device)
+    perceptual = None if metric is None else Perceptual(metric)
     return Composition(
         model=model,
-        objectives=objectives,
+        objectives=[
+            JointPicture(capture, perceptual),
+            HumanPicture(capture, perceptual),
+            SkinningTarget(refresh=SKINNING_REFRESH),
+        ],
         weights={
-            "l1": loss.l1,
-            "dssim": loss.dssim,
-            "perceptual": loss.perceptual_weight,
-            "human_l1": loss.human_l1,
-            "human_dssim": loss.human_dssim,
-            "human_perceptual": loss.perceptual_weight,
-            "skinning": loss.skinning,
+            "l1": config.l1_weight,
+            "dssim": config.dssim_weight,
+            "perceptual": config.perceptual_weight,
+            "human_l1": config.human_l1_weight,
+            "human_dssim": config.human_dssim_weight,
+            "human_perceptual": config.perceptual_weight,
+            "skinning": config.skinning_weight,
         },
         learning=_learning(model, config, extent),
         densify=_limits(config, extent),
         body_frames=None,
         generator=generator,
-        capture=capture if alone else None,
     )
 
 
@@ -233,18 +158,19 @@ def _human(
     config: HugsConfig, capture: TrainingCapture, track: BodyTrack, generator: torch.Generator
 ) -> tuple[TriplaneHuman, float]:
     """The person at its start, and the mean distance of neighbouring Gaussians, metres."""
-    points = human_start(config.human, capture, track, generator, 0.0)["means"]
+    points = human_start(config.human, Surface(), capture, track, generator, 0.0)["means"]
     vertices = track.body.canonical_vertices()
     low, high = vertices.amin(0), vertices.amax(0)
-    half_side = config.triplane.half_side_m or max(1.0, 1.1 * float((high - low).max()) / 2)
+    # Of the cube that the planes cover: 1 m as released, more for a body that is larger.
+    half_side = max(1.0, 1.1 * float((high - low).max()) / 2)
     human = TriplaneHuman(
         points,
         len(track.body.parents),
-        channels=config.triplane.channels,
-        resolution=config.triplane.resolution or _resolution(capture, track, half_side),
+        channels=config.channels,
+        resolution=config.resolution or _resolution(capture, track, half_side),
         center=(low + high) / 2,
         half_side=half_side,
-        skinning_turns=config.skinning_turns,
+        skinning_turns=SKINNING_TURNS,
     )
     return human, float(nearest_spacing(points).mean())
 
@@ -265,8 +191,6 @@ def _extent(config: HugsConfig, capture: TrainingCapture, track: BodyTrack) -> f
     """
     frames = capture.train_frames
     centers = torch.stack([capture.camera(frame).center() for frame in frames])
-    if config.release_compatible:
-        return 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max())
     if config.scene.cube_half_side_m:
         return config.scene.cube_half_side_m
     translation = track.at(torch.tensor([frame.mid_us for frame in frames]))[1]
@@ -277,12 +201,9 @@ def _extent(config: HugsConfig, capture: TrainingCapture, track: BodyTrack) -> f
 def _scene(
     config: HugsConfig, capture: TrainingCapture, track: BodyTrack, generator: torch.Generator
 ) -> SphericalScene:
-    scene = config.scene
-    if config.mode == "human":
-        return SphericalScene(no_gaussians(), torch.zeros(0, 3), 0)
-    values, colours = scene_start(scene, capture, track, generator, 0.0)
+    values, colours = scene_start(config.scene, capture, track, generator, 0.0)
     seen = _seen(values["means"], capture)
-    degree = scene.sh_degree
+    degree = config.sh_degree
     if degree is None:
         degree = 0 if capture.is_static_camera else 3
     return SphericalScene({k: v[seen] for k, v in values.items()}, colours[seen], degree)
@@ -299,27 +220,39 @@ def _seen(points: Float[Tensor, "N 3"], capture: TrainingCapture) -> Tensor:
     return seen
 
 
-def _limits(config: HugsConfig, extent: float) -> dict[Part, DensifyConfig]:
-    human, scene = config.densify_human, config.densify_scene
-    still = config.scene.kind == "median_backdrop"
-    if config.mode == "human" or (scene is None and still):
+def _limits(config: HugsConfig, extent: float) -> dict[Part, DensifyLimits]:
+    """Released limits (2.6); a median backdrop would only grow in front of the person."""
+    human = DensifyLimits(
+        start=config.densify.start,
+        end=config.densify.end,
+        every=600,
+        gradient=config.densify.gradient,
+        split_above_m=0.01,
+        prune_opacity=0.005,
+        prune_after=0,
+        prune_screen_px=20,
+        prune_scale_m=0.1,
+        max_count=config.densify.max_human,
+    )
+    if config.scene.growth_limit is None:
         return {"human": human}
-    if scene is None:
-        scene = DensifyConfig(
-            start=500, end=15_000, every=100, split_above_m=0.01 * extent, prune_opacity=0.005,
-            prune_screen_px=None, prune_scale_m=None, max_count=150_000,
-        )  # fmt: skip
-    if config.release_compatible:
-        # For a stored background that is white, though every picture is drawn over another one.
-        scene = replace(scene, opacity_reset=(500,))
+    scene = replace(
+        human,
+        start=500,
+        every=100,
+        split_above_m=0.01 * extent,
+        prune_after=3_000,
+        prune_screen_px=None,
+        prune_scale_m=None,
+        max_count=config.scene.growth_limit,
+    )
     return {"human": human, "scene": scene}
 
 
 def _learning(model: HugsModel, config: HugsConfig, extent: float) -> Learning:
-    rates = config.optimisation.rates
-    human = model.human
-    falling = 0.1
-    start = rates.scene_means * extent
+    """Released rates (2.5); centres fall to a tenth, as after half of the released 30,000."""
+    scale, human = config.rate_scale, model.human
+    start = 1.6e-4 * scale * extent
     if config.scene.kind == "median_backdrop":
         start *= BACKDROP_SHARE
     decoders = [
@@ -327,25 +260,24 @@ def _learning(model: HugsModel, config: HugsConfig, extent: float) -> Learning:
         *human.appearance.parameters(),
         *human.geometry.parameters(),
     ]
-    pose = [model.turns] if config.release_compatible else [model.turns, model.shifts]
     return Learning(
         rows={
             "human": {
-                "means": RowRate(Rate(rates.human_means, falling)),
+                "means": RowRate(Rate(3.2e-4 * scale, final=0.1)),
                 "scales_log": RowRate(Rate(0.0)),
             },
             "scene": {
-                "means": RowRate(Rate(start, falling)),
-                "scales_log": RowRate(Rate(rates.scales_log)),
-                "quaternions": RowRate(Rate(rates.quaternions)),
-                "opacity_logits": RowRate(Rate(rates.opacity_logits)),
-                "constant": RowRate(Rate(rates.constant)),
-                "directional": RowRate(Rate(rates.constant / 20)),
+                "means": RowRate(Rate(start, final=0.1)),
+                "scales_log": RowRate(Rate(5e-3 * scale)),
+                "quaternions": RowRate(Rate(1e-3 * scale)),
+                "opacity_logits": RowRate(Rate(0.05 * scale)),
+                "constant": RowRate(Rate(2.5e-3 * scale)),
+                "directional": RowRate(Rate(2.5e-3 / 20 * scale)),
             },
         },
         networks=[
-            Network(decoders, Rate(rates.triplane)),
-            Network(list(human.skinning.parameters()), Rate(rates.skinning)),
-            Network(pose, Rate(rates.pose)),
+            Network(decoders, Rate(1e-3 * scale)),
+            Network(list(human.skinning.parameters()), Rate(1e-4 * scale)),
+            Network([model.turns, model.shifts], Rate(1e-4 * scale)),
         ],
     )

@@ -13,8 +13,8 @@ from evsplat.body.smoothing import MotionNoise, motion_noise, smoothed
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError
-from evsplat.models.pose_spline import PoseSpline
 from evsplat.methods.settings import Nominal, NotNegative, Weight
+from evsplat.models.pose_spline import PoseSpline
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.camera import Camera
-from evsplat.deform.skinned import SkinnedGaussians
+from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.render import Splats
 
 Parts = Literal["all", "human", "scene"]

@@ -46,6 +46,7 @@ class Densify:
     """A Gaussian is cloned or split above this mean screen-space gradient (NDC units, as 3DGS)."""
     max_human: Annotated[int, AtLeast(1)] = 10_000
     """No clone or split of the person beyond this number of Gaussians."""
+
     def limits(self, *, cube_max_count: int | None = None) -> dict[Part, DensifyLimits]:
         """Limits of the person as 3DGS-Avatar's (1.11), and of a random cube as 3DGS's (A20).
 

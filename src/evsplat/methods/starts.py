@@ -22,7 +22,6 @@ from evsplat.gaussians.initialise import (
 )
 from evsplat.methods.settings import Positive
 
-
 MOST_SAMPLES = 20_000
 """Upper bound of the automatic number of samples of the person."""
 CUBE_OPACITY, BACKDROP_OPACITY = 0.1, 0.9

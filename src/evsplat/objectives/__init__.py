@@ -1,9 +1,7 @@
 """Losses, each a small object: which times it needs, what it compares."""
 
-from evsplat.objectives.activity import Activity
 from evsplat.objectives.alpha import Alpha
 from evsplat.objectives.base import Objective, Step
-from evsplat.objectives.edi import EdiTarget
 from evsplat.objectives.event import EventChange, event_loss
 from evsplat.objectives.event_noise import EventNoise
 from evsplat.objectives.event_sensor import EventSensor
@@ -17,9 +15,7 @@ from evsplat.objectives.semantic import PackedBounds, RenderedSemantics, silhoue
 from evsplat.objectives.skinning import SkinningPrior
 
 __all__ = [
-    "Activity",
     "Alpha",
-    "EdiTarget",
     "EventChange",
     "EventNoise",
     "EventSensor",

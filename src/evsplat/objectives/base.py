@@ -10,11 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture
-from evsplat.deform.drawing import Drawing
-from evsplat.deform.model import Model
 from evsplat.devices import DeviceCache
-from evsplat.gaussians import PosedGaussians
 from evsplat.imaging import decode
+from evsplat.models.drawing import Drawing
+from evsplat.models.layers import Layers
+from evsplat.models.model import Model
 
 ModelType = TypeVar("ModelType", bound=Model)
 
@@ -49,9 +49,9 @@ class Step(Generic[ModelType]):
         return self.drawing.semantic
 
     @property
-    def posed(self) -> PosedGaussians:
-        """The Gaussians in the world."""
-        return self.drawing.posed
+    def layers(self) -> Layers:
+        """The Gaussians in the world, as they were drawn."""
+        return self.drawing.layers
 
     @cached_property
     def linear(self) -> Float[Tensor, "T H W 3"]:

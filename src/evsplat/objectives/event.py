@@ -77,11 +77,10 @@ class EventChange(Stateless):
         capture: TrainingCapture,
         *,
         start: float,
-        floor: float,
-        eps: float,
-        across_gaps: bool,
-        weight_by_activity: bool,
-        min_active: float,
+        floor: float = 0.03,
+        eps: float = 1e-5,
+        weight_by_activity: bool = True,
+        min_active: float = 0.001,
     ) -> None:
         """``start`` in nominal iterations; ``min_active`` is the least share of active pixels."""
         assert capture.events is not None
@@ -93,7 +92,7 @@ class EventChange(Stateless):
         frames = capture.frames
         train = capture.train_frames
         follows = zip(train, train[1:], strict=False)
-        pairs = [(a, b) for a, b in follows if across_gaps or b.index == a.index + 1]
+        pairs = [(a, b) for a, b in follows if b.index == a.index + 1]
         for first, second in pairs:
             if frames[first.index].camera != frames[second.index].camera:
                 continue

@@ -46,11 +46,11 @@ class EventWindows(Stateless):
         eps: float,
         noise: EventNoise,
         reach: float = 0.5,
-        begun_us: int = 0,
+        ramp_us: int = 0,
     ) -> None:
         """``start`` in nominal iterations; ``eps`` is added to linear luminance.
 
-        Between events of one polarity at most ``begun_us`` apart brightness changes evenly
+        Between events of one polarity at most ``ramp_us`` apart brightness changes evenly
         (`begun_counts`); 0: all at once, when the second one tells.
         """
         assert capture.events is not None
@@ -61,7 +61,7 @@ class EventWindows(Stateless):
         self.reach_us = reach * _median_gap([frame.mid_us for frame in capture.train_frames])
         self.range_us = (min(mids), max(mids))
         self.noise = noise
-        self.begun_us = begun_us
+        self.ramp_us = ramp_us
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """One time outside of the exposure; none where there is no room on either side."""
@@ -113,16 +113,16 @@ class EventWindows(Stateless):
         late = [time + self._late_us for time in step.times_us[kept]]
         low, high = self.events.open_around(step.frame.mid_us)
         brightness = torch.log(luminance(step.linear[kept]) + self.eps)
-        reach = max(_RATE_US, self.begun_us)
+        reach = max(_RATE_US, self.ramp_us)
         stream = self.events.between(max(late[0] - reach, low), min(late[-1] + reach, high))
         windows = list(zip(late, late[1:], strict=False))
         counts = self._counts(stream, windows, brightness.device)
         changes = brightness[1:] - brightness[:-1]
         if not self.events.has_polarity:
             return changes.abs() - self.sensor.path(counts.sum(1))
-        if self.begun_us > 0:
+        if self.ramp_us > 0:
             size = self.events.height, self.events.width
-            begun = begun_counts(stream, late, *size, reach_us=self.begun_us)
+            begun = begun_counts(stream, late, *size, reach_us=self.ramp_us)
             counts = counts + send(begun[1:] - begun[:-1], counts.device)
         reported = self.sensor.change(*counts.unbind(1))
         if offset is not None:

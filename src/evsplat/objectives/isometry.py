@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Frame
 from evsplat.compiled import native, runs_native
-from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.devices import DeviceCache, send
+from evsplat.models.paper import PaperModel
 from evsplat.neighbours import nearest
 from evsplat.objectives.base import Step
 
@@ -109,9 +109,9 @@ class Isometry:
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
         """Nothing recorded is needed."""
 
-    def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
+    def loss(self, step: Step[PaperModel]) -> dict[str, Tensor]:
         """``isometry_centers`` and ``isometry_covariances``."""
-        gaussians, posed = step.model.gaussians, step.posed.human
+        gaussians, posed = step.model.gaussians, step.layers.human
         count = gaussians.human_count
         if count <= NEIGHBOURS:
             return {}
@@ -132,9 +132,9 @@ class Isometry:
         every = -(-len(posed.means) // MOST_TIMES)
         moved = (
             posed.means[::every],
-            posed.quaternions[::every],
+            posed.quats[::every],
             posed.scales[::every],
-            posed.transforms[::every],
+            step.layers.transforms[::every],
         )
         centers, covariances = isometry_change(rows, at_rest, moved)
         return {"isometry_centers": centers, "isometry_covariances": covariances}

@@ -1,4 +1,4 @@
-"""What keeps learned pose residuals small and smooth where pictures and events say little."""
+"""Prior that keeps learned pose residuals small and smooth where the recording says little."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from evsplat.capture import Frame
-from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.models.discs import DiscModel
 from evsplat.objectives.base import Stateless, Step
 
 
@@ -28,20 +28,16 @@ class PosePrior(Stateless):
         """No renders."""
         return ()
 
-    def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
+    def loss(self, step: Step[DiscModel]) -> dict[str, Tensor]:
         """``pose_prior``, once residuals are learned."""
-        model, spline = step.model, step.model.pose_spline
-        if spline is None or not model.pose_correction_active:
+        spline = step.model.residual
+        if spline is None or not step.model.residual_active:
             return {}
         weights = spline.weights(self.times_us)
         bends = spline.weights(self.times_us, derivative=2)
         moving = (spline.joint_rad > 0).float()[:, None]
-        joints = self._price(
-            weights, bends, model.rotation_residuals * moving, spline.joint_stiffness
-        )
-        root = self._price(
-            weights, bends, model.translation_residuals[:, None], spline.root_stiffness
-        )
+        joints = self._price(weights, bends, spline.rotations * moving, spline.joint_stiffness)
+        root = self._price(weights, bends, spline.translations[:, None], spline.root_stiffness)
         return {"pose_prior": (joints.sum() + root.sum()) / (moving.sum() + 1)}
 
     def _price(self, weights: Tensor, bends: Tensor, points: Tensor, stiffness: Tensor) -> Tensor:

@@ -13,8 +13,9 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.capture import Frame
 from evsplat.compiled import native, runs_native
-from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.devices import DeviceCache
+from evsplat.models.discs import DiscModel
+from evsplat.models.paper import PaperModel
 from evsplat.objectives.base import Stateless, Step
 
 LEAST_SHARE = 1e-4
@@ -120,7 +121,7 @@ class RenderedSemantics(Stateless):
         if frame.mid_us in self.bounds:
             data.prefetch(("bounds", frame.mid_us), self.bounds[frame.mid_us].masks)
 
-    def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
+    def loss(self, step: Step[PaperModel | DiscModel]) -> dict[str, Tensor]:
         """``semantic`` and the pressure ``binarise`` = mean m (1 - m) (A2)."""
         values: list[Float[Tensor, ""]] = []
         for time, drawn in zip(step.times_us, step.semantic, strict=True):

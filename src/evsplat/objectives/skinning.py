@@ -7,8 +7,8 @@ from torch import Tensor
 
 from evsplat.body import SurfaceSamples
 from evsplat.capture import Frame
-from evsplat.deform.human_scene import HumanSceneModel
 from evsplat.devices import send
+from evsplat.models.paper import PaperModel
 from evsplat.objectives.base import Stateless, Step
 
 
@@ -23,16 +23,15 @@ class SkinningPrior(Stateless):
         """None: the prior lives in canonical space."""
         return ()
 
-    def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
+    def loss(self, step: Step[PaperModel]) -> dict[str, Tensor]:
         """``skinning``."""
         return {"skinning": self.of(step.model, step.generator)}
 
-    def of(self, model: HumanSceneModel, generator: torch.Generator) -> Tensor:
-        """The prior of a model with a skinning network, at random surface points."""
-        assert model.skinning is not None
+    def of(self, model: PaperModel, generator: torch.Generator) -> Tensor:
+        """The prior of a model, at random surface points."""
         chosen = torch.randint(
             len(self.surface.points), (self.points_per_step,), generator=generator
         )
         chosen = send(chosen, self.surface.points.device)
-        weights = model.skinning(model.normalise(self.surface.points[chosen]))
+        weights = model.skinning_weights(self.surface.points[chosen])
         return (weights - self.surface.weights[chosen]).square().sum(-1).mean()

@@ -9,9 +9,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from evsplat.deform.model import Model
 from evsplat.errors import DataError
 from evsplat.files import atomic_path
+from evsplat.models.model import Model
 
 KEEP = 2
 """Checkpoints kept in a run; the one before the last survives a disk that fills up."""

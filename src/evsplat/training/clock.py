@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from evsplat.methods.config import NOMINAL_ITERATIONS
+from evsplat.methods.settings import NOMINAL_ITERATIONS
 
 SMOOTHING = 0.1
 """Weight of the newest step in the running mean of the step time."""

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from evsplat.deform.model import Model
 from evsplat.gaussians import RowAdam
-from evsplat.methods.rates import Learning
+from evsplat.methods.learning import Learning
+from evsplat.models.model import Model
 
 
 class Optimiser:

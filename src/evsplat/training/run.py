@@ -17,16 +17,15 @@ from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.config import load_yaml, to_dict
-from evsplat.deform.at_rest import Skinned, mean_at_rest
-from evsplat.deform.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
-from evsplat.deform.model import Model
-from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.devices import hardware
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text
 from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
+from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
+from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
+from evsplat.models.model import Model
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import check_fits, latest_checkpoint, load_checkpoint, load_model
 
@@ -119,22 +118,18 @@ class GaussianReconstruction:
         """Pictures at the given times; see `Reconstruction`."""
         with torch.no_grad():
             camera = camera.to(self.model.device)
-            posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+            layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
             if parts == "all":
                 drawing = draw(
-                    self.model,
-                    posed,
-                    camera,
-                    backdrop=self.backdrop,
-                    shadow_step_px=self.shadow_step_px,
+                    layers, camera, backdrop=self.backdrop, shadow_step_px=self.shadow_step_px
                 )
                 return Rendering(
                     rgb=_stacked(drawing.rgb).cpu().clamp(0, 1),
                     alpha=drawing.output.alpha.cpu(),
                     human=_stacked(drawing.semantic).cpu().clamp(0, 1),
                 )
-            layer = posed.moving() if parts == "human" else posed.static()
-            output = render(layer, camera, low_pass=posed.low_pass)
+            layer = layers.human if parts == "human" else layers.scene
+            output = render(layer, camera, low_pass=layers.low_pass)
         times = len(times_us)
 
         def all_times(values: torch.Tensor) -> torch.Tensor:
@@ -153,8 +148,8 @@ class GaussianReconstruction:
         """Mean depth of what is drawn; see `WithDepth`."""
         with torch.no_grad():
             camera = camera.to(self.model.device)
-            posed = self.model.at(list(times_us), camera.center(), hard_semantics=True)
-            depth = draw_depth(posed, camera, parts=parts).cpu()
+            layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+            depth = draw_depth(layers, camera, parts=parts).cpu()
         return depth.expand(len(times_us), *depth.shape[1:])
 
     @property
@@ -177,10 +172,10 @@ class GaussianReconstruction:
     ) -> list[Splats]:
         """Gaussians at the given times; see `SplatReconstruction`."""
         center = camera.to(self.model.device).center()
-        posed = self.model.at(list(times_us), center, hard_semantics=True)
+        layers = self.model.at(list(times_us), center, hard_semantics=True)
         if parts == "all":
-            return [posed.moving(), shadowed_scene(self.model, posed)]
-        return [posed.moving() if parts == "human" else posed.static()]
+            return [layers.human, shadowed_scene(layers)]
+        return [layers.human if parts == "human" else layers.scene]
 
     def at_rest(self, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
         """The person's mean in canonical space; see `Bakeable`."""
@@ -233,8 +228,6 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
         raise DataError(f"{folder.path}: not a run folder, config.yaml is missing.")
     values = load_yaml(folder.config)
     method = values.pop("method", DEFAULT_METHOD)
-    # Before there was a policy, events of held-out intervals were open to every method.
-    values.setdefault("policy", {"held_out_events": True})
     return method, method_config(method, values, where=str(folder.config)), read_json(folder.facts)
 
 
@@ -264,9 +257,8 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
     seen = seen_by_training(capture, config)
-    compose = TRAINABLE[method][1]
-    composition = compose(
-        _without_perceptual(method, config), seen, facts["seed"], device=device, fit=False
+    composition = TRAINABLE[method].build(
+        config, seen, facts["seed"], device=device, purpose="draw"
     )
     check_fits(composition.model, tensors, path)
     load_model(composition.model, tensors, progress["human_count"])
@@ -281,13 +273,6 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         human_only=isinstance(composition.capture, MaskedCapture),
         **_progress(composition.model, progress),
     )
-
-
-def _without_perceptual(method: str, config: MethodConfig) -> MethodConfig:
-    """The settings without a term that only training needs and whose weights need not be here."""
-    values = to_dict(config)
-    values["loss"]["perceptual"] = "none"
-    return method_config(method, values, where="config.yaml")
 
 
 def reload_run(run: Run, state: Path) -> Run:

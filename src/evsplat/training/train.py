@@ -18,8 +18,8 @@ from evsplat.capture import load_capture
 from evsplat.capture.policy import Use
 from evsplat.config import load_yaml, override, save_yaml
 from evsplat.errors import ConfigError, DataError
-from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
-from evsplat.methods.config import Weight
+from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, Purpose, method_config
+from evsplat.methods.settings import Weight
 from evsplat.render import choose_device
 from evsplat.training.checkpoint import (
     check_fits,
@@ -124,12 +124,12 @@ def train(
         seed = 0 if seed is None else seed
 
     checkpoint = latest_checkpoint(folder.checkpoints) if resume else None
-    compose = TRAINABLE[method][1]
     started = time.perf_counter()
     seen = seen_by_training(capture, settings)
-    composition = compose(settings, seen, seed, device=device, fit=checkpoint is None)
+    purpose: Purpose = "train" if checkpoint is None else "resume"
+    composition = TRAINABLE[method].build(settings, seen, seed, device=device, purpose=purpose)
     clock = Clock(
-        iterations or settings.optimisation.iterations,
+        iterations or settings.iterations,
         None if max_minutes is None else 60 * max_minutes,
         shrink=max_minutes is not None and iterations is None,
         seconds=time.perf_counter() - started,
@@ -157,7 +157,7 @@ def train(
 
 def schedule_table(settings: MethodConfig, weights: dict[str, Weight]) -> str:
     """Every weight over nominal iterations, one line each."""
-    lines = [f"schedule of {settings.optimisation.iterations} iterations (nominal units):"]
+    lines = [f"schedule of {settings.iterations} iterations (nominal units):"]
     for name, weight in weights.items():
         if isinstance(weight, tuple):
             text = ", ".join(f"{value:g} from {start:g}" for start, value in weight)

@@ -11,12 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture
-from evsplat.deform.drawing import Drawing
 from evsplat.devices import DeviceCache, default_cache_bytes
 from evsplat.gaussians import GaussianSet, Part, Rows, ScreenStatistics, densify, flip_labels
-from evsplat.gaussians.densify import reset_opacities
-from evsplat.methods.composition import Composition
-from evsplat.methods.config import weight_at
+from evsplat.methods.base import Composition
+from evsplat.methods.settings import weight_at
+from evsplat.models.drawing import Drawing
 from evsplat.objectives import Objective, Step
 from evsplat.training.bad_steps import BadSteps
 from evsplat.training.checkpoint import below, flatten, load_model
@@ -115,9 +114,9 @@ class Trainer:
             return None
         self.bad.count(sound)
         # The host knows that the step is sound, or a GPU will know it.
-        unsure = None if self.bad.at_once else sound
-        self.optimiser.step(nominal, unsure)
-        self._count(step.drawing, unsure)
+        if_sound = None if self.bad.at_once else sound
+        self.optimiser.step(nominal, if_sound)
+        self._count(step.drawing, if_sound)
         self._edit(nominal)
         self._learn_held_out(nominal)
         drawn = step.drawing.rgb[step.index(frame.mid_us)].detach()
@@ -225,8 +224,8 @@ class Trainer:
             objective.prefetch(frames[self.queue[-1]], self.clock.nominal, self.data)
         return frame
 
-    def _count(self, drawing: Drawing, unsure: Tensor | None) -> None:
-        """Add the step to the statistics, nothing where ``unsure`` is false."""
+    def _count(self, drawing: Drawing, if_sound: Tensor | None) -> None:
+        """Add the step to the statistics, nothing where ``if_sound`` is false."""
         height, width = drawing.output.alpha.shape[1:]
         gradients = drawing.center_gradients()
         radii = drawing.radii()
@@ -235,8 +234,8 @@ class Trainer:
                 place = rows.rows_of(part)
                 if place.start == place.stop:
                     continue
-                if unsure is not None:
-                    gradient, radius = (torch.where(unsure, v, 0) for v in (gradient, radius))
+                if if_sound is not None:
+                    gradient, radius = (torch.where(if_sound, v, 0) for v in (gradient, radius))
                 self.statistics[name].add(place, gradient, radius, width, height)
 
     def _edit(self, nominal: float) -> None:
@@ -248,9 +247,6 @@ class Trainer:
             limits = {
                 part: limit for part, limit in self.composition.densify.items() if rows.holds(part)
             }
-            for part, limit in limits.items():
-                if any(previous < reset <= nominal for reset in limit.opacity_reset):
-                    reset_opacities(rows, optimiser, rows.rows_of(part))
             every = next((limit.every for limit in limits.values()), math.inf)
             if nominal // every == previous // every:
                 continue

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from evsplat.deform.non_rigid import NonRigid
+from evsplat.models.networks.non_rigid import NonRigid
 from evsplat.render.backdrop import same_values
 
 

@@ -4,7 +4,6 @@ import logging
 from dataclasses import asdict
 from pathlib import Path
 
-from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.errors import ConfigError, DataError
 from evsplat.export.avatar.figure import Clip, clip_of, figure_of, recorded_clip
 from evsplat.export.avatar.loss import measure_loss
@@ -12,6 +11,7 @@ from evsplat.export.avatar.package import write_avatar
 from evsplat.export.gaussians import cloud_at, facts_of, instant_of
 from evsplat.film import camera_at, load_motion_of
 from evsplat.methods.reconstruction import Bakeable, Parts
+from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.training.run import Run
 
 logger = logging.getLogger(__name__)

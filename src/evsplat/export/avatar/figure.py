@@ -9,9 +9,9 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.body.rotations import matrix_to_quaternion
-from evsplat.deform.skinned import SkinnedGaussians
 from evsplat.errors import DataError
 from evsplat.methods.reconstruction import Bakeable
+from evsplat.models.at_rest import SkinnedGaussians
 
 BONES_EACH = 4
 _MOST_JOINTS = 256

@@ -13,12 +13,12 @@ import torch
 
 from evsplat.body import BodyTrack, up_axis
 from evsplat.capture import Camera
-from evsplat.deform.shading import SurfaceLight
 from evsplat.errors import DataError
 from evsplat.export.avatar.figure import Clip, Figure
 from evsplat.export.cloud import SplatCloud, cloud_of
 from evsplat.export.formats import write_ply
 from evsplat.files import new_folder, write_json, write_text
+from evsplat.models.discs.shading import SurfaceLight
 
 FORMAT, VERSION = "evsplat-avatar", 1
 _PLAYER = files("evsplat") / "data" / "player"

@@ -165,9 +165,7 @@ class DiscModel(PosedModel):
         semantics, scene_semantics = gaussians.of_parts(labels)
 
         if float(self.nominal) >= self.non_rigid_start:
-            centers, scales, turned, _ = self.deformation(
-                means, scales_log, quaternions, rotations
-            )
+            centers, scales, turned, _ = self.deformation(means, scales_log, quaternions, rotations)
         else:
             centers, scales, turned = means[None], scales_log.exp()[None], quaternions[None]
         world, transforms = skin(centers, self.surface.weights(means)[None], bones)

@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body.rotations import matrix_to_quaternion, six_to_matrix
-from evsplat.deform.skinning_turns import SkinningTurns
 from evsplat.gaussians import OneClassRows, Shape
-from evsplat.hugs.decoders import AppearanceDecoder, GeometryDecoder, SkinningDecoder
-from evsplat.hugs.triplane import Triplane
+from evsplat.models.hugs.decoders import AppearanceDecoder, GeometryDecoder, SkinningDecoder
+from evsplat.models.hugs.triplane import Triplane
+from evsplat.models.networks.skinning_turns import SkinningTurns
 
 SH_CONSTANT = 0.28209479177387814
 """The constant spherical harmonic; colour is 0.5 more than its multiple, as 3DGS."""

@@ -3,7 +3,6 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -12,14 +11,13 @@ from torch import Tensor, nn
 from evsplat.body import BodyTrack, skin
 from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import Camera, Frame
-from evsplat.deform.drawing import Drawing, draw
-from evsplat.deform.lamps import Lamps
-from evsplat.deform.model import RowCache
-from evsplat.deform.shadow import BodyShadow
 from evsplat.devices import send
-from evsplat.gaussians import OneClassRows, PosedGaussians, PosedHuman, StaticScene
-from evsplat.hugs.human import Decoded, TriplaneHuman
-from evsplat.hugs.scene import SphericalScene
+from evsplat.gaussians import OneClassRows
+from evsplat.models.drawing import Drawing, draw
+from evsplat.models.hugs.human import Decoded, TriplaneHuman
+from evsplat.models.hugs.scene import SphericalScene
+from evsplat.models.layers import Layers, human_splats, scene_splats
+from evsplat.models.model import PosedModel, RowCache
 from evsplat.render import LOW_PASS
 
 DEGREE_EVERY = 1_000
@@ -32,26 +30,12 @@ class HugsDrawing(Drawing):
     """A drawing that remembers what the person was decoded to."""
 
     decoded: Decoded
-    shifted: bool
-    """Whether the scene is told other Gaussians' gradients, as the released code does."""
-
-    def center_gradients(self) -> tuple[Float[Tensor, "T H 2"], Float[Tensor, "1 S 2"]]:
-        """Gradients of the projected centres of person and scene, pixels.
-
-        The released code draws one array, the person's Gaussians first, and takes the gradients of
-        its first rows for the scene's.
-        """
-        human, scene = super().center_gradients()
-        if not self.shifted:
-            return human, scene
-        return human, torch.cat([human, scene], 1)[:, : scene.shape[1]]
 
 
-class HugsModel(nn.Module):
+class HugsModel(PosedModel):
     """Both sets, and the body track with a correction of the pose per training frame."""
 
-    shadow: BodyShadow | None = None
-    lamps: Lamps | None = None
+    frame_times: Tensor
 
     def __init__(
         self,
@@ -59,40 +43,21 @@ class HugsModel(nn.Module):
         scene: SphericalScene,
         track: BodyTrack,
         frame_times_us: Sequence[int],
-        *,
-        release_compatible: bool,
     ) -> None:
         """``frame_times_us`` are the mid-exposures of the training frames."""
-        super().__init__()
-        self.human, self.scene, self.track = human, scene, track
-        self.release_compatible = release_compatible
-        self.row_caches: dict[str, RowCache] = {"skinning_turns": human.skinning_turns}
+        super().__init__(track)
+        self.human, self.scene = human, scene
         frames, joints = len(frame_times_us), len(track.body.parents)
         self.turns = nn.Parameter(torch.tensor(_NO_TURN).repeat(frames, joints, 1))
         """Rotation after each joint's own, six numbers, see `six_to_matrix`."""
         self.shifts = nn.Parameter(torch.zeros(frames, 3))
         """Added to the body's translation, metres."""
-        self.frame_times: Tensor
-        self.nominal: Tensor
         times = torch.tensor(list(frame_times_us), dtype=torch.float64)
         self.register_buffer("frame_times", times)
-        self.register_buffer("nominal", torch.zeros((), dtype=torch.float64))
-
-    def _apply(self, fn: Any, recurse: bool = True) -> "HugsModel":
-        nominal = self.nominal
-        super()._apply(fn, recurse)
-        self.nominal = nominal  # read by the host
-        self.track = self.track.to(self.device)
-        return self
-
-    @property
-    def device(self) -> torch.device:
-        """Where the Gaussians are."""
-        return self.frame_times.device
 
     @property
     def low_pass(self) -> float:
-        """What a pixel integrates over, px^2."""
+        """Variance of the filter of a pixel, px^2: that of 3DGS."""
         return LOW_PASS
 
     @property
@@ -101,12 +66,14 @@ class HugsModel(nn.Module):
         return {"human": self.human, "scene": self.scene}
 
     @property
-    def active_degree(self) -> int:
-        """Degree of the scene's harmonics that are drawn.
+    def row_caches(self) -> dict[str, RowCache]:
+        """Skinning weights that are a few steps old."""
+        return {"skinning_turns": self.human.skinning_turns}
 
-        The released code draws both sets with the person's, which is 0.
-        """
-        return 0 if self.release_compatible else min(3, int(self.nominal) // DEGREE_EVERY)
+    @property
+    def active_degree(self) -> int:
+        """Degree of the scene's harmonics that are drawn."""
+        return min(3, int(self.nominal) // DEGREE_EVERY)
 
     def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4).
@@ -135,9 +102,9 @@ class HugsModel(nn.Module):
         camera_center: Float[Tensor, "3"],
         *,
         hard_semantics: bool = True,
-    ) -> PosedGaussians:
+    ) -> Layers:
         """All Gaussians in the world; the classes are hard whatever is asked for."""
-        return self._posed(self.human.look_up(self.human.means), times_us, camera_center)
+        return self._layers(self.human.look_up(self.human.means), times_us, camera_center)
 
     def training_drawing(
         self,
@@ -146,14 +113,12 @@ class HugsModel(nn.Module):
         camera: Camera,
         generator: torch.Generator,
     ) -> Drawing:
-        """Person and scene over a random colour, the person alone over black; see `Model`."""
-        background = None
-        if len(self.scene):
-            background = send(torch.rand(3, generator=generator), self.device)
+        """Person and scene over a random colour; see `Model`."""
+        background = send(torch.rand(3, generator=generator), self.device)
         decoded = self.human.for_training()
-        posed = self._posed(decoded, times_us, camera.center())
-        drawing = draw(self, posed, camera, center_gradients=True, background=background)
-        return HugsDrawing(**vars(drawing), decoded=decoded, shifted=self.release_compatible)
+        layers = self._layers(decoded, times_us, camera.center())
+        drawing = draw(layers, camera, center_gradients=True, background=background)
+        return HugsDrawing(**vars(drawing), decoded=decoded)
 
     def following(self, track: BodyTrack) -> "HugsModel":
         """The same person doing what ``track`` says, without the corrections; see `Model`."""
@@ -164,29 +129,29 @@ class HugsModel(nn.Module):
             model.shifts.zero_()
         return model
 
-    def _posed(
-        self, decoded: Decoded, times_us: Sequence[int], camera_center: Tensor
-    ) -> PosedGaussians:
+    def _layers(
+        self, decoded: Decoded, times_us: Sequence[int], camera_center: Float[Tensor, "3"]
+    ) -> Layers:
         human, scene = self.human, self.scene
         _, bones = self.pose(times_us)
         world, transforms = skin(human.means + decoded.offsets, decoded.weights, bones)
-        times = (len(times_us), -1, -1)
-        return PosedGaussians(
-            human=PosedHuman(
+        return Layers(
+            human_splats(
                 world,
-                decoded.quaternions().expand(times),
-                (decoded.scales * human.multipliers()).expand(times),
-                decoded.rgb.expand(times),
+                decoded.quaternions()[None],
+                (decoded.scales * human.multipliers())[None],
+                decoded.opacities,
+                decoded.rgb[None],
+                torch.ones_like(decoded.opacities),
                 transforms,
             ),
-            scene=StaticScene(
+            scene_splats(
                 scene.means,
                 scene.quaternions,
                 scene.scales_log.exp(),
+                scene.opacities(),
                 scene.rgb(camera_center, self.active_degree),
+                torch.zeros_like(scene.opacity_logits),
             ),
-            human_opacities=decoded.opacities,
-            scene_opacities=scene.opacities(),
-            human_semantics=torch.ones_like(decoded.opacities),
-            scene_semantics=torch.zeros_like(scene.opacity_logits),
+            transforms,
         )

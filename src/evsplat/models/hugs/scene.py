@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from evsplat.deform.spherical_harmonics import sh_basis
 from evsplat.gaussians import OneClassRows, Shape
-from evsplat.hugs.human import SH_CONSTANT
+from evsplat.models.hugs.human import SH_CONSTANT
+from evsplat.models.networks.spherical_harmonics import sh_basis
 
 
 class SphericalScene(OneClassRows):

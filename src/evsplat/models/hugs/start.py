@@ -7,7 +7,7 @@ from torch import Tensor
 from evsplat.body import SurfaceSamples
 from evsplat.body.rotations import matrix_to_six
 from evsplat.devices import send
-from evsplat.hugs.human import TriplaneHuman
+from evsplat.models.hugs.human import TriplaneHuman
 from evsplat.neighbours import nearest
 
 START_COLOUR, START_OPACITY = 0.5, 0.1

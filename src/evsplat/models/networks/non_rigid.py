@@ -10,8 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import quaternion_multiply
 from evsplat.compiled import native, runs_native
-from evsplat.deform.encodings import HashGridEncoding, OneBlobEncoding
-from evsplat.deform.mlp import PointMLP
+from evsplat.models.networks.encodings import OneBlobEncoding
+from evsplat.models.networks.mlp import PointMLP
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class NonRigidNetwork(nn.Module):
 
     def __init__(
         self,
-        encoding: OneBlobEncoding | HashGridEncoding,
+        encoding: OneBlobEncoding,
         pose_dim: int,
         width: int = 128,
         depth: int = 3,

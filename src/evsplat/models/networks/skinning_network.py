@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body.tree import joint_depths
 from evsplat.compiled import native, runs_native
-from evsplat.deform.mlp import PointMLP
+from evsplat.models.networks.mlp import PointMLP
 
 
 class HierarchicalSoftmax(nn.Module):

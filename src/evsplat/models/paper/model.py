@@ -30,7 +30,7 @@ COLOUR_FEATURE_DIM = 16
 """Values that the non-rigid network gives to the person's colour (1.5)."""
 
 Semantics = Literal["fixed", "ste", "rendered"]
-"""How the attribute learns: not at all, by straight-through placement, by the rendered attribute."""
+"""Teacher of the attribute: none, straight-through placement, the rendered attribute."""
 
 
 @dataclass(frozen=True)
