@@ -20,10 +20,10 @@ from evsplat.config import (
     from_dict,
     load_yaml,
     override,
-    save_yaml,
     settings,
     to_dict,
 )
+from evsplat.config_docs import save_yaml
 from evsplat.errors import ConfigError
 from evsplat.methods import TRAINABLE, PaperConfig, method_config
 from evsplat.methods.evsplat import EvsplatConfig

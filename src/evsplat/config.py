@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import yaml
 
 from evsplat.errors import ConfigError
-from evsplat.files import read_text, without_advice, write_text
+from evsplat.files import read_text, without_advice
 
 Config = TypeVar("Config")
 _DEEPEST = 50
@@ -213,11 +213,6 @@ def from_dict(cls: type[Config], values: Any, *, where: str) -> Config:
     config: Config = _convert(cls, values, where, "")
     check_read(config, where)
     return config
-
-
-def save_yaml(path: Path | str, config: Any) -> None:
-    """Write a configuration so that `load_yaml` gives it back."""
-    write_text(path, yaml.safe_dump(to_dict(config), sort_keys=False))
 
 
 def load_yaml(path: Path | str) -> dict[str, Any]:

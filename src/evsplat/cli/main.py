@@ -22,6 +22,7 @@ from evsplat.cli.masks import masks
 from evsplat.cli.render import render
 from evsplat.cli.report import report
 from evsplat.cli.restore import restore
+from evsplat.cli.settings import settings
 from evsplat.cli.simulate import simulate
 from evsplat.cli.stage import stage
 from evsplat.cli.synthesize import synthesize
@@ -33,7 +34,7 @@ _VERBS: dict[str, Callable[..., Any]] = {
     verb.__name__.rstrip("_"): verb
     for verb in (
         *(demo, doctor, import_, convert, simulate, synthesize, stage, inspect),
-        *(masks, restore, train, evaluate, report, render, view, export, bench),
+        *(masks, restore, settings, train, evaluate, report, render, view, export, bench),
     )
 }
 _DESCRIPTION = (

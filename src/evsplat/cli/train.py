@@ -43,7 +43,7 @@ def train(
         max_minutes: Minutes of training after which to stop gracefully, save and evaluate.
         resume: Go on from the last checkpoint in --out.
         config: A config.yaml of an earlier run to start from.
-        overrides: Configuration values to change, such as event.weight=0.2.
+        overrides: Settings to change, such as event.weight=0.2; see docs/settings.md.
         threads: CPU threads.
         device_memory_gb: GPU memory for recorded pictures and event maps.
         seed: Seed of every random number.

@@ -236,11 +236,6 @@ def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:
     return capture.for_training(config.policy, MASKERS["background"])
 
 
-def config_values(method: str, config: MethodConfig) -> dict[str, Any]:
-    """What config.yaml holds."""
-    return {"method": method, **to_dict(config)}
-
-
 def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = None) -> Run:
     """Read a run at its last checkpoint; a folder without one is a `DataError`.
 

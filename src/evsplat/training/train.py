@@ -16,7 +16,8 @@ from tqdm import tqdm
 
 from evsplat.capture import load_capture
 from evsplat.capture.policy import Use
-from evsplat.config import load_yaml, override, save_yaml
+from evsplat.config import load_yaml, override
+from evsplat.config_docs import save_yaml
 from evsplat.errors import ConfigError, DataError
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, Purpose, method_config
 from evsplat.methods.settings import Weight
@@ -30,7 +31,6 @@ from evsplat.training.checkpoint import (
 from evsplat.training.clock import Clock
 from evsplat.training.run import (
     RunFolder,
-    config_values,
     new_run_folder,
     read_config,
     seen_by_training,
@@ -145,7 +145,7 @@ def train(
         folder.truncate_log(clock.iteration)
     else:
         folder.path.mkdir(parents=True, exist_ok=True)
-        save_yaml(folder.config, config_values(method, settings))
+        save_yaml(folder.config, settings, method=method)
         write_facts(folder, capture, method, device, seed)
         logger.info("%s", schedule_table(settings, composition.weights))
         logger.info("%s", seen.terms.sentence)
