@@ -25,7 +25,6 @@ from evsplat.deform import (
     PoseEncoder,
     SceneColour,
     SkinningNetwork,
-    make_encoding,
     normalise_joints,
 )
 from evsplat.deform.skinning_grid import SkinningGrid
@@ -85,17 +84,16 @@ def _cases(points: int, times: int) -> dict[str, tuple[Callable[[], object], flo
             6 * times * (joints * 19 * 25 + 12 * joints * 6),
         )
     }
-    for kind in ("oneblob", "hashgrid"):
-        network = NonRigidNetwork(make_encoding(kind), encoder.dim, last_layer_std=None)
-        encoding = network.encoding
-        cases[f"encoding_{kind}"] = (lambda e=encoding: _step(e(0.5 * (positions + 1))), 0.0)
+    network = NonRigidNetwork(encoder.dim, last_layer_std=None)
+    encoding = network.encoding
+    cases["encoding"] = (lambda: _step(encoding(0.5 * (positions + 1))), 0.0)
 
-        def non_rigid(network: NonRigidNetwork = network) -> None:
-            out = network(positions, pose)
-            _step(out.offset, out.log_scale, out.rotation, out.feature)
+    def non_rigid() -> None:
+        out = network(positions, pose)
+        _step(out.offset, out.log_scale, out.rotation, out.feature)
 
-        products = 6 * points * encoding.dim * 128 + 2 * hidden + 6 * rows * 128 * 25
-        cases[f"non_rigid_{kind}"] = (non_rigid, products)
+    products = 6 * points * encoding.dim * 128 + 2 * hidden + 6 * rows * 128 * 25
+    cases["non_rigid"] = (non_rigid, products)
     products = 6 * rows * 128 * (3 + skinning.softmax.logits) + 3 * hidden
     cases["skinning"] = (lambda: _step(skinning(posed)), products)
     low, high = bounding_box(body)

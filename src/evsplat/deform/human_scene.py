@@ -14,7 +14,6 @@ from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.capture import Camera, Frame
 from evsplat.deform.colour import HumanColour, SceneColour, view_directions, view_jitter
 from evsplat.deform.drawing import Drawing, draw
-from evsplat.deform.encodings import make_encoding
 from evsplat.deform.frame_weights import UnseenFrames, interpolated, seen, seen_or_last
 from evsplat.deform.lamps import Lamps
 from evsplat.deform.mlp import PointMLP, Precision
@@ -52,9 +51,6 @@ Semantics = Literal["fixed", "ste", "rendered", "two_branch"]
 class DeformConfig:
     """Networks that move and colour Gaussians (3DGS-Avatar; reference 1.4-1.8)."""
 
-    encoding: Literal["oneblob", "hashgrid"] = "oneblob"
-    """Position encoding of the non-rigid network. The released 3DGS-Avatar asks for a hash grid and
-    gets one-blob (reference 1.5); the smooth one generalises better to held-out poses."""
     width: int = 128
     """Hidden width of the non-rigid and the skinning network."""
     non_rigid_depth: int = 3
@@ -157,7 +153,6 @@ class HumanSceneModel(nn.Module):
         joints_seen = normalise_joints(body.rest_joints, body.rest_vertices)
         self.pose_encoder = PoseEncoder(parents, joints_seen)
         self.non_rigid = NonRigidNetwork(
-            make_encoding(config.encoding),
             self.pose_encoder.dim,
             width=config.width,
             depth=config.non_rigid_depth,
