@@ -31,23 +31,15 @@ class Drawing:
     static: Splats
 
     def center_gradients(self) -> tuple[Float[Tensor, "T H 2"], Float[Tensor, "1 S 2"]]:
-        """Gradients of the projected centres of person and scene, per pixel, after backward.
-
-        Those of the rows themselves, not of second copies.
-        """
+        """Gradients of the projected centres of person and scene, per pixel, after backward."""
         moving, static = self.moving.centers2d_offset, self.static.centers2d_offset
         assert moving is not None and moving.grad is not None
         assert static is not None and static.grad is not None
-        people, things = self._counts()
-        return moving.grad[:, :people], static.grad[:, :things]
+        return moving.grad, static.grad
 
     def radii(self) -> tuple[Int[Tensor, "T H"], Int[Tensor, "1 S"]]:
         """Radii on the screen of the same rows, pixels; 0 = not drawn."""
-        people, things = self._counts()
-        return self.output.radii[:, :people], self.output.static_radii[:, :things]
-
-    def _counts(self) -> tuple[int, int]:
-        return len(self.posed.human_opacities), len(self.posed.scene_opacities)
+        return self.output.radii, self.output.static_radii
 
 
 class _Drawable(Protocol):

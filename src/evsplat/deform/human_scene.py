@@ -26,7 +26,6 @@ from evsplat.deform.shadow import BodyShadow
 from evsplat.deform.skinning_grid import SkinningGrid
 from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.deform.skinning_turns import SkinningTurns
-from evsplat.deform.two_branch import Branches, Open
 from evsplat.devices import send
 from evsplat.errors import ConfigError
 from evsplat.gaussians import (
@@ -44,7 +43,7 @@ NORMAL_SAMPLES = 20_000
 CASTERS = 400
 """Points of the body that hide lights."""
 
-Semantics = Literal["fixed", "ste", "rendered", "two_branch"]
+Semantics = Literal["fixed", "ste", "rendered"]
 
 
 @dataclass(frozen=True)
@@ -191,8 +190,6 @@ class HumanSceneModel(nn.Module):
         """What is learned of the event camera, by methods that do."""
         self.shading: Shading | None = None
         self.shadow: BodyShadow | None = None
-        self.branches: Branches | None = None
-        """What `two_branch` draws twice in training; see `draw_twice`."""
         self.row_caches: dict[str, RowCache] = {"skinning_turns": self.skinning_turns}
         generator = torch.Generator().manual_seed(0)
         if config.shading or config.skinning == "surface":
@@ -261,10 +258,6 @@ class HumanSceneModel(nn.Module):
         start = self.config.pose_correction_start
         return start is not None and float(self.nominal) >= start
 
-    def draw_twice(self, branches: Branches) -> None:
-        """From now on draw rows of an open class twice in training."""
-        self.branches = self.row_caches["branches"] = branches
-
     def normalise(self, positions: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
         """Canonical metres to [-1, 1] over the enlarged bounding box of the body."""
         return 2 * (positions - self.box_low) / (self.box_high - self.box_low) - 1
@@ -314,7 +307,6 @@ class HumanSceneModel(nn.Module):
         hard_semantics: bool = False,
         share_skinning: bool = False,
         networks_at_us: int | None = None,
-        both_branches: bool = False,
         shown: PinholeCamera | None = None,
     ) -> PosedGaussians:
         """All Gaussians in world space at ``times_us``, coloured for a camera at that centre.
@@ -329,25 +321,19 @@ class HumanSceneModel(nn.Module):
         ``hard_semantics`` puts the hard label into the semantic channel (evaluation); otherwise it
         is the soft attribute m.
 
-        ``both_branches`` adds second copies of rows whose class is open, see `Branches`.
-
         ``shown``: only this camera's picture is asked for; rows of the scene outside of it may be
         black.
         """
         gaussians = self.gaussians
         parts = {name: gaussians.of_parts(getattr(gaussians, name)) for name in ATTRIBUTES}
-        twice = None
-        if both_branches and self.branches is not None:
-            twice = self.branches.of(gaussians, float(self.nominal))
         rotations, bones = self.pose(times_us)
-        moving = self._moving(parts, twice)
+        moving = self._moving(parts)
         seen_times, seen = list(times_us), rotations
         if networks_at_us is not None:
             seen_times, seen = [networks_at_us], self.pose([networks_at_us])[0]
         deformed, scales, quaternions, feature = self._non_rigid(moving, seen, noise)
         if self.skinning is None:
-            weights = self.surface.weights(parts["means"][0])
-            weights = (weights if twice is None else torch.cat([weights, twice.weights]))[None]
+            weights = self.surface.weights(parts["means"][0])[None]
         elif share_skinning:
             shared = self.normalise(deformed.mean(0))
             weights = self.skinning_turns.weights(self.skinning, shared)[None]
@@ -399,21 +385,9 @@ class HumanSceneModel(nn.Module):
 
         scene_scales = parts["scales_log"][1].exp()
         rows = None
-        if shown is not None and twice is None:  # else the colours are read by other rows as well
+        if shown is not None:
             rows = rows_in_view(scene_means, scene_scales, shown)
         scene_rgb = self._scene_rgb(scene_features, scene_means, rows, camera_center, noise)
-        copies = None
-        if twice is not None:
-            shares = twice.shares(gaussians)
-            soft = torch.where(shares < 1, gaussians.human_mask().to(soft.dtype), soft)
-            rest = slice(gaussians.human_count, None)
-            copies = twice.copies(
-                gaussians,
-                opacities * (1 - shares),
-                posed(rest, world[:, rest], rgb[:, twice.human_donors]),
-                scene_rgb[twice.scene_donors],
-            )
-            opacities = opacities * shares
         human_opacities, scene_opacities = gaussians.of_parts(opacities)
         human_semantics, scene_semantics = gaussians.of_parts(soft)
         return PosedGaussians(
@@ -424,7 +398,6 @@ class HumanSceneModel(nn.Module):
             human_semantics,
             scene_semantics,
             casters=casters,
-            copies=copies,
             low_pass=self.low_pass,
         )
 
@@ -443,7 +416,6 @@ class HumanSceneModel(nn.Module):
             noise=self.draw_noise(1 if once else len(times_us), generator),
             share_skinning=True,
             networks_at_us=frame.mid_us if once else None,
-            both_branches=True,
             shown=camera,
         )
         return draw(self, posed, camera, center_gradients=True)
@@ -474,16 +446,8 @@ class HumanSceneModel(nn.Module):
         hide = float(torch.rand((), generator=generator)) < config.scene_direction_dropout
         return Noise(rotations, send(turn, self.box_low.device), hide)
 
-    def _moving(
-        self, parts: dict[str, tuple[Tensor, Tensor]], twice: Open | None = None
-    ) -> dict[str, Tensor]:
-        """What the networks see: the person, and scene rows that stand for it as well.
-
-        Those are the ones drawn ``twice``, or with ``ste`` those inside the box.
-        """
-        if twice is not None:
-            more = twice.canonical({name: scene for name, (_, scene) in parts.items()})
-            return {name: torch.cat([human, more[name]]) for name, (human, _) in parts.items()}
+    def _moving(self, parts: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+        """What the networks see: the person, with ``ste`` scene rows inside the box as well."""
         if self.semantics != "ste":
             return {name: human for name, (human, _) in parts.items()}
         inside = self._scene_inside_box()

@@ -11,7 +11,7 @@ from evsplat.gaussians.gaussian_set import (
     Rows,
     Shape,
 )
-from evsplat.gaussians.posed import PosedGaussians, PosedHuman, SecondCopies, StaticScene
+from evsplat.gaussians.posed import PosedGaussians, PosedHuman, StaticScene
 from evsplat.gaussians.row_adam import RowAdam
 
 __all__ = [
@@ -28,7 +28,6 @@ __all__ = [
     "RowAdam",
     "Rows",
     "ScreenStatistics",
-    "SecondCopies",
     "Shape",
     "StaticScene",
     "densify",

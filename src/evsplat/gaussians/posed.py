@@ -1,6 +1,6 @@
 """The Gaussian set at given times: everything in world space, ready to be drawn."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -33,18 +33,6 @@ class StaticScene:
 
 
 @dataclass(frozen=True)
-class SecondCopies:
-    """Rows whose class is open, once more in the class that is not theirs."""
-
-    human: PosedHuman
-    """K rows of the scene, posed."""
-    scene: StaticScene
-    """L rows of the person, standing still."""
-    human_opacities: Float[Tensor, " K"]
-    scene_opacities: Float[Tensor, " L"]
-
-
-@dataclass(frozen=True)
 class PosedGaussians:
     """Both classes with what they share; opacities and semantics are person first."""
 
@@ -57,8 +45,6 @@ class PosedGaussians:
     scene_semantics: Float[Tensor, " S"]
     casters: Float[Tensor, "T P 3"] | None = None
     """Points of the body that hide the light; without them there are no shadows."""
-    copies: SecondCopies | None = None
-    """Drawn besides, after the rows of their layer."""
     low_pass: float = LOW_PASS
     """What the pixels of a picture integrate over, px^2; see `evsplat.render.render`."""
 
@@ -69,36 +55,24 @@ class PosedGaussians:
 
     def moving(self) -> Splats:
         """What the rasteriser draws of the person; channels are RGB and the semantic attribute."""
-        person, opacities, semantics = self.human, self.human_opacities, self.human_semantics
-        if (copies := self.copies) is not None:
-            pairs = [
-                (getattr(person, f.name), getattr(copies.human, f.name)) for f in fields(person)
-            ]
-            person = PosedHuman(*(torch.cat(pair, 1) for pair in pairs))
-            opacities = torch.cat([opacities, copies.human_opacities])
-            semantics = torch.cat([semantics, torch.ones_like(copies.human_opacities)])
-        channel = semantics[None, :, None].expand(self.times, -1, 1)
+        person = self.human
+        channel = self.human_semantics[None, :, None].expand(self.times, -1, 1)
         return Splats(
             person.means,
             person.quaternions,
             person.scales,
-            opacities,
+            self.human_opacities,
             torch.cat([person.rgb, channel], dim=-1),
             person.transforms[..., :3, :3],
         )
 
     def static(self) -> Splats:
         """The same of the scene, one for all times."""
-        scene, opacities, semantics = self.scene, self.scene_opacities, self.scene_semantics
-        if (copies := self.copies) is not None:
-            pairs = [(getattr(scene, f.name), getattr(copies.scene, f.name)) for f in fields(scene)]
-            scene = StaticScene(*(torch.cat(pair) for pair in pairs))
-            opacities = torch.cat([opacities, copies.scene_opacities])
-            semantics = torch.cat([semantics, torch.zeros_like(copies.scene_opacities)])
+        scene = self.scene
         return Splats(
             scene.means[None],
             scene.quaternions,
             scene.scales,
-            opacities,
-            torch.cat([scene.rgb, semantics[:, None]], dim=-1)[None],
+            self.scene_opacities,
+            torch.cat([scene.rgb, self.scene_semantics[:, None]], dim=-1)[None],
         )

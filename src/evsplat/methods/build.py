@@ -10,7 +10,6 @@ from evsplat.capture import Policy, TrainingCapture
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
 from evsplat.deform.mlp import bfloat16_runs
 from evsplat.deform.pose_spline import PoseSpline
-from evsplat.deform.two_branch import Branches
 from evsplat.errors import DataError
 from evsplat.gaussians import BodyFrames, DensifyConfig, GaussianSet, Part
 from evsplat.methods.composition import Composition, HeldOut
@@ -117,11 +116,7 @@ class Build:
         prior = SkinningPrior(ground.surface.to(device), config.skinning_points)
         if fit and model.skinning is not None:
             fit_skinning(model, prior, config.skinning_prefit_steps, ground.generator)
-        build = cls(ground, model, prior)
-        if semantics == "two_branch":
-            window = config.optimisation.semantics_window
-            model.draw_twice(Branches(build.body_frames(), window))
-        return build
+        return cls(ground, model, prior)
 
     def body_frames(self) -> BodyFrames:
         """The body as given at the training frames."""

@@ -68,8 +68,7 @@ class PaperConfig(PersonConfig):
 
     semantics: Semantics = "rendered"
     """How the attribute learns (A2): ``fixed``; ``ste`` (straight-through); ``rendered``, by the
-    posed body's silhouette; ``two_branch``, by that and by which copy explains the pixels of
-    Gaussians that are drawn both posed and standing still while 0.05 < m < 0.95."""
+    posed body's silhouette."""
     semantic_start: float = 2.0
     """Labels start as logits +a and -a (A1)."""
     semantic_band_px_at_256: float = 9.0
@@ -156,7 +155,7 @@ def composition(
     terms beside ``l1`` and ``dssim``; ``held_out`` is what held-out frames teach.
     """
     ground = build.ground
-    if config.semantics in ("rendered", "two_branch"):
+    if config.semantics == "rendered":
         bounds = _bounds(config, ground.capture, ground.track)
         observed = [*observed, RenderedSemantics(bounds)]
     return build.composition(
