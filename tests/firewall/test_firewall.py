@@ -51,7 +51,7 @@ METHODS = {
     "evsplat": ("evsplat", EVSPLAT),
     "evsplat with all that can be switched on": (
         "evsplat",
-        (*EVSPLAT, "edi.weight=0.5", "edi.until=15000", "windows.clock=always",
+        (*EVSPLAT, "windows.clock=always",
          "pose.refine=always", "pose.smooth=always", "semantic_activity=true",
          "windows.pixel_thresholds=true"),
     ),

@@ -28,7 +28,6 @@ from evsplat.methods.paper import (
 from evsplat.methods.poses import PoseConfig, prepare_poses
 from evsplat.methods.starts import HumanStartConfig
 from evsplat.objectives import (
-    EdiTarget,
     EventNoise,
     EventSensor,
     EventWindows,
@@ -82,22 +81,6 @@ class WindowConfig:
 
 
 @dataclass(frozen=True)
-class EdiConfig:
-    """Frames sharpened by the events of their exposure, as targets at mid-exposure.
-
-    For events with polarity; thresholds are those that the windows start from.
-    """
-
-    alone_until: float = 0.0
-    """Nominal iteration until which they stand in place of the blurry frames, at weight 1: one
-    render a step brings the person into place."""
-    weight: float = 0.0
-    """From then on, beside the blurry frames."""
-    until: float = 8_000.0
-    """Nominal iteration at which they are gone; the weight falls to there in a straight line."""
-
-
-@dataclass(frozen=True)
 class EvsplatConfig(PaperConfig):
     """All settings of method `evsplat`; those of `paper` that it shares keep their names."""
 
@@ -107,7 +90,6 @@ class EvsplatConfig(PaperConfig):
     """Without isometry: discs that hang on the body's own weights stretch with it already."""
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
-    edi: EdiConfig = field(default_factory=EdiConfig)
     event_term: Literal["windows", "paper"] = "windows"
     """``paper`` compares normalised changes between neighbouring frames' middles (its eq. 8-9) in
     place of windows."""
@@ -167,14 +149,11 @@ def compose(
         )
         for frame in capture.train_frames
     }
-    windows = edi = held_out = None
+    windows = held_out = None
     if config.event.weight != 0.0 and config.event_term == "windows" and capture.events is not None:
         windows = _windows(config.windows, capture, build, device=device, fit=fit)
-        edi = _edi(config.edi, capture, windows)
         held_out = _held_out(config, capture, build, windows)
-    alone_until = 0.0 if edi is None else config.edi.alone_until
-    exposure = Exposure(capture, renders, build.ground.generator, start=alone_until)
-    observed: list[Objective] = [exposure]
+    observed: list[Objective] = [Exposure(capture, renders, build.ground.generator)]
     weights: dict[str, Weight] = {}
     if poses.spline is not None:
         observed.append(PosePrior(poses.priced_us))
@@ -190,9 +169,6 @@ def compose(
         else:
             observed.append(windows)
             weights["contrast"] = config.windows.contrast_weight
-    if edi is not None:
-        observed.append(edi)
-        weights["edi"] = 1.0
     return composition(config, build, observed, weights, held_out)
 
 
@@ -248,21 +224,6 @@ def _windows(
         noise=EventNoise(capture.events, aware=windows.noise_aware),
         reach=windows.reach,
         begun_us=windows.begun_us,
-    )
-
-
-def _edi(config: EdiConfig, capture: TrainingCapture, windows: EventWindows) -> EdiTarget | None:
-    """The frames sharpened by their events, where they are asked for and events have polarity."""
-    asked = config.alone_until > 0.0 or config.weight > 0.0
-    if not asked or not windows.events.has_polarity:
-        return None
-    return EdiTarget(
-        capture,
-        windows.sensor,
-        windows.noise,
-        alone_until=config.alone_until,
-        weight=config.weight,
-        end=config.until,
     )
 
 

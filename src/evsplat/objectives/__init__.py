@@ -3,7 +3,6 @@
 from evsplat.objectives.activity import Activity
 from evsplat.objectives.alpha import Alpha
 from evsplat.objectives.base import Objective, Step
-from evsplat.objectives.edi import EdiTarget
 from evsplat.objectives.event import EventChange, event_loss
 from evsplat.objectives.event_noise import EventNoise
 from evsplat.objectives.event_sensor import EventSensor
@@ -19,7 +18,6 @@ from evsplat.objectives.skinning import SkinningPrior
 __all__ = [
     "Activity",
     "Alpha",
-    "EdiTarget",
     "EventChange",
     "EventNoise",
     "EventSensor",

@@ -46,21 +46,13 @@ class Exposure(Stateless):
     """
 
     def __init__(
-        self,
-        capture: TrainingCapture,
-        renders: dict[str, int],
-        generator: torch.Generator,
-        *,
-        start: float = 0.0,
+        self, capture: TrainingCapture, renders: dict[str, int], generator: torch.Generator
     ) -> None:
-        """``renders``: K per training frame's name, odd; ``start``: first nominal iteration."""
+        """``renders``: K per training frame's name, odd."""
         self.capture, self.renders, self.generator = capture, renders, generator
-        self.start = start
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """K distinct times, the middle of the exposure among them."""
-        if nominal < self.start:
-            return ()
         start, end = frame.exposure_us
         count = self.renders[frame.name]
         places = torch.arange(count) + torch.rand(count, generator=self.generator)
@@ -74,8 +66,6 @@ class Exposure(Stateless):
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``l1`` and ``dssim`` of the drawn frame."""
-        if step.nominal < self.start:
-            return {}
         start, end = step.frame.exposure_us
         first, last = (bisect_left(step.times_us, time) for time in (start, end))
         mean = step.linear[first:last].mean(0)
