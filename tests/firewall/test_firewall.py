@@ -52,7 +52,7 @@ METHODS = {
     "evsplat with all that can be switched on": (
         "evsplat",
         (*EVSPLAT, "windows.clock=always",
-         "pose.refine=always", "pose.smooth=always", "semantic_activity=true",
+         "pose.refine=always", "pose.smooth=always",
          "windows.pixel_thresholds=true"),
     ),
     "evsplat with the paper's events": ("evsplat", (*EVSPLAT, "event_term=paper")),

@@ -19,7 +19,6 @@ from evsplat.methods.config import Weight
 from evsplat.methods.prefit import fit_scene, fit_scene_colours
 from evsplat.methods.starts import FittedSceneConfig, human_start, scene_start
 from evsplat.objectives import (
-    Activity,
     EventChange,
     Objective,
     PackedBounds,
@@ -73,9 +72,6 @@ class PaperConfig(PersonConfig):
     """Labels start as logits +a and -a (A1)."""
     semantic_band_px_at_256: float = 9.0
     """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
-    semantic_activity: bool = False
-    """Pixels of that band at which no event tells of anything moving are the scene's, where the
-    body beside them moves; static cameras with events only (A8)."""
     scene: FittedSceneConfig = field(default_factory=FittedSceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     event: EventConfig = field(default_factory=EventConfig)
@@ -183,13 +179,11 @@ def _bounds(
 ) -> dict[int, PackedBounds]:
     """Where the posed body says that the person is, by mid-exposure."""
     bounds = {}
-    activity = Activity.of(capture) if config.semantic_activity else None
     for frame in capture.train_frames:
         camera = capture.camera(frame)
         mask = silhouette(track.vertices(frame.mid_us), track.body.faces, camera)
         band = max(1, round(config.semantic_band_px_at_256 * camera.height / 256))
-        still = None if activity is None else activity.still_scene(frame, track, mask.numpy(), band)
-        bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band, still)
+        bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band)
     return bounds
 
 

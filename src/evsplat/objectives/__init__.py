@@ -1,6 +1,5 @@
 """Losses, each a small object: which times it needs, what it compares."""
 
-from evsplat.objectives.activity import Activity
 from evsplat.objectives.alpha import Alpha
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event import EventChange, event_loss
@@ -16,7 +15,6 @@ from evsplat.objectives.semantic import PackedBounds, RenderedSemantics, silhoue
 from evsplat.objectives.skinning import SkinningPrior
 
 __all__ = [
-    "Activity",
     "Alpha",
     "EventChange",
     "EventNoise",
