@@ -23,7 +23,6 @@ from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
 from evsplat.deform.pose_spline import PoseSpline
 from evsplat.deform.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.deform.shadow import BodyShadow
-from evsplat.deform.skinning_grid import SkinningGrid
 from evsplat.deform.skinning_network import SkinningNetwork
 from evsplat.deform.skinning_turns import SkinningTurns
 from evsplat.devices import send
@@ -64,10 +63,6 @@ class DeformConfig:
     the body's surface, which costs nothing and is what the network's prior asks for."""
     skinning_turns: int = 4
     """A training step looks up the skinning weights of one row in so many, in turns; 1 = of all."""
-    skinning_grid: int = 0
-    """Draw a trained person with skinning weights baked on a voxel grid of so many cells along each
-    side of the body's box, 8 to 256: less exact, and faster from ten pictures on; 0 = by the
-    network. See docs/performance.md."""
     human_colour: Literal["network", "own"] = "network"
     """The person's canonical colours: by the network, or a colour of each Gaussian's own."""
     colour_width: int = 64
@@ -168,12 +163,6 @@ class HumanSceneModel(nn.Module):
                 "semantics is ste, which deforms points far from the body, and deform.skinning is "
                 "surface, which knows weights on it only; set deform.skinning=network."
             )
-        if config.skinning_grid and not 8 <= config.skinning_grid <= 256:
-            raise ConfigError(
-                f"deform.skinning_grid is {config.skinning_grid}; it takes 8 to 256 cells, or 0 "
-                "for no grid."
-            )
-        self.skinning_grid = SkinningGrid(config.skinning_grid) if config.skinning_grid else None
         self.skinning_turns = SkinningTurns(config.skinning_turns)
         self.human_colour: HumanColour | None = None
         """None where each Gaussian has a colour of its own."""
@@ -337,8 +326,6 @@ class HumanSceneModel(nn.Module):
         elif share_skinning:
             shared = self.normalise(deformed.mean(0))
             weights = self.skinning_turns.weights(self.skinning, shared)[None]
-        elif self.skinning_grid is not None and not torch.is_grad_enabled():
-            weights = self.skinning_grid.fresh_weights(self.skinning, self.normalise(deformed))
         else:
             weights = self.skinning(self.normalise(deformed))
         world, transforms = skin(deformed, weights, bones)
