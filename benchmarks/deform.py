@@ -18,19 +18,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from evsplat.body import bounding_box, default_body
+from evsplat.body import default_body
 from evsplat.deform import (
     HumanColour,
     NonRigidNetwork,
     PoseEncoder,
     SceneColour,
     SkinningNetwork,
-    make_encoding,
     normalise_joints,
 )
-from evsplat.deform.skinning_grid import SkinningGrid
-
-GRID_CELLS = 128
 
 
 def main() -> None:
@@ -58,10 +54,7 @@ def main() -> None:
 
 
 def _cases(points: int, times: int) -> dict[str, tuple[Callable[[], object], float]]:
-    """Name -> (one forward and backward, its matrix products in floating-point operations).
-
-    Of a trained person drawn once: forward alone.
-    """
+    """Name -> (one forward and backward, its matrix products in floating-point operations)."""
     body = default_body()
     parents = body.parents.tolist()
     joints = len(parents)
@@ -85,27 +78,18 @@ def _cases(points: int, times: int) -> dict[str, tuple[Callable[[], object], flo
             6 * times * (joints * 19 * 25 + 12 * joints * 6),
         )
     }
-    for kind in ("oneblob", "hashgrid"):
-        network = NonRigidNetwork(make_encoding(kind), encoder.dim, last_layer_std=None)
-        encoding = network.encoding
-        cases[f"encoding_{kind}"] = (lambda e=encoding: _step(e(0.5 * (positions + 1))), 0.0)
+    network = NonRigidNetwork(encoder.dim, last_layer_std=None)
+    encoding = network.encoding
+    cases["encoding"] = (lambda: _step(encoding(0.5 * (positions + 1))), 0.0)
 
-        def non_rigid(network: NonRigidNetwork = network) -> None:
-            out = network(positions, pose)
-            _step(out.offset, out.log_scale, out.rotation, out.feature)
+    def non_rigid() -> None:
+        out = network(positions, pose)
+        _step(out.offset, out.log_scale, out.rotation, out.feature)
 
-        products = 6 * points * encoding.dim * 128 + 2 * hidden + 6 * rows * 128 * 25
-        cases[f"non_rigid_{kind}"] = (non_rigid, products)
+    products = 6 * points * encoding.dim * 128 + 2 * hidden + 6 * rows * 128 * 25
+    cases["non_rigid"] = (non_rigid, products)
     products = 6 * rows * 128 * (3 + skinning.softmax.logits) + 3 * hidden
     cases["skinning"] = (lambda: _step(skinning(posed)), products)
-    low, high = bounding_box(body)
-    surface = body.sample_surface(points, torch.Generator().manual_seed(0)).points
-    on_body = (2 * (surface - low) / (high - low) - 1).float()
-    grid = SkinningGrid(GRID_CELLS)
-    grid.bake(skinning, on_body)
-    cases["skinning_drawn"] = (torch.no_grad()(lambda: skinning(on_body)), products / 3 / times)
-    cases["skinning_grid_drawn"] = (torch.no_grad()(lambda: grid.weights(skinning, on_body)), 0.0)
-    cases["skinning_grid_baked"] = (lambda: grid.bake(skinning, on_body), 0.0)
     cases["human_colour"] = (
         lambda: _step(human(features, directions, carried, latent)),
         6 * (points * 32 * 64 + rows * (31 * 64 + 64 * 64 + 64 * 3)),

@@ -2,9 +2,9 @@
 
 python benchmarks/gpu.py [--minutes M] [--device cuda|cpu] [--size PX]
 
-Building gsplat's kernels (once), agreement of the rasteriser with the native one, its time and that
-of the hash grid beside plain torch, a training step, a whole training of the demo capture at
---size, its quality, frames per second of drawing it, memory. A part that fails is told and the rest
+Building gsplat's kernels (once), agreement of the rasteriser with the native one, its time, a
+training step, a whole training of the demo capture at --size, its quality, frames per second of
+drawing it, memory. A part that fails is told and the rest
 goes on. With --device cpu the same parts run with the native backend, to try this file where there
 is no GPU. The last line is JSON with a unit in each key; without a GPU the exit status is 2.
 """
@@ -30,7 +30,6 @@ from torch import Tensor
 
 from evsplat.capture import Capture
 from evsplat.cuda_support import needs, what_is_missing
-from evsplat.deform import HashGridEncoding, encodings
 from evsplat.render import Splats, cuda, render
 from evsplat.similarity import psnr
 from evsplat.training import load_run, train
@@ -62,7 +61,6 @@ def main() -> None:
         bench.part("build", bench.build)
         bench.part("agreement", lambda: bench.agreement(arguments.gaussians))
         bench.part("rasteriser", lambda: bench.rasteriser(arguments.gaussians))
-        bench.part("hash_grid", bench.hash_grid)
         bench.part("step", lambda: bench.step(capture))
         bench.part("train", lambda: bench.train(capture, run, arguments.method, arguments.minutes))
         bench.part("draw", lambda: bench.draw(run))
@@ -148,25 +146,6 @@ class Bench:
             "render_both_ms": self._timed(both),
             "render_five_times_both_ms": self._timed(five),
         }
-
-    def hash_grid(self) -> Results:
-        """Triton (on a GPU) or native, and plain torch, forward and backward at 20,000 points."""
-        grid = HashGridEncoding().to(self.device)
-        positions = torch.rand(20_000, 3, device=self.device, requires_grad=True)
-
-        def both() -> None:
-            grid(positions).sum().backward()
-
-        found: Results = {"hash_grid_both_ms": self._timed(both)}
-        expected = grid(positions).detach()
-        chosen = encodings._runs_triton, encodings.runs_native
-        encodings._runs_triton = encodings.runs_native = lambda tensor: False  # type: ignore[assignment]
-        try:
-            found["hash_grid_torch_both_ms"] = self._timed(both)
-            found["hash_grid_difference"] = float((grid(positions).detach() - expected).abs().max())
-        finally:
-            encodings._runs_triton, encodings.runs_native = chosen
-        return found
 
     def step(self, capture: Path) -> Results:
         """A training step of method `paper` with everything on, at two sizes."""

@@ -102,8 +102,8 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
     """What lies before and behind the networks' layers, which `benchmarks/deform.py` times."""
     times = 2
     positions = torch.rand(points, 3).requires_grad_()
-    blob, grid = encodings.OneBlobEncoding(), encodings.HashGridEncoding()
-    blob_upstream, grid_upstream = torch.randn(points, blob.dim), torch.randn(points, grid.dim)
+    blob = encodings.OneBlobEncoding()
+    blob_upstream = torch.randn(points, blob.dim)
     softmax = skinning_network.HierarchicalSoftmax(body.default_body().parents.tolist())
     logits = torch.randn(points, softmax.logits).requires_grad_()
     changes = (0.1 * torch.randn(times, points, 25)).requires_grad_()
@@ -114,10 +114,6 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
 
     def one_blob() -> None:
         torch.autograd.grad(blob(positions), positions, blob_upstream)
-
-    def hash_grid(lookup: type[torch.autograd.Function]) -> None:
-        encoded = lookup.apply(positions, grid.table, grid).T
-        torch.autograd.grad(encoded, (positions, grid.table), grid_upstream)
 
     def tree_softmax() -> None:
         torch.autograd.grad(softmax(logits), logits, torch.ones(points, 1).expand(-1, joints))
@@ -133,10 +129,6 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
     joints = softmax(logits).shape[-1]
     return {
         "one_blob": (one_blob, in_torch(one_blob, encodings)),
-        "hash_grid": (
-            lambda: hash_grid(encodings._NativeLookup),
-            lambda: hash_grid(encodings._TorchLookup),
-        ),
         "skinning_softmax": (tree_softmax, in_torch(tree_softmax, skinning_network)),
         "shape_change": (change_shape, in_torch(change_shape, non_rigid)),
         "view_basis": (view_basis, in_torch(view_basis, colour)),

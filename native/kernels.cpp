@@ -754,8 +754,7 @@ const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,         project, forw
                          ssim_band,    log_brightness, power, add_sign,
                          membership,   square_sums,    difference_sums, difference_slope,
                          view_directions, sh_rows, tree_softmax, skin, skin_backward,
-                         surface_light, surface_light_backward,
-                         hash_forward, hash_backward,  sensor_step};
+                         surface_light, surface_light_backward, sensor_step};
 
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

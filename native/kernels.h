@@ -4,7 +4,6 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "hash_grid.h"
 #include "mlp_kernels.h"
 #include "picture.h"
 #include "posing.h"
@@ -147,8 +146,6 @@ struct Kernels {
     // Sums over the points, and the gradient of the shares unless it is null.
     void (*surface_light_backward)(const SurfaceLight&, size_t begin, size_t end, const float* above, float* sums,
                                    float* lit);
-    void (*hash_forward)(const HashLevel&);
-    void (*hash_backward)(const HashLevel&);
     void (*sensor_step)(const SensorPiece&);
 };
 
@@ -170,8 +167,6 @@ struct Kernels {
     void skin_backward(const Skinning&, const SkinningGrads&, const float*, size_t, size_t);     \
     void surface_light(const SurfaceLight&, size_t, size_t, float*);                             \
     void surface_light_backward(const SurfaceLight&, size_t, size_t, const float*, float*, float*); \
-    void hash_forward(const HashLevel&);         \
-    void hash_backward(const HashLevel&);        \
     void sensor_step(const SensorPiece&);        \
     }
 EVSPLAT_LEVEL_TABLE(portable)

@@ -14,7 +14,6 @@
 #include <stdexcept>
 
 #include "event_module.h"
-#include "hash_grid.h"
 #include "levels.h"
 #include "mlp.h"
 #include "neighbours.h"
@@ -300,40 +299,6 @@ void picture_log_brightness(In coded, const std::array<float, 3>& weight, float 
     log_brightness(job, count, threads);
 }
 
-// Table (entries, features); level l has `cells[l]` cells per axis and entries from begin[l].
-HashGrid hash_grid(const In& positions, const In& table, const std::vector<int64_t>& cells,
-                   const std::vector<int64_t>& begin, uint32_t mask) {
-    require(positions.ndim() == 2 && positions.shape(1) == 3, "positions");
-    require(table.ndim() == 2 && !cells.empty() && begin.size() == cells.size() + 1, "the table");
-    require(begin[0] == 0 && size_t(begin.back()) == table.shape(0), "the table");
-    for (size_t l = 0; l < cells.size(); ++l) {
-        const int64_t entries = begin[l + 1] - begin[l], side = cells[l] + 1;
-        require(side > 1 && side < 1 << 20 && (entries == side * side * side || entries == int64_t(mask) + 1), "a level");
-    }
-    return {positions.shape(0), cells.size(), int(table.shape(1)), cells.data(), begin.data(), mask, positions.data(),
-            table.data()};
-}
-
-void hash_encode(In positions, In table, std::vector<int64_t> cells, std::vector<int64_t> begin, uint32_t mask,
-                 Out encoded, int threads) {
-    const HashGrid grid = hash_grid(positions, table, cells, begin, mask);
-    require(encoded.size() == grid.points * grid.levels * grid.features, "the encoding");
-    nb::gil_scoped_release release;
-    hash_grid_forward(grid, threads, encoded.data());
-}
-
-void hash_encode_backward(In positions, In table, std::vector<int64_t> cells, std::vector<int64_t> begin, uint32_t mask,
-                          In encoded_grad, std::optional<Out> table_grad, std::optional<Out> position_grad,
-                          int threads) {
-    const HashGrid grid = hash_grid(positions, table, cells, begin, mask);
-    require(encoded_grad.size() == grid.points * grid.levels * grid.features, "the gradient");
-    require(!table_grad || table_grad->size() == table.size(), "the gradient of the table");
-    require(!position_grad || position_grad->size() == positions.size(), "the gradient of positions");
-    nb::gil_scoped_release release;
-    hash_grid_backward(grid, threads, encoded_grad.data(), table_grad ? table_grad->data() : nullptr,
-                       position_grad ? position_grad->data() : nullptr);
-}
-
 using OutIndex = nb::ndarray<int64_t, nb::c_contig, nb::device::cpu>;
 
 Skinning skinning(const In& position, const In& weight, const In& bones) {
@@ -437,12 +402,6 @@ NB_MODULE(_native, m) {
           nb::arg("blended"), nb::arg("moved_grad").none(), nb::arg("blended_grad").none(),
           nb::arg("position_grad").none(), nb::arg("weight_grad").none(), nb::arg("bones_grad").none(),
           nb::arg("threads"), "Writes the gradients of skin.");
-    m.def("hash_encode", &hash_encode, nb::arg("positions"), nb::arg("table"), nb::arg("cells"), nb::arg("begin"),
-          nb::arg("mask"), nb::arg("encoded"), nb::arg("threads"), "Hash grid encoding (levels * features, N).");
-    m.def("hash_encode_backward", &hash_encode_backward, nb::arg("positions"), nb::arg("table"), nb::arg("cells"),
-          nb::arg("begin"), nb::arg("mask"), nb::arg("encoded_grad"), nb::arg("table_grad").none(),
-          nb::arg("position_grad").none(), nb::arg("threads"),
-          "Adds to the table's gradient and writes that of the positions.");
     bind_sensor(m);
     bind_step(m);
     bind_events(m);

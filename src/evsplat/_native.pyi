@@ -123,26 +123,6 @@ def skin_backward(
     threads: int,
 ) -> None: ...
 def isometry(rows: Tensor, arrays: list[Tensor], grads: list[Tensor]) -> tuple[float, float]: ...
-def hash_encode(
-    positions: Tensor,
-    table: Tensor,
-    cells: list[int],
-    begin: list[int],
-    mask: int,
-    encoded: Tensor,
-    threads: int,
-) -> None: ...
-def hash_encode_backward(
-    positions: Tensor,
-    table: Tensor,
-    cells: list[int],
-    begin: list[int],
-    mask: int,
-    encoded_grad: Tensor,
-    table_grad: Tensor | None,
-    position_grad: Tensor | None,
-    threads: int,
-) -> None: ...
 def ssim(
     image: Tensor,
     reference: Tensor,

@@ -52,24 +52,6 @@ def test_before_the_non_rigid_network_the_person_is_blend_skinned(tiny_capture):
     assert torch.equal(posed.scene.means, model.gaussians.means[model.gaussians.scene])
 
 
-def test_a_skinning_grid_draws_nearly_what_the_network_does_and_leaves_training_alone(tiny_capture):
-    path = tiny_capture()
-    model, times, center = model_of(path)
-    baked, _, _ = model_of(path, "deform.skinning_grid=128")
-    baked.load_state_dict(model.state_dict())
-    for one in (model, baked):
-        one.nominal.fill_(10_000.0)
-    assert torch.equal(baked.at(times, center).human.means, model.at(times, center).human.means)
-    with torch.no_grad():
-        exact, near = (one.at(times, center).human.means for one in (model, baked))
-    assert 0 < float((near - exact).norm(dim=-1).mean()) < 1e-3
-
-
-def test_a_skinning_grid_of_impossible_size_is_refused(tiny_capture):
-    with pytest.raises(ConfigError, match="skinning_grid is 3; it takes 8 to 256 cells"):
-        model_of(tiny_capture(), "deform.skinning_grid=3")
-
-
 def test_times_do_not_see_each_other(tiny_capture):
     model, times, center = model_of(tiny_capture())
     activate(model)

@@ -51,8 +51,8 @@ METHODS = {
     "evsplat": ("evsplat", EVSPLAT),
     "evsplat with all that can be switched on": (
         "evsplat",
-        (*EVSPLAT, "edi.weight=0.5", "edi.until=15000", "windows.clock=always",
-         "pose.refine=always", "pose.smooth=always", "semantic_activity=true",
+        (*EVSPLAT, "windows.clock=always",
+         "pose.refine=always", "pose.smooth=always",
          "windows.pixel_thresholds=true"),
     ),
     "evsplat with the paper's events": ("evsplat", (*EVSPLAT, "event_term=paper")),

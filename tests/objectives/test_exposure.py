@@ -40,7 +40,6 @@ def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
     pictures = torch.rand(4, 20, 24, 3, generator=generator, dtype=torch.float64)
     observed = torch.rand(20, 24, 3, generator=generator, dtype=torch.float64)
     step = SimpleNamespace(
-        nominal=0.0,
         frame=frame(),
         times_us=(500, 2_000, 16_000, 30_999),
         linear=pictures**2.2,
@@ -69,7 +68,6 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
     linear = (pictures**2.2).requires_grad_()
     observed = torch.rand(16, 16, 3, generator=generator, dtype=torch.float64)
     step = SimpleNamespace(
-        nominal=0.0,
         frame=frame(),
         times_us=tuple(times),
         linear=linear,
@@ -87,7 +85,6 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
 def test_a_black_exposure_has_a_finite_gradient():
     pictures = torch.zeros(3, 16, 16, 3, requires_grad=True)
     step = SimpleNamespace(
-        nominal=0.0,
         frame=frame(),
         times_us=(2_000, 16_000, 30_000),
         linear=pictures,
@@ -95,10 +92,3 @@ def test_a_black_exposure_has_a_finite_gradient():
     )
     Exposure(None, {"a": 3}, torch.Generator()).loss(step)["l1"].backward()
     assert pictures.grad.isfinite().all()
-
-
-def test_before_its_start_it_asks_for_nothing():
-    objective = Exposure(None, {"a": 3}, torch.Generator(), start=500.0)
-    assert objective.times(frame(), 499.0) == ()
-    assert objective.loss(SimpleNamespace(nominal=499.0)) == {}
-    assert len(objective.times(frame(), 500.0)) == 3

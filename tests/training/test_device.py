@@ -40,22 +40,20 @@ def without_native(monkeypatch):
         "evsplat.objectives.event",
         "evsplat.objectives.isometry",
         "evsplat.objectives.semantic",
-        "evsplat.models.networks.encodings",
+        "evsplat.models.networks.one_blob",
         "evsplat.similarity.psnr_ssim",
     ):
         monkeypatch.setattr(f"{module}.runs_native", lambda tensor: False)
 
 
-@pytest.mark.parametrize("encoding", ["oneblob", "hashgrid"])
-def test_plain_torch_takes_the_steps_that_native_takes(encoding, tiny_capture, monkeypatch):
+def test_plain_torch_takes_the_steps_that_native_takes(tiny_capture, monkeypatch):
     """All but the rasteriser, which has tests of its own: what a GPU runs in their place."""
     path = tiny_capture(width=64, height=48)
-    deform = SMALL["deform"] | {"encoding": encoding}
     results = []
     for native in (True, False):
         if not native:
             without_native(monkeypatch)
-        trainer = quick(path, deform=deform)
+        trainer = quick(path)
         reports = [trainer.step() for _ in range(3)]
         results.append(reports)
     reports, expected_reports = results
@@ -171,7 +169,7 @@ def foreign(monkeypatch):
             "deform": SMALL["deform"]
             | {"shading": True, "shadow_lights": 2, "self_shadow": True, "networks_once": True},
         },
-        {"deform": SMALL["deform"] | {"encoding": "hashgrid", "pose_correction_start": 0}},
+        {"deform": SMALL["deform"] | {"pose_correction_start": 0}},
         pytest.param(
             {"loss": {"perceptual": "st_lpips"}},
             marks=pytest.mark.skipif(

@@ -143,7 +143,7 @@ def test_every_semantics_mode_trains_and_only_learning_modes_move_labels(
     assert moved == (mode != "fixed")
 
 
-def test_hash_grid_and_random_cube_are_selectable(tiny_capture, tmp_path):
+def test_random_cube_is_selectable(tiny_capture, tmp_path):
     out = train(
         tiny_capture(frames=10),
         method="paper",
@@ -151,7 +151,6 @@ def test_hash_grid_and_random_cube_are_selectable(tiny_capture, tmp_path):
         iterations=6,
         overrides=(
             *SMALL,
-            "deform.encoding=hashgrid",
             "scene.kind=random_cube",
             "scene.cube_count=300",
         ),

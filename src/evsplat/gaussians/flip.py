@@ -46,7 +46,7 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames) 
         carry(values, leaving, to_world(frames, values["means"][leaving]))
         _take_colour(gaussians.colour, values, leaving, torch.nonzero(~human)[:, 0])
     if len(joining):
-        near, transforms, _ = to_canonical(frames, values["means"][joining])
+        near, transforms = to_canonical(frames, values["means"][joining])
         values["semantic_logits"][joining[~near]] = 0.0
         joining = joining[near]
         carry(values, joining, transforms)
@@ -93,17 +93,14 @@ def to_world(frames: BodyFrames, means: Float[Tensor, "M 3"]) -> Float[Tensor, "
 
 def to_canonical(
     frames: BodyFrames, points: Float[Tensor, "M 3"]
-) -> tuple[Bool[Tensor, " M"], Float[Tensor, "K 4 4"], Float[Tensor, "K J"]]:
+) -> tuple[Bool[Tensor, " M"], Float[Tensor, "K 4 4"]]:
     """Which scene rows can be the person's, and transforms that place these K on it.
 
-    The nearest posed body vertex over all frames carries a row back; it lies within `REACH_M`. The
-    last are the vertices' skinning weights.
+    The nearest posed body vertex over all frames carries a row back; it lies within `REACH_M`.
     """
     distance, frame, vertex = _nearest_over_frames(frames, points)
     near = distance <= REACH_M
-    vertex = vertex[near]
-    transforms = torch.linalg.inv(_blend(frames, vertex, frame[near]))
-    return near, transforms, frames.body.weights[vertex]
+    return near, torch.linalg.inv(_blend(frames, vertex[near], frame[near]))
 
 
 def _take_colour(name: str, values: dict[str, Tensor], rows: Tensor, others: Tensor) -> None:

@@ -46,17 +46,9 @@ class PackedBounds:
     width: int
 
     @classmethod
-    def of(
-        cls,
-        silhouette: Bool[np.ndarray, "H W"],
-        band_px: int,
-        still: Bool[np.ndarray, "H W"] | None = None,
-    ) -> "PackedBounds":
-        """Find and pack them; ``still`` pixels of the band are the scene's, see `still_scene`."""
-        inside, outside = (mask.numpy() for mask in silhouette_bounds(silhouette, band_px))
-        if still is not None:
-            outside = outside | (still & ~inside)
-        masks = np.stack([inside, outside])
+    def of(cls, silhouette: Bool[np.ndarray, "H W"], band_px: int) -> "PackedBounds":
+        """Find and pack them."""
+        masks = torch.stack(silhouette_bounds(silhouette, band_px)).numpy()
         return cls(np.packbits(masks.reshape(2, -1), axis=1), *silhouette.shape)
 
     def masks(self) -> Bool[Tensor, "2 H W"]:

@@ -6,7 +6,6 @@ from torch import Tensor, nn
 
 from evsplat.body import Body, bounding_box
 from evsplat.devices import send
-from evsplat.models.networks.encodings import OneBlobEncoding
 from evsplat.models.networks.non_rigid import NonRigidNetwork
 from evsplat.models.networks.pose_encoder import PoseEncoder, normalise_joints
 
@@ -30,7 +29,6 @@ class PoseDeformation(nn.Module):
         joints = normalise_joints(body.rest_joints, body.rest_vertices)
         self.pose_encoder = PoseEncoder(body.parents.tolist(), joints)
         self.network = NonRigidNetwork(
-            OneBlobEncoding(),
             self.pose_encoder.dim,
             width=width,
             feature_dim=feature_dim,

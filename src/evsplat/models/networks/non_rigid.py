@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import quaternion_multiply
 from evsplat.compiled import native, runs_native
-from evsplat.models.networks.encodings import OneBlobEncoding
+from evsplat.models.networks.one_blob import OneBlobEncoding
 from evsplat.models.networks.mlp import PointMLP
 
 
@@ -97,12 +97,12 @@ class NonRigidNetwork(nn.Module):
 
     def __init__(
         self,
-        encoding: OneBlobEncoding,
         pose_dim: int,
         width: int = 128,
         depth: int = 3,
         feature_dim: int = 16,
         last_layer_std: float | None = 1e-3,
+        bins: int = 16,
     ) -> None:
         """``last_layer_std`` None starts the last layer as any other, as the released code does.
 
@@ -110,10 +110,10 @@ class NonRigidNetwork(nn.Module):
         (method.md 1.5); a small value starts from almost none.
         """
         super().__init__()
-        self.encoding = encoding
+        self.encoding = OneBlobEncoding(bins)
         self.feature_dim = feature_dim
         self.mlp = PointMLP(
-            encoding.dim,
+            self.encoding.dim,
             pose_dim,
             0,
             width,
