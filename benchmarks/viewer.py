@@ -52,7 +52,7 @@ def untrained_run(gaussians: int, method: str) -> Run:
     values = override({}, (f"human.count={human}", "deform.non_rigid_start=0"))
     config = method_config(method, values, where="benchmark")
     seen = capture.for_training(config.policy)
-    model = TRAINABLE[method][1](config, seen, 0, fit=False).model
+    model = TRAINABLE[method].build(config, seen, 0, fit=False).model
     rows = model.gaussians
     more = gaussians - len(rows)
     own = torch.randint(rows.human_count, len(rows), (max(more, 0),))

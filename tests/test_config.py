@@ -393,7 +393,7 @@ def test_five_unknown_settings_are_named(count):
 
 @pytest.mark.parametrize("method", TRAINABLE)
 def test_defaults_of_every_method_are_in_range_and_survive_yaml(method, tmp_path):
-    kind = TRAINABLE[method][0]
+    kind = TRAINABLE[method].config
     check(kind(), method)
     check_read(kind(), method)
     save_yaml(tmp_path / "c.yaml", kind())
@@ -402,7 +402,7 @@ def test_defaults_of_every_method_are_in_range_and_survive_yaml(method, tmp_path
 
 @pytest.mark.parametrize("method", TRAINABLE)
 def test_conditions_name_settings_that_there_are(method):
-    every = {setting.name: setting for setting in settings(TRAINABLE[method][0]())}
+    every = {setting.name: setting for setting in settings(TRAINABLE[method].config())}
     for setting in every.values():
         for name, condition in setting.conditions:
             assert condition.holds(every[name].value) in (True, False), (setting.name, name)

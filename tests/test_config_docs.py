@@ -152,7 +152,7 @@ def test_every_method_is_explained_and_loads_as_printed(method, tmp_path, capsys
     text = capsys.readouterr().out
     (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
     values = load_yaml(tmp_path / "c.yaml")
-    kind = TRAINABLE[method][0]
+    kind = TRAINABLE[method].config
     assert values.pop("method") == method
     assert from_dict(kind, values, where="c") == kind()
     assert max(map(len, text.splitlines())) <= 100
@@ -160,7 +160,7 @@ def test_every_method_is_explained_and_loads_as_printed(method, tmp_path, capsys
 
 @pytest.mark.parametrize("method", TRAINABLE)
 def test_every_setting_of_every_method_has_a_docstring(method):
-    config = TRAINABLE[method][0]()
+    config = TRAINABLE[method].config()
     owners = {"": type(config).__name__}
     lacking = []
     for item in explained(config):
@@ -185,7 +185,7 @@ def test_the_docs_list_the_settings_of_every_method():
         sys.path.pop(0)
     shown = on_page_markdown(page)
     for method in TRAINABLE:
-        for item in explained(TRAINABLE[method][0]()):
+        for item in explained(TRAINABLE[method].config()):
             assert item.is_section or f"| `{item.name}` | " in shown
             # Which keys is said by the name of a section that has them.
             assert item.is_section or "with keys" not in item.takes

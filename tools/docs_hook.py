@@ -34,7 +34,7 @@ def _settings(method: str) -> str:
 
     head = "\n| setting | default | takes | meaning |\n|---|---|---|---|"
     tables: dict[str, list[str]] = {"": [head]}
-    for item in explained(TRAINABLE[method][0]()):
+    for item in explained(TRAINABLE[method].config()):
         doc = item.doc.replace("``", "`").replace("|", "\\|")
         if item.is_section:
             tables[item.name] = [f"\n### {method}: {item.name}\n\n{doc}", head]

@@ -112,7 +112,7 @@ def test_a_model_without_pose_dependence_is_its_avatar(tiny_capture, method):
         values = override(values, ("deform.self_shadow=false",))
     config = method_config(method, values, where="test")
     seen = capture.for_training(config.policy)
-    model = TRAINABLE[method][1](config, seen, 0, fit=False).model
+    model = TRAINABLE[method].build(config, seen, 0, fit=False).model
     if method == "evsplat":
         with torch.no_grad():
             model.shading.coefficients.normal_(std=0.1)

@@ -79,7 +79,7 @@ def two_steps(path: Path, method: str, assignments: tuple[str, ...]) -> dict[str
     """All that is left of two training steps in the middle of the schedule."""
     config = method_config(method, override({}, assignments), where="test")
     capture = seen_by_training(load_capture(path), config)
-    composition = TRAINABLE[method][1](config, capture, 0)
+    composition = TRAINABLE[method].build(config, capture, 0)
     trainer = Trainer(composition, composition.capture or capture, Clock(100, fraction=0.5))
     losses = [trainer.step() for _ in range(2)]
     assert all(report is not None for report in losses)

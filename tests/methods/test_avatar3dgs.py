@@ -35,7 +35,7 @@ SMALL = (
 
 def composed(path, *settings: str, fit: bool = False):
     config = method_config("avatar3dgs", override({}, (*SMALL, *settings)), where="test")
-    return TRAINABLE["avatar3dgs"][1](
+    return TRAINABLE["avatar3dgs"].build(
         config, load_capture(path).for_training(config.policy), 3, fit=fit
     )
 

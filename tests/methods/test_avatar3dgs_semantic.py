@@ -22,7 +22,7 @@ SMALL = (
 
 def test_all_gaussians_start_as_the_person_with_the_attribute_at_one_half(tiny_capture):
     config = method_config("avatar3dgs_semantic", override({}, SMALL), where="test")
-    composition = TRAINABLE["avatar3dgs_semantic"][1](
+    composition = TRAINABLE["avatar3dgs_semantic"].build(
         config, load_capture(tiny_capture()), 0, fit=False
     )
     gaussians = composition.model.gaussians

@@ -25,7 +25,7 @@ SMALL = {
 
 def thresholds(path, *, fit: bool = True) -> list[float]:
     config = method_config("evsplat", SMALL, where="test")
-    composition = TRAINABLE["evsplat"][1](config, seen(path), 0, fit=fit)
+    composition = TRAINABLE["evsplat"].build(config, seen(path), 0, fit=fit)
     return composition.model.sensor.logs.exp().tolist()
 
 
@@ -50,7 +50,7 @@ def test_a_clock_that_is_late_is_learned_from_there(
     found = None if late_us is None else SensorEstimate(lag(late_us), None)
     monkeypatch.setattr(method, "estimate_sensor", lambda capture: found)
     config = method_config("evsplat", SMALL | {"windows": {"clock": choice}}, where="test")
-    sensor = TRAINABLE["evsplat"][1](config, seen(tiny_capture()), 0).model.sensor
+    sensor = TRAINABLE["evsplat"].build(config, seen(tiny_capture()), 0).model.sensor
     if start_us is None:
         assert sensor.offset_us is None
     else:

@@ -37,7 +37,7 @@ def captures(tiny_capture):
 
 def composed(capture: Capture, *settings: str):
     config = method_config("evsplat", override({}, (*SMALL, *settings)), where="test")
-    return TRAINABLE["evsplat"][1](config, capture.for_training(config.policy), 0)
+    return TRAINABLE["evsplat"].build(config, capture.for_training(config.policy), 0)
 
 
 def test_noisy_poses_are_told_and_exact_ones_stay_at_every_key(captures, caplog):

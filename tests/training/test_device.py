@@ -147,7 +147,7 @@ def foreign(monkeypatch):
         monkeypatch.setattr(api, "_BACKEND_OF_DEVICE", {NAME: "gsplat"})
         monkeypatch.setattr(torch.optim, "Adam", Descent)
         torch.__future__.set_overwrite_module_params_on_conversion(True)
-        composition = TRAINABLE[method][1](
+        composition = TRAINABLE[method].build(
             method_config(method, {**SMALL, **settings}, where="test"), capture, 0,
             device=NAME, fit=False,
         )  # fmt: skip

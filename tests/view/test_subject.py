@@ -31,7 +31,7 @@ def _run(tiny_capture, request):
     method, capture = request.param, load_capture(tiny_capture())
     config = method_config(method, override({}, SMALL[method]), where="test")
     seen = capture.for_training(config.policy)
-    model = TRAINABLE[method][1](config, seen, 0, fit=False).model
+    model = TRAINABLE[method].build(config, seen, 0, fit=False).model
     with torch.no_grad():
         for name, parameter in model.named_parameters():
             if "logits" not in name:

@@ -16,7 +16,7 @@ from torch import Tensor
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
-from evsplat.config import load_yaml, to_dict
+from evsplat.config import load_yaml
 from evsplat.devices import hardware
 from evsplat.errors import DataError
 from evsplat.files import read_json, write_json, write_text

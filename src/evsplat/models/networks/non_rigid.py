@@ -10,8 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import quaternion_multiply
 from evsplat.compiled import native, runs_native
-from evsplat.models.networks.one_blob import OneBlobEncoding
 from evsplat.models.networks.mlp import PointMLP
+from evsplat.models.networks.one_blob import OneBlobEncoding
 
 
 @dataclass(frozen=True)

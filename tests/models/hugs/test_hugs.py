@@ -29,7 +29,7 @@ SMALL = {
 
 def composed(path, **settings):
     config = method_config("hugs", SMALL | settings, where="test")
-    return TRAINABLE["hugs"][1](
+    return TRAINABLE["hugs"].build(
         config, load_capture(path).for_training(config.policy), 0, fit=False
     )
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from evsplat.deform import sh_basis
+from evsplat.models.networks.spherical_harmonics import sh_basis
 
 
 def directions(count, seed=0):

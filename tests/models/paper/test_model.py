@@ -16,7 +16,7 @@ from evsplat.errors import ConfigError
 from evsplat.gaussians import ATTRIBUTES
 from evsplat.methods import PaperConfig, compose, method_config
 
-from ..seen import seen
+from ...seen import seen
 
 SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16")
 

@@ -3,13 +3,8 @@
 import pytest
 import torch
 
-<<<<<<< HEAD
-from evsplat.deform import HashGridEncoding, NonRigidNetwork, OneBlobEncoding, make_encoding
-from evsplat.models.networks.non_rigid import NonRigid
-=======
-from evsplat.deform import NonRigidNetwork, OneBlobEncoding
-from evsplat.models.networks.non_rigid import NonRigid
->>>>>>> 92ee0057e7ea83420b89e3b0bdfec0fe1414f025
+from evsplat.models.networks.one_blob import OneBlobEncoding
+from evsplat.models.networks.non_rigid import NonRigid, NonRigidNetwork
 
 
 def test_start_changes_almost_nothing_unless_asked_for():

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from evsplat.body import SurfaceSamples
-from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
+from evsplat.models.discs.shading import Shading, SurfaceLight
+from evsplat.models.discs.surface import NearestSurface
 
 
 def sphere(count: int, generator: torch.Generator) -> SurfaceSamples:

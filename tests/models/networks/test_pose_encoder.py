@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.body import default_body
 from evsplat.body.canonical import SMPL_PARENTS
-from evsplat.deform import PoseEncoder, normalise_joints
+from evsplat.models.networks.pose_encoder import PoseEncoder, normalise_joints
 
 TREES = {
     "smpl": SMPL_PARENTS,

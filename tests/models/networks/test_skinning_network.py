@@ -7,7 +7,7 @@ import torch
 
 from evsplat.body import bounding_box, default_body
 from evsplat.body.canonical import SMPL_PARENTS
-from evsplat.deform import HierarchicalSoftmax, SkinningNetwork
+from evsplat.models.networks.skinning_network import HierarchicalSoftmax, SkinningNetwork
 from evsplat.errors import DataError
 
 

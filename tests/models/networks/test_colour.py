@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from evsplat.deform import HumanColour, SceneColour, sh_basis, view_jitter
+from evsplat.models.networks.colour import HumanColour, SceneColour, view_jitter
+from evsplat.models.networks.spherical_harmonics import sh_basis
 from evsplat.models.networks.colour import beside_basis, view_directions
 
 
