@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.events import EventStream
-from evsplat.imaging import deblur
+from evsplat.events import EventStream, deblur
 from evsplat.objectives import EdiTarget, EventNoise, EventSensor
 from evsplat.similarity import ssim
 

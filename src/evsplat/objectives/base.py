@@ -14,7 +14,7 @@ from evsplat.deform.drawing import Drawing
 from evsplat.deform.model import Model
 from evsplat.devices import DeviceCache
 from evsplat.gaussians import PosedGaussians
-from evsplat.imaging import decode
+from evsplat.pictures import decode
 
 ModelType = TypeVar("ModelType", bound=Model)
 

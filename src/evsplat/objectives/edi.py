@@ -10,7 +10,7 @@ from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import DeviceCache
-from evsplat.imaging import deblur
+from evsplat.events import deblur
 from evsplat.objectives.base import Stateless, Step
 from evsplat.objectives.event_noise import EventNoise
 from evsplat.objectives.event_sensor import EventSensor
