@@ -18,9 +18,9 @@ import torch
 from PIL import Image
 
 from evsplat.capture import Capture, Frame, Policy, estimate_sensor, load_capture
-from evsplat.evaluation.pictures import to_bytes
 from evsplat.evaluation.regions import CROP_MARGIN, mask_box
-from evsplat.imaging import deblur
+from evsplat.events import deblur
+from evsplat.pictures import to_bytes
 
 REGIONS = ("full", "person_crop", "person_mask")
 

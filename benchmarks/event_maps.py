@@ -27,7 +27,7 @@ from evsplat.events import (
     time_surface,
     voxel_grid,
 )
-from evsplat.imaging import log_brightness
+from evsplat.pictures import log_brightness
 
 REACH_US = 100_000
 EPS = 0.004

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.capture import load_capture
-from evsplat.capture.images import read_image
 from evsplat.footage import open_footage
+from evsplat.pictures.files import read_image
 from evsplat.synthesis.exposure import ExposureMean, plan_exposures
 from evsplat.synthesis.flow import FlowInterpolator
 from evsplat.synthesis.interpolate import Blend, Interpolator, Picture

@@ -22,9 +22,9 @@ from scipy.spatial import cKDTree
 from evsplat import body
 from evsplat.body import body as skin_module
 from evsplat.deform import colour, encodings, non_rigid, shading, skinning_network
-from evsplat.imaging import events, srgb
 from evsplat.neighbours import nearest
 from evsplat.objectives import event, isometry, semantic
+from evsplat.pictures import light
 from evsplat.similarity import psnr_ssim
 
 Call = Callable[[], object]
@@ -78,18 +78,18 @@ def picture_cases(size: int) -> dict[str, tuple[Call, Call]]:
         _backward(sum(psnr_ssim.l1_and_ssim(image, truth)), image)
 
     def brightness() -> None:
-        _backward(events.log_brightness(image).sum(), image)
+        _backward(light.log_brightness(image).sum(), image)
 
     def power() -> None:
-        _backward(srgb.decode(image).sum(), image)
+        _backward(light.decode(image).sum(), image)
 
     def event_maps() -> None:
         _backward(event.event_loss(change, counts), change)
 
     return {
         "ssim_and_l1": (similarity, in_torch(similarity, psnr_ssim)),
-        "log_brightness": (brightness, in_torch(brightness, events)),
-        "power_curve": (power, in_torch(power, srgb)),
+        "log_brightness": (brightness, in_torch(brightness, light)),
+        "power_curve": (power, in_torch(power, light)),
         "event_loss": (event_maps, in_torch(event_maps, event)),
         "membership": (
             lambda: _backward(semantic.membership_loss(share, packed), share),

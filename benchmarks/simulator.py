@@ -23,7 +23,7 @@ import torch
 from scipy import ndimage
 
 from evsplat.events import SensorSettings, SensorSimulator
-from evsplat.imaging import decode
+from evsplat.pictures import decode
 
 STEP_US = 1_000
 CLEAN = SensorSettings(response="lin-log")

@@ -5,8 +5,8 @@ from pathlib import Path
 from PIL import Image
 
 import evsplat as ev
-from evsplat.evaluation.pictures import signed_map
 from evsplat.events import count_map, voxel_grid, write_events
+from evsplat.pictures import signed_map
 from evsplat.shipped import demo_capture
 
 OUT = Path("example_output")

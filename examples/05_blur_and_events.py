@@ -3,8 +3,8 @@
 import torch
 
 import evsplat as ev
-from evsplat.events import count_map
-from evsplat.imaging import deblur, log_brightness_change
+from evsplat.events import count_map, deblur
+from evsplat.pictures import log_brightness_change
 from evsplat.shipped import demo_capture
 
 capture = ev.load_capture(demo_capture())

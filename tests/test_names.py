@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from evsplat.errors import DataError
-from evsplat.names import checked_name, is_name, is_path_of_names, leads_out
+from evsplat.names import checked_name, file_stem, is_name, is_path_of_names, leads_out
 
 BAD_NAMES = {
     "empty": "",
@@ -71,3 +71,9 @@ def test_links_lead_out_where_their_end_is_elsewhere(tmp_path: Path) -> None:
             assert not leads_out(root / inside, root), inside
         for outside in ("out", "beside", "up", "up/secret", "."):
             assert leads_out(root / outside, root), outside
+
+
+def test_names_of_frames_cannot_leave_the_folder_or_collide():
+    assert file_stem("test", "0007") == "test_0007"
+    stems = {file_stem("test", name) for name in ("../a/b", "../a b", "../a-b")}
+    assert len(stems) == 3 and not any("/" in stem or " " in stem for stem in stems)

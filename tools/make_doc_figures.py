@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image
 
 from evsplat.capture import Capture
-from evsplat.evaluation.pictures import to_bytes
 from evsplat.export import render_run
 from evsplat.files import read_json
+from evsplat.pictures import to_bytes
 from evsplat.training import load_run
 
 OUT = Path(__file__).parents[1] / "docs" / "images"

@@ -1,7 +1,9 @@
 """The one rule for names that other people's files give: any of them may become a file's name."""
 
 import os
+import re
 import unicodedata
+import zlib
 from pathlib import Path, PurePath
 
 from evsplat.errors import DataError
@@ -44,3 +46,15 @@ def leads_out(path: Path, folder: Path) -> bool:
     """Whether ``path``, all links in it followed, lies elsewhere than below ``folder``."""
     inside = os.path.join(os.path.realpath(folder), "")
     return not os.path.realpath(path).startswith(inside)
+
+
+def file_stem(*parts: str) -> str:
+    """Names joined with "_", reduced to letters, digits, dot, dash and underscore.
+
+    A name that loses something gets a checksum, so that two such names stay apart.
+    """
+    stems = []
+    for part in parts:
+        safe = re.sub(r"[^A-Za-z0-9._-]+", "-", part)
+        stems.append(safe if safe == part else f"{safe}-{zlib.crc32(part.encode()):08x}")
+    return "_".join(stems)

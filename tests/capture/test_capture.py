@@ -16,9 +16,9 @@ from PIL import Image
 
 from evsplat.capture import load_capture
 from evsplat.capture.distortion import Distortion
-from evsplat.capture.images import ImageCache
 from evsplat.errors import DataError
 from evsplat.events import count_map
+from evsplat.pictures.files import ImageCache
 
 Factory = Callable[..., Path]
 FILES_READ: list[str] | None = None

@@ -11,10 +11,11 @@ from evsplat.body import BodyTrack, up_axis
 from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import open_recording
-from evsplat.export import render_run, rendering, write_animation
+from evsplat.export import render_run, rendering
 from evsplat.film import Film, kept, scene
 from evsplat.film.looks import Look
 from evsplat.methods.reconstruction import Rendering
+from evsplat.pictures.video import write_animation
 
 LAST_US = 9 * 40_000
 

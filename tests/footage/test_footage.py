@@ -59,7 +59,7 @@ def test_given_rate_replaces_the_times_of_a_slow_motion_file(tmp_path):
 
 def test_colours_of_a_usual_video_survive(tmp_path):
     """H.264 of large BT.709 colour patches: within rounding of yuv420p and its coding."""
-    from evsplat.export import write_video as write_h264
+    from evsplat.pictures.video import write_video as write_h264
 
     colours = np.random.default_rng(2).integers(30, 226, (3, 4, 3), dtype=np.uint8)
     picture = np.kron(colours, np.ones((16, 16, 1), dtype=np.uint8))

@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 
 import evsplat as ev
-from evsplat.capture.encode import write_image
 from evsplat.cli import main
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import (
@@ -21,8 +20,9 @@ from evsplat.events import (
     SensorSimulator,
     sensor_settings,
 )
-from evsplat.export.video import write_video
-from evsplat.imaging import Transfer, decode, luminance
+from evsplat.pictures import Transfer, decode, luminance
+from evsplat.pictures.files import write_image
+from evsplat.pictures.video import write_video
 
 from ..events.formats.helpers import same
 from ..events.simulator.helpers import joined

@@ -7,10 +7,10 @@ import pytest
 
 from evsplat.body.smpl import ENVIRONMENT
 from evsplat.capture import load_capture
-from evsplat.capture.images import read_image
 from evsplat.cli import main
 from evsplat.errors import ConfigError, WeightsError
 from evsplat.importers import Blur, import_capture
+from evsplat.pictures.files import read_image
 
 from . import trees
 

@@ -10,9 +10,9 @@ from scipy.ndimage import binary_dilation
 from evsplat.body import BodyTrack, silhouette
 from evsplat.body.smpl import ENVIRONMENT
 from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
-from evsplat.capture.images import read_image
 from evsplat.importers import import_capture
 from evsplat.importers.base import shrunk
+from evsplat.pictures.files import read_image
 
 from . import trees
 from .person import Person, View, write_smpl

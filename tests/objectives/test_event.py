@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from evsplat.errors import ConfigError
-from evsplat.imaging import decode, encode, log_brightness_change
 from evsplat.methods.paper import EventConfig, paper_events
 from evsplat.objectives import EventChange, event_loss
+from evsplat.pictures import decode, encode, log_brightness_change
 
 from ..seen import seen
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from evsplat.capture import Capture, Frame, Policy, load_capture, validate_capture
 from evsplat.errors import ConfigError, DataError
-from evsplat.imaging import deblur
+from evsplat.events import deblur
 from evsplat.restore import RESTORERS, restore_capture
 
 from ..seen import seen

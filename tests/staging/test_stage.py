@@ -15,7 +15,7 @@ from evsplat.cli import main
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import count_map
 from evsplat.events.simulator import PRESETS
-from evsplat.imaging import luminance
+from evsplat.pictures import luminance
 from evsplat.staging import StageSettings, characters, motions, stage
 from evsplat.staging.assets import find_character, find_motion
 from evsplat.staging.camera_path import CameraPath

@@ -8,11 +8,10 @@ import pytest
 from PIL import Image
 
 from evsplat.capture import CaptureWriter, load_capture, validate_capture
-from evsplat.capture.encode import write_image
-from evsplat.capture.images import read_image
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import count_map
 from evsplat.inspection import inspect_capture
+from evsplat.pictures.files import read_image, write_image
 from evsplat.synthesis import RECIPES, synthesize
 
 Factory = Callable[..., Path]

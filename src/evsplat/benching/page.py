@@ -16,10 +16,10 @@ from evsplat.benching.writers import LEGEND, html
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.errors import DataError
 from evsplat.evaluation.people import People
-from evsplat.evaluation.pictures import to_bytes
 from evsplat.evaluation.regions import CROP_MARGIN, Box
 from evsplat.evaluation.report.embed import Embedder
 from evsplat.evaluation.report.html import folded, section, spread
+from evsplat.pictures import to_bytes
 
 _PIXELS = 60_000_000
 """Of all pictures of the page together; beyond, captures show fewer frames, evenly spread."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from evsplat.errors import DataError
 from evsplat.events import EventStream, Span
 from evsplat.events.maps import event_pixels
-from evsplat.imaging.srgb import Transfer, decode, luminance
+from evsplat.pictures.light import Transfer, decode, luminance
 
 DARKEST, BRIGHTEST = 0.02, 0.98
 """Coded values outside of this range are mostly noise, or clipped."""

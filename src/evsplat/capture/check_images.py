@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evsplat.capture.finding import Findings, reason_and_remedy
-from evsplat.capture.images import image_size, read_image
 from evsplat.capture.metadata import Metadata
 from evsplat.errors import DataError
+from evsplat.pictures.files import image_size, read_image
 
 _KIND_NAMES = {"image": "blurry picture", "sharp": "sharp picture", "mask": "person mask"}
 

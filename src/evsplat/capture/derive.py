@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture.capture import Capture
-from evsplat.capture.encode import write_image
 from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
 from evsplat.capture.training_capture import TrainingCapture
@@ -21,6 +20,7 @@ from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
 from evsplat.files import new_folder, read_json, write_json
+from evsplat.pictures.files import write_image
 
 Frames = Sequence[Frame]
 Made = Iterator[tuple[Frame, Float[Tensor, "..."]]]

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -16,12 +16,10 @@ from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.policy import Policy
+from evsplat.capture.read import CaptureReader
 from evsplat.capture.spans import held_out_spans, open_spans
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS, EventStore
-
-if TYPE_CHECKING:
-    from evsplat.capture.capture import Capture
 
 _KEPT_MASKS = 64
 """Estimated masks kept in memory; the least recently used one goes first."""
@@ -47,7 +45,7 @@ class TrainingCapture:
 
     def __init__(
         self,
-        source: "Capture",
+        source: CaptureReader,
         policy: Policy,
         masker: "Callable[[TrainingCapture], FindsPeople] | None" = None,
     ) -> None:

@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evsplat.capture.body_file import RIG_ARRAYS
-from evsplat.capture.encode import write_image
-from evsplat.capture.images import image_size
 from evsplat.capture.parse import FORMAT, VERSION, default_split
 from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
@@ -22,6 +20,7 @@ from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
 from evsplat.files import write_json
 from evsplat.names import checked_name
+from evsplat.pictures.files import image_size, write_image
 
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 

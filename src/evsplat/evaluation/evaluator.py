@@ -17,7 +17,6 @@ from evsplat.config import to_dict
 from evsplat.errors import DataError
 from evsplat.evaluation.event_maps import evaluate_event_maps
 from evsplat.evaluation.people import People
-from evsplat.evaluation.pictures import error_map, file_stem, save_png, to_bytes
 from evsplat.evaluation.protocols import (
     METRICS,
     PROTOCOLS,
@@ -34,6 +33,9 @@ from evsplat.files import write_json
 from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
+from evsplat.names import file_stem
+from evsplat.pictures import error_map, to_bytes
+from evsplat.pictures.files import save_png
 from evsplat.render import choose_device
 from evsplat.similarity.lpips import load_lpips
 from evsplat.similarity.perceptual import PerceptualMetric

@@ -10,11 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.evaluation.pictures import file_stem, save_png, signed_map
 from evsplat.evaluation.protocols import Absent
 from evsplat.events import count_map
-from evsplat.imaging.events import log_brightness_change
 from evsplat.methods.reconstruction import Reconstruction
+from evsplat.names import file_stem
+from evsplat.pictures import signed_map
+from evsplat.pictures.files import save_png
+from evsplat.pictures.light import log_brightness_change
 
 _TRAIN_PAIRS_SHOWN = 3
 

@@ -1,5 +1,6 @@
-"""Event streams: recordings of any format, slices, stores on disk, maps, a simulated sensor."""
+"""Event streams: recordings of any format, slices, maps, deblurring, a simulated sensor."""
 
+from evsplat.events.edi import deblur
 from evsplat.events.formats.base import RecordedFrame
 from evsplat.events.maps import begun_counts, count_map, polarity_counts, time_surface, voxel_grid
 from evsplat.events.recording import EventRecording, open_recording, read_events
@@ -26,6 +27,7 @@ __all__ = [
     "Span",
     "begun_counts",
     "count_map",
+    "deblur",
     "open_recording",
     "polarity_counts",
     "read_events",

@@ -9,15 +9,15 @@ from PIL import Image
 from tqdm import tqdm
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.evaluation.pictures import to_bytes
 from evsplat.events import SensorSettings
-from evsplat.export.video import write_animation, write_pictures, write_video
 from evsplat.film.events import copy_events, event_picture, event_pictures, simulate_film
 from evsplat.film.film import Film
 from evsplat.film.kept import KeptPictures, Shot, plan_of
 from evsplat.film.looks import Look, depth_colours
 from evsplat.film.scene import Scene, recorded_by
 from evsplat.methods.trivial import nearest_in_time
+from evsplat.pictures import to_bytes
+from evsplat.pictures.video import write_animation, write_pictures, write_video
 from evsplat.training.run import load_run
 
 _NEAREST = 0.6

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from evsplat.evaluation.pictures import signed_map
 from evsplat.events import (
     EventStore,
     EventStream,
@@ -17,6 +16,7 @@ from evsplat.events import (
 )
 from evsplat.film.kept import KeptPictures, Shot
 from evsplat.film.looks import linear_luma
+from evsplat.pictures import signed_map
 
 _FULL_SCALE = 3.0
 """Events of a pixel in one picture that get the strongest colour."""

@@ -10,9 +10,9 @@ from jaxtyping import Float, UInt16
 
 from evsplat.capture import Camera
 from evsplat.errors import ConfigError
-from evsplat.evaluation.pictures import colours
-from evsplat.imaging import decode, encode, luminance
 from evsplat.methods.reconstruction import Parts, Reconstruction, WithDepth
+from evsplat.pictures import decode, encode, luminance
+from evsplat.pictures.colours import colours
 
 Shown = Literal["rgb", "semantic", "depth", "events"]
 SHOWN: tuple[Shown, ...] = get_args(Shown)

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.capture.images import to_unit_range
 from evsplat.errors import DataError
 from evsplat.events import EventStream, SensorSettings, simulate_events, write_events
 from evsplat.footage import Footage, open_footage
-from evsplat.imaging import Transfer, decode, luminance
+from evsplat.pictures import Transfer, decode, luminance
+from evsplat.pictures.files import to_unit_range
 
 logger = logging.getLogger(__name__)
 

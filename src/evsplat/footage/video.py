@@ -8,7 +8,7 @@ import av
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.footage.footage import TimedPicture, times_of_rate
+from evsplat.footage.pictures import TimedPicture, times_of_rate
 
 # Transfer characteristics of ITU-T H.273: PQ and HLG code light in ways no other part understands.
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}

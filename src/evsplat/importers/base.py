@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from evsplat.capture.images import image_size, read_image
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
+from evsplat.pictures.files import image_size, read_image
 
 GUIDE = "docs/import.md shows the tree"
 SHARP_EXPOSURE_US = 1_000

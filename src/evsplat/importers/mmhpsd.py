@@ -11,7 +11,6 @@ from tqdm import tqdm
 from evsplat.body.pose_files import PoseSequence, read_poses
 from evsplat.body.pose_files.fields import axis_angles, numbers
 from evsplat.body.pose_files.sequence import make_sequence
-from evsplat.capture.images import image_size
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import DataError
 from evsplat.events import EventStream, open_recording
@@ -30,6 +29,7 @@ from evsplat.importers.base import (
     picture,
 )
 from evsplat.importers.smpl import add_body, chosen_poses, unposed
+from evsplat.pictures.files import image_size
 from evsplat.safe_pickle import read_npz, read_pickle
 
 _FOCAL_PX, _CENTRE_PX, _CANVAS_PX = 1679.3, 641.0, 1280

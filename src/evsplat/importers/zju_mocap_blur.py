@@ -13,7 +13,6 @@ from evsplat.body.pose_files import PoseSequence
 from evsplat.body.pose_files.fields import has, numbers
 from evsplat.body.pose_files.sequence import make_sequence, moved
 from evsplat.body.smpl_skeleton import rest_pelvis
-from evsplat.capture.images import image_size
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import DataError
 from evsplat.events import EventStream
@@ -32,6 +31,7 @@ from evsplat.importers.base import (
     table,
 )
 from evsplat.importers.smpl import add_body
+from evsplat.pictures.files import image_size
 from evsplat.safe_pickle import read_pickle
 
 _EVENTS_PER_PIECE = 1 << 20

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.errors import ConfigError, DataError
-from evsplat.imaging import decode
 from evsplat.masks.silhouette import track_silhouette
+from evsplat.pictures import decode
 
 THRESHOLD = 0.08
 """Least difference to the background, in coded values: fewer are shading of the scene."""

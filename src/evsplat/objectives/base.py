@@ -11,10 +11,10 @@ from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import DeviceCache
-from evsplat.imaging import decode
 from evsplat.models.drawing import Drawing
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
+from evsplat.pictures import decode
 
 ModelType = TypeVar("ModelType", bound=Model)
 

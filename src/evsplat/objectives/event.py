@@ -14,8 +14,8 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.compiled import native, runs_native
 from evsplat.devices import DeviceCache
 from evsplat.events import count_map, polarity_counts
-from evsplat.imaging import log_brightness_change
 from evsplat.objectives.base import Stateless, Step
+from evsplat.pictures import log_brightness_change
 
 CACHED_MAPS = 256
 """Event maps kept in memory; at 1280x720 about 0.9 GB, at 256x256 64 MB."""

@@ -10,10 +10,10 @@ from torch import Tensor
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import send
 from evsplat.events import EventStream, begun_counts, polarity_counts
-from evsplat.imaging import luminance
 from evsplat.objectives.base import Stateless, Step
 from evsplat.objectives.event_noise import EventNoise
 from evsplat.objectives.event_sensor import EventSensor
+from evsplat.pictures import luminance
 
 _RATE_US = 1_000
 """How far before and after an instant events are counted for their rate there."""

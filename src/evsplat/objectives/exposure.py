@@ -9,8 +9,8 @@ from torch import Tensor
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.devices import DeviceCache
-from evsplat.imaging import encode
 from evsplat.objectives.base import Stateless, Step, picture
+from evsplat.pictures import encode
 from evsplat.similarity.psnr_ssim import l1_and_ssim
 
 DARKEST_LINEAR = 1e-6

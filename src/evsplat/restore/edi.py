@@ -1,4 +1,4 @@
-"""Event double integral as a restorer (`evsplat.imaging.edi`)."""
+"""Event double integral as a restorer (`evsplat.events.edi`)."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -8,7 +8,8 @@ from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import ConfigError, DataError
-from evsplat.imaging import Transfer, deblur
+from evsplat.events import deblur
+from evsplat.pictures import Transfer
 from evsplat.restore.needs import require_signed_events
 
 

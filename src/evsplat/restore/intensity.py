@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.events import EventStream
 from evsplat.events.maps import polarity_counts
-from evsplat.imaging.srgb import REC709
+from evsplat.pictures.light import REC709
 from evsplat.restore.needs import require_signed_events
 
 MATCHED_OVER = 0.02

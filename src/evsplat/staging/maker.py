@@ -20,7 +20,7 @@ from evsplat.capture.parse import default_split
 from evsplat.errors import ConfigError
 from evsplat.events import EventStream
 from evsplat.events.simulator import PRESETS, SensorSimulator
-from evsplat.imaging import encode, luminance
+from evsplat.pictures import encode, luminance
 from evsplat.staging.assets import find_character, find_motion
 from evsplat.staging.camera_path import MAIN, NOVEL, CameraPath, make_camera
 from evsplat.staging.character import Character, load_character

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from evsplat.capture.images import opened_picture
+from evsplat.pictures.files import opened_picture
 
 GAMMA = 2.2
 """Pictures are decoded and encoded with this power, as the rest of the project does."""

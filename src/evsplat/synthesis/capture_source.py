@@ -7,10 +7,10 @@ from typing import Any, Literal
 import numpy as np
 
 from evsplat.capture import Capture, CaptureWriter, Frame, load_capture
-from evsplat.capture.images import read_image
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture
+from evsplat.pictures.files import read_image
 from evsplat.synthesis.source import RecordedEvents, set_body
 
 _PIECE_US = 100_000

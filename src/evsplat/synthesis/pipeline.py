@@ -16,7 +16,7 @@ from evsplat.capture import CaptureWriter
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import simulate_events
 from evsplat.footage import TimedPicture, open_footage
-from evsplat.imaging.srgb import Transfer, decode, encode
+from evsplat.pictures.light import Transfer, decode, encode
 from evsplat.synthesis.capture_source import CaptureSource
 from evsplat.synthesis.exposure import Exposure, ExposureMean, Plan, plan_exposures
 from evsplat.synthesis.footage_source import FootageSource

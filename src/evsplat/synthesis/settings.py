@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from evsplat.errors import ConfigError
 from evsplat.events import PRESETS, SensorSettings, sensor_settings
-from evsplat.imaging.srgb import Transfer
+from evsplat.pictures.light import Transfer
 
 Interpolation = Literal["flow", "super-slomo", "none"]
 Events = Literal["simulate", "source", "none"]

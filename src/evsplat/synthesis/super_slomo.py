@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evsplat.errors import WeightsError
-from evsplat.imaging.srgb import Transfer, decode
+from evsplat.pictures.light import Transfer, decode
 from evsplat.synthesis.interpolate import Picture
 from evsplat.weights import (
     MissingWeights,

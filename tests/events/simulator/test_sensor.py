@@ -18,7 +18,7 @@ from evsplat.events import (
     sensor_settings,
     simulate_events,
 )
-from evsplat.imaging import luminance
+from evsplat.pictures import luminance
 
 from ..formats.helpers import same
 from .helpers import by_pixel, joined, moving_pattern, reference_events, run

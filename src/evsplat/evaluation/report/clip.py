@@ -10,9 +10,10 @@ import torch
 from jaxtyping import UInt8
 
 from evsplat.capture import Capture
-from evsplat.evaluation.pictures import to_bytes
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import nearest_in_time
+from evsplat.pictures import to_bytes
+from evsplat.pictures.video import write_video
 
 _PLAYED_HZ = 25
 _SLOWER = 5.0
@@ -41,8 +42,6 @@ def make_clip(capture: Capture, reconstruction: Reconstruction) -> Clip | None:
     cameras that stand still; a moving camera's pose is known at its frames only, so its clip has
     one picture per frame.
     """
-    from evsplat.export.video import write_video
-
     camera_name = capture.frames[0].camera
     frames = sorted((f for f in capture.frames if f.camera == camera_name), key=lambda f: f.mid_us)
     moves = any(frame.world_to_camera is not None for frame in frames)

@@ -5,7 +5,6 @@ from html import escape
 from importlib import resources
 from typing import Any
 
-from evsplat.evaluation.pictures import css_gradient, to_bytes
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
 from evsplat.evaluation.report.configuration import configuration, duration, made_with
@@ -23,6 +22,8 @@ from evsplat.evaluation.report.html import (
 )
 from evsplat.evaluation.report.shots import test_frames
 from evsplat.evaluation.report.source import Source
+from evsplat.pictures import to_bytes
+from evsplat.pictures.colours import css_gradient
 
 _PAIRS_OPEN = {"test": 4, "train": 2}
 """Event map pairs shown at once per split; the others are folded."""

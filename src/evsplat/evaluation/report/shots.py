@@ -9,7 +9,6 @@ from jaxtyping import UInt8
 
 from evsplat.capture import Frame, Policy
 from evsplat.capture.policy import policy_of
-from evsplat.evaluation.pictures import ERROR_FULL_SCALE, css_gradient, to_bytes
 from evsplat.evaluation.regions import Box
 from evsplat.evaluation.report.embed import Embedder
 from evsplat.evaluation.report.figures import no_test_figures
@@ -24,6 +23,8 @@ from evsplat.evaluation.report.html import (
     spread,
 )
 from evsplat.evaluation.report.source import Source
+from evsplat.pictures import to_bytes
+from evsplat.pictures.colours import ERROR_FULL_SCALE, css_gradient
 
 _WORTH_ENLARGING = 0.8
 """Crops wider than this share of the picture show nothing new."""

@@ -11,7 +11,7 @@ from evsplat.compiled import import_error, native
 from evsplat.errors import BackendError, DataError
 from evsplat.events.simulator.settings import LOWEST_CONTRAST, SensorSettings
 from evsplat.events.stream import EventStream
-from evsplat.imaging.srgb import luminance
+from evsplat.pictures.light import luminance
 
 _LONGEST_STEP_US = 2**31
 
@@ -95,7 +95,7 @@ class SensorSimulator:
         if luma.shape != (self.height, self.width):
             raise DataError(
                 f"the picture at {time_us} us has shape {luma.shape}, expected luma of shape "
-                f"{(self.height, self.width)}; use evsplat.imaging.luminance for colour."
+                f"{(self.height, self.width)}; use evsplat.pictures.luminance for colour."
             )
         last = self._time_us
         if last is not None and not last < time_us < last + _LONGEST_STEP_US:

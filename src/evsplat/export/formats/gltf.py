@@ -12,7 +12,7 @@ import torch
 from evsplat.export.cloud import SplatCloud
 from evsplat.export.formats.ply import SH_C0
 from evsplat.files import atomic_path
-from evsplat.imaging.srgb import decode
+from evsplat.pictures.light import decode
 
 EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0

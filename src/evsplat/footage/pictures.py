@@ -1,14 +1,48 @@
-"""A folder of pictures, one file each."""
+"""Pictures with times, and a folder of them, one file each."""
 
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
-from evsplat.capture.images import image_size, read_image
+import numpy as np
+from jaxtyping import Int64
+
 from evsplat.errors import DataError
-from evsplat.footage.footage import TimedPicture, times_of_rate
+from evsplat.pictures.files import image_size, read_image
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPicture:
+    """One picture of a recording."""
+
+    name: str
+    """Of the picture file, or its number in the video."""
+    time_us: int
+    pixels: np.ndarray
+    """As stored, (H, W) or (H, W, 3), uint8 or uint16."""
+
+
+class Footage(Protocol):
+    """A recording whose times are known before its pictures are decoded."""
+
+    path: Path
+    width: int
+    height: int
+    times_us: Int64[np.ndarray, "N"]
+    """Strictly ascending; footage without a clock of its own begins at 0."""
+
+    def __iter__(self) -> Iterator[TimedPicture]:
+        """Decode the pictures one after the other, as many as there are times."""
+        ...
+
+
+def times_of_rate(count: int, fps: float) -> Int64[np.ndarray, "count"]:
+    """Whole microseconds of ``count`` pictures at a rate, the first at 0."""
+    return np.round(np.arange(count) * 1e6 / fps).astype(np.int64)
 
 
 class FolderFootage:

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.export import write_pictures, write_video
+from evsplat.pictures.video import write_pictures, write_video
 
 
 def _flat_pictures(count: int, height: int, width: int) -> list[np.ndarray]:

@@ -6,8 +6,8 @@ import torch
 
 from evsplat.errors import DataError
 from evsplat.events import EventStream
-from evsplat.imaging import decode, encode
-from evsplat.imaging.edi import deblur, log_gain
+from evsplat.events.edi import deblur, log_gain
+from evsplat.pictures import decode, encode
 
 EXPOSURE = (10_000, 40_000)
 LENGTH = EXPOSURE[1] - EXPOSURE[0]

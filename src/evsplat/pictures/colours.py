@@ -1,16 +1,9 @@
-"""Pictures of what was measured: error maps, signed event maps, PNG files."""
-
-import re
-import zlib
-from pathlib import Path
+"""8-bit pictures, and colours of what was measured: error maps, signed maps."""
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from torch import Tensor
-
-from evsplat.files import atomic_path
 
 ERROR_FULL_SCALE = 64
 """Mean absolute difference, in 8-bit levels, that gets the brightest colour of an error map."""
@@ -56,21 +49,3 @@ def css_gradient(signed: bool) -> str:
     """The colours of error maps or signed maps as a CSS gradient, left to right."""
     anchors = _SIGNED if signed else _HEAT
     return "linear-gradient(90deg," + ",".join(f"rgb{anchor}" for anchor in anchors) + ")"
-
-
-def save_png(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
-    """Write a PNG, whole or not at all."""
-    with atomic_path(path) as temporary:
-        Image.fromarray(picture).save(temporary)
-
-
-def file_stem(*parts: str) -> str:
-    """Names joined with "_", reduced to letters, digits, dot, dash and underscore.
-
-    A name that loses something gets a checksum, so that two such names stay apart.
-    """
-    stems = []
-    for part in parts:
-        safe = re.sub(r"[^A-Za-z0-9._-]+", "-", part)
-        stems.append(safe if safe == part else f"{safe}-{zlib.crc32(part.encode()):08x}")
-    return "_".join(stems)

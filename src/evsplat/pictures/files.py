@@ -1,20 +1,22 @@
-"""Decoding pictures (8 or 16 bit, grey or RGB) and a cache of them bounded in bytes."""
+"""Picture files, 8 or 16 bit, grey or RGB: reading, a cache bounded in bytes, writing as PNG."""
 
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from evsplat.errors import DataError
-from evsplat.files import why_not_read
+from evsplat.files import atomic_path, why_not_read
 
 
 @contextmanager
@@ -107,6 +109,31 @@ class ImageCache:
         return array
 
 
+def write_image(path: Path, pixels: np.ndarray, *, source: str = "") -> None:
+    """Write (H, W) or (H, W, 3) as PNG: uint8 and uint16 as they are, the rest as 8 bit.
+
+    Booleans and floats mean the range [0, 1], which floats may leave by no more than rounding.
+    ``source`` is what errors call the picture, by default ``path``.
+    """
+    source = source or str(path)
+    if pixels.ndim != 2 and not (pixels.ndim == 3 and pixels.shape[2] == 3):
+        raise DataError(f"{source}: has shape {pixels.shape}, expected (H, W) or (H, W, 3).")
+    if pixels.dtype.kind in "fb":
+        pixels = _eight_bits(pixels, source)
+    if pixels.dtype == np.uint16 and pixels.ndim == 3:
+        path.write_bytes(_encode_16_bit_colour(pixels))
+    elif pixels.dtype in (np.uint8, np.uint16):
+        Image.fromarray(np.ascontiguousarray(pixels)).save(path)
+    else:
+        raise DataError(f"{source}: holds {pixels.dtype}, expected uint8, uint16 or floats.")
+
+
+def save_png(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
+    """Write a PNG, whole or not at all."""
+    with atomic_path(path) as temporary:
+        Image.fromarray(picture).save(temporary)
+
+
 def _has_16_bits(image: Image.Image) -> bool:
     """Whether the file holds 16 bits per channel, which Pillow would cut to 8."""
     return any(
@@ -116,8 +143,6 @@ def _has_16_bits(image: Image.Image) -> bool:
 
 
 def _read_16_bit_colour(path: Path) -> np.ndarray:
-    import av
-
     try:
         with av.open(str(path)) as container:
             return next(container.decode(video=0)).to_ndarray(format="rgb48le")
@@ -125,3 +150,21 @@ def _read_16_bit_colour(path: Path) -> np.ndarray:
         raise DataError(
             f"{path}: cannot be decoded as a 16-bit picture ({error}); save it again as PNG."
         ) from error
+
+
+def _eight_bits(pixels: np.ndarray, source: str) -> np.ndarray:
+    low, high = float(pixels.min()), float(pixels.max())
+    if not (low >= -1e-3 and high <= 1 + 1e-3):
+        raise DataError(f"{source}: has values in [{low:.4g}, {high:.4g}], expected [0, 1].")
+    return (pixels.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _encode_16_bit_colour(pixels: np.ndarray) -> bytes:
+    """PNG of (H, W, 3) uint16, which Pillow cannot write."""
+    context = av.CodecContext.create("png", "w")
+    assert isinstance(context, av.VideoCodecContext)
+    context.height, context.width = pixels.shape[:2]
+    context.pix_fmt, context.time_base = "rgb48be", Fraction(1)
+    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb48le")
+    packets = [*context.encode(frame.reformat(format="rgb48be")), *context.encode(None)]
+    return b"".join(bytes(packet) for packet in packets)

@@ -17,7 +17,7 @@ from torch import Tensor
 from evsplat.errors import DataError
 from evsplat.events.maps import event_pixels
 from evsplat.events.stream import EventStream
-from evsplat.imaging.srgb import Transfer, decode, encode
+from evsplat.pictures.light import Transfer, decode, encode
 
 ContrastThreshold = tuple[float, float]
 """C+ and C-: change of log intensity per event, both positive."""

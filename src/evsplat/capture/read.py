@@ -1,0 +1,215 @@
+"""All of a capture folder, read when asked for."""
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.camera import Camera
+from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
+from evsplat.capture.metadata import Frame, Metadata, NovelView
+from evsplat.capture.points import read_points
+from evsplat.errors import DataError
+from evsplat.events import EventStore
+from evsplat.pictures.files import (
+    ImageCache,
+    planar,
+    read_image,
+    to_grey,
+    to_rgb,
+    to_unit_range,
+)
+
+IMAGE_CACHE_BYTES = 512 << 20
+# A temporal median settles long before this many frames; more would only cost memory.
+_MEDIAN_FRAMES = 255
+
+
+class CaptureReader:
+    """Pictures, events and poses of a capture folder, held out or not, as `Capture` says."""
+
+    def __init__(self, metadata: Metadata, *, cache_bytes: int = IMAGE_CACHE_BYTES) -> None:
+        self._metadata = metadata
+        self._by_name = {frame.name: frame for frame in metadata.frames}
+        self._images = ImageCache(cache_bytes)
+        self.path: Path = metadata.path
+        self.name: str = metadata.name
+        self.cameras: dict[str, Camera] = metadata.cameras
+        self.frames: tuple[Frame, ...] = metadata.frames
+        self.novel_views: tuple[NovelView, ...] = metadata.novel_views
+        self.provenance: dict[str, Any] = metadata.provenance
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.path)!r}, {len(self.frames)} frames)"
+
+    def with_nothing_held_out(self) -> Self:
+        """The same recording with all frames for training, and so none for a test."""
+        frames = tuple(replace(frame, split="train") for frame in self.frames)
+        return type(self)(replace(self._metadata, frames=frames))
+
+    @property
+    def metadata(self) -> Metadata:
+        """All of capture.json; what other parts need is given by the other members."""
+        return self._metadata
+
+    @property
+    def train_frames(self) -> tuple[Frame, ...]:
+        """Frames for training."""
+        return tuple(frame for frame in self.frames if frame.split == "train")
+
+    @property
+    def test_frames(self) -> tuple[Frame, ...]:
+        """Frames held out for evaluation."""
+        return tuple(frame for frame in self.frames if frame.split == "test")
+
+    def frame(self, name: str) -> Frame:
+        """The frame of that name."""
+        if name not in self._by_name:
+            raise DataError(f"{self.path}: no frame is named {name!r}.")
+        return self._by_name[name]
+
+    def camera(self, frame: Frame | str) -> Camera:
+        """The pinhole camera at the mid-exposure of a frame, with a moving camera's own pose."""
+        frame = self._frame(frame)
+        camera = self.cameras[frame.camera]
+        if frame.world_to_camera is None:
+            return camera
+        return Camera(camera.width, camera.height, camera.K, frame.world_to_camera)
+
+    def is_distorted(self, camera: str) -> bool:
+        """Whether the lens of a camera distorts, which reading pictures and events undoes."""
+        return camera in self._metadata.distortions
+
+    @property
+    def is_static_camera(self) -> bool:
+        """Whether all frames come from one camera that stands still."""
+        one = len({frame.camera for frame in self.frames}) == 1
+        return one and all(frame.world_to_camera is None for frame in self.frames)
+
+    def image(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
+        """The blurry picture."""
+        frame = self._frame(frame)
+        return to_rgb(self._picture(frame.image, frame.camera))
+
+    def sharp(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
+        """The sharp truth at mid-exposure; for evaluation only, nothing else opens these files."""
+        frame = self._frame(frame)
+        if frame.sharp is None:
+            raise DataError(
+                f"{self.path / 'capture.json'}: frame {frame.name!r} names no sharp picture; "
+                "evaluate against frames that do."
+            )
+        return to_rgb(self._picture(frame.sharp, frame.camera))
+
+    def mask(self, frame: Frame | str) -> Float[Tensor, "H W"] | None:
+        """Share of the person per pixel in [0, 1]; None where the frame has no mask."""
+        frame = self._frame(frame)
+        return None if frame.mask is None else to_grey(self._picture(frame.mask, frame.camera))
+
+    def novel_image(self, view: NovelView) -> Float[Tensor, "H W 3"]:
+        """A sharp picture of another camera."""
+        return to_rgb(self._picture(view.image, view.camera))
+
+    @functools.cached_property
+    def events(self) -> EventStore | None:
+        """The event recording, on the camera's clock; None where the capture has none."""
+        entry = self._metadata.events
+        if entry is None:
+            return None
+        distortion = self._metadata.distortions.get(self.frames[0].camera)
+        lookup = None if distortion is None else distortion.event_lookup()
+        return EventStore(entry.file, entry.width, entry.height, entry.clock_offset_us, lookup)
+
+    @property
+    def contrast_threshold(self) -> tuple[float, float] | None:
+        """C+ and C- of the event sensor in log intensity; None where unknown."""
+        return None if self._metadata.events is None else self._metadata.events.contrast_threshold
+
+    @property
+    def events_simulated(self) -> bool:
+        """Whether the events were computed rather than recorded."""
+        return self._metadata.events is not None and self._metadata.events.simulated
+
+    @property
+    def clock_offset_us(self) -> int:
+        """What was added to the event file's times to bring them to the camera's clock."""
+        return 0 if self._metadata.events is None else self._metadata.events.clock_offset_us
+
+    @property
+    def has_body(self) -> bool:
+        """Whether body and poses are given."""
+        return bool(self._metadata.body_model)
+
+    @functools.cached_property
+    def body_file(self) -> BodyFile:
+        """The body and its key poses as stored; a `DataError` where there are none."""
+        if not self.has_body:
+            raise DataError(
+                f"{self.path / 'capture.json'}: has no body; write body.npz with the poses and "
+                "name it under 'body' (docs/capture-format.md)."
+            )
+        path = self._metadata.body_file
+        return body_from_arrays(path, read_arrays(path), self._metadata.body_model)
+
+    @functools.cached_property
+    def dense_body_file(self) -> BodyFile | None:
+        """True poses at many times (evaluation and ablation only); None where not given."""
+        path = self.path / "body_dense.npz"
+        if not self.has_body or not path.exists():
+            return None
+        return body_from_arrays(path, read_arrays(path), self._metadata.body_model)
+
+    def median_background(self) -> Float[Tensor, "H W 3"]:
+        """Per-pixel temporal median of the train frames (at most 255, evenly spread)."""
+        return self._median.clone()
+
+    @functools.cached_property
+    def _median(self) -> Tensor:
+        if not self.is_static_camera:
+            raise DataError(
+                f"{self.path}: a median background needs one camera that stands still; this "
+                "capture has a moving camera or several."
+            )
+        train = self.train_frames
+        chosen = np.unique(np.linspace(0, len(train) - 1, min(len(train), _MEDIAN_FRAMES)).round())
+        stored = [self._stored(train[int(i)].image, train[int(i)].camera) for i in chosen]
+        stack = np.stack(stored)
+        rows = [np.median(stack[:, row], axis=0) for row in range(stack.shape[1])]
+        scale = 1.0 if stack.dtype == np.float32 else float(np.iinfo(stack.dtype).max)
+        return to_rgb(torch.from_numpy((np.stack(rows) / scale).astype(np.float32)))
+
+    def initial_points(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]] | None:
+        """World points and their colours (sRGB in [0, 1]) of points.ply; None where not given."""
+        path = self.path / "points.ply"
+        if not path.exists():
+            return None
+        points, colours = read_points(path)
+        return torch.from_numpy(points), torch.from_numpy(colours)
+
+    def _frame(self, frame: Frame | str) -> Frame:
+        return self.frame(frame if isinstance(frame, str) else frame.name)
+
+    def _picture(self, path: Path, camera: str) -> Tensor:
+        return to_unit_range(self._stored(path, camera))
+
+    def _stored(self, path: Path, camera: str) -> np.ndarray:
+        return self._images.get(path, lambda: self._decode(path, camera))
+
+    def _decode(self, path: Path, camera: str) -> np.ndarray:
+        pixels = read_image(path)
+        expected = self.cameras[camera]
+        if pixels.shape[:2] != (expected.height, expected.width):
+            raise DataError(
+                f"{path}: the picture has {pixels.shape[1]}x{pixels.shape[0]} pixels, expected "
+                f"{expected.width}x{expected.height} of camera {camera!r}; resize it or correct "
+                "the camera in capture.json."
+            )
+        distortion = self._metadata.distortions.get(camera)
+        if distortion is not None:
+            pixels = distortion.undistort_image(to_unit_range(pixels).numpy())
+        return planar(pixels)

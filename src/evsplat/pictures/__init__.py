@@ -1,0 +1,23 @@
+"""Pictures: light and coded values, 8-bit colours, files and videos."""
+
+from evsplat.pictures.colours import error_map, signed_map, to_bytes
+from evsplat.pictures.light import (
+    Transfer,
+    decode,
+    encode,
+    log_brightness,
+    log_brightness_change,
+    luminance,
+)
+
+__all__ = [
+    "Transfer",
+    "decode",
+    "encode",
+    "error_map",
+    "log_brightness",
+    "log_brightness_change",
+    "luminance",
+    "signed_map",
+    "to_bytes",
+]
