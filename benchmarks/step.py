@@ -35,7 +35,6 @@ from torch import Tensor
 from evsplat import _native
 from evsplat.capture import Frame, load_capture
 from evsplat.deform import drawing, human_scene
-from evsplat.deform.mlp import Precision
 from evsplat.gaussians import ATTRIBUTES, GaussianSet
 from evsplat.methods import PaperConfig, compose
 from evsplat.objectives.base import Stateless, Step
@@ -52,14 +51,11 @@ def main() -> None:
     parser.add_argument("--human", type=int, default=20_000)
     parser.add_argument("--scene", type=int, default=30_000)
     parser.add_argument("--renders", type=int, default=2, help="times per step")
-    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--steps", type=int, default=20)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    trainer = build(
-        arguments.size, arguments.human, arguments.scene, arguments.renders, arguments.precision
-    )
+    trainer = build(arguments.size, arguments.human, arguments.scene, arguments.renders)
     for _ in range(5):
         trainer.step()
 
@@ -91,7 +87,6 @@ def main() -> None:
         "scene": counts["scene"],
         "renders": arguments.renders,
         "threads": arguments.threads,
-        "precision": arguments.precision,
         "step_median_ms": round(median, 2),
         "step_best_ms": round(best, 2),
         "products_gflop": round(gflop, 2),
@@ -104,11 +99,11 @@ def main() -> None:
     print(json.dumps(results))
 
 
-def build(size: int, human: int, scene: int, renders: int, precision: Precision) -> Trainer:
+def build(size: int, human: int, scene: int, renders: int) -> Trainer:
     """A training on the demo capture, with pictures of that size."""
     folder = tempfile.TemporaryDirectory()
     _KEPT.append(folder)
-    return build_on(resized_demo(size, Path(folder.name)), human, scene, renders, precision)
+    return build_on(resized_demo(size, Path(folder.name)), human, scene, renders)
 
 
 def build_on(
@@ -116,7 +111,6 @@ def build_on(
     human: int | None,
     scene: int | None,
     renders: int,
-    precision: Precision,
     device: str = "cpu",
 ) -> Trainer:
     """A training in the middle of its schedule, with everything switched on."""
@@ -124,7 +118,6 @@ def build_on(
     config = dataclasses.replace(
         config,
         human=dataclasses.replace(config.human, count=human),
-        deform=dataclasses.replace(config.deform, precision=precision),
         densify_human=dataclasses.replace(config.densify_human, max_count=human or 10_000),
     )
     capture = load_capture(path).for_training(config.policy)

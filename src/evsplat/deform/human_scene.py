@@ -16,7 +16,6 @@ from evsplat.deform.colour import HumanColour, SceneColour, view_directions, vie
 from evsplat.deform.drawing import Drawing, draw
 from evsplat.deform.frame_weights import UnseenFrames, interpolated, seen, seen_or_last
 from evsplat.deform.lamps import Lamps
-from evsplat.deform.mlp import PointMLP, Precision
 from evsplat.deform.model import RowCache
 from evsplat.deform.non_rigid import NonRigidNetwork
 from evsplat.deform.pose_encoder import PoseEncoder, normalise_joints
@@ -69,9 +68,6 @@ class DeformConfig:
     """Hidden width of the colour networks (A10)."""
     latent_dim: int = 16
     """Size of the per-frame latent of the person's colour."""
-    precision: Precision = "float32"
-    """bfloat16: the hidden layers multiply with 8 bits and sum with 24, on CPUs with AVX-512 BF16
-    and on GPUs; elsewhere a warning says that it is float32. See docs/performance.md."""
     non_rigid_start: float = 3_000
     """Nominal iteration at which the non-rigid network is switched on (A9)."""
     pose_noise: float = 0.1
@@ -171,9 +167,6 @@ class HumanSceneModel(nn.Module):
         self.scene_colour = SceneColour(
             view_dependent=config.scene_view_dependent, width=config.colour_width
         )
-        for module in self.modules():
-            if isinstance(module, PointMLP):
-                module.precision = config.precision
         frames = len(frame_times_us)
         self.sensor: nn.Module | None = None
         """What is learned of the event camera, by methods that do."""

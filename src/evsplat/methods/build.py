@@ -1,6 +1,5 @@
 """What all methods of one model share: the person's settings, and the model at its start."""
 
-import logging
 from dataclasses import dataclass, field
 
 import torch
@@ -8,7 +7,6 @@ import torch
 from evsplat.body import BodyTrack, SurfaceSamples, load_body_track
 from evsplat.capture import Policy, TrainingCapture
 from evsplat.deform.human_scene import DeformConfig, HumanSceneModel, Semantics
-from evsplat.deform.mlp import bfloat16_runs
 from evsplat.deform.pose_spline import PoseSpline
 from evsplat.errors import DataError
 from evsplat.gaussians import BodyFrames, DensifyConfig, GaussianSet, Part
@@ -18,8 +16,6 @@ from evsplat.methods.prefit import fit_skinning
 from evsplat.methods.rates import learning_of
 from evsplat.methods.starts import HumanStartConfig
 from evsplat.objectives import Isometry, Objective, SkinningPrior
-
-logger = logging.getLogger(__name__)
 
 SURFACE_SAMPLES = 100_000
 """Body surface points drawn once for the skinning prior."""
@@ -111,8 +107,6 @@ class Build:
         model = HumanSceneModel(
             config.deform, semantics, ground.track, ground.times_us, gaussians, pose_spline
         ).to(device)
-        if config.deform.precision == "bfloat16" and not bfloat16_runs(model.box_low.device):
-            logger.warning("This machine multiplies no bfloat16: the networks run in float32.")
         prior = SkinningPrior(ground.surface.to(device), config.skinning_points)
         if fit and model.skinning is not None:
             fit_skinning(model, prior, config.skinning_prefit_steps, ground.generator)
