@@ -151,11 +151,8 @@ class Bench:
         """A training step of method `paper` with everything on, at two sizes."""
         found: Results = {}
         for name, human, scene, renders in (("2", 20_000, 30_000, 2), ("5", 20_000, 30_000, 5)):
-            trainer = build_on(capture, human, scene, renders, "float32", self.device)
+            trainer = build_on(capture, human, scene, renders, self.device)
             found[f"step_{name}_renders_ms"] = self._timed(trainer.step, repeats=30, warm_up=10)
-        if self.cuda:
-            trainer = build_on(capture, 20_000, 30_000, 2, "bfloat16", self.device)
-            found["step_2_renders_bfloat16_ms"] = self._timed(trainer.step, 30, 10)
         return found
 
     def train(self, capture: Path, run: Path, method: str, minutes: float) -> Results:

@@ -75,7 +75,7 @@ def measure(curve: str, value: int) -> float:
     """Median milliseconds of one point."""
     if curve == "recording":
         with tempfile.TemporaryDirectory() as folder:
-            trainer = build_on(repeated_demo(value, Path(folder)), None, None, 2, "float32")
+            trainer = build_on(repeated_demo(value, Path(folder)), None, None, 2)
             for frame in trainer.capture.frames:
                 trainer.capture.image(frame)
             return timed(trainer.step, 40).median

@@ -35,7 +35,6 @@ from torch import Tensor
 from evsplat import _native
 from evsplat.capture import Frame, load_capture
 from evsplat.deform import drawing, human_scene
-from evsplat.models.networks.mlp import Precision
 from evsplat.gaussians import ATTRIBUTES, GaussianSet
 from evsplat.methods import PaperConfig, compose
 from evsplat.objectives.base import Stateless, Step
@@ -104,7 +103,6 @@ def main() -> None:
     print(json.dumps(results))
 
 
-def build(size: int, human: int, scene: int, renders: int, precision: Precision) -> Trainer:
     """A training on the demo capture, with pictures of that size."""
     folder = tempfile.TemporaryDirectory()
     _KEPT.append(folder)
@@ -116,7 +114,6 @@ def build_on(
     human: int | None,
     scene: int | None,
     renders: int,
-    precision: Precision,
     device: str = "cpu",
 ) -> Trainer:
     """A training in the middle of its schedule, with everything switched on."""

@@ -750,8 +750,8 @@ double multiply_add(int64_t rounds, float* sink) {
 }  // namespace
 
 const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,         project, forward,
-                         backward,     project_backward, multiply_add, &mlp_kernels,
-                         ssim_band,    log_brightness, power, add_sign,
+                         backward,     project_backward, multiply_add, mlp_forward,
+                         mlp_backward, ssim_band,    log_brightness, power, add_sign,
                          membership,   square_sums,    difference_sums, difference_slope,
                          view_directions, sh_rows, tree_softmax, skin, skin_backward,
                          surface_light, surface_light_backward, sensor_step};

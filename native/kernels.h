@@ -125,7 +125,8 @@ struct Kernels {
                              int channels, const GaussianGrads&);
     // Independent multiply-adds for `rounds`; returns the floating-point operations done.
     double (*multiply_add)(int64_t rounds, float* sink);
-    const MlpKernels* mlp;
+    void (*mlp_forward)(const MlpShape&, const MlpForward&, size_t block, float* scratch);
+    void (*mlp_backward)(const MlpShape&, const MlpBackward&, size_t block, const MlpSums&, float* scratch);
     // Sums over a band, and the gradient of the similarity.
     SsimSums (*ssim)(const SsimBand&);
     void (*log_brightness)(const LogBrightness&, size_t begin, size_t end);
@@ -152,6 +153,8 @@ struct Kernels {
 #define EVSPLAT_LEVEL_TABLE(level)               \
     namespace level {                            \
     extern const Kernels kernels;                \
+    void mlp_forward(const MlpShape&, const MlpForward&, size_t, float*);                        \
+    void mlp_backward(const MlpShape&, const MlpBackward&, size_t, const MlpSums&, float*);      \
     SsimSums ssim_band(const SsimBand&);         \
     void log_brightness(const LogBrightness&, size_t, size_t);                      \
     void power(const Power&, size_t, size_t);                                       \

@@ -37,23 +37,4 @@ const Kernels& select_kernels() {
     return portable::kernels;
 }
 
-bool has_bf16() {
-#ifdef EVSPLAT_BF16
-    __builtin_cpu_init();
-    return __builtin_cpu_supports("avx512bf16") && &select_kernels() == &avx512::kernels;
-#else
-    return false;
-#endif
-}
-
-const MlpKernels& select_mlp(bool bf16) {
-    if (!bf16) return *select_kernels().mlp;
-    if (!has_bf16()) throw std::runtime_error("this CPU and build multiply no bfloat16");
-#ifdef EVSPLAT_BF16
-    return avx512bf16::mlp_kernels;
-#else
-    return portable::mlp_kernels;
-#endif
-}
-
 }  // namespace evsplat

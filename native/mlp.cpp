@@ -1,7 +1,6 @@
 #include "mlp.h"
 
 #include <algorithm>
-#include <cstring>
 #include <stdexcept>
 
 #include "levels.h"
@@ -35,37 +34,16 @@ struct Pieces {
     }
 };
 
-// The nearest bfloat16, ties to even.
-uint32_t to_bf16(float value) {
-    uint32_t bits;
-    std::memcpy(&bits, &value, sizeof bits);
-    return value != value ? 0x7fc0u : (bits + 0x7fffu + (bits >> 16 & 1)) >> 16;
-}
-
-// The same with two rows of a panel as one of pairs.
-void to_pairs(const float* from, int rows, int columns, int row_step, int column_step, int lanes, float* to) {
-    for (int p = 0; p < panels_of(columns, lanes); ++p)
-        for (int r = 0; r < rows; r += 2)
-            for (int l = 0; l < lanes; ++l, ++to) {
-                const int c = p * lanes + l;
-                const float* low = from + size_t(r) * row_step + size_t(c) * column_step;
-                uint32_t pair = c < columns ? to_bf16(*low) : 0;
-                if (c < columns && r + 1 < rows) pair |= to_bf16(low[row_step]) << 16;
-                std::memcpy(to, &pair, sizeof pair);
-            }
-}
-
 size_t weight_floats(int out, int in, int lanes) {
     return size_t(panels_of(out, lanes)) * lanes * (in + 1) + size_t(panels_of(in, lanes)) * lanes * out;
 }
 
-MlpWeight pack_weight(const float* weight, const float* bias, int out, int in, int lanes, int per, Pieces& pieces) {
+MlpWeight pack_weight(const float* weight, const float* bias, int out, int in, int lanes, Pieces& pieces) {
     float* forward = pieces.take(size_t(panels_of(out, lanes)) * lanes * in);
     float* backward = pieces.take(size_t(panels_of(in, lanes)) * lanes * out);
     float* padded = pieces.take(size_t(panels_of(out, lanes)) * lanes);
-    const auto fill = per == 2 ? to_pairs : to_panels;
-    fill(weight, in, out, 1, in, lanes, forward);
-    fill(weight, out, in, in, 1, lanes, backward);
+    to_panels(weight, in, out, 1, in, lanes, forward);
+    to_panels(weight, out, in, in, 1, lanes, backward);
     if (bias) to_panels(bias, 1, out, 0, 1, lanes, padded);
     return {forward, backward, padded};
 }
@@ -105,12 +83,12 @@ void from_panels(const float* from, int out, int in, int lanes, float* to) {
 
 }  // namespace
 
-Mlp::Mlp(const MlpInputs& inputs, bool keep, bool bf16, int threads)
-    : in_(inputs), threads_(threads), kernels_(select_mlp(bf16)), shape_() {
+Mlp::Mlp(const MlpInputs& inputs, bool keep, int threads)
+    : in_(inputs), threads_(threads), kernels_(select_kernels()), shape_() {
     if (in_.weights.size() > kMlpLayers) throw std::runtime_error("an MLP of more than 16 layers");
     MlpShape& s = shape_;
     s.points = in_.points, s.times = in_.times, s.blocks = (in_.points + kMlpRows - 1) / kMlpRows;
-    s.lanes = kernels_.lanes, s.per = kernels_.per, s.layers = int(in_.weights.size());
+    s.lanes = kernels_.lanes, s.layers = int(in_.weights.size());
     s.per_point = in_.per_point, s.per_both = in_.both ? in_.per_both : 0;
     s.width = in_.width, s.out = in_.out;
     s.point_panels = panels_of(s.per_point, s.lanes), s.both_panels = panels_of(s.per_both, s.lanes);
@@ -127,10 +105,10 @@ static MlpForward pack_weights(const MlpInputs& in, const MlpShape& s, Buffer<fl
     Pieces pieces{packed.data()};
     MlpForward job = {};
     job.point = in.point, job.both = in.both;
-    job.point_weight = pack_weight(in.point_weight, nullptr, s.width, s.per_point, s.lanes, 1, pieces);
-    job.both_weight = pack_weight(in.both_weight, nullptr, s.width, s.per_both, s.lanes, 1, pieces);
+    job.point_weight = pack_weight(in.point_weight, nullptr, s.width, s.per_point, s.lanes, pieces);
+    job.both_weight = pack_weight(in.both_weight, nullptr, s.width, s.per_both, s.lanes, pieces);
     for (int l = 0; l < s.layers; ++l)
-        job.layer[l] = pack_weight(in.weights[l], in.biases[l], s.columns(l), s.width, s.lanes, s.per, pieces);
+        job.layer[l] = pack_weight(in.weights[l], in.biases[l], s.columns(l), s.width, s.lanes, pieces);
     float* bias = pieces.take(s.times * s.width_panels * s.lanes);
     for (size_t t = 0; t < s.times; ++t)
         to_panels(in.bias + t * s.width, 1, s.width, 0, 1, s.lanes, bias + t * s.width_panels * s.lanes);
@@ -144,7 +122,7 @@ void Mlp::forward(float* output) {
     job_.activations = activations_.data(), job_.output = output;
     parallel_for(threads_, shape_.blocks, [&](size_t block) {
         Buffer<float> scratch(mlp_scratch(shape_));
-        kernels_.forward(shape_, job_, block, scratch.data());
+        kernels_.mlp_forward(shape_, job_, block, scratch.data());
     });
 }
 
@@ -162,7 +140,7 @@ void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
         std::fill(mine, mine + floats, 0.f);
         const MlpSums parts = sums_in(s, mine);
         for (size_t block = s.blocks * group / groups; block < s.blocks * (group + 1) / groups; ++block)
-            kernels_.backward(s, job, block, parts, scratch.data());
+            kernels_.mlp_backward(s, job, block, parts, scratch.data());
     });
     // Pieces of the vector of sums, each over the groups in order.
     constexpr size_t kPiece = 4096;

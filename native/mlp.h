@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "buffer.h"
-#include "mlp_kernels.h"
+#include "kernels.h"
 
 namespace evsplat {
 
@@ -32,15 +32,15 @@ struct MlpGrads {
 // One evaluation. Sums are in an order that does not depend on the number of threads.
 class Mlp {
   public:
-    // `keep` stores what `backward` needs; `bf16` multiplies the later layers in bfloat16.
-    Mlp(const MlpInputs& inputs, bool keep, bool bf16, int threads);
+    // `keep` stores what `backward` needs.
+    Mlp(const MlpInputs& inputs, bool keep, int threads);
     void forward(float* output);
     void backward(const float* output_grad, const MlpGrads& grads);
 
   private:
     MlpInputs in_;
     int threads_;
-    const MlpKernels& kernels_;
+    const Kernels& kernels_;
     MlpShape shape_;
     Buffer<float> packed_, activations_;
     MlpForward job_ = {};  // points into the buffers

@@ -12,7 +12,7 @@ constexpr int kMlpLayers = 16;  // most layers behind the first
 // Numbers of columns, each padded to full panels where it counts panels.
 struct MlpShape {
     size_t points, times, blocks;
-    int lanes, per, layers;     // layers behind the first, the last one among them
+    int lanes, layers;          // layers behind the first, the last one among them
     int per_point, per_both, width, out;
     int point_panels, both_panels, width_panels, out_panels;
     float slope;
@@ -22,11 +22,10 @@ struct MlpShape {
     int panels(int layer) const { return layer + 1 < layers ? width_panels : out_panels; }
     size_t panel() const { return size_t(kMlpRows) * lanes; }
     // Activations of one block at one time: `layers` matrices of `width` columns.
-    size_t kept() const { return layers * width_panels * panel() / per; }
+    size_t kept() const { return layers * width_panels * panel(); }
 };
 
-// A weight (out, in) twice: ready for x W^T and for y W. Biases are padded with zeros. In bfloat16 two
-// rows of a panel share one, as pairs.
+// A weight (out, in) twice: ready for x W^T and for y W. Biases are padded with zeros.
 struct MlpWeight {
     const float *forward;   // (out panels, in, lanes)
     const float *backward;  // (in panels, out, lanes)
@@ -53,25 +52,10 @@ struct MlpBackward {
     float *point_grad, *both_grad;      // may be null
 };
 
-struct MlpKernels {
-    int lanes, per;         // floats of a vector; values in an element of the later layers' weights
-    void (*forward)(const MlpShape&, const MlpForward&, size_t block, float* scratch);
-    void (*backward)(const MlpShape&, const MlpBackward&, size_t block, const MlpSums&, float* scratch);
-};
-
 // Floats of scratch that a block needs.
 inline size_t mlp_scratch(const MlpShape& s) {
-    const size_t widest = s.point_panels + s.both_panels + 2 * s.out_panels + 4 * s.width_panels;
+    const size_t widest = s.point_panels + s.both_panels + s.out_panels + 4 * s.width_panels;
     return widest * s.panel();
 }
-
-namespace portable { extern const MlpKernels mlp_kernels; }
-#ifdef EVSPLAT_X86
-namespace avx2 { extern const MlpKernels mlp_kernels; }
-namespace avx512 { extern const MlpKernels mlp_kernels; }
-#ifdef EVSPLAT_BF16
-namespace avx512bf16 { extern const MlpKernels mlp_kernels; }
-#endif
-#endif
 
 }  // namespace evsplat

@@ -197,7 +197,7 @@ class Render {
 class PyMlp {
   public:
     PyMlp(In point, std::optional<In> both, In bias, In point_weight, In both_weight, std::vector<In> layers,
-          float slope, bool keep, bool bf16, int threads)
+          float slope, bool keep, int threads)
         : point_(point), bias_(bias), point_weight_(point_weight), both_weight_(both_weight), both_(both),
           layers_(std::move(layers)) {
         require(point.ndim() == 2 && bias.ndim() == 2 && bias.shape(0) > 0, "point or bias");
@@ -223,7 +223,7 @@ class PyMlp {
             in.out = int(w.shape(0));
         }
         in_ = in;
-        mlp_ = std::make_unique<Mlp>(in, keep, bf16, threads);
+        mlp_ = std::make_unique<Mlp>(in, keep, threads);
     }
 
     void forward(Out output) {
@@ -379,9 +379,9 @@ NB_MODULE(_native, m) {
         .def_prop_ro("intersections", &Render::intersections, "Pairs of Gaussian and tile.")
         .def_prop_ro("patch_steps", &Render::patch_steps, "Pairs of Gaussian and patch.");
     nb::class_<PyMlp>(m, "Mlp", "One evaluation of a network; keeps what its backward pass needs.")
-        .def(nb::init<In, std::optional<In>, In, In, In, std::vector<In>, float, bool, bool, int>(), nb::arg("point"),
+        .def(nb::init<In, std::optional<In>, In, In, In, std::vector<In>, float, bool, int>(), nb::arg("point"),
              nb::arg("both").none(), nb::arg("bias"), nb::arg("point_weight"), nb::arg("both_weight"),
-             nb::arg("layers"), nb::arg("slope"), nb::arg("keep"), nb::arg("bf16"), nb::arg("threads"))
+             nb::arg("layers"), nb::arg("slope"), nb::arg("keep"), nb::arg("threads"))
         .def("forward", &PyMlp::forward, nb::arg("output"))
         .def("backward", &PyMlp::backward, nb::arg("output_grad"), nb::arg("point").none(), nb::arg("both").none(),
              nb::arg("bias"), nb::arg("point_weight"), nb::arg("both_weight"), nb::arg("layers"));
@@ -408,7 +408,6 @@ NB_MODULE(_native, m) {
     m.def("nearest", &nearest, nb::arg("points"), nb::arg("queries").none(), nb::arg("index"), nb::arg("square"),
           nb::arg("threads"), "Nearest points of queries, or of the points themselves; squared distances.");
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
-    m.def("has_bf16", &has_bf16, "Whether networks can multiply bfloat16 here.");
     m.def("levels", &available_levels, "SIMD levels that run here, best first.");
     m.def("level", [] { return std::string(select_kernels().name); }, "SIMD level in use.");
     m.def("multiply_add", &multiply_add, nb::arg("rounds"),

@@ -42,7 +42,7 @@ TRAINING_STEPS = 8
 
 def leaves(method: str) -> list[Setting]:
     """Settings of a method at its defaults, without the sections that they are in."""
-    every = settings(TRAINABLE[method][0]())
+    every = settings(TRAINABLE[method].config())
     return [setting for setting in every if not dataclasses.is_dataclass(setting.value)]
 
 
@@ -64,7 +64,7 @@ def circles(*, of_folders: bool) -> list[list[str]]:
 
 def homes(method: str) -> list[str]:
     """Modules that define a method's configuration, its sections and what these inherit."""
-    kinds = {kind for s in settings(TRAINABLE[method][0]()) for kind in s.owner.__mro__[:-1]}
+    kinds = {kind for s in settings(TRAINABLE[method].config()) for kind in s.owner.__mro__[:-1]}
     return sorted({kind.__module__ for kind in kinds})
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from evsplat._native import levels as native_levels
-from evsplat.models.networks.mlp import PointMLP, bfloat16_runs, plain_mlp
+from evsplat.models.networks.mlp import PointMLP
 
 
 def plain(network, point, time=None, both=None, hiddens=None):
@@ -123,63 +123,9 @@ def test_native_values_and_gradients_equal_those_in_float64(inputs_of, width, de
         assert (value - truth).norm() < 3e-6 * truth.norm()
 
 
-def rounded(tensor):
-    return tensor.to(torch.bfloat16).to(tensor.dtype)
-
-
-class RoundedProduct(torch.autograd.Function):
-    """Of a hidden layer: all factors are rounded to bfloat16, forward and backward, and no sum."""
-
-    @staticmethod
-    def forward(ctx, hidden, weight, bias):
-        factors = rounded(hidden), rounded(weight)
-        ctx.save_for_backward(*factors)
-        return factors[0] @ factors[1].T + bias
-
-    @staticmethod
-    def backward(ctx, upstream):
-        hidden, weight = ctx.saved_tensors
-        flow = rounded(upstream)
-        over = flow.flatten(0, -2)
-        return flow @ weight, over.T @ hidden.flatten(0, -2), over.sum(0)
-
-
-@pytest.mark.parametrize(("inputs_of", "width", "depth", "out"), SIZES)
-@pytest.mark.parametrize("points", [1, 97, 1000])
-def test_bfloat16_rounds_factors_of_hidden_layers_and_nothing_else(
-    inputs_of, width, depth, out, points
-):
-    if not bfloat16_runs():
-        pytest.skip("this processor multiplies no bfloat16")
-    network, arguments, exact, doubles = sized(inputs_of, width, depth, out, points)
-    network.precision = "bfloat16"
-    values, _ = both_ways(network, arguments)
-
-    def rounding(point, time, both):
-        hidden = exact.first_bias + point @ exact.point_weight.T
-        hidden = hidden[None] if time is None else hidden + (time @ exact.time_weight.T)[:, None]
-        hidden = hidden if both is None else hidden + both @ exact.both_weight.T
-        for weight, bias in zip(exact.weights, exact.biases, strict=True):
-            hidden = RoundedProduct.apply(nn.functional.leaky_relu(hidden, 0.01), weight, bias)
-        return hidden
-
-    leaves = [leaf for leaf in (*doubles, *exact.parameters()) if leaf is not None and leaf.numel()]
-    output = rounding(*doubles)
-    upstream = torch.randn(
-        output.shape, generator=torch.Generator().manual_seed(output.numel()), dtype=torch.float32
-    )
-    expected = [output, *torch.autograd.grad(output, leaves, upstream.double())]
-    assert len(values) == len(expected)
-    for value, truth in zip(values, expected, strict=True):
-        # Sums near a tie of the rounding may fall on its other side, 2^-8 of a value away.
-        assert (value - truth).norm() < 2**-8 * truth.norm()
-
-
-@pytest.mark.parametrize("bfloat16", [False, True])
-def test_native_results_do_not_depend_on_the_number_of_threads(bfloat16):
+def test_native_results_do_not_depend_on_the_number_of_threads():
     torch.manual_seed(0)
     network = PointMLP(48, 144, 0, width=128, depth=3, out=25)
-    network.precision = "bfloat16" if bfloat16 else "float32"
     arguments = [torch.randn(2_000, 48).requires_grad_(), torch.randn(2, 144), None]
     threads = torch.get_num_threads()
     try:
@@ -242,31 +188,3 @@ def test_start_is_that_of_linear_layers_and_the_last_can_be_near_zero():
     assert abs(network.weights[0].abs().max().item() - 200**-0.5) < 1e-4
     assert abs(network.weights[-1].std().item() - 1e-4) < 1e-5
     assert (network.biases[-1] == 0).all()
-
-
-def test_plain_torch_multiplies_hidden_layers_in_bfloat16_as_a_gpu_does():
-    """By PyTorch's autocast, here on the CPU; the first layer sees positions and keeps its digits.
-
-    With one input in 300 the first layer's rounding would be 0.2, the others' is below 1e-2.
-    """
-    generator = torch.Generator().manual_seed(0)
-
-    def normal(*shape):
-        return torch.randn(*shape, generator=generator)
-
-    point = normal(50, 3) * 1e-3 + 300
-    first, bias = normal(16, 3), normal(1, 16)
-    bias = bias - first.sum(-1) * 300
-    layers = [normal(16, 16) / 4, normal(16), normal(5, 16) / 4, normal(5)]
-    inputs = [point, None, bias, first, normal(16, 0), *layers]
-    exact = plain_mlp(*(None if v is None else v.double() for v in inputs))
-    leaves = [layer.requires_grad_() for layer in layers]
-    rounded = plain_mlp(*inputs, bf16=True)
-    assert rounded.dtype == torch.float32
-    error = (rounded - exact).norm() / exact.norm()
-    assert 1e-5 < error < 2e-2
-    gradients = torch.autograd.grad(rounded.sum(), leaves)
-    expected = torch.autograd.grad(plain_mlp(*inputs).sum(), leaves)
-    for value, wanted in zip(gradients, expected, strict=True):
-        assert value.dtype == torch.float32
-        assert (value - wanted).norm() < 2e-2 * wanted.norm()

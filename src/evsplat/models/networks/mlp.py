@@ -7,9 +7,8 @@ back, while they are in the cache; everywhere else plain torch does the same.
 """
 
 import math
-from contextlib import nullcontext
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,8 +16,6 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from evsplat.compiled import native, runs_native
-
-Precision = Literal["float32", "bfloat16"]
 
 SLOPE = 0.01
 """Of the leaky ReLU, as 3DGS-Avatar."""
@@ -29,9 +26,6 @@ class PointMLP(nn.Module):
 
     Weights start as PyTorch's linear layers do, except that ``last_std`` (if given) draws those of
     the last layer from N(0, last_std^2) with zero bias, so that the output starts near zero.
-
-    With ``precision`` set to bfloat16, all layers but the first multiply in bfloat16 and sum in
-    float32, where `bfloat16_runs`; elsewhere they stay in float32.
     """
 
     def __init__(
@@ -45,7 +39,6 @@ class PointMLP(nn.Module):
         last_std: float | None = None,
     ) -> None:
         super().__init__()
-        self.precision: Precision = "float32"
         fan_in = per_point + per_time + per_both
         self.point_weight = nn.Parameter(_uniform((width, per_point), fan_in))
         self.time_weight = nn.Parameter(_uniform((width, per_time), fan_in))
@@ -72,25 +65,13 @@ class PointMLP(nn.Module):
             bias = bias.expand(len(both), -1)
         layers = [layer for pair in zip(self.weights, self.biases, strict=True) for layer in pair]
         inputs = (point, both, bias, self.point_weight, self.both_weight, *layers)
-        bf16 = self.precision == "bfloat16" and bfloat16_runs(point.device)
         if runs_native(point):
             keep = torch.is_grad_enabled() and any(
                 tensor is not None and tensor.requires_grad for tensor in inputs
             )
-            output: Tensor = _NativeMLP.apply(keep, bf16, *inputs)
+            output: Tensor = _NativeMLP.apply(keep, *inputs)
             return output
-        return plain_mlp(*inputs, bf16=bf16)
-
-
-def bfloat16_runs(device: torch.device | None = None) -> bool:
-    """Whether networks multiply bfloat16 there: a CPU with AVX-512 BF16, a GPU from Ampere on.
-
-    Without a device: the CPU.
-    """
-    if device is not None and device.type == "cuda":
-        return torch.cuda.get_device_capability(device) >= (8, 0)
-    on_cpu = device is None or device.type == "cpu"
-    return on_cpu and native is not None and native.has_bf16()
+        return plain_mlp(*inputs)
 
 
 def plain_mlp(
@@ -100,33 +81,29 @@ def plain_mlp(
     point_weight: Float[Tensor, "W A"],
     both_weight: Float[Tensor, "W C"],
     *layers: Tensor,
-    bf16: bool = False,
 ) -> Float[Tensor, "T N out"]:
     """The network in plain torch, on any device and in any precision.
 
-    ``bias`` is the first layer's, ``layers`` are weight and bias of each later layer, which are
-    multiplied in bfloat16 if ``bf16``.
+    ``bias`` is the first layer's, ``layers`` are weight and bias of each later layer.
     """
     hidden = (point @ point_weight.T) + bias[:, None]
     if both is not None:
         hidden = hidden + both @ both_weight.T
-    with torch.autocast(point.device.type, torch.bfloat16) if bf16 else nullcontext():
-        for weight, layer_bias in zip(layers[::2], layers[1::2], strict=True):
-            inner = nn.functional.leaky_relu(hidden, SLOPE)
-            hidden = nn.functional.linear(inner, weight, layer_bias)
-    return hidden.float() if bf16 else hidden
+    for weight, layer_bias in zip(layers[::2], layers[1::2], strict=True):
+        hidden = nn.functional.linear(nn.functional.leaky_relu(hidden, SLOPE), weight, layer_bias)
+    return hidden
 
 
 class _NativeMLP(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, keep: bool, bf16: bool, point: Tensor, both: Tensor | None, *parameters: Tensor
+        ctx: Any, keep: bool, point: Tensor, both: Tensor | None, *parameters: Tensor
     ) -> Float[Tensor, "T N out"]:
         points, (bias, point_weight, both_weight, *layers) = _plain(point), map(_plain, parameters)
         moving = None if both is None else _plain(both)
         threads = torch.get_num_threads()
         ctx.job = native.Mlp(
-            points, moving, bias, point_weight, both_weight, layers, SLOPE, keep, bf16, threads
+            points, moving, bias, point_weight, both_weight, layers, SLOPE, keep, threads
         )
         output = torch.empty(len(bias), len(points), len(layers[-1]))
         ctx.job.forward(output)
@@ -143,11 +120,11 @@ class _NativeMLP(torch.autograd.Function):
         point, both, bias, point_weight, both_weight, *layers = inputs
         point, both = (
             gradient if needed else None
-            for gradient, needed in zip((point, both), ctx.needs_input_grad[2:4], strict=True)
+            for gradient, needed in zip((point, both), ctx.needs_input_grad[1:3], strict=True)
         )
         upstream = gradients[0].contiguous()
         ctx.job.backward(upstream, point, both, bias, point_weight, both_weight, layers)
-        return None, None, point, both, bias, point_weight, both_weight, *layers
+        return None, point, both, bias, point_weight, both_weight, *layers
 
 
 def _plain(tensor: Tensor) -> Tensor:
