@@ -23,7 +23,7 @@ SEE_EVERYTHING = set(
     "capture inspection synthesis evaluation benching film export view evsplat".split()
 )
 SEE_EVERYTHING |= {"masks.capture", "restore.capture", "training.run", "training.train"}
-SEE_TRAINING_ALONE = set("body calibration gaussians deform objectives hugs methods".split())
+SEE_TRAINING_ALONE = set("body calibration gaussians models objectives methods".split())
 
 
 def imports_of(module: str, tree: ast.Module) -> Iterator[tuple[str, str, str]]:
