@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 
 from evsplat.body import BodyTrack
-from evsplat.body.between_keys import BetweenKeys, between_keys
-from evsplat.body.smoothing import MotionNoise, motion_noise, smoothed
+from evsplat.body.smoothing import MotionNoise, SplineError, motion_noise, smoothed, spline_error
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.deform.pose_spline import PoseSpline
 from evsplat.methods.config import Weight
@@ -69,7 +68,7 @@ class Poses:
 def prepare_poses(config: PoseConfig, capture: TrainingCapture, *, tell: bool = True) -> Poses:
     """Look at a capture's key poses and do what the settings say; the log can tell what it is."""
     track = load_body_track(capture)
-    noise, expected = motion_noise(track), between_keys(track)
+    noise, expected = motion_noise(track), spline_error(track)
     surer = _surer_than_between(noise, expected)
     noisy = noise.rotation_rad >= (config.noisy_rad if surer else EXACT_RAD)
     smooth, refine = (
@@ -108,7 +107,7 @@ def prepare_poses(config: PoseConfig, capture: TrainingCapture, *, tell: bool = 
     return Poses(track, spline, times.tolist())
 
 
-def _surer_than_between(noise: MotionNoise, expected: BetweenKeys) -> bool:
+def _surer_than_between(noise: MotionNoise, expected: SplineError) -> bool:
     """Whether key poses err by less than half of the variance of what lies between them.
 
     Where they do not, either is as likely an error of fitting, and a residual that is held at the
