@@ -6,8 +6,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import Body, axis_angle_to_matrix, default_body
-from evsplat.body.continuity import nearest_axis_angle
 from evsplat.body.retarget import COLLAR_SHARE, retarget, smallest_rotation
+from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import DataError
 

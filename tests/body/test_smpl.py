@@ -14,8 +14,7 @@ from scipy import sparse
 
 from evsplat.body import axis_angle_to_matrix, skin
 from evsplat.body.canonical import SMPL_PARENTS
-from evsplat.body.model_files import read_model_file
-from evsplat.body.smpl import ENVIRONMENT, find_model_file, smpl_body
+from evsplat.body.smpl import ENVIRONMENT, find_model_file, read_model_file, smpl_body
 from evsplat.errors import DataError, WeightsError
 
 VERTICES = 40

@@ -11,8 +11,7 @@ from evsplat.body.rotations import (
 )
 from evsplat.body.silhouette import body_box, silhouette
 from evsplat.body.surface import SurfaceSamples
-from evsplat.body.track import BodyTrack
-from evsplat.body.upright import up_axis
+from evsplat.body.track import BodyTrack, up_axis
 
 __all__ = [
     "Body",

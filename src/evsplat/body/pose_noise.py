@@ -8,8 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from evsplat.body.body import Body
-from evsplat.body.continuity import nearest_axis_angle
-from evsplat.body.rotations import axis_angle_to_matrix
+from evsplat.body.rotations import axis_angle_to_matrix, nearest_axis_angle
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import ConfigError
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from evsplat.body.body import Body, skin
-from evsplat.body.continuity import nearest_axis_angle
+from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.skeleton import Skeleton, find_skeleton
 from evsplat.body.tree import topological_order
 from evsplat.errors import DataError

@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from evsplat.body.body import Body
 from evsplat.body.make import fit_betas, make_body
-from evsplat.body.model_files import read_model_file
 from evsplat.errors import DataError, WeightsError
+from evsplat.safe_pickle import read_npz, read_pickle
 
 ENVIRONMENT = "EVSPLAT_BODY_MODELS"
 _SITES = {
@@ -23,7 +23,12 @@ _SITES = {
     "smplx": "https://smpl-x.is.tue.mpg.de",
 }
 _LEGACY = {"neutral": "neutral", "male": "m", "female": "f"}
-"""How SMPL 1.0 and 1.1 name the genders: basicModel_m_lbs_10_207_0_v1.0.0.pkl, basicmodel_m_..."""
+"""Genders in the file names of SMPL 1.0 and 1.1, such as basicModel_m_lbs_10_207_0_v1.0.0.pkl."""
+_KEYS = (
+    *("v_template", "f", "weights", "shapedirs", "posedirs", "J_regressor", "kintree_table"),
+    *("hands_meanl", "hands_meanr", "joint2num"),
+)
+_SPARSE = ("scipy.sparse.csc", "scipy.sparse._csc")
 
 
 def smpl_body(
@@ -98,11 +103,35 @@ def find_model_file(family: str, gender: str, path: Path | str | None = None) ->
     )
 
 
+def read_model_file(path: Path) -> dict[str, Any]:
+    """The arrays of an SMPL-family .pkl or .npz, and joint names by index where they are given.
+
+    body-models 0.26 would unpickle without restriction, so that a tampered file could run anything.
+    Here only the few types that these files need are allowed (`evsplat.safe_pickle`).
+
+    Raises:
+        DataError: unreadable, or holding a pickled type that no body model needs.
+    """
+    what = "body model"
+    if path.suffix == ".npz":
+        raw = read_npz(path, what=what, keys=_KEYS, stand_ins=_stand_in)
+    else:
+        raw = read_pickle(path, what=what, stand_ins=_stand_in)
+    if not isinstance(raw, dict):
+        raise DataError(
+            f"{path}: not a readable body model (holds a {type(raw).__name__}, expected a dict)."
+        )
+    try:
+        return {key: _plain(raw[key]) for key in _KEYS if key in raw}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise DataError(f"{path}: not a readable body model ({error}).") from error
+
+
 def _open(family: str, file: Path) -> Any:
     """The body-models object of a file, given to it as a clean copy of the file's arrays.
 
-    body-models would unpickle the user's file without restriction; the pickle that it reads here
-    was written by ourselves a moment before, from arrays that `read_model_file` let through.
+    The pickle that body-models reads was written by ourselves a moment before, from arrays that
+    `read_model_file` let through.
     """
     try:
         module = import_module(f"body_models.{family}.torch")
@@ -123,3 +152,45 @@ def _open(family: str, file: Path) -> Any:
             return getattr(module, family.upper())(model_path=copy)
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise DataError(f"{file}: not a {family.upper()} model ({error}).") from error
+
+
+class _Chumpy:
+    """Stands for any chumpy object: SMPL's first files wrap some arrays in them."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if "x" in state:
+            self.value = np.asarray(state["x"])
+        else:  # a selection of another array
+            source = state["a"].value if isinstance(state["a"], _Chumpy) else state["a"]
+            chosen = np.asarray(source).reshape(-1)[np.asarray(state["idxs"], np.int64)]
+            self.value = chosen.reshape(state.get("preferred_shape", chosen.shape))
+
+
+class _SparseColumns:
+    """A pickled scipy.sparse.csc_matrix, which is no more than its four arrays."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        rows, columns = state["_shape"] if "_shape" in state else state["shape"]
+        indices, starts = np.asarray(state["indices"]), np.asarray(state["indptr"])
+        self.value = np.zeros((rows, columns))
+        np.add.at(
+            self.value,
+            (indices, np.repeat(np.arange(columns), np.diff(starts))),
+            np.asarray(state["data"]),
+        )
+
+
+def _stand_in(module: str, name: str) -> type | None:
+    if module == "chumpy" or module.startswith("chumpy."):
+        return _Chumpy
+    return _SparseColumns if module in _SPARSE and name == "csc_matrix" else None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, _Chumpy | _SparseColumns):
+        return value.value
+    if isinstance(value, np.ndarray) and value.dtype.hasobject:
+        return _plain(value.item())  # 0-d: a dict, or an object that was wrapped on saving
+    if isinstance(value, dict):
+        return {str(name): int(index) for name, index in value.items()}
+    return np.asarray(value)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from evsplat.body.body import Body, skin
+from evsplat.body.canonical import find_legs
 from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.devices import send
 from evsplat.errors import DataError
@@ -84,6 +85,24 @@ class BodyTrack:
         return skin(body.canonical_vertices(), body.weights, self.bones([time_us]))[0][0]
 
 
+def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
+    """The signed world axis nearest to the body's own up direction in the middle of the track."""
+    body = track.body
+    legs = find_legs(body.parents.tolist(), body.joint_names)
+    rest = body.canonical_vertices()
+    if legs is None:
+        tallest = int((rest.amax(0) - rest.amin(0)).argmax())
+        below = rest[:, tallest] < rest[:, tallest].mean()
+    else:
+        below = _leg_share(body, (legs.left, legs.right)) > 0.5
+    posed = track.vertices(int(track.times_us[len(track.times_us) // 2]))
+    direction = posed[~below].mean(0) - posed[below].mean(0)
+    up = torch.zeros(3)
+    axis = int(direction.abs().argmax())
+    up[axis] = direction[axis].sign()
+    return up
+
+
 def _rotation_polynomials(
     seconds: Float[np.ndarray, "P"], poses: Float[np.ndarray, "P J 3"]
 ) -> tuple[Float[np.ndarray, "I J 3 3"], Float[np.ndarray, "I J 4 3"]]:
@@ -132,3 +151,12 @@ def _check(
             f"{source}: times_us[{key}] = {times[key]} does not follow {times[key - 1]}; "
             "times must increase strictly. Sort the key poses and drop repeated ones."
         )
+
+
+def _leg_share(body: Body, thighs: tuple[int, int]) -> Tensor:
+    """Share of each vertex's weight that belongs to the joints from the thighs down."""
+    chain = set(thighs)
+    for joint, parent in enumerate(body.parents.tolist()):
+        if parent in chain:
+            chain.add(joint)
+    return body.weights[:, sorted(chain)].sum(-1)

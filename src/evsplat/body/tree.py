@@ -1,11 +1,11 @@
-"""Kinematic trees: order, levels and depth of joints given by the index of their parent."""
+"""Kinematic trees given by the index of each joint's parent: order, levels, world rotations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from evsplat.errors import DataError
@@ -86,5 +86,16 @@ def tree_levels(parents: Sequence[int]) -> tuple[Level, ...]:
 
 
 def level_inverse(levels: Sequence[Level]) -> Int[Tensor, "J"]:
-    """Where each joint lies in the concatenation of all levels."""
+    """Position of each joint in the concatenation of all levels."""
     return torch.argsort(torch.cat([level.joints for level in levels]))
+
+
+def world_rotations(
+    local: Float[np.ndarray, "T J 3 3"], parents: Sequence[int]
+) -> Float[np.ndarray, "T J 3 3"]:
+    """World rotations of rotations relative to the parent; parents come before their children."""
+    world = np.array(local, dtype=np.float64)
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            world[:, joint] = world[:, parent] @ world[:, joint]
+    return world

@@ -9,10 +9,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import Body, BodyTrack, SkeletonMotion, retarget, up_axis
-from evsplat.body.continuity import nearest_axis_angle
 from evsplat.body.motion import load_motion
 from evsplat.body.pose_files import PoseSequence, read_poses, skeleton_motion
 from evsplat.body.retarget import smallest_rotation
+from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import ConfigError, DataError
 from evsplat.staging.assets import find_motion, motions

@@ -12,15 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.body import smpl_skeleton
 from evsplat.body.body import Body
-from evsplat.body.make import default_body
-from evsplat.body.model_files import read_model_file
+from evsplat.body.make import default_body, shape_like
 from evsplat.body.pose_files import PoseSequence
 from evsplat.body.pose_files.transfer import skeleton_motion
 from evsplat.body.retarget import SkeletonMotion, retarget
 from evsplat.body.rotations import axis_angle_to_matrix
-from evsplat.body.shape_fit import shape_like
 from evsplat.body.skeleton import find_skeleton
-from evsplat.body.smpl import ENVIRONMENT, find_model_file
+from evsplat.body.smpl import ENVIRONMENT, find_model_file, read_model_file
+from evsplat.body.tree import world_rotations
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import DataError, WeightsError
 
@@ -117,7 +116,8 @@ def unposed(
     """
     poses, places, shifts = (np.stack(part) for part in zip(*samples, strict=True))
     parents = list(smpl_skeleton.SMPL_PARENTS)
-    turns = _world_rotations(poses)[:, parents[1:]]
+    local = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
+    turns = world_rotations(local, parents)[:, parents[1:]]
     bones = np.einsum("tjrc,tjr->tjc", turns, places[:, 1:] - places[:, parents[1:]])
     # only one of the two readings puts the pelvis where SMPL's template has it
     roots = [np.median(places[:, 0], axis=0), np.median(places[:, 0] - shifts, axis=0)]
@@ -161,12 +161,3 @@ def _limb_offset(
     sources = motion.joints()[:, [mover.limbs[name] for name in limbs]]
     targets = placed[:, [taker.limbs[name] for name in limbs], :3, 3].numpy()
     return (sources - targets).mean(axis=1)
-
-
-def _world_rotations(local: Float[np.ndarray, "T J 3"]) -> Float[np.ndarray, "T J 3 3"]:
-    """Rotation of each joint from the zero pose to the world; J joints of SMPL's tree."""
-    turns = Rotation.from_rotvec(local.reshape(-1, 3)).as_matrix().reshape(*local.shape, 3)
-    for joint, parent in enumerate(smpl_skeleton.SMPL_PARENTS[: local.shape[1]]):
-        if parent >= 0:
-            turns[:, joint] = turns[:, parent] @ turns[:, joint]
-    return turns

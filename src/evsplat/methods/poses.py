@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from evsplat.body import BodyTrack
-from evsplat.body.between_keys import BetweenKeys, between_keys
-from evsplat.body.smoothing import MotionNoise, motion_noise, smoothed
+from evsplat.body.smoothing import MotionNoise, SplineError, motion_noise, smoothed, spline_error
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError
@@ -72,7 +71,7 @@ class Poses:
 def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, announce: bool) -> Poses:
     """Track of a capture by the settings, and the residual to learn; said at level INFO on wish."""
     track = load_body_track(capture)
-    noise, expected = motion_noise(track), between_keys(track)
+    noise, expected = motion_noise(track), spline_error(track)
     surer = _surer_than_between(noise, expected)
     noisy = noise.rotation_rad >= (config.noisy_rad if surer else EXACT_RAD)
     smooth, refine = (
@@ -117,7 +116,7 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, announce: b
     return Poses(track, spline, times.tolist())
 
 
-def _surer_than_between(noise: MotionNoise, expected: BetweenKeys) -> bool:
+def _surer_than_between(noise: MotionNoise, expected: SplineError) -> bool:
     """Whether key poses err by less than half of the variance of what lies between them.
 
     Where they do not, either is as likely an error of fitting, and a residual that is held at the

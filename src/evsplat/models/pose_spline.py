@@ -10,8 +10,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack
-from evsplat.body.between_keys import BetweenKeys
-from evsplat.body.smoothing import MotionNoise
+from evsplat.body.smoothing import MotionNoise, SplineError
 from evsplat.devices import send
 
 # Columns: the four pieces of a uniform cubic B-spline; rows: powers 0 to 3 of the place in between.
@@ -118,7 +117,7 @@ class PoseSpline(nn.Module):
         )
 
     @classmethod
-    def between_keys(cls, track: BodyTrack, expected: BetweenKeys) -> Self:
+    def between_keys(cls, track: BodyTrack, expected: SplineError) -> Self:
         """For a track with exact key poses: zero at each, two knots from one to the next."""
         times = torch.from_numpy(track.times_us)
         return cls(

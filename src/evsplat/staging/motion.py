@@ -9,8 +9,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import Body, BodyTrack, skin
-from evsplat.body.continuity import nearest_axis_angle
 from evsplat.body.retarget import SkeletonMotion, retarget
+from evsplat.body.rotations import nearest_axis_angle
 from evsplat.camera import Camera
 from evsplat.staging.character import Character
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.motion.world import down_the_tree
 from evsplat.body.retarget import SkeletonMotion
+from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
 from evsplat.files import read_text
 
@@ -16,7 +16,7 @@ FRAME_RATE_HZ = 120.0
 _METRES = 0.0254
 """CMU's lengths are inches once divided by the skeleton's unit."""
 _WORLD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""From x left, y up, z forward to z up, facing -y."""
+"""Rotation from x left, y up, z forward to z up, facing -y."""
 _TURNS = ("rx", "ry", "rz")
 
 
@@ -60,7 +60,7 @@ def read_acclaim(path: Path, skeleton: Path) -> SkeletonMotion:
         joint_names=tuple(bone.name for bone in bones),
         parents=np.array(parents),
         zero_joints=zero * metres,
-        world_rotations=down_the_tree(local, parents),
+        world_rotations=world_rotations(local, parents),
         root_positions=positions * metres,
         times_us=np.round(np.arange(count) * 1e6 / FRAME_RATE_HZ).astype(np.int64),
         world_from_source=_WORLD,

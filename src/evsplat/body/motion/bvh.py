@@ -1,14 +1,17 @@
 """Biovision hierarchies (``.bvh``), what most motion tools export."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.motion.world import down_the_tree, upright_world
-from evsplat.body.retarget import SkeletonMotion
+from evsplat.body.make import default_body
+from evsplat.body.retarget import SkeletonMotion, rest_from_zero
+from evsplat.body.skeleton import find_skeleton
+from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
 from evsplat.files import read_text
 
@@ -63,10 +66,10 @@ def read_bvh(path: Path) -> SkeletonMotion:
         joint_names=names,
         parents=np.array(parents),
         zero_joints=zero,
-        world_rotations=down_the_tree(local, parents),
+        world_rotations=world_rotations(local, parents),
         root_positions=positions,
         times_us=np.round(np.arange(len(values)) * frame_time * 1e6).astype(np.int64),
-        world_from_source=upright_world(parents, names, zero, str(path)),
+        world_from_source=_upright_world(parents, names, zero, str(path)),
         source=str(path),
     )
 
@@ -111,3 +114,16 @@ def _channel(word: str) -> str:
     if word.lower() not in _CHANNELS:
         raise ValueError(f"a channel {word!r}, expected Xposition to Zrotation")
     return word.lower()
+
+
+def _upright_world(
+    parents: Sequence[int],
+    joint_names: Sequence[str],
+    zero_joints: Float[np.ndarray, "J 3"],
+    source: str,
+) -> Float[np.ndarray, "3 3"]:
+    """Rotation to z up, facing -y, of the axes in which the zero pose stands."""
+    body = default_body()
+    taker = find_skeleton(body.parents.tolist(), body.joint_names)
+    mover = find_skeleton(parents, joint_names, source)
+    return rest_from_zero(mover, zero_joints, taker, body.rest_joints.double().numpy())

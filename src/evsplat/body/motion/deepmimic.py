@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.motion.world import down_the_tree
 from evsplat.body.retarget import SkeletonMotion
+from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
 from evsplat.files import parse_json, read_text
 
@@ -31,7 +31,7 @@ _JOINTS = (
 )
 _NUMBERS = 4 + sum(joint[3] for joint in _JOINTS)
 _WORLD = np.array([[0, 0, -1.0], [-1, 0, 0], [0, 1, 0]])
-"""To z up, facing -y."""
+"""Rotation from the humanoid's axes to z up, facing -y."""
 
 
 def read_deepmimic(path: Path) -> SkeletonMotion:
@@ -67,7 +67,7 @@ def read_deepmimic(path: Path) -> SkeletonMotion:
         joint_names=tuple(joint[0] for joint in _JOINTS),
         parents=np.array(parents),
         zero_joints=zero,
-        world_rotations=down_the_tree(local, parents),
+        world_rotations=world_rotations(local, parents),
         root_positions=frames[:, 1:4],
         times_us=np.round(seconds * 1e6).astype(np.int64),
         world_from_source=_WORLD,

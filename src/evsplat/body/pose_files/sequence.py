@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.continuity import nearest_axis_angle
+from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.smpl_skeleton import JOINTS
 from evsplat.errors import DataError
 

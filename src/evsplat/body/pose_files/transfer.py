@@ -11,6 +11,7 @@ from evsplat.body.make import default_betas_for_stature, default_body
 from evsplat.body.pose_files.sequence import PoseSequence
 from evsplat.body.retarget import SkeletonMotion, retarget
 from evsplat.body.smpl_skeleton import NAMES, PARENTS, rest_joints
+from evsplat.body.tree import world_rotations
 
 
 def skeleton_motion(
@@ -37,14 +38,11 @@ def skeleton_motion(
         )
     vectors = sequence.poses[:, : len(NAMES)]
     local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
-    world = local.copy()
-    for joint, parent in enumerate(PARENTS[1:], start=1):
-        world[:, joint] = world[:, parent] @ local[:, joint]
     return SkeletonMotion(
         joint_names=NAMES,
         parents=np.array(PARENTS),
         zero_joints=zero,
-        world_rotations=world,
+        world_rotations=world_rotations(local, PARENTS),
         root_positions=zero[0] + sequence.transl,
         times_us=sequence.times_us(sequence.fps or 1.0),
         world_from_source=np.eye(3) if world_from_sequence is None else world_from_sequence,

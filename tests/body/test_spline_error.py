@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, default_body
-from evsplat.body.between_keys import FEWEST_KEYS, between_keys
+from evsplat.body.smoothing import FEWEST_SPLINE_KEYS, spline_error
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def test_the_error_of_fast_motion_is_told_and_that_of_slow_motion_bounded(
     at = wander(body, seed, keys_per_bend)
     keys = np.arange(41)
     track = BodyTrack(body, 40_000 * keys, *at(keys))
-    found = between_keys(track)
+    found = spline_error(track)
     # The ends are worse; nothing is learned there that the middle does not need.
     place = np.linspace(3, 37, 341)
     poses, transl = at(place)
@@ -55,7 +55,7 @@ def test_the_error_of_fast_motion_is_told_and_that_of_slow_motion_bounded(
 
 
 def test_too_few_keys_tell_nothing(body):
-    keys = np.arange(FEWEST_KEYS - 1)
+    keys = np.arange(FEWEST_SPLINE_KEYS - 1)
     track = BodyTrack(body, 40_000 * keys, *wander(body, 0, 1.0)(keys))
-    found = between_keys(track)
+    found = spline_error(track)
     assert not found.rotation_rad.any() and found.translation_m == 0
