@@ -16,7 +16,7 @@ from torch import Tensor
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
-from evsplat.config import load_yaml, to_dict
+from evsplat.config import load_yaml
 from evsplat.deform.at_rest import Skinned, mean_at_rest
 from evsplat.deform.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.deform.model import Model
@@ -261,7 +261,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     seen = seen_by_training(capture, config)
     compose = TRAINABLE[method][1]
     composition = compose(
-        _without_perceptual(method, config), seen, facts["seed"], device=device, fit=False
+        _without_perceptual(config), seen, facts["seed"], device=device, fit=False
     )
     check_fits(composition.model, tensors, path)
     load_model(composition.model, tensors, progress["human_count"])
@@ -278,11 +278,9 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     )
 
 
-def _without_perceptual(method: str, config: MethodConfig) -> MethodConfig:
+def _without_perceptual(config: Any) -> Any:
     """The settings without a term that only training needs and whose weights need not be here."""
-    values = to_dict(config)
-    values["loss"]["perceptual"] = "none"
-    return method_config(method, values, where="config.yaml")
+    return replace(config, loss=replace(config.loss, perceptual="none"))
 
 
 def reload_run(run: Run, state: Path) -> Run:
