@@ -34,8 +34,7 @@ class Above:
 
     bound: float
 
-    def holds(self, number: float) -> bool:
-        """Whether it is in the range."""
+    def __contains__(self, number: float) -> bool:
         return number > self.bound
 
     def __str__(self) -> str:
@@ -48,8 +47,7 @@ class AtLeast:
 
     bound: float
 
-    def holds(self, number: float) -> bool:
-        """Whether it is in the range."""
+    def __contains__(self, number: float) -> bool:
         return number >= self.bound
 
     def __str__(self) -> str:
@@ -62,8 +60,7 @@ class AtMost:
 
     bound: float
 
-    def holds(self, number: float) -> bool:
-        """Whether it is in the range."""
+    def __contains__(self, number: float) -> bool:
         return number <= self.bound
 
     def __str__(self) -> str:
@@ -77,8 +74,7 @@ class Within:
     low: float
     high: float
 
-    def holds(self, number: float) -> bool:
-        """Whether it is in the range."""
+    def __contains__(self, number: float) -> bool:
         return self.low <= number <= self.high
 
     def __str__(self) -> str:
@@ -338,7 +334,7 @@ def _convert(
         fits = converted is not None
     else:
         fits = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
-    if not fits or (kind in (int, float) and not all(r.holds(converted) for r in ranges)):
+    if not fits or (kind in (int, float) and not all(converted in r for r in ranges)):
         raise _wrong(where, key, value, expected(kind, ranges))
     return converted
 

@@ -7,8 +7,10 @@ from typing import Any
 
 from evsplat.config import from_dict
 from evsplat.errors import ConfigError
-from evsplat.methods import avatar3dgs, avatar3dgs_semantic, evsplat, hugs, paper
+from evsplat.methods import avatar3dgs, avatar3dgs_semantic, hugs, paper
 from evsplat.methods.base import Composition, MethodConfig, Purpose
+from evsplat.methods.evsplat import EvsplatConfig
+from evsplat.methods.evsplat import build as build_evsplat
 from evsplat.methods.settings import NOMINAL_ITERATIONS
 
 
@@ -27,7 +29,7 @@ TRAINABLE = {
     "avatar3dgs_semantic": Method(
         avatar3dgs_semantic.AvatarSemanticConfig, avatar3dgs_semantic.build
     ),
-    "evsplat": Method(evsplat.EvsplatConfig, evsplat.build),
+    "evsplat": Method(EvsplatConfig, build_evsplat),
     "hugs": Method(hugs.HugsConfig, hugs.build),
     "paper": Method(paper.PaperConfig, paper.build),
 }
