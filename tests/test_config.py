@@ -25,8 +25,9 @@ from evsplat.config import (
 )
 from evsplat.config_docs import save_yaml
 from evsplat.errors import ConfigError
-from evsplat.methods import TRAINABLE, PaperConfig, method_config
-from evsplat.methods.evsplat import EvsplatConfig
+from evsplat.methods import TRAINABLE, method_config
+from evsplat.methods.avatar3dgs import AvatarConfig
+from evsplat.methods.paper import PaperConfig
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,9 @@ class Method:
     DROPPED: ClassVar[dict[str, str]] = {
         "deform.encoding": "gone: the hash grid earned nothing (docs/method.md)",
         "edi": "gone: sharpened frames earned nothing",
+        "loss": "its weights stand alone",
+        "loss.l1": "renamed to l1_weight",
+        "loss.dssim": "renamed to dssim_weight",
         "pose_begin": "renamed to pose_start",
     }
 
@@ -163,8 +167,9 @@ def test_a_section_given_in_part_keeps_what_its_owner_set():
 
 
 def test_a_method_keeps_its_parts_when_one_setting_of_them_changes():
-    config = method_config("evsplat", {"deform": {"width": 16}}, where="test")
-    assert config.deform == replace(EvsplatConfig().deform, width=16)
+    config = method_config("avatar3dgs", {"networks": {"width": 16}}, where="test")
+    assert config.networks == replace(AvatarConfig().networks, width=16)
+    assert config.networks.pose_start == 5_000  # which its type alone would not give
 
 
 @pytest.mark.parametrize(
@@ -365,6 +370,14 @@ def test_a_whole_configuration_with_unread_settings_loads_again(tmp_path):
         ),
         ({"edi": {"weight": 0.1}}, "edi: gone: sharpened frames earned nothing."),
         ({"pose_begin": 3}, "pose_begin: renamed to pose_start."),
+        ({"loss": {"l1": 1.0}}, "loss.l1: renamed to l1_weight."),
+        (
+            {"loss": {"dssim": 0.1, "l1": 1.0}},
+            "loss.dssim: renamed to dssim_weight; loss.l1: renamed to l1_weight.",
+        ),
+        ({"loss": {"l1": 1.0, "alpha": 0.0}}, "loss: its weights stand alone."),
+        ({"loss": {}}, "loss: its weights stand alone."),
+        ({"loss": None}, "loss: its weights stand alone."),
         (
             {"deform": {"encoding": "x", "lamps": {"light": 1}}, "pose_begin": 3, "?": 0},
             "deform.encoding: gone: the hash grid earned nothing (docs/method.md); unknown setting "

@@ -395,7 +395,10 @@ def _unknown(
     for name, item in values.items():
         full = f"{prefix}{name}"
         if full in dropped:
-            yield f"{full}: {dropped[full]}", None
+            inside = [f"{full}.{key}" for key in item] if isinstance(item, dict) else []
+            # Of a section that is gone, its settings where there is a word on each that is given.
+            for gone in inside if inside and dropped.keys() >= {*inside} else [full]:
+                yield f"{gone}: {dropped[gone]}", None
         elif name not in names:
             near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.3)
             yield f"unknown setting {full}", prefix + near[0] if near else None
