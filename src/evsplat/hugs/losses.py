@@ -32,9 +32,9 @@ def mask_of(capture: TrainingCapture, frame: Frame) -> Float[Tensor, "H W"]:
 class Perceptual:
     """Mean perceptual distance of random squares, most of them on the person."""
 
-    def __init__(self, metric: PerceptualMetric, *, rescaled: bool) -> None:
-        """``rescaled``: to the [-1, 1] that the networks expect; the released code leaves it."""
-        self.metric, self.rescaled = metric, rescaled
+    def __init__(self, metric: PerceptualMetric) -> None:
+        """``metric`` takes pictures in [-1, 1]."""
+        self.metric = metric
 
     def __call__(
         self,
@@ -44,8 +44,7 @@ class Perceptual:
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
         """Distance of ``image`` from ``reference``, both in [0, 1]."""
-        if self.rescaled:
-            image, reference = 2 * image - 1, 2 * reference - 1
+        image, reference = 2 * image - 1, 2 * reference - 1
         squares = draw_squares(mask.cpu() > 0.5, generator)
         distances = [
             self.metric(image[rows, cols], reference[rows, cols]) for rows, cols in squares
@@ -98,10 +97,7 @@ class JointPicture(Stateless):
 
 
 class HumanPicture(Stateless):
-    """The person alone, over a random colour of its own, against its pixels over the same colour.
-
-    Where the model has no scene, the step's picture shows the person alone already, over black.
-    """
+    """The person alone over a random colour of its own, against its pixels over the same."""
 
     def __init__(self, capture: TrainingCapture, perceptual: Perceptual | None) -> None:
         """Pictures and masks are the capture's."""
@@ -142,9 +138,6 @@ class HumanPicture(Stateless):
     def _drawn(
         self, step: Step[HugsModel], index: int, colour: Float[Tensor, "3"]
     ) -> Float[Tensor, "H W 3"]:
-        if len(step.model.scene) == 0:
-            through = 1 - step.drawing.output.alpha[index]
-            return step.rgb[index] + through[..., None] * colour
         moving = step.drawing.moving
         person = replace(
             moving,

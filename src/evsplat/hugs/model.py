@@ -32,19 +32,6 @@ class HugsDrawing(Drawing):
     """A drawing that remembers what the person was decoded to."""
 
     decoded: Decoded
-    shifted: bool
-    """Whether the scene is told other Gaussians' gradients, as the released code does."""
-
-    def center_gradients(self) -> tuple[Float[Tensor, "T H 2"], Float[Tensor, "1 S 2"]]:
-        """Gradients of the projected centres of person and scene, pixels.
-
-        The released code draws one array, the person's Gaussians first, and takes the gradients of
-        its first rows for the scene's.
-        """
-        human, scene = super().center_gradients()
-        if not self.shifted:
-            return human, scene
-        return human, torch.cat([human, scene], 1)[:, : scene.shape[1]]
 
 
 class HugsModel(nn.Module):
@@ -59,13 +46,10 @@ class HugsModel(nn.Module):
         scene: SphericalScene,
         track: BodyTrack,
         frame_times_us: Sequence[int],
-        *,
-        release_compatible: bool,
     ) -> None:
         """``frame_times_us`` are the mid-exposures of the training frames."""
         super().__init__()
         self.human, self.scene, self.track = human, scene, track
-        self.release_compatible = release_compatible
         self.row_caches: dict[str, RowCache] = {"skinning_turns": human.skinning_turns}
         frames, joints = len(frame_times_us), len(track.body.parents)
         self.turns = nn.Parameter(torch.tensor(_NO_TURN).repeat(frames, joints, 1))
@@ -102,11 +86,8 @@ class HugsModel(nn.Module):
 
     @property
     def active_degree(self) -> int:
-        """Degree of the scene's harmonics that are drawn.
-
-        The released code draws both sets with the person's, which is 0.
-        """
-        return 0 if self.release_compatible else min(3, int(self.nominal) // DEGREE_EVERY)
+        """Degree of the scene's harmonics that are drawn."""
+        return min(3, int(self.nominal) // DEGREE_EVERY)
 
     def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4).
@@ -146,14 +127,12 @@ class HugsModel(nn.Module):
         camera: Camera,
         generator: torch.Generator,
     ) -> Drawing:
-        """Person and scene over a random colour, the person alone over black; see `Model`."""
-        background = None
-        if len(self.scene):
-            background = send(torch.rand(3, generator=generator), self.device)
+        """Person and scene over a random colour; see `Model`."""
+        background = send(torch.rand(3, generator=generator), self.device)
         decoded = self.human.for_training()
         posed = self._posed(decoded, times_us, camera.center())
         drawing = draw(self, posed, camera, center_gradients=True, background=background)
-        return HugsDrawing(**vars(drawing), decoded=decoded, shifted=self.release_compatible)
+        return HugsDrawing(**vars(drawing), decoded=decoded)
 
     def following(self, track: BodyTrack) -> "HugsModel":
         """The same person doing what ``track`` says, without the corrections; see `Model`."""

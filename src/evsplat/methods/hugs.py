@@ -5,7 +5,7 @@ iterations are nominal ones of 15,000; the released code makes 14,999.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack, load_body_track
 from evsplat.capture import Policy, TrainingCapture
-from evsplat.capture.masked import MaskedCapture, require_masks
+from evsplat.capture.masked import require_masks
 from evsplat.errors import DataError
 from evsplat.gaussians import DensifyConfig, Part
 from evsplat.gaussians.initialise import nearest_spacing
@@ -30,7 +30,6 @@ from evsplat.methods.starts import (
     HumanStartConfig,
     SceneStartConfig,
     human_start,
-    no_gaussians,
     scene_start,
 )
 from evsplat.objectives import Objective
@@ -130,11 +129,6 @@ class HugsConfig:
 
     policy: Policy = field(default_factory=lambda: Policy(masks="given"))
     """What training may see of what is held out."""
-    mode: Literal["human_scene", "human"] = "human_scene"
-    """What is reconstructed, in the released code's words. ``human``: the person alone, on black,
-    from pictures that are black outside of the mask; the settings of the scene mean nothing."""
-    release_compatible: bool = False
-    """Repeat the released code's slips (2.7); docs/baselines.md lists them."""
     human: HumanStartConfig = field(default_factory=HumanStartConfig)
     triplane: TriplaneConfig = field(default_factory=TriplaneConfig)
     fit: FitConfig = field(default_factory=FitConfig)
@@ -174,22 +168,14 @@ def compose(
     if not capture.train_frames:
         raise DataError(f"{capture.path}: no frame has split 'train'; nothing to learn from.")
     require_masks(capture, "method hugs")
-    alone = config.mode == "human"
-    if alone:
-        capture = MaskedCapture(capture, "method hugs")
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     track = load_body_track(capture)
     human, spacing = _human(config, capture, track, generator)
     extent = _extent(config, capture, track)
     scene = _scene(config, capture, track, generator)
-    model = HugsModel(
-        human,
-        scene,
-        track,
-        [frame.mid_us for frame in capture.train_frames],
-        release_compatible=config.release_compatible,
-    ).to(device)
+    times_us = [frame.mid_us for frame in capture.train_frames]
+    model = HugsModel(human, scene, track, times_us).to(device)
     if fit:
         fit_to_body(
             human,
@@ -200,14 +186,12 @@ def compose(
             generator=generator,
         )
     metric = make_perceptual(config.loss.perceptual, device=device)
-    rescaled = not config.release_compatible
-    perceptual = None if metric is None else Perceptual(metric, rescaled=rescaled)
+    perceptual = None if metric is None else Perceptual(metric)
     objectives: list[Objective] = [
+        JointPicture(capture, perceptual),
         HumanPicture(capture, perceptual),
         SkinningTarget(refresh=config.skinning_refresh),
     ]
-    if not alone:
-        objectives.insert(0, JointPicture(capture, perceptual))
     loss = config.loss
     return Composition(
         model=model,
@@ -225,7 +209,6 @@ def compose(
         densify=_limits(config, extent),
         body_frames=None,
         generator=generator,
-        capture=capture if alone else None,
     )
 
 
@@ -265,8 +248,6 @@ def _extent(config: HugsConfig, capture: TrainingCapture, track: BodyTrack) -> f
     """
     frames = capture.train_frames
     centers = torch.stack([capture.camera(frame).center() for frame in frames])
-    if config.release_compatible:
-        return 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max())
     if config.scene.cube_half_side_m:
         return config.scene.cube_half_side_m
     translation = track.at(torch.tensor([frame.mid_us for frame in frames]))[1]
@@ -278,8 +259,6 @@ def _scene(
     config: HugsConfig, capture: TrainingCapture, track: BodyTrack, generator: torch.Generator
 ) -> SphericalScene:
     scene = config.scene
-    if config.mode == "human":
-        return SphericalScene(no_gaussians(), torch.zeros(0, 3), 0)
     values, colours = scene_start(scene, capture, track, generator, 0.0)
     seen = _seen(values["means"], capture)
     degree = scene.sh_degree
@@ -302,16 +281,13 @@ def _seen(points: Float[Tensor, "N 3"], capture: TrainingCapture) -> Tensor:
 def _limits(config: HugsConfig, extent: float) -> dict[Part, DensifyConfig]:
     human, scene = config.densify_human, config.densify_scene
     still = config.scene.kind == "median_backdrop"
-    if config.mode == "human" or (scene is None and still):
+    if scene is None and still:
         return {"human": human}
     if scene is None:
         scene = DensifyConfig(
             start=500, end=15_000, every=100, split_above_m=0.01 * extent, prune_opacity=0.005,
             prune_screen_px=None, prune_scale_m=None, max_count=150_000,
         )  # fmt: skip
-    if config.release_compatible:
-        # For a stored background that is white, though every picture is drawn over another one.
-        scene = replace(scene, opacity_reset=(500,))
     return {"human": human, "scene": scene}
 
 
@@ -327,7 +303,6 @@ def _learning(model: HugsModel, config: HugsConfig, extent: float) -> Learning:
         *human.appearance.parameters(),
         *human.geometry.parameters(),
     ]
-    pose = [model.turns] if config.release_compatible else [model.turns, model.shifts]
     return Learning(
         rows={
             "human": {
@@ -346,6 +321,6 @@ def _learning(model: HugsModel, config: HugsConfig, extent: float) -> Learning:
         networks=[
             Network(decoders, Rate(rates.triplane)),
             Network(list(human.skinning.parameters()), Rate(rates.skinning)),
-            Network(pose, Rate(rates.pose)),
+            Network([model.turns, model.shifts], Rate(rates.pose)),
         ],
     )
