@@ -72,8 +72,6 @@ class WindowConfig:
     begun_us: int = 100_000
     """Between two events of one polarity that lie at most so far apart, brightness is taken to
     change evenly instead of all at once at the second; 0: all at once."""
-    pixel_thresholds: bool = False
-    """Each pixel learns a factor on its contrast thresholds."""
     clock: Literal["auto", "always", "never"] = "auto"
     """Learn by how much the events' clock is late, on top of the capture's own offset, starting at
     what training frames and events tell where that is over 4 ms and three standard errors.
@@ -208,8 +206,7 @@ def _windows(
             estimate = estimate_from_capture(capture)
         known = _thresholds(capture, estimate)
         late_us = _late_us(windows, estimate)
-    pixels = (capture.events.height, capture.events.width) if windows.pixel_thresholds else None
-    build.model.sensor = EventSensor(*known, pixels=pixels, late_us=late_us).to(device)
+    build.model.sensor = EventSensor(*known, late_us=late_us).to(device)
     if fit and not capture.events.has_polarity:
         logger.warning(
             "%s: its events have no polarity; the size of changes is compared with their number.",

@@ -40,9 +40,6 @@ class EventConfig:
     """Absolute floor of both norms (A16)."""
     eps: float = 1e-5
     """Added to linear luminance before the logarithm (A11)."""
-    across_gaps: bool = False
-    """Also pair training frames with held-out frames between them (A13); needs
-    ``policy.held_out_events``."""
     weight_by_activity: bool = True
     """Weigh pairs by their share of active pixels, within 0.25 to 4 of the median (A17)."""
     min_active: float = 0.001
@@ -220,14 +217,11 @@ def observed(
 
 def paper_events(config: EventConfig, capture: TrainingCapture) -> EventChange:
     """The paper's event term (eq. 8-9)."""
-    if config.across_gaps:
-        capture.policy.require_held_out_events("event.across_gaps")
     return EventChange(
         capture,
         start=config.start,
         floor=config.floor,
         eps=config.eps,
-        across_gaps=config.across_gaps,
         weight_by_activity=config.weight_by_activity,
         min_active=config.min_active,
     )

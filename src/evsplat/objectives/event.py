@@ -79,7 +79,6 @@ class EventChange(Stateless):
         start: float,
         floor: float,
         eps: float,
-        across_gaps: bool,
         weight_by_activity: bool,
         min_active: float,
     ) -> None:
@@ -93,7 +92,7 @@ class EventChange(Stateless):
         frames = capture.frames
         train = capture.train_frames
         follows = zip(train, train[1:], strict=False)
-        pairs = [(a, b) for a, b in follows if across_gaps or b.index == a.index + 1]
+        pairs = [(a, b) for a, b in follows if b.index == a.index + 1]
         for first, second in pairs:
             if frames[first.index].camera != frames[second.index].camera:
                 continue

@@ -17,24 +17,14 @@ class EventSensor(nn.Module):
 
     start_logs: Tensor
 
-    def __init__(
-        self,
-        on: float,
-        off: float,
-        *,
-        pixels: tuple[int, int] | None = None,
-        late_us: float | None = None,
-    ) -> None:
+    def __init__(self, on: float, off: float, *, late_us: float | None = None) -> None:
         """Thresholds to start from and to stay near, above 0.
 
-        With ``pixels`` (height, width) each pixel learns a factor on both of its thresholds, as
-        sensors have it; the offset of the events' clock is learned from ``late_us`` on, unless that
-        is None.
+        The offset of the events' clock is learned from ``late_us`` on, unless that is None.
         """
         super().__init__()
         self.register_buffer("start_logs", torch.tensor([on, off]).log())
         self.logs = nn.Parameter(self.start_logs.clone())
-        self.pixel_logs = None if pixels is None else nn.Parameter(torch.zeros(pixels))
         self.offset = nn.Parameter(torch.tensor((late_us or 0.0) / _OFFSET_UNIT_US))
         self.learns_clock = late_us is not None
 
@@ -52,23 +42,16 @@ class EventSensor(nn.Module):
         self.learns_clock = bool(state)
 
     def apart(self) -> Float[Tensor, ""]:
-        """Squared distance of the logarithms from where they started, mean over polarities.
-
-        That of the pixels, mean over pixels, comes on top.
-        """
-        together = (self.logs - self.start_logs).square().mean()
-        return together if self.pixel_logs is None else together + self.pixel_logs.square().mean()
+        """Squared distance of the logarithms from where they started, mean over polarities."""
+        return (self.logs - self.start_logs).square().mean()
 
     def change(
         self, on: Float[Tensor, "*batch H W"], off: Float[Tensor, "*batch H W"]
     ) -> Float[Tensor, "*batch H W"]:
         """Log-brightness change that counts of events of both polarities report."""
         threshold = self.logs.exp()
-        return self._per_pixel(threshold[0] * on - threshold[1] * off)
+        return threshold[0] * on - threshold[1] * off
 
     def path(self, count: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
         """How far log-brightness moved, up or down, when events do not say which way."""
-        return self._per_pixel(self.logs.mean().exp() * count)
-
-    def _per_pixel(self, values: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
-        return values if self.pixel_logs is None else values * self.pixel_logs.exp()
+        return self.logs.mean().exp() * count
