@@ -5,8 +5,6 @@ import math
 import pytest
 import torch
 
-from evsplat.errors import ConfigError
-from evsplat.methods.paper import EventConfig, paper_events
 from evsplat.objectives import EventChange, event_loss
 from evsplat.pictures import decode, encode, log_brightness_change
 
@@ -109,24 +107,16 @@ def test_compiled_loss_of_no_number_is_none():
     assert bool(event_loss(change, torch.ones(20, 30)).isnan())
 
 
-@pytest.mark.parametrize("across_gaps", [False, True])
-def test_pairs_cross_held_out_frames_only_where_that_is_asked_for(tiny_capture, across_gaps):
+def test_no_pair_crosses_held_out_frames(tiny_capture):
     capture = seen(tiny_capture(frames=20), held_out_events=True)
     objective = EventChange(
-        capture, start=0, floor=0.03, eps=1e-5, across_gaps=across_gaps, weight_by_activity=True,
+        capture, start=0, floor=0.03, eps=1e-5, weight_by_activity=True,
         min_active=0.0,
     )  # fmt: skip
     mids = [frame.mid_us for frame in capture.frames]
     pairs = {objective.times(frame, 1.0) for frame in capture.train_frames}
     steps = {(mids.index(a), mids.index(b)) for a, b in pairs}
     within = {(i, i + 1) for i in (*range(6), *range(10, 16))}
-    # the last frame before the gap looks ahead over it, or back; so does the last of all
-    assert steps == (within | {(6, 10)} if across_gaps else within)
+    # the last frame before the gap looks back, and so does the last of all
+    assert steps == within
     assert len(pairs) == len(objective.weights)
-
-
-def test_pairs_across_held_out_frames_need_a_policy_that_shows_their_events(tiny_capture):
-    config, path = EventConfig(across_gaps=True), tiny_capture(frames=20)
-    with pytest.raises(ConfigError, match="policy.held_out_events=true as well"):
-        paper_events(config, seen(path))
-    assert paper_events(config, seen(path, held_out_events=True)).partner

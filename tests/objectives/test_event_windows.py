@@ -129,28 +129,6 @@ def test_a_time_outside_of_the_exposure_is_asked_for_after_the_start():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_each_pixel_learns_its_own_threshold(seed):
-    capture, step = scene(seed, on=0.2, off=0.2)
-    factors = 1 + 0.3 * torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed))
-    log = torch.log(step.linear + EPS).double()
-    step.linear = torch.exp(-2 + (log + 2) * factors[..., None]) - EPS
-    objective = make(capture, 0.2, 0.2, pixels=(HEIGHT, WIDTH))
-    objective.sensor.logs.requires_grad_(False)
-    adam = torch.optim.Adam(objective.sensor.parameters(), lr=0.01)
-    for _ in range(200):
-        adam.zero_grad()
-        objective.loss(step)["event"].backward()
-        adam.step()
-    counts = objective._counts(capture.events.stream, [(0, 10_000)], torch.device("cpu"))
-    seen = counts.sum((0, 1)) > 0
-    learned = objective.sensor.pixel_logs.exp()
-    assert torch.allclose(learned[seen], factors[seen].double(), rtol=0.03)
-    assert float(objective.sensor.apart()) == pytest.approx(
-        float(objective.sensor.pixel_logs.square().mean())
-    )
-
-
-@pytest.mark.parametrize("seed", range(3))
 def test_without_polarity_the_size_of_the_change_is_compared(seed):
     capture, step = scene(seed, on=0.25, off=0.25)
     stream = capture.events.stream
