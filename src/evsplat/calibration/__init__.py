@@ -37,7 +37,7 @@ MOST_PAIRS = 60
 
 @dataclass(frozen=True)
 class SensorEstimate:
-    """What frames tell about the events that were recorded with them."""
+    """Clock and thresholds of events, estimated from the frames recorded with them."""
 
     clock: ClockEstimate
     thresholds: ThresholdEstimate | None
