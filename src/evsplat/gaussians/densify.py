@@ -162,7 +162,7 @@ def _decide(
     limit: DensifyLimits,
     nominal: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which rows of one class are kept, cloned and split."""
+    """Masks of the rows of one class to keep, clone and split."""
     largest = shape.scales[rows].amax(-1)
     keep = shape.opacities[rows] >= limit.prune_opacity
     if nominal >= limit.prune_after:

@@ -94,7 +94,7 @@ def to_world(frames: BodyFrames, means: Float[Tensor, "M 3"]) -> Float[Tensor, "
 def to_canonical(
     frames: BodyFrames, points: Float[Tensor, "M 3"]
 ) -> tuple[Bool[Tensor, " M"], Float[Tensor, "K 4 4"]]:
-    """Which scene rows can be the person's, and transforms that place these K on it.
+    """Mask of scene rows near the person, and transforms that place these K on it.
 
     The nearest posed body vertex over all frames carries a row back; it lies within `REACH_M`.
     """

@@ -19,7 +19,7 @@ Part = Literal["human", "scene"]
 
 @dataclass(frozen=True)
 class Shape:
-    """What densification must know of ``N`` Gaussians as they are drawn; without gradient."""
+    """Sizes of ``N`` Gaussians as they are drawn, for densification; without gradient."""
 
     scales: Float[Tensor, "N 3"]
     """Standard deviations, metres."""

@@ -70,7 +70,7 @@ class Skinned(Protocol):
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians are."""
+        """Device of the Gaussians."""
 
     def at(
         self, times_us: Sequence[int], camera_center: Float[Tensor, "3"], *, hard_semantics: bool
@@ -96,7 +96,7 @@ class Skinned(Protocol):
 
 @torch.no_grad()
 def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
-    """What skinning can show of a model: its mean over ``views``, instants (us) and their cameras.
+    """Mean of a model over ``views``, instants (us) and their cameras, as skinning can show it.
 
     Centre, log-scales, rotation and colour are the means of what the model shows at those instants
     with the skinning undone, and the light where the model knows it. That drops less than switching

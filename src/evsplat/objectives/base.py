@@ -1,4 +1,4 @@
-"""What an objective is: it names the times it needs, and compares what was rendered there."""
+"""Contract of an objective: it names the times it needs, and compares what was rendered there."""
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
@@ -99,7 +99,7 @@ class Objective(Protocol):
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """What a checkpoint must hold for a resume to repeat the same steps."""
+        """Tensors of a checkpoint by which a resume repeats the same steps."""
         ...
 
     def load_state(self, state: dict[str, Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""How far a recording's events can be trusted, per pixel and per time they are counted over."""
+"""Trust in a recording's events, per pixel and per time they are counted over."""
 
 import math
 from functools import cached_property
@@ -20,7 +20,7 @@ class EventNoise:
     """
 
     def __init__(self, events: EventStore, *, aware: bool = True) -> None:
-        """Of a whole recording; not ``aware`` of it, every event counts fully."""
+        """Noise of a whole recording; not ``aware`` of it, every event counts fully."""
         self.events, self.aware = events, aware
 
     @cached_property
@@ -38,5 +38,5 @@ class EventNoise:
         return self._measured[1]
 
     def weight(self, duration_us: int) -> float:
-        """Of what is compared with the events of so many microseconds, in 0..1."""
+        """Weight of what is compared with the events of so many microseconds, in 0..1."""
         return 1 / (1 + 2 * math.sqrt(self._measured[0] * duration_us * 1e-6))

@@ -9,7 +9,7 @@ _OFFSET_UNIT_US = 10_000.0
 
 
 class EventSensor(nn.Module):
-    """How much log-brightness changes per event, for either polarity, and how late events come.
+    """Change of log-brightness per event, for either polarity, and delay of the events.
 
     Events alone would have thresholds shrink: the mean absolute difference to a change that is not
     yet reconstructed is smallest when events mean little. `apart` is what holds them.
@@ -36,7 +36,7 @@ class EventSensor(nn.Module):
 
     @property
     def offset_us(self) -> Float[Tensor, ""] | None:
-        """How much later events are stamped than the frames' clock says; None: not learned."""
+        """Delay of the events' stamps against the frames' clock; None: not learned."""
         return _OFFSET_UNIT_US * self.offset if self.learns_clock else None
 
     def get_extra_state(self) -> Tensor:
@@ -59,5 +59,5 @@ class EventSensor(nn.Module):
         return threshold[0] * on - threshold[1] * off
 
     def path(self, count: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
-        """How far log-brightness moved, up or down, when events do not say which way."""
+        """Way of log-brightness, up or down, when events do not say which."""
         return self.logs.mean().exp() * count

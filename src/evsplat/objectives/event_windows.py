@@ -93,14 +93,14 @@ class EventWindows(Stateless):
         return {"event": event, "contrast": self.sensor.apart()}
 
     def readable(self, step: Step) -> slice:
-        """Which of a step's times are between events that may be read, by the events' clock."""
+        """Slice of a step's times between events that may be read, by the events' clock."""
         low, high = self.events.open_around(step.frame.mid_us)
         late = [time + self._late_us for time in step.times_us]
         return slice(bisect_left(late, low), bisect_right(late, high))
 
     @property
     def _late_us(self) -> int:
-        """By how much events are stamped later than the frames' clock says, as learned so far."""
+        """Delay of the events' stamps against the frames' clock, as learned so far."""
         offset = self.sensor.offset_us
         return 0 if offset is None else round(float(offset.detach()))
 

@@ -25,7 +25,7 @@ LEAST_SHARE = 1e-4
 def silhouette_bounds(
     silhouette: Bool[np.ndarray, "H W"], band_px: int
 ) -> tuple[Bool[Tensor, "H W"], Bool[Tensor, "H W"]]:
-    """Where a pixel surely is the person, and where it surely is the scene.
+    """Masks of pixels that surely are the person, and of those that surely are the scene.
 
     Inside the posed bare body it is the person; farther than ``band_px`` from it the scene; between
     lie clothes and hair, about which nothing is said.

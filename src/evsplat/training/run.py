@@ -34,7 +34,7 @@ PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Where the parts of a run lie."""
+    """Paths of the parts of a run."""
 
     path: Path
 
@@ -232,7 +232,7 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
 
 
 def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:
-    """What a method with this configuration is given of a capture."""
+    """The part of a capture that a method with this configuration is given."""
     return capture.for_training(config.policy, MASKERS["background"])
 
 

@@ -1,4 +1,4 @@
-"""What the triplane's features mean: appearance, geometry and skinning (reference 2.1)."""
+"""Decoders of the triplane's features: appearance, geometry and skinning (reference 2.1)."""
 
 import torch
 from jaxtyping import Float

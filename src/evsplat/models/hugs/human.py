@@ -73,7 +73,7 @@ class TriplaneHuman(OneClassRows):
         self.skinning_turns = SkinningTurns(skinning_turns)
 
     def look_up(self, positions: Float[Tensor, "M 3"]) -> Decoded:
-        """What the decoders say of any canonical places."""
+        """Decoded Gaussians at any canonical places."""
         features = self.triplane(positions)
         return self._decode(features, self.skinning(features))
 
