@@ -79,7 +79,7 @@ class SplatReconstruction(Protocol):
     def splats(
         self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
     ) -> list[Splats]:
-        """Gaussians that `Reconstruction.render` draws, world metres; first the person, then the scene.
+        """Gaussians that `Reconstruction.render` draws, world metres; the person first.
 
         Channels are R, G, B (sRGB) and the semantic attribute (1 = person). Colours that depend on
         the direction are those seen from ``camera``.
