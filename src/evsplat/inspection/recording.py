@@ -124,9 +124,6 @@ class _Totals:
         if not gathered.parts:
             raise DataError(f"{recording.path}: holds no events; is it the right file?")
         start, end = gathered.start_us, gathered.end_us
-        columns = (
-            np.concatenate([getattr(part, name) for part in gathered.parts]) for name in "txyp"
-        )
         bins = np.concatenate(gathered.bins)
         counts = np.bincount(bins[:, 0], bins[:, 1])
         return cls(
@@ -138,7 +135,7 @@ class _Totals:
             start,
             end,
             counts / (_RATE_BIN_US / 1e6),
-            EventStream(*columns),
+            EventStream.joined(gathered.parts),
         )
 
     def text(self, has_polarity: bool) -> str:

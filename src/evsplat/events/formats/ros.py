@@ -102,10 +102,10 @@ class _Message:
     width: int
     height: int
     encoding: str
-    """Of a packet; empty for an array."""
+    """Encoding of a packet; empty for an array."""
     events: bytes
     kind: np.dtype
-    """Of an event of an array."""
+    """Layout of an event of an array."""
 
 
 def _array(message: _Message) -> RawEvents:
