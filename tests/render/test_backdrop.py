@@ -77,7 +77,7 @@ def test_whatever_changes_the_layer_or_the_camera_begins_anew(layers):
     backdrop = Backdrop()
     show = dict(static=static, backdrop=backdrop)
     assert_same(at(moving, 0), camera, **show)
-    for name in ("means", "quats", "scales", "opacities", "channels"):
+    for name in ("means", "quaternions", "scales", "opacities", "channels"):
         changed = replace(static, **{name: getattr(static, name) * 0.9 + 0.01})
         assert_same(at(moving, 1), camera, static=changed, backdrop=backdrop)
     assert_same(at(moving, 2), camera, **show)

@@ -143,7 +143,7 @@ class HumanPicture(Stateless):
             human,
             **{
                 name: getattr(human, name)[index : index + 1]
-                for name in ("means", "quats", "scales", "linear")
+                for name in ("means", "quaternions", "scales", "linear")
             },
             channels=human.channels[index : index + 1, :, :3],
             centers2d_offset=None,

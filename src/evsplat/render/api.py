@@ -89,7 +89,7 @@ def _check_splats(splats: Splats, prefix: str) -> int:
     count = means.shape[1]
     inner: dict[str, tuple[int, ...]] = {
         "means": (count, 3),
-        "quats": (count, 4),
+        "quaternions": (count, 4),
         "scales": (count, 3),
         "opacities": (count,),
         "channels": (count, max(1, splats.channels.shape[-1])),

@@ -136,17 +136,17 @@ def _project(
         return torch.where(mask, value, 0.0).expand(times, *inner).contiguous()
 
     means, opacities = usable(splats.means), usable(splats.opacities)
-    quats, scales = usable(splats.quats), usable(splats.scales)
+    quaternions, scales = usable(splats.quaternions), usable(splats.scales)
     covariances = None
     if splats.linear is not None:
-        shape = usable(splats.linear) @ rotation_matrices(quats) * scales[..., None, :]
+        shape = usable(splats.linear) @ rotation_matrices(quaternions) * scales[..., None, :]
         covariances = _upper(shape @ shape.mT)
     view = send(camera.world_to_camera, device).to(means.dtype)
     K = send(camera.K.detach().float(), device)
     radii, centers, depths, conics, _ = gsplat.fully_fused_projection(
         means,
         covariances,
-        quats if covariances is None else None,
+        quaternions if covariances is None else None,
         scales if covariances is None else None,
         view.expand(times, 1, 4, 4),
         K.expand(times, 1, 3, 3),

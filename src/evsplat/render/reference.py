@@ -32,7 +32,7 @@ def render(
     """Draw tile by tile, all pairs of a tile's pixels and Gaussians at once."""
     s = splats if static is None else join(splats, static, times)
     fields = (
-        s.means, s.quats, s.scales, s.opacities, s.channels, s.linear, s.centers2d_offset
+        s.means, s.quaternions, s.scales, s.opacities, s.channels, s.linear, s.centers2d_offset
     )  # fmt: skip
     drawn = [
         _draw(
@@ -55,10 +55,10 @@ def _draw(
     fields: list[Tensor | None], camera: PinholeCamera, near: float, low_pass: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image, alpha and radii of one time, without background."""
-    means, quats, scales, opacities, channels, linear, offset = fields
-    assert means is not None and quats is not None and scales is not None
+    means, quaternions, scales, opacities, channels, linear, offset = fields
+    assert means is not None and quaternions is not None and scales is not None
     assert opacities is not None and channels is not None
-    centers, covariance, depth = project(means, quats, scales, linear, camera, low_pass)
+    centers, covariance, depth = project(means, quaternions, scales, linear, camera, low_pass)
     if offset is not None:
         centers = centers + offset
     reach, visible = _extents(centers, covariance, depth, opacities, camera, near)
@@ -95,7 +95,7 @@ def _draw(
 
 def project(
     means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
+    quaternions: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
     linear: Float[Tensor, "N 3 3"] | None,
     camera: PinholeCamera,
@@ -121,14 +121,14 @@ def project(
     factor = jacobian.view(-1, 2, 3) @ view[:3, :3]
     if linear is not None:
         factor = factor @ linear
-    factor = factor @ rotation_matrices(quats) * scales[:, None, :]
+    factor = factor @ rotation_matrices(quaternions) * scales[:, None, :]
     blur = low_pass * torch.eye(2, dtype=means.dtype, device=means.device)
     return centers, factor @ factor.mT + blur, local[:, 2]
 
 
-def rotation_matrices(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
+def rotation_matrices(quaternions: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
     """Rotations of quaternions wxyz of any length but zero."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
     return torch.stack(
         [
             1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

@@ -37,7 +37,7 @@ class Splats:
 
     means: Float[Tensor, "T N 3"]
     """Centres in the world, metres."""
-    quats: Float[Tensor, "*T N 4"]
+    quaternions: Float[Tensor, "*T N 4"]
     """Rotations wxyz, of any length but zero."""
     scales: Float[Tensor, "*T N 3"]
     """Standard deviations along the rotated axes, metres."""
@@ -80,7 +80,7 @@ def join(first: Splats, second: Splats, times: int) -> Splats:
         parts.append(
             (
                 splats.means,
-                splats.quats,
+                splats.quaternions,
                 splats.scales,
                 splats.opacities,
                 splats.channels,
