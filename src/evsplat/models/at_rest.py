@@ -112,7 +112,7 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
         transforms = layers.transforms[0].double()
         offset = person.means[0].double() - transforms[:, :3, 3]
         centers = torch.linalg.solve(transforms[:, :3, :3], offset)
-        quaternions = normalize(person.quats[0].double(), dim=-1)
+        quaternions = normalize(person.quaternions[0].double(), dim=-1)
         first = quaternions if first is None else first
         # q and -q are one rotation: only those on one side have a mean.
         quaternions = quaternions * torch.where((quaternions * first).sum(-1) < 0, -1, 1)[:, None]
