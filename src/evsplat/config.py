@@ -389,13 +389,17 @@ def _convert_dataclass(kind: Any, value: Any, where: str, key: str, start: Any) 
 def _unknown(
     kind: Any, values: dict[Any, Any], prefix: str, dropped: dict[str, str]
 ) -> Iterator[tuple[str, str | None]]:
-    """What is wrong with keys that a section, or one inside it, has not; the name that is near."""
+    """Faults of keys that a section, or one inside it, has not; the name that is near."""
     hints = get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind)]
     for name, item in values.items():
         full = f"{prefix}{name}"
         if full in dropped:
-            yield f"{full}: {dropped[full]}", None
+            parts = [f"{full}.{key}" for key in item] if isinstance(item, dict) else []
+            named = [part for part in parts if part in dropped]
+            # The section's own sentence serves those of its parts that have none.
+            rest = [full] if len(named) < max(len(parts), 1) else []
+            yield from ((f"{part}: {dropped[part]}", None) for part in [*named, *rest])
         elif name not in names:
             near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.3)
             yield f"unknown setting {full}", prefix + near[0] if near else None
