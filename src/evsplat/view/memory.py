@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from evsplat.deform.non_rigid import NonRigid
-from evsplat.render.backdrop import same_values
+from evsplat.render.job import same_values
 
 
 @dataclass(frozen=True)
