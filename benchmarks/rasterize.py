@@ -228,7 +228,7 @@ def many_times(scene: TwoLayers, repeats: int) -> dict[str, float]:
 
         timing = timed(both, repeats)
         alpha = render(moving, scene.camera, static=fixed, low_pass=scene.low_pass).alpha
-        steps = alpha.grad_fn.job.patch_steps  # type: ignore[union-attr]
+        steps = alpha.grad_fn.kept.patch_steps  # type: ignore[union-attr]
         print(f"  {name}: {timing}, {steps} patch steps")
         return timing.best, steps
 

@@ -48,7 +48,7 @@ def test_pictures_of_a_moving_layer_are_bit_for_bit_those_without(
     backdrop, jobs = Backdrop(), []
     for time in (0, 1, 2, 3, 0):
         assert_same(at(moving, time), camera, static, backdrop, background=background)
-        jobs.append(backdrop.job)
+        jobs.append(backdrop.kept)
     assert_same(moving, camera, static, backdrop, background=background)
     assert None not in jobs
 
@@ -101,7 +101,7 @@ def test_without_a_static_layer_there_is_nothing_to_keep(layers):
     moving, _, camera = layers(7)
     backdrop = Backdrop()
     assert_same(moving, camera, None, backdrop)
-    assert backdrop.job is None
+    assert backdrop.kept is None
 
 
 def test_there_are_no_gradients(layers):

@@ -36,7 +36,7 @@ def device(request, monkeypatch):
             pytest.skip(f"needs an NVIDIA GPU with gsplat: {missing}")
         return "cuda"
     gsplat = install(monkeypatch)
-    backends = api._BACKENDS | {"gsplat": lambda *inputs: cuda.draw(gsplat, *inputs)}
+    backends = api._BACKENDS | {"gsplat": lambda job: cuda.draw(gsplat, job)}
     monkeypatch.setattr(api, "_BACKENDS", backends)
     return "cpu"
 
