@@ -9,7 +9,6 @@ from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import load_capture
 from evsplat.errors import DataError
 from evsplat.objectives.hugs import PATCH_PX, Perceptual, draw_squares
-from evsplat.methods import TRAINABLE, method_config
 from evsplat.render import render
 from evsplat.similarity.psnr_ssim import ssim
 from evsplat.training import load_run, train
@@ -17,19 +16,11 @@ from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
-SMALL = {
-    "human": {"count": 80},
-    "triplane": {"resolution": 16, "channels": 8},
-    "fit": {"steps": 2, "batch": 32},
-    "scene": {"cube_count": 600},
-}
+from ...small_model import built, small
 
 
-def composed(path, **settings):
-    config = method_config("hugs", SMALL | settings, where="test")
-    return TRAINABLE["hugs"].build(
-        config, load_capture(path).for_training(config.policy), 0, fit=False
-    )
+def composed(path, *settings: str):
+    return built("hugs", path, *settings)
 
 
 def step_of(composition, capture, frame):
@@ -63,7 +54,7 @@ def test_terms_are_those_of_the_description(tiny_capture):
     generator.set_state(composed(capture.path).generator.get_state())
     background, colour = (torch.rand(3, generator=generator) for _ in range(2))
     assert not torch.equal(background, colour)
-    person = step.posed.moving()
+    person = step.layers.human
     alone = render(person, capture.camera(frame), background=torch.cat([colour, torch.zeros(1)]))
     alone = alone.image[0, ..., :3].detach().clamp(0, 1)
     expected = torch.where(mask, observed, colour)
@@ -80,7 +71,7 @@ def test_terms_are_those_of_the_description(tiny_capture):
 
 def test_every_set_of_parameters_learns(tiny_capture):
     capture = load_capture(tiny_capture(frames=10))
-    composition = composed(capture.path, scene=SMALL["scene"] | {"sh_degree": 1})
+    composition = composed(capture.path, "sh_degree=1")
     model = composition.model
     model.scene.directional.data += 0.01
     before = {n: p.detach().clone() for n, p in model.named_parameters()}
@@ -105,7 +96,7 @@ def test_squares_lie_in_the_picture_and_mostly_on_the_person():
     assert draw_squares(torch.zeros(40, 30, dtype=torch.bool), generator)[0][1] == slice(0, 30)
 
 
-def test_the_perceptual_distance_sees_pictures_from_minus_one_to_one():
+def test_the_perceptual_distance_sees_pictures_between_minus_one_and_one():
     seen = []
 
     def metric(image, reference):
@@ -118,11 +109,23 @@ def test_the_perceptual_distance_sees_pictures_from_minus_one_to_one():
     assert (min(seen), max(seen)) == (-1.0, 1.0)
 
 
+def test_scene_harmonics_come_one_degree_at_a_time_and_poses_are_corrected(tiny_capture):
+    composition = composed(tiny_capture(frames=10))
+    model, learning = composition.model, composition.learning
+    for nominal, degree in ((0, 0), (999, 0), (1_000, 1), (2_500, 2), (9_000, 3)):
+        model.nominal.fill_(nominal)
+        assert model.active_degree == degree
+    learned = {id(p) for network in learning.networks for p in network.parameters}
+    assert {id(model.turns), id(model.shifts)} <= learned
+    # A static camera is no distance away from itself: lengths are those of the cube.
+    assert learning.rows["scene"]["means"].rate.start > 0
+    assert composition.densify["scene"].split_above_m > 0
+
+
 def test_a_backdrop_is_not_densified_and_hardly_moves(tiny_capture):
     path = tiny_capture(frames=10)
     cube, backdrop = (
-        composed(path, scene=SMALL["scene"] | {"kind": kind})
-        for kind in ("random_cube", "median_backdrop")
+        composed(path, f"scene.kind={kind}") for kind in ("random_cube", "median_backdrop")
     )
     assert {*cube.densify} == {"human", "scene"}
     assert {*backdrop.densify} == {"human"}
@@ -133,7 +136,7 @@ def test_a_backdrop_is_not_densified_and_hardly_moves(tiny_capture):
 def test_a_scene_colour_has_the_harmonics_that_are_asked_for(tiny_capture):
     path = tiny_capture()
     assert composed(path).model.scene.directional.shape[1] == 0  # one static camera
-    scene = composed(path, scene=SMALL["scene"] | {"sh_degree": 3}).model.scene
+    scene = composed(path, "sh_degree=3").model.scene
     center = torch.tensor([0.1, 0.2, -3.0])
     constant = scene.rgb(center, 3)
     torch.nn.init.normal_(scene.directional)
@@ -147,7 +150,7 @@ def test_points_that_no_camera_sees_are_left_out(tiny_capture):
     capture = load_capture(path)
     camera = capture.camera(capture.frames[0])
     pixels, depth = camera.project(scene.means.detach())
-    assert 0 < len(scene) < SMALL["scene"]["cube_count"]
+    assert 0 < len(scene) < 600
     assert (depth > 0).all()
     assert (pixels[:, 0].abs() < 1.2 * camera.width).all()
 
@@ -193,11 +196,8 @@ def test_a_resumed_run_goes_on_as_the_uninterrupted_one(tiny_capture):
 
 def test_a_run_is_drawn_after_loading_and_its_sets_densify(tiny_capture, tmp_path):
     path = tiny_capture(frames=10)
-    settings = ("human.count=80", "triplane.resolution=16", "triplane.channels=8", "fit.steps=5")
-    out = train(
-        path, method="hugs", out=tmp_path / "run", iterations=30,
-        overrides=(*settings, "scene.cube_count=600", "densify_human.gradient=1e-7"),
-    )  # fmt: skip
+    settings = small("hugs", "fit_steps=5", "densify.gradient=1e-7")
+    out = train(path, method="hugs", out=tmp_path / "run", iterations=30, overrides=settings)
     run = load_run(out)
     assert run.gaussians["human"] > 80
     tensors, _ = load_checkpoint(latest_checkpoint(out / "checkpoints"))
