@@ -1,8 +1,7 @@
 """How large and entangled the package is, and which settings of a method do nothing.
 
-Prints a table, and one JSON object as the last line. ``--inert`` takes minutes: it trains a tiny
-capture with each setting changed in turn and compares losses and the final picture bit for bit. A
-change that is refused with one sentence is no silent one.
+Prints a table, and one JSON object as the last line. ``--inert`` takes many minutes: it trains a
+tiny capture with each setting changed in turn, and compares losses and the final picture exactly.
 """
 
 import argparse
@@ -49,8 +48,8 @@ def leaves(method: str) -> list[Setting]:
 def lines(*folders: str) -> int:
     """Lines of Python and C++ in folders."""
     paths = [path for folder in folders for path in (ROOT / folder).rglob("*.*")]
-    code = [p.read_text("utf-8") for p in paths if p.suffix in (".py", ".pyi", ".cpp", ".h")]
-    return sum(len(text.splitlines()) for text in code)
+    code = [path for path in paths if path.suffix in (".py", ".pyi", ".cpp", ".h")]
+    return sum(len(path.read_text("utf-8").splitlines()) for path in code)
 
 
 def circles(*, of_folders: bool) -> list[list[str]]:
@@ -80,7 +79,8 @@ def tiny_capture(folder: Path, *, jitter_rad: float) -> Path:
 def trained(capture: Path, method: str, *changes: str) -> Path:
     """Run folder of a short training."""
     out = Path(tempfile.mkdtemp(dir=capture.parent))
-    overrides = (f"optimisation.iterations={TRAINING_STEPS}", *changes)
+    name = next(s.name for s in leaves(method) if s.name.endswith("iterations"))
+    overrides = (f"{name}={TRAINING_STEPS}", *changes)
     with contextlib.redirect_stderr(io.StringIO()):
         return train(capture, method=method, out=out, device="cpu", overrides=overrides)
 
