@@ -89,7 +89,7 @@ class ReadIf:
     """Condition under which a setting, or all of a section, is read at all."""
 
     setting: str
-    """Field of the same section, or dotted name from the root of the configuration."""
+    """Another field of the same section, or else a name from the root of the configuration."""
     condition: str
     """Words for it that follow the setting's name and "is": "above 0"."""
     holds: Callable[[Any], bool]
@@ -135,7 +135,8 @@ def _settings(
         name, hint, value = prefix + field.name, hints[field.name], getattr(part, field.name)
         default = _default(field) if start is None else getattr(start, field.name)
         marks = [mark for mark in _marks(hint) if isinstance(mark, ReadIf)]
-        asked = [(prefix if m.setting in hints else "") + m.setting for m in marks]
+        beside = hints.keys() - {field.name}
+        asked = [(prefix if m.setting in beside else "") + m.setting for m in marks]
         conditions = (*around, *zip(asked, marks, strict=True))
         yield Setting(name, type(part), hint, value, default, conditions)
         if dataclasses.is_dataclass(value):
