@@ -46,7 +46,7 @@ class PosedGaussians:
     casters: Float[Tensor, "T P 3"] | None = None
     """Points of the body that hide the light; without them there are no shadows."""
     low_pass: float = LOW_PASS
-    """What the pixels of a picture integrate over, px^2; see `evsplat.render.render`."""
+    """Low-pass of the projection, px^2; see `evsplat.render.render`."""
 
     @property
     def times(self) -> int:
@@ -54,20 +54,20 @@ class PosedGaussians:
         return len(self.human.means)
 
     def moving(self) -> Splats:
-        """What the rasteriser draws of the person; channels are RGB and the semantic attribute."""
-        person = self.human
+        """The person for the rasteriser; channels are RGB and the semantic attribute."""
+        human = self.human
         channel = self.human_semantics[None, :, None].expand(self.times, -1, 1)
         return Splats(
-            person.means,
-            person.quaternions,
-            person.scales,
+            human.means,
+            human.quaternions,
+            human.scales,
             self.human_opacities,
-            torch.cat([person.rgb, channel], dim=-1),
-            person.transforms[..., :3, :3],
+            torch.cat([human.rgb, channel], dim=-1),
+            human.transforms[..., :3, :3],
         )
 
     def static(self) -> Splats:
-        """The same of the scene, one for all times."""
+        """The scene for the rasteriser, one for all times."""
         scene = self.scene
         return Splats(
             scene.means[None],

@@ -71,17 +71,17 @@ class HugsModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians are."""
+        """Device of the Gaussians."""
         return self.frame_times.device
 
     @property
     def low_pass(self) -> float:
-        """What a pixel integrates over, px^2."""
+        """Low-pass of the projection, px^2."""
         return LOW_PASS
 
     @property
     def sets(self) -> dict[str, OneClassRows]:
-        """Person and scene."""
+        """The two sets, by class."""
         return {"human": self.human, "scene": self.scene}
 
     @property

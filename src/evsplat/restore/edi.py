@@ -10,7 +10,7 @@ from evsplat.calibration import estimate_from_capture
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import ConfigError, DataError
 from evsplat.imaging import Transfer, deblur
-from evsplat.restore.needs import require_signed_events
+from evsplat.restore.network import require_signed_events
 
 
 class Edi:

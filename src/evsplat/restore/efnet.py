@@ -253,7 +253,7 @@ class ChannelAttention(nn.Module):
         )
 
     def forward(self, picture: Tensor, events: Tensor) -> Tensor:
-        """What the events answer to the picture; same shape as both."""
+        """Attention of the picture to the events; same shape as both."""
         query, key, value = (
             part.unflatten(1, (len(self.temperature), -1)).flatten(3)
             for part in (self.q(picture), self.k(events), self.v(events))
@@ -272,13 +272,13 @@ class PixelNorm(nn.Module):
         self.body = nn.LayerNorm(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape."""
+        """Features of the same shape."""
         normal: Tensor = self.body(x.movedim(1, -1))
         return normal.movedim(-1, 1)
 
 
 class SupervisedAttention(nn.Module):
-    """What the first stage passes on, weighted by its own picture."""
+    """Features that the first stage passes on, weighted by its own picture."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

@@ -91,7 +91,7 @@ class ThreeStages(nn.Module):
         return restored
 
     def _first(self, half: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """What the first stage finds in the two quarters of a half."""
+        """Features that the first stage finds in the two quarters of a half."""
         quarters = [
             self.stage1_encoder(self.shallow_feat1(quarter)) for quarter in half.chunk(2, -1)
         ]
@@ -110,7 +110,7 @@ class AttentionBlock(nn.Module):
         self.body = nn.Sequential(_conv(channels, channels), act, _conv(channels, channels))
 
     def forward(self, x: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 C H W"]:
-        """Same shape."""
+        """Features of the same shape."""
         return self.CA(self.body(x)) + x
 
 
@@ -125,12 +125,12 @@ class ChannelAttention(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 C H W"]:
-        """Same shape."""
+        """Features of the same shape."""
         return x * self.conv_du(x.mean((-2, -1), keepdim=True))
 
 
 class SupervisedAttention(nn.Module):
-    """What one stage passes on, weighted by its own picture."""
+    """Features that one stage passes on, weighted by its own picture."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -234,7 +234,7 @@ class Original(nn.Module):
         self.body = nn.Sequential(*blocks, _conv(WIDE, WIDE))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape."""
+        """Features of the same shape."""
         return self.body(x) + x
 
 

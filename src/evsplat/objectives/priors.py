@@ -1,12 +1,13 @@
-"""What keeps learned pose residuals small and smooth where pictures and events say little."""
+"""Priors: skinning near the body model's weights, pose residuals small and smooth."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from evsplat.capture import Frame
+from evsplat.body import SurfaceSamples
 from evsplat.deform.human_scene import HumanSceneModel
+from evsplat.devices import send
 from evsplat.objectives.base import Stateless, Step
 
 
@@ -23,10 +24,6 @@ class PosePrior(Stateless):
         self.times_us = list(times_us)
         span = self.times_us[-1] - self.times_us[0]
         self.gap_s = 1e-6 * span / max(1, len(self.times_us) - 1)
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """No renders."""
-        return ()
 
     def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
         """``pose_prior``, once residuals are learned."""
@@ -49,3 +46,25 @@ class PosePrior(Stateless):
         value = torch.einsum("tk,kjc->tjc", weights, points).square().mean((0, 2))
         bend = torch.einsum("tk,kjc->tjc", bends, points).square().mean((0, 2))
         return value + stiffness * self.gap_s * bend
+
+
+class SkinningPrior(Stateless):
+    """Mean over surface points of the squared weight error, summed over joints (1.6)."""
+
+    def __init__(self, surface: SurfaceSamples, points_per_step: int) -> None:
+        """``surface``: samples of the canonical body, drawn once; each step uses a few of them."""
+        self.surface, self.points_per_step = surface, points_per_step
+
+    def loss(self, step: Step[HumanSceneModel]) -> dict[str, Tensor]:
+        """``skinning``: see `of`."""
+        return {"skinning": self.of(step.model, step.generator)}
+
+    def of(self, model: HumanSceneModel, generator: torch.Generator) -> Tensor:
+        """The prior of a model with a skinning network, at random surface points."""
+        assert model.skinning is not None
+        chosen = torch.randint(
+            len(self.surface.points), (self.points_per_step,), generator=generator
+        )
+        chosen = send(chosen, self.surface.points.device)
+        weights = model.skinning(model.normalise(self.surface.points[chosen]))
+        return (weights - self.surface.weights[chosen]).square().sum(-1).mean()
