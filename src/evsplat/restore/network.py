@@ -76,6 +76,25 @@ class NetworkRestorer(ABC):
         }
 
 
+class SupervisedAttention(nn.Module):
+    """Features that one stage passes on to the next, weighted by its own picture."""
+
+    def __init__(self, channels: int, size: int, *, bias: bool) -> None:
+        """``size`` of the convolutions, pixels."""
+        super().__init__()
+        self.conv1, self.conv2, self.conv3 = (
+            nn.Conv2d(inputs, outputs, size, padding=size // 2, bias=bias)
+            for inputs, outputs in ((channels, channels), (channels, 3), (3, channels))
+        )
+
+    def forward(
+        self, x: Float[Tensor, "1 C H W"], picture: Float[Tensor, "1 3 H W"]
+    ) -> Float[Tensor, "1 C H W"]:
+        """Features for the next stage."""
+        attention = torch.sigmoid(self.conv3(self.conv2(x) + picture))
+        return x + self.conv1(x) * attention
+
+
 def as_input(picture: Float[Tensor, "H W C"]) -> Float[Tensor, "1 C H W"]:
     """A picture in the order that networks take."""
     return picture.permute(2, 0, 1)[None]
