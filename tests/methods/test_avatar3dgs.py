@@ -9,13 +9,13 @@ import torch
 from evsplat.capture import load_capture
 from evsplat.cli.summary import summary_table
 from evsplat.config import override
-from evsplat.models.drawing import draw
 from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation.evaluator import evaluate_run
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.avatar3dgs import AvatarConfig
 from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.settings import weight_at
+from evsplat.models.drawing import draw
 from evsplat.objectives import perceptual
 from evsplat.training import load_run, train
 from evsplat.training.clock import Clock

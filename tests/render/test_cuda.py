@@ -13,7 +13,7 @@ from .gsplat_on_cpu import install
 
 GRADIENT_BOUND = 1e-3
 MILD = 5
-"""How much longer than wide the longest Gaussians are; for needles see the test of their own."""
+"""Length by width of the longest Gaussians; needles have a test of their own."""
 CASES = {
     "plain": dict(seed=0),
     "whole tiles": dict(seed=1, width=64, height=48),
@@ -29,7 +29,7 @@ CASES = {
 
 @pytest.fixture(params=["stand-in", "gpu"])
 def device(request, monkeypatch):
-    """Where tensors of the backend go: the GPU, or the CPU with gsplat's kernels in torch."""
+    """Device of the backend: the GPU, or the CPU with gsplat's kernels in torch."""
     if request.param == "gpu":
         missing = cuda_support.what_is_missing()
         if missing is not None:

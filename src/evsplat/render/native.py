@@ -78,21 +78,21 @@ class _Rasterize(torch.autograd.Function):
         camera, times = job.camera, job.times
         backdrop = None if job.static is None else job.backdrop
         pose, background, *layers = map(_plain, inputs)
-        moving, still = layers[:_FIELDS], layers[_FIELDS:]
+        moving, static = layers[:_FIELDS], layers[_FIELDS:]
         means, channels = moving[0], moving[4]
         assert means is not None and channels is not None
-        still_count = 0 if still[0] is None else still[0].shape[1]
+        static_count = 0 if static[0] is None else static[0].shape[1]
         try:
             kept = native.Render(
                 camera.width, camera.height, _plain(camera.K), pose, job.near, job.low_pass, moving,
-                still if still_count else [], background, times, torch.get_num_threads(),
+                static if static_count else [], background, times, torch.get_num_threads(),
             )  # fmt: skip
             image = torch.empty(times, channels.shape[2], camera.height, camera.width)
             alpha = torch.empty(times, camera.height, camera.width)
             radii = torch.empty(times, means.shape[1], dtype=torch.int32)
-            still_radii = torch.empty(1, still_count, dtype=torch.int32)
+            static_radii = torch.empty(1, static_count, dtype=torch.int32)
             earlier = None if backdrop is None else backdrop.kept
-            kept.forward(image, alpha, radii, still_radii, backdrop is not None, earlier)
+            kept.forward(image, alpha, radii, static_radii, backdrop is not None, earlier)
             if backdrop is not None:
                 backdrop.kept = kept
         except (RuntimeError, ValueError) as error:
@@ -100,10 +100,10 @@ class _Rasterize(torch.autograd.Function):
         # Planar in memory, which is what the kernels and convolutions like.
         image = image.permute(0, 2, 3, 1)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii, still_radii)
+        ctx.mark_non_differentiable(radii, static_radii)
         ctx.kept = kept
         ctx.save_for_backward(*inputs)
-        return image, alpha, radii, still_radii
+        return image, alpha, radii, static_radii
 
     @staticmethod
     @once_differentiable
@@ -118,8 +118,8 @@ class _Rasterize(torch.autograd.Function):
             for tensor, need in zip(inputs, needed, strict=True)
         ]
         view = torch.zeros(12) if needed[0] else None
-        moving, still = layers[:_FIELDS], layers[_FIELDS:]
-        ctx.kept.backward(image_grad, alpha_grad, moving, still, view, background)
+        moving, static = layers[:_FIELDS], layers[_FIELDS:]
+        ctx.kept.backward(image_grad, alpha_grad, moving, static, view, background)
         pose = None
         if view is not None:
             pose = torch.zeros(4, 4)
