@@ -66,12 +66,12 @@ def step_at(times: tuple[int, ...], linear: torch.Tensor) -> SimpleNamespace:
     return SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0, frame=frame)
 
 
-def make(capture, on: float, off: float, begun_us: int = 0, **learned) -> EventWindows:
+def make(capture, on: float, off: float, ramp_us: int = 0, **learned) -> EventWindows:
     sensor = EventSensor(on, off, **learned).double()
     generator = torch.Generator().manual_seed(0)
     options = {"start": 750, "eps": EPS, "reach": 0.5}
     noise = EventNoise(capture.events, aware=False)
-    return EventWindows(capture, sensor, generator, noise=noise, begun_us=begun_us, **options)
+    return EventWindows(capture, sensor, generator, noise=noise, ramp_us=ramp_us, **options)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -206,7 +206,7 @@ def test_steady_change_is_explained_between_its_events_too(seed):
     log = slope.view(HEIGHT, WIDTH) * torch.tensor(times).view(-1, 1, 1)
     linear = (log.exp() - EPS)[..., None].expand(-1, -1, -1, 3)
     step = step_at(times, linear)
-    assert float(make(capture, on, off, begun_us=20_000).loss(step)["event"]) < 1e-6
+    assert float(make(capture, on, off, ramp_us=20_000).loss(step)["event"]) < 1e-6
     assert float(make(capture, on, off).loss(step)["event"]) > 0.05
 
 

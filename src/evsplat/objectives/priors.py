@@ -8,6 +8,7 @@ from torch import Tensor
 from evsplat.body import SurfaceSamples
 from evsplat.devices import send
 from evsplat.models.discs import DiscModel
+from evsplat.models.paper import PaperModel
 from evsplat.objectives.base import Stateless, Step
 
 
