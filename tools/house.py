@@ -63,9 +63,17 @@ def circles(*, of_folders: bool) -> list[list[str]]:
 
 
 def homes(method: str) -> list[str]:
-    """Modules that define a method's configuration, its sections and what these inherit."""
-    kinds = {kind for s in settings(TRAINABLE[method].config()) for kind in s.owner.__mro__[:-1]}
-    return sorted({kind.__module__ for kind in kinds})
+    """Modules in which defaults of a method stand: its own, and those of values that have some."""
+    kinds = {setting.owner for setting in settings(TRAINABLE[method].config())}
+    missing = dataclasses.MISSING
+    return sorted(
+        {
+            kind.__module__
+            for kind in kinds
+            for field in dataclasses.fields(kind)
+            if field.default is not missing or field.default_factory is not missing
+        }
+    )
 
 
 def tiny_capture(folder: Path, *, jitter_rad: float) -> Path:
