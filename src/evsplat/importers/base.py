@@ -117,7 +117,7 @@ def shrunk(pixels: np.ndarray, factor: int) -> np.ndarray:
     return means if pixels.dtype.kind == "f" else (means + 0.5).astype(pixels.dtype)
 
 
-def person_mask(
+def human_mask(
     path: Path | None, shrink: int = 1, *, person_is: str = "nonzero"
 ) -> np.ndarray | None:
     """(H, W) share of the person in [0, 1] of a label picture; None where there is no file.

@@ -20,8 +20,8 @@ from evsplat.importers.base import (
     Importer,
     check_positive,
     exposure_around,
+    human_mask,
     need,
-    person_mask,
     table,
 )
 from evsplat.importers.smpl import add_body, chosen_poses
@@ -83,7 +83,7 @@ class Folder(Importer):
                 "main",
                 timed.pixels,
                 (int(exposures[index, 0]), int(exposures[index, 1])),
-                mask=person_mask(masks / f"{timed.name}.png"),
+                mask=human_mask(masks / f"{timed.name}.png"),
                 world_to_camera=views.get(index),
             )
         notes = self._add_events(source, writer, size)

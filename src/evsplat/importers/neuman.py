@@ -19,9 +19,9 @@ from evsplat.importers.base import (
     add_picture,
     check_positive,
     chosen_frames,
+    human_mask,
     need,
     numbered,
-    person_mask,
 )
 from evsplat.importers.colmap import read_colmap
 from evsplat.importers.smpl import add_body, chosen_poses
@@ -76,7 +76,7 @@ class Neuman(Importer):
                 pictures[number],
                 time_us,
                 self.shrink,
-                mask=person_mask(mask, self.shrink, person_is=turned),
+                mask=human_mask(mask, self.shrink, person_is=turned),
                 world_to_camera=pose,
             )
             times.append(time_us)

@@ -22,10 +22,10 @@ from evsplat.importers.base import (
     add_picture,
     check_positive,
     chosen_frames,
+    human_mask,
     need,
     numbered,
     opencv_intrinsics,
-    person_mask,
     picture,
     rigid,
     table,
@@ -97,7 +97,7 @@ class ZjuMocap(Importer):
             time_us,
             self.shrink,
             camera=self.camera,
-            mask=person_mask(sequence.mask(self.camera, number), self.shrink),
+            mask=human_mask(sequence.mask(self.camera, number), self.shrink),
         )
         for other in self.novel_cameras:
             view = need(sequence.image(other, number), f"frame {number} of camera {other}")

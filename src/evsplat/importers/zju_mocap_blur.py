@@ -22,10 +22,10 @@ from evsplat.importers.base import (
     SourceCamera,
     add_picture,
     check_positive,
+    human_mask,
     need,
     numbered,
     opencv_intrinsics,
-    person_mask,
     rigid,
     table,
 )
@@ -75,7 +75,7 @@ class ZjuMocapBlur(Importer):
                 time_us,
                 self.shrink,
                 exposure_us=exposure_us,
-                mask=person_mask(source / "masks" / f"{name}.png", self.shrink),
+                mask=human_mask(source / "masks" / f"{name}.png", self.shrink),
                 world_to_camera=cameras[name].world_to_camera if moving else None,
             )
             times.append(round(time_us))

@@ -28,8 +28,8 @@ from evsplat.inspection.drawing import (
     short_number,
     to_picture,
 )
+from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings, sensor_lines
-from evsplat.inspection.timeline import draw_timeline
 
 CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
 SHOWN_FINDINGS = 12
@@ -40,7 +40,7 @@ _OUTLINE, _OUTLINE_ENDS = (60, 255, 120), (255, 225, 80)
 
 @dataclass(frozen=True)
 class InspectReport:
-    """What `inspect_capture` found out."""
+    """Findings, summary and pictures of an inspection."""
 
     path: Path
     findings: tuple[Finding, ...]
@@ -50,7 +50,7 @@ class InspectReport:
 
     @property
     def usable(self) -> bool:
-        """Whether there are no errors (warnings are allowed)."""
+        """True without errors (warnings are allowed)."""
         return not any(finding.severity == "error" for finding in self.findings)
 
 
@@ -188,7 +188,7 @@ def _findings_text(findings: tuple[Finding, ...]) -> str:
 
 
 def _spread(frames: tuple[Frame, ...], count: int) -> tuple[Frame, ...]:
-    """At most ``count`` frames, evenly spread."""
+    """Frames evenly spread over the capture, at most ``count``."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
     return tuple(frames[i] for i in chosen)
 

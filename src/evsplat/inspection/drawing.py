@@ -1,4 +1,4 @@
-"""Small Pillow helpers: sheets of labelled tiles, outlines, colours."""
+"""Sheets of labelled tiles, outlines, lines and colours, drawn with Pillow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Tile:
 
 
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own font."""
+    """Pillow's own font in pixels of height."""
     return ImageFont.load_default(size)
 
 
@@ -120,7 +120,7 @@ def round_ticks(start: int, end: int) -> list[int]:
 
 
 def short_number(value: float) -> str:
-    """1234567 as '1.2M'."""
+    """A number in short, such as 1234567 as '1.23M'."""
     for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
         if value >= size:
             return f"{value / size:.3g}{unit}"

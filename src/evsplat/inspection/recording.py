@@ -1,4 +1,4 @@
-"""`evsplat inspect` for a bare event recording: what is in it, and how it fits its frames."""
+"""`evsplat inspect` for a bare event recording: its content, and how it fits its frames."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,7 +27,7 @@ from evsplat.inspection.capture import (
     save_drawings,
 )
 from evsplat.inspection.drawing import Tile, events_over, fit, sheet, short_number, to_picture
-from evsplat.inspection.plot import draw_curve
+from evsplat.inspection.plots import draw_curve
 from evsplat.inspection.sensor import sensor_lines
 
 MOST_EVENTS = 20_000_000
@@ -97,7 +97,7 @@ def inspect_recording(
 
 @dataclass
 class _Totals:
-    """One pass over the recording."""
+    """Statistics of one pass over the recording."""
 
     width: int
     height: int
@@ -194,7 +194,7 @@ def _size_text(recording: EventRecording, totals: _Totals) -> str:
 
 
 def _sensor_size(recording: EventRecording) -> tuple[int, int]:
-    """As the file says, or as far as events reach."""
+    """Width and height that the file gives, or as far as events reach."""
     if recording.width is not None and recording.height is not None:
         return recording.width, recording.height
     width = height = 0

@@ -126,7 +126,7 @@ def _boxes(capture: MaskedCapture) -> dict[str, tuple[int, int, int, int]]:
     """Tight pixel box (x0, y0, x1, y1) of the mask, per training frame that shows somebody."""
     boxes = {}
     for frame in capture.train_frames:
-        rows, columns = torch.nonzero(capture.person(frame), as_tuple=True)
+        rows, columns = torch.nonzero(capture.human(frame), as_tuple=True)
         if len(rows):
             x0, x1, y0, y1 = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
             boxes[frame.name] = (int(x0), int(y0), int(x1), int(y1))

@@ -28,11 +28,11 @@ class Alpha(Stateless):
 
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
         """The mask."""
-        data.prefetch(("person", frame.name), partial(self.capture.person, frame))
+        data.prefetch(("person", frame.name), partial(self.capture.human, frame))
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``alpha``: mean absolute difference over all pixels."""
         frame = step.frame
-        mask = step.data.get(("person", frame.name), partial(self.capture.person, frame))
+        mask = step.data.get(("person", frame.name), partial(self.capture.human, frame))
         drawn = step.semantic[step.index(frame.mid_us)]
         return {"alpha": (drawn - mask.to(drawn.dtype)).abs().mean()}
