@@ -16,14 +16,7 @@ from evsplat.capture.metadata import Frame, Metadata, NovelView
 from evsplat.capture.points import read_points
 from evsplat.errors import DataError
 from evsplat.events import EventStore
-from evsplat.pictures.files import (
-    ImageCache,
-    planar,
-    read_image,
-    to_grey,
-    to_rgb,
-    to_unit_range,
-)
+from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_rgb, to_unit_range
 
 IMAGE_CACHE_BYTES = 512 << 20
 # A temporal median settles long before this many frames; more would only cost memory.

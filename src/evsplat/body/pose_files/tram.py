@@ -6,13 +6,7 @@ from typing import Any
 import numpy as np
 
 from evsplat.body.pose_files.documents import Document, Request, open_document
-from evsplat.body.pose_files.fields import (
-    axis_angles,
-    choose_person,
-    has,
-    numbers,
-    whole_numbers,
-)
+from evsplat.body.pose_files.fields import axis_angles, choose_person, has, numbers, whole_numbers
 from evsplat.body.pose_files.sequence import PoseSequence, make_sequence, moved
 from evsplat.errors import DataError
 

@@ -10,13 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import (
-    ByteReader,
-    Damage,
-    RawEvents,
-    ReadOptions,
-    Source,
-)
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, ReadOptions, Source
 from evsplat.events.formats.words import WordDecoder
 
 _MAX_HEADER_LINES = 1000

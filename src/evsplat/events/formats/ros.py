@@ -15,13 +15,7 @@ from typing import Any
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import (
-    Damage,
-    RawEvents,
-    ReadOptions,
-    Source,
-    peek,
-)
+from evsplat.events.formats.base import Damage, RawEvents, ReadOptions, Source, peek
 from evsplat.events.formats.words import WordDecoder
 
 ROS1_MAGIC = b"#ROSBAG V2.0"

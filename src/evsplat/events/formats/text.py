@@ -7,13 +7,7 @@ import numpy as np
 
 from evsplat import compiled
 from evsplat.errors import BackendError, DataError
-from evsplat.events.formats.base import (
-    ByteReader,
-    Damage,
-    RawEvents,
-    ReadOptions,
-    Source,
-)
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, ReadOptions, Source
 from evsplat.events.formats.table import (
     NO_POLARITY,
     guess_time_unit,
