@@ -91,6 +91,7 @@ class EventWindows(Stateless):
             wrong, [end - start for start, end in zip(times, times[1:], strict=False)]
         )
         if self.events.has_polarity:
+            # The whole span as well: small errors of one sign in each window add up in it.
             event = 0.5 * (event + self.mean(wrong.sum(0, keepdim=True), [times[-1] - times[0]]))
         return {"event": event, "contrast": self.sensor.apart()}
 
@@ -114,12 +115,14 @@ class EventWindows(Stateless):
         offset = self.sensor.offset_us
         late = [time + self._late_us for time in step.times_us[kept]]
         low, high = self.events.open_around(step.frame.mid_us)
+        # A sensor compares logarithms of light, before any transfer curve of a camera.
         brightness = torch.log(luminance(step.linear[kept]) + self.eps)
         reach = max(_RATE_US, self.ramp_us)
         stream = self.events.between(max(late[0] - reach, low), min(late[-1] + reach, high))
         windows = list(zip(late, late[1:], strict=False))
         counts = self._counts(stream, windows, brightness.device)
         changes = brightness[1:] - brightness[:-1]
+        # Without polarity a window's events tell how far brightness went, not which way.
         if not self.events.has_polarity:
             return changes.abs() - self.sensor.path(counts.sum(1))
         if self.ramp_us > 0:
