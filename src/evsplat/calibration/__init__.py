@@ -17,6 +17,7 @@ from evsplat.calibration.thresholds import ThresholdEstimate, estimate_threshold
 
 __all__ = [
     "ClockEstimate",
+    "EventSource",
     "Exposure",
     "FramePair",
     "NoiseEstimate",
