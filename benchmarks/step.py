@@ -217,7 +217,7 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
         jobs.append(_native.Render(*inputs))
         return jobs[-1]
 
-    native_backend.native = SimpleNamespace(Render=keep)
+    native_backend.native = SimpleNamespace(Render=keep, rows_in_view=_native.rows_in_view)
     for _ in range(steps):
         trainer.step()
         watch.nodes.clear()

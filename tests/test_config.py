@@ -72,6 +72,7 @@ class Lamps:
         ReadIf("lights", "above 0", lambda n: n > 0),
         ReadIf("deform.shading", "true", bool),
     ] = "white"
+    shading: Annotated[float, ReadIf("shading", "above 0", lambda s: s > 0)] = 0.5
     blur: Annotated[float, ReadIf("width", "above 1", lambda w: w > 1)] = 0.0
 
 
@@ -86,13 +87,11 @@ class Method:
     DROPPED: ClassVar[dict[str, str]] = {
         "deform.encoding": "gone: the hash grid earned nothing (docs/method.md)",
         "edi": "gone: sharpened frames earned nothing",
-        "loss": "its weights stand alone",
-        "loss.l1": "renamed to l1_weight",
-        "loss.dssim": "renamed to dssim_weight",
         "pose_begin": "renamed to pose_start",
     }
 
     pose_start: float = 0.0
+    shading: float = 0.0
     deform: Deform = field(default_factory=lambda: Deform(lamps=Lamps(width=0.2)))
     extra: Annotated[Lamps | None, ReadIf("deform.shading", "true", bool)] = None
     part: Annotated[Lamps, ReadIf("pose_start", "above 0", lambda s: s > 0)] = field(
@@ -315,6 +314,11 @@ def test_any_configuration_in_range_survives_yaml(tmp_path_factory, config):
             "deform.lamps.colour is 'red', but nothing reads it unless deform.shading is true; "
             "leave it out or set deform.shading.",
         ),
+        (  # by a setting of the same name at the root
+            {"deform": {"lamps": {"shading": 0.1}}},
+            "deform.lamps.shading is 0.1, but nothing reads it unless shading is above 0; leave it "
+            "out or set shading.",
+        ),
         (  # read only with a setting that is not read itself
             {"deform": {"lamps": {"blur": 1.0}}},
             "deform.lamps.blur is 1.0, but nothing reads it unless deform.lamps.width is above 1; "
@@ -370,14 +374,6 @@ def test_a_whole_configuration_with_unread_settings_loads_again(tmp_path):
         ),
         ({"edi": {"weight": 0.1}}, "edi: gone: sharpened frames earned nothing."),
         ({"pose_begin": 3}, "pose_begin: renamed to pose_start."),
-        ({"loss": {"l1": 1.0}}, "loss.l1: renamed to l1_weight."),
-        (
-            {"loss": {"dssim": 0.1, "l1": 1.0}},
-            "loss.dssim: renamed to dssim_weight; loss.l1: renamed to l1_weight.",
-        ),
-        ({"loss": {"l1": 1.0, "alpha": 0.0}}, "loss: its weights stand alone."),
-        ({"loss": {}}, "loss: its weights stand alone."),
-        ({"loss": None}, "loss: its weights stand alone."),
         (
             {"deform": {"encoding": "x", "lamps": {"light": 1}}, "pose_begin": 3, "?": 0},
             "deform.encoding: gone: the hash grid earned nothing (docs/method.md); unknown setting "
@@ -419,3 +415,9 @@ def test_conditions_name_settings_that_there_are(method):
     for setting in every.values():
         for name, condition in setting.conditions:
             assert condition.holds(every[name].value) in (True, False), (setting.name, name)
+        asked, waiting = set(), [setting.name]
+        while waiting:
+            new = {name for name, _ in every[waiting.pop()].conditions} - asked
+            asked |= new
+            waiting += new
+        assert setting.name not in asked

@@ -34,8 +34,8 @@ from evsplat.methods import DEFAULT_METHOD, TRAINABLE  # noqa: E402
 from evsplat.training.run import load_run  # noqa: E402
 from evsplat.training.train import train  # noqa: E402
 
-CONTAINERS = ("PosedHuman", "StaticScene", "PosedGaussians", "SecondCopies", "Splats", "Layers")
-"""Dataclasses that hold Gaussians between a model and the rasteriser, of today or planned."""
+CONTAINERS = ("Splats", "Layers")
+"""Dataclasses that hold Gaussians between a model and the rasteriser."""
 LONGEST_FUNCTION = 80
 TRAINING_STEPS = 8
 
@@ -63,9 +63,17 @@ def circles(*, of_folders: bool) -> list[list[str]]:
 
 
 def homes(method: str) -> list[str]:
-    """Modules that define a method's configuration, its sections and what these inherit."""
-    kinds = {kind for s in settings(TRAINABLE[method].config()) for kind in s.owner.__mro__[:-1]}
-    return sorted({kind.__module__ for kind in kinds})
+    """Modules in which defaults of a method stand: its own, and those of values that have some."""
+    kinds = {setting.owner for setting in settings(TRAINABLE[method].config())}
+    missing = dataclasses.MISSING
+    return sorted(
+        {
+            kind.__module__
+            for kind in kinds
+            for field in dataclasses.fields(kind)
+            if field.default is not missing or field.default_factory is not missing
+        }
+    )
 
 
 def tiny_capture(folder: Path, *, jitter_rad: float) -> Path:
@@ -80,7 +88,7 @@ def tiny_capture(folder: Path, *, jitter_rad: float) -> Path:
 def trained(capture: Path, method: str, *changes: str) -> Path:
     """Run folder of a short training."""
     out = Path(tempfile.mkdtemp(dir=capture.parent))
-    overrides = (f"optimisation.iterations={TRAINING_STEPS}", *changes)
+    overrides = (f"iterations={TRAINING_STEPS}", *changes)
     with contextlib.redirect_stderr(io.StringIO()):
         return train(capture, method=method, out=out, device="cpu", overrides=overrides)
 
@@ -146,7 +154,7 @@ def effects(folder: Path, method: str) -> dict[str, list[str]]:
 
 def measured(method: str, *, inert: bool) -> dict[str, Any]:
     """The table."""
-    folder = next(f for f in ("models", "deform") if (imports.SOURCE / f).is_dir())
+    folder = "models"
     files = {p: len(p.read_text("utf-8").splitlines()) for p in imports.SOURCE.rglob("*.py")}
     nodes = [(module, n) for module, tree in imports.FILES.items() for n in ast.walk(tree)]
     classes = {node.name for _, node in nodes if isinstance(node, ast.ClassDef)}

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evsplat.capture import Frame, Policy, load_body_track, load_capture
-from evsplat.capture.spans import held_out_spans, open_spans
+from evsplat.capture.training_capture import held_out_spans, open_spans
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS
 from evsplat.masks import MASKERS

@@ -16,8 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.capture import load_body_track, load_capture
 from evsplat.config import override
-from evsplat.models.at_rest import mean_at_rest
-from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.errors import DataError
 from evsplat.export import export_run
 from evsplat.export.avatar.figure import clip_of, figure_of, recorded_clip
@@ -27,6 +25,7 @@ from evsplat.export.cloud import cloud_of
 from evsplat.gaussians import PosedHuman
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.reconstruction import Bakeable
+from evsplat.models.at_rest import SkinnedGaussians, mean_at_rest
 from evsplat.training.run import GaussianReconstruction
 
 from ..body.helpers import reference_bones

@@ -52,8 +52,7 @@ METHODS = {
     "evsplat with all that can be switched on": (
         "evsplat",
         (*EVSPLAT, "windows.clock=always",
-         "pose.refine=always", "pose.smooth=always",
-         "windows.pixel_thresholds=true"),
+         "pose.refine=always", "pose.smooth=always"),
     ),
     "evsplat with the paper's events": ("evsplat", (*EVSPLAT, "event_term=paper")),
     "paper": ("paper", SMALL_MODEL),
@@ -104,13 +103,10 @@ def test_two_training_steps_know_nothing_of_what_is_held_out(name, recorded, noi
         assert same(ours, others)
 
 
-@pytest.mark.parametrize("event_term", ["windows", "paper"])
-def test_events_of_held_out_frames_teach_where_the_policy_shows_them(event_term):
+def test_events_of_held_out_frames_teach_where_the_policy_shows_them():
     """The noise reaches what it should: without the firewall the same test fails."""
     recorded = Recorded(frozenset({4, 7, 8, 9}), 0, True, True, 1)
-    assignments = (*EVSPLAT, "policy.held_out_events=true", f"event_term={event_term}")
-    if event_term == "paper":
-        assignments += ("event.across_gaps=true",)
+    assignments = (*EVSPLAT, "policy.held_out_events=true")
     with both(recorded, 0, masks=False) as (path, noisy):
         ours, others = (two_steps(p, "evsplat", assignments) for p in (path, noisy))
         assert not same(ours, others)

@@ -9,13 +9,13 @@ import torch
 from evsplat.capture import load_capture
 from evsplat.cli.summary import summary_table
 from evsplat.config import override
-from evsplat.models.drawing import draw
 from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation.evaluator import evaluate_run
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.avatar3dgs import AvatarConfig
 from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.settings import weight_at
+from evsplat.models.drawing import draw
 from evsplat.objectives import perceptual
 from evsplat.training import load_run, train
 from evsplat.training.clock import Clock
@@ -129,7 +129,7 @@ def test_the_mask_term_is_the_distance_of_alpha_and_mask(tiny_capture):
     camera = capture.camera(frame)
     drawing = draw(model, model.at([frame.mid_us], camera.center()), camera)
     assert torch.allclose(drawing.semantic[0], drawing.output.alpha[0], atol=1e-6)
-    expected = (drawing.output.alpha[0] - capture.person(frame).float()).abs().mean()
+    expected = (drawing.output.alpha[0] - capture.human(frame).float()).abs().mean()
     assert terms["alpha"] == pytest.approx(float(expected.detach()), rel=1e-4)
     drawing.semantic[0].sum().backward()
     assert bool((model.gaussians.opacity_logits.grad > 0).any())

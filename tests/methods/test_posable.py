@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from evsplat.body import BodyTrack
 from evsplat.capture import load_capture
 from evsplat.config import override
-from evsplat.models.drawing import draw_depth
 from evsplat.methods import compose, method_config
 from evsplat.methods.reconstruction import Posable, WithDepth
+from evsplat.models.drawing import draw_depth
 from evsplat.training.run import GaussianReconstruction
 
 from ..seen import seen

@@ -142,7 +142,7 @@ def foreign(monkeypatch):
         capture = seen(capture_path)
         camera = capture.camera(capture.frames[0])
         gsplat = drawing(camera.width, camera.height)
-        backends = api._BACKENDS | {"gsplat": lambda *inputs: cuda.draw(gsplat, *inputs)}
+        backends = api._BACKENDS | {"gsplat": lambda job: cuda.draw(gsplat, job)}
         monkeypatch.setattr(api, "_BACKENDS", backends)
         monkeypatch.setattr(api, "_BACKEND_OF_DEVICE", {NAME: "gsplat"})
         monkeypatch.setattr(torch.optim, "Adam", Descent)

@@ -1,8 +1,9 @@
-"""From any recording that evsplat reads to one that it writes, piece by piece."""
+"""Conversion of any recording that evsplat reads to one that it writes, piece by piece."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -14,14 +15,14 @@ from evsplat.events.write import write_events
 
 @dataclass(frozen=True)
 class Conversion:
-    """What was written."""
+    """A recording that was written."""
 
     path: Path
     events: int
     start_us: int
-    """Of the first event, as written; 0 for an empty recording."""
+    """Time of the first event, as written; 0 for an empty recording."""
     end_us: int
-    """Of the last event."""
+    """Time of the last event."""
     width: int | None
     height: int | None
     notes: list[str]
@@ -42,12 +43,7 @@ def convert_recording(
     *,
     from_zero: bool = False,
     to: str | None = None,
-    format: str | None = None,
-    width: int | None = None,
-    height: int | None = None,
-    repair: bool = False,
-    columns: Sequence[str] | Mapping[str, str] | None = None,
-    time_unit: str | None = None,
+    **options: Any,
 ) -> Conversion:
     """Read any recording and write it as another; memory does not grow with its length.
 
@@ -56,25 +52,12 @@ def convert_recording(
         out: The file to write; the suffix chooses the format as in `write_events`.
         from_zero: Let the first event be at 0.
         to: Format to write, whatever the suffix.
-        format: Options of `open_recording`, as are all that follow.
-        width: Columns of the sensor.
-        height: Rows of the sensor.
-        repair: Repair what can be repaired.
-        columns: Which column is which.
-        time_unit: What times are in.
+        options: Options of `open_recording`, such as ``repair`` or ``time_unit``.
     """
     source, out = Path(source), Path(out)
     if out.exists() and source.exists() and out.samefile(source):
         raise ConfigError(f"{out}: is the recording itself; write to another file.")
-    recording = open_recording(
-        source,
-        format=format,
-        width=width,
-        height=height,
-        repair=repair,
-        columns=columns,
-        time_unit=time_unit,
-    )
+    recording = open_recording(source, **options)
     times: list[int] = []
     pieces = _watched(recording, from_zero, times)
     count = write_events(out, pieces, format=to, width=recording.width, height=recording.height)

@@ -1,9 +1,8 @@
-"""Recordings of any format, opened by what their first bytes say and read as event streams."""
+"""Recordings of any format, recognised by their first bytes, read as event streams."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from evsplat.errors import ConfigError, DataError
 from evsplat.events.formats import find_format
@@ -40,7 +39,7 @@ class EventRecording:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know: assumptions made and, after a pass, what was repaired."""
+        """Notes for the user: assumptions made and, after a pass, what was repaired."""
         return [*self._source.notes, *self._damage.notes()]
 
     def chunks(self) -> Iterator[EventStream]:
@@ -71,11 +70,7 @@ class EventRecording:
                 parts.append(part)
             if end_us is not None and chunk.t[-1] >= end_us:
                 break
-        columns = []
-        for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
-            empty = np.zeros(0, dtype=dtype)
-            columns.append(np.concatenate([empty, *(getattr(part, name) for part in parts)]))
-        return EventStream(*columns)
+        return EventStream.joined(parts)
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Pictures recorded beside the events (AEDAT4 only), in order of the file."""
@@ -95,7 +90,7 @@ def open_recording(
     """Open an event recording of any format that evsplat reads (docs/event-formats.md).
 
     Args:
-        path: The recording; its format is told from its content, whatever its name.
+        path: The recording; its content names the format, not its suffix.
         format: One of `evsplat.events.formats.FORMATS`; the content must agree.
         width: Columns of the sensor, where the file does not say or says it wrongly.
         height: Rows of the sensor, likewise.
@@ -136,23 +131,6 @@ def open_recording(
     return EventRecording(path, found.name, source, damage)
 
 
-def read_events(
-    path: Path | str,
-    *,
-    format: str | None = None,
-    width: int | None = None,
-    height: int | None = None,
-    repair: bool = False,
-    columns: Sequence[str] | Mapping[str, str] | None = None,
-    time_unit: str | None = None,
-) -> EventStream:
+def read_events(path: Path | str, **options: Any) -> EventStream:
     """All events of a recording in memory; options and errors are those of `open_recording`."""
-    return open_recording(
-        path,
-        format=format,
-        width=width,
-        height=height,
-        repair=repair,
-        columns=columns,
-        time_unit=time_unit,
-    ).read()
+    return open_recording(path, **options).read()

@@ -40,7 +40,7 @@ class EventStore:
     -1 where it falls outside; those events are dropped from slices (but counted by ``len``).
 
     ``open_us`` are the stretches of time that may be read, in order; what lies between them is held
-    out: to ask for it is a `HeldOutError`, and nothing that is told of the recording depends on it.
+    out: to ask for it is a `HeldOutError`, and nothing that is said of the recording depends on it.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class EventStore:
 
     @property
     def stretches_us(self) -> tuple[Span, ...]:
-        """What of `time_range_us` may be read; one stretch where nothing is held out."""
+        """Stretches of `time_range_us` that may be read; one where nothing is held out."""
         start, end = self.time_range_us
         within = ((max(first, start), min(last, end)) for first, last in self._open_us)
         return tuple((first, last) for first, last in within if first < last)
@@ -244,9 +244,4 @@ class EventStore:
         assert self._pixel_lookup is not None
         x, y = self._pixel_lookup[stream.y, stream.x].T
         keep = x >= 0
-        return EventStream(
-            stream.t[keep],
-            x[keep].astype(np.uint16),
-            y[keep].astype(np.uint16),
-            stream.p[keep],
-        )
+        return EventStream(stream.t, x.astype(np.uint16), y.astype(np.uint16), stream.p).take(keep)

@@ -20,8 +20,8 @@ from evsplat.importers.base import (
     Importer,
     check_positive,
     exposure_around,
+    human_mask,
     need,
-    person_mask,
     table,
 )
 from evsplat.importers.smpl import add_body, chosen_poses
@@ -46,7 +46,7 @@ class Folder(Importer):
     fps: float | None = None
     """Pictures per second; a video has its own."""
     exposure_us: float | None = None
-    """How long the shutter was open; not needed with SOURCE/exposures.txt."""
+    """Exposure time, microseconds; not needed with SOURCE/exposures.txt."""
     start_us: int = 0
     """Middle of the first exposure."""
     clock_offset_us: int = 0
@@ -54,7 +54,7 @@ class Folder(Importer):
     contrast: tuple[float, float] | None = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
     person: str | None = None
-    """Which of several people in the pose file."""
+    """Choice among several people in the pose file."""
     repair: bool = False
     """Read on where the event recording is damaged."""
 
@@ -78,13 +78,12 @@ class Folder(Importer):
         for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
             if index not in seen:
                 continue
-            mask = masks / f"{timed.name}.png"
             writer.add_frame(
                 timed.name,
                 "main",
                 timed.pixels,
                 (int(exposures[index, 0]), int(exposures[index, 1])),
-                mask=person_mask(mask, 1) if mask.exists() else None,
+                mask=human_mask(masks / f"{timed.name}.png"),
                 world_to_camera=views.get(index),
             )
         notes = self._add_events(source, writer, size)
@@ -226,7 +225,7 @@ def _matrix(entry: Any, key: str, size: int, path: Path) -> Float[np.ndarray, "N
 
 
 def _camera_poses(motion: "PoseSequence | BodyFile") -> dict[int, np.ndarray]:
-    """Of a moving camera, by the index of the picture; empty where it stands."""
+    """Poses of a moving camera by the index of the picture; empty where it stands."""
     if isinstance(motion, BodyFile) or motion.world_to_camera is None:
         return {}
     return dict(zip(motion.frames.tolist(), motion.world_to_camera, strict=True))

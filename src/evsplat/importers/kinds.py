@@ -30,7 +30,7 @@ KINDS: dict[str, type[Importer]] = {
 
 @dataclass(frozen=True)
 class Blur:
-    """How an import goes on to blurry frames; None: as the recipe of the paper says."""
+    """The step from an import to blurry frames; None: as the recipe of the paper says."""
 
     interpolation: str | None = None
     """"super-slomo" or "flow"."""

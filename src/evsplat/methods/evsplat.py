@@ -6,7 +6,7 @@ own, the person's by how the surface is turned and where it stands; the person c
 """
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -108,16 +108,23 @@ class EvsplatConfig:
 
     DROPPED: ClassVar[dict[str, str]] = EVSPLAT
 
-    policy: Policy = field(default_factory=Policy)
+    policy: Policy = Policy()
     """Held-out data that training may see."""
     iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
     """Training steps; all schedules stretch with it."""
 
-    human: HumanStart = field(default_factory=lambda: HumanStart(spacing_px=0.85))
+    human: HumanStart = HumanStart(count=None, spacing_px=0.85)
     """Discs of the person at the start."""
-    scene: FittedScene = field(default_factory=FittedScene)
+    scene: FittedScene = FittedScene(
+        kind="median_backdrop",
+        cube_count=100_000,
+        cube_half_side_m=None,
+        cube_max_count=150_000,
+        backdrop_stride_px=2,
+        prefit_steps=300,
+    )
     """Discs of the scene at the start."""
-    densify: Densify = field(default_factory=Densify)
+    densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=10_000)
     """Growth and pruning."""
 
     width: Annotated[int, AtLeast(1)] = 128
@@ -165,7 +172,17 @@ class EvsplatConfig:
     what training frames and events tell where that is over 4 ms and three standard errors.
     ``auto``: only there; ``always``: elsewhere from 0."""
 
-    pose: PoseSettings = field(default_factory=PoseSettings)
+    pose: PoseSettings = PoseSettings(
+        smooth="auto",
+        refine="auto",
+        between=True,
+        noisy_rad=0.006,
+        start=1_500,
+        prior=1e-3,
+        std_rad=None,
+        std_m=None,
+        events_of_held_out=False,
+    )
     """Errors of the given poses."""
 
     l1_weight: Weight = 0.8
@@ -179,7 +196,7 @@ class EvsplatConfig:
     semantic_band_px_at_256: Positive = 9.0
     """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
 
-    rates: DiscRates = field(default_factory=DiscRates)
+    rates: DiscRates = DiscRates()
     """Learning rates."""
 
 

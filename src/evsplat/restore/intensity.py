@@ -18,7 +18,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.events import EventStream
 from evsplat.events.maps import polarity_counts
 from evsplat.pictures.light import REC709
-from evsplat.restore.needs import require_signed_events
+from evsplat.restore.network import require_signed_events
 
 MATCHED_OVER = 0.02
 """Standard deviation, over the picture's shorter side, of the weights of brightness matching."""

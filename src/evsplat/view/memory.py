@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from evsplat.models.networks.non_rigid import NonRigid
-from evsplat.render.backdrop import same_values
+from evsplat.render.job import same_values
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Turns:
 
 
 NETWORKS = {
-    "non_rigid": Turns(4, (0, None)),
+    "deformation.network": Turns(4, (0, None)),
     "skinning": Turns(16, (1,)),
     "human_colour": Turns(4, (0, 1, 1, None)),
     "scene_colour": Turns(8, (0, 0)),
@@ -125,8 +125,8 @@ def _with_memory(module: nn.Module, path: str, turns: Turns) -> nn.Module:
 
 def set_rough(model: nn.Module, rough: bool) -> None:
     """Let the networks that remember answer in turns, or exactly."""
-    for network in model._modules.values():
-        if isinstance(network, Remembering):
+    for network in model.modules():
+        if isinstance(network, Remembering) and network.turns.every > 1:
             network.rough = rough
 
 

@@ -38,7 +38,7 @@ def activate(model) -> None:
 
 
 def fields(splats) -> dict[str, torch.Tensor]:
-    names = ("means", "quats", "scales", "channels", "linear")
+    names = ("means", "quaternions", "scales", "channels", "linear")
     return {name: value for name in names if (value := getattr(splats, name)) is not None}
 
 
@@ -74,7 +74,7 @@ def test_own_colours_on_the_body_surface_need_no_network(tiny_capture, seed):
     expected, _ = skin(deformed, weights, bones)
     assert torch.allclose(layers.human.means, expected, atol=1e-5)
     assert torch.allclose(layers.human.scales, scales) and feature.numel() == 0
-    assert torch.allclose(layers.human.quats, quaternions)
+    assert torch.allclose(layers.human.quaternions, quaternions)
     # Wherever the rows have been moved to, they are drawn with the weights they have.
     assert torch.equal(model.skinning_weights(canonical + 0.3), weights)
     colours = gaussians.colour_logits[gaussians.human].sigmoid()
@@ -208,7 +208,7 @@ def test_a_training_step_deforms_by_the_pose_at_the_middle_of_its_frame(tiny_cap
         each = model.at(times, center)
     assert torch.allclose(step.human.means, expected, atol=1e-5)
     assert torch.allclose(step.human.scales, scales.expand(3, -1, -1), atol=1e-6)
-    assert torch.allclose(step.human.quats, quaternions.expand(3, -1, -1), atol=1e-6)
+    assert torch.allclose(step.human.quaternions, quaternions.expand(3, -1, -1), atol=1e-6)
     # Evaluation asks at each time: another deformation, under the same bones.
     assert not torch.allclose(each.human.means, expected, atol=1e-3)
     assert torch.allclose(each.transforms, step.transforms, atol=1e-6)

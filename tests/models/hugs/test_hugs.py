@@ -24,7 +24,7 @@ def composed(path, *settings: str):
 
 
 def step_of(composition, capture, frame):
-    """What the losses see of one step, and the pieces that they are made from."""
+    """The step that the losses see, and their terms."""
     trainer = Trainer(composition, capture, Clock(10))
     seen = []
 

@@ -49,7 +49,7 @@ def test_times_do_not_see_each_other(tiny_capture):
     together = model.at(times, center)
     for index, time in enumerate(times):
         alone = model.at([time], center)
-        for name in ("means", "quats", "scales", "channels", "linear"):
+        for name in ("means", "quaternions", "scales", "channels", "linear"):
             both, one = getattr(together.human, name)[index], getattr(alone.human, name)[0]
             assert torch.allclose(both, one, atol=1e-5), name
         assert torch.allclose(together.transforms[index], alone.transforms[0], atol=1e-5)
@@ -103,7 +103,7 @@ def test_every_network_and_attribute_gets_a_gradient(tiny_capture):
     fields = [
         value
         for splats in (layers.human, layers.scene)
-        for value in (splats.means, splats.quats, splats.scales, splats.opacities, splats.channels)
+        for value in (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.channels)
     ]
     generator = torch.Generator().manual_seed(0)
     sum((f * torch.randn(f.shape, generator=generator)).sum() for f in fields).backward()

@@ -1,4 +1,4 @@
-"""Body poses that other tools estimated, one module per format."""
+"""Body poses that other tools estimated."""
 
 from evsplat.body.pose_files.read import FORMATS, read_poses
 from evsplat.body.pose_files.sequence import PoseSequence

@@ -1,21 +1,11 @@
-"""Reading body poses of any known tool: the format is told by what the file holds."""
+"""Reading body poses of any known tool: what the file holds names the format."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evsplat.body.pose_files import (
-    amass,
-    arah,
-    easymocap,
-    gvhmr,
-    mmhpsd,
-    phalp,
-    romp,
-    tram,
-    wham,
-)
+from evsplat.body.pose_files import data_sets, easymocap, gvhmr, in_camera, tram
 from evsplat.body.pose_files.documents import Document, Request, open_document, pose_paths
 from evsplat.body.pose_files.sequence import PoseSequence
 from evsplat.errors import DataError
@@ -23,25 +13,25 @@ from evsplat.errors import DataError
 
 @dataclass(frozen=True)
 class PoseFormat:
-    """One tool's files."""
+    """A tool's files: their test and their reader."""
 
     name: str
     fits: Callable[[Any], bool]
     read: Callable[[list[Document], Request], PoseSequence]
     many: bool = False
-    """Whether a folder of files makes one sequence."""
+    """A folder of files makes one sequence."""
 
 
 FORMATS = (
     PoseFormat("GVHMR", gvhmr.fits, gvhmr.read),
-    PoseFormat("WHAM", wham.fits, wham.read),
+    PoseFormat("WHAM", in_camera.fits_wham, in_camera.read_wham),
     PoseFormat("TRAM", tram.fits, tram.read, many=True),
-    PoseFormat("PHALP", phalp.fits, phalp.read),
-    PoseFormat("ROMP", romp.fits, romp.read, many=True),
+    PoseFormat("PHALP", in_camera.fits_phalp, in_camera.read_phalp),
+    PoseFormat("ROMP", in_camera.fits_romp, in_camera.read_romp, many=True),
     PoseFormat("EasyMocap", easymocap.fits, easymocap.read, many=True),
-    PoseFormat("ARAH", arah.fits, arah.read, many=True),
-    PoseFormat("AMASS", amass.fits, amass.read),
-    PoseFormat("MMHPSD", mmhpsd.fits, mmhpsd.read, many=True),
+    PoseFormat("ARAH", data_sets.fits_arah, data_sets.read_arah, many=True),
+    PoseFormat("AMASS", data_sets.fits_amass, data_sets.read_amass),
+    PoseFormat("MMHPSD", data_sets.fits_mmhpsd, data_sets.read_mmhpsd, many=True),
 )
 
 
