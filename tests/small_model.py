@@ -55,6 +55,7 @@ def built(
     capture: Capture | Path,
     *settings: str,
     seed: int = 0,
+    device: str = "cpu",
     purpose: Purpose = "resume",
 ) -> Composition:
     """The small ``method`` put together, by default without the fits before the first step."""
@@ -62,5 +63,5 @@ def built(
         capture = load_capture(capture)
     config = small_config(method, *settings)
     return TRAINABLE[method].build(
-        config, capture.for_training(config.policy), seed, purpose=purpose
+        config, capture.for_training(config.policy), seed, device=device, purpose=purpose
     )
