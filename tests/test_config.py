@@ -25,8 +25,9 @@ from evsplat.config import (
 )
 from evsplat.config_docs import save_yaml
 from evsplat.errors import ConfigError
-from evsplat.methods import TRAINABLE, PaperConfig, method_config
-from evsplat.methods.evsplat import EvsplatConfig
+from evsplat.methods import TRAINABLE, method_config
+from evsplat.methods.avatar3dgs import AvatarConfig
+from evsplat.methods.paper import PaperConfig
 
 
 @dataclass(frozen=True)
@@ -165,8 +166,9 @@ def test_a_section_given_in_part_keeps_what_its_owner_set():
 
 
 def test_a_method_keeps_its_parts_when_one_setting_of_them_changes():
-    config = method_config("evsplat", {"deform": {"width": 16}}, where="test")
-    assert config.deform == replace(EvsplatConfig().deform, width=16)
+    config = method_config("avatar3dgs", {"networks": {"width": 16}}, where="test")
+    assert config.networks == replace(AvatarConfig().networks, width=16)
+    assert config.networks.pose_start == 5_000  # which its type alone would not give
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from evsplat.methods.base import (
     semantic_bounds,
     start_of_randomness,
 )
-from evsplat.methods.dropped import PAPER
+from evsplat.methods.dropped import AVATAR_SEMANTIC
 from evsplat.methods.settings import NOMINAL_ITERATIONS, Densify, Share, Weight
 from evsplat.methods.starts import (
     HumanStart,
@@ -53,7 +53,7 @@ from evsplat.objectives import RenderedSemantics
 class AvatarSemanticConfig:
     """All settings of method `avatar3dgs_semantic`."""
 
-    DROPPED: ClassVar[dict[str, str]] = PAPER
+    DROPPED: ClassVar[dict[str, str]] = AVATAR_SEMANTIC
 
     policy: Policy = Policy()
     """Held-out data that training may see."""

@@ -35,6 +35,7 @@ from evsplat.methods.dropped import PAPER
 from evsplat.methods.prefit import fit_scene, fit_scene_colours
 from evsplat.methods.settings import (
     NOMINAL_ITERATIONS,
+    WITH_EVENTS,
     Densify,
     Nominal,
     Share,
@@ -44,7 +45,6 @@ from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start
 from evsplat.models.paper import Released, Semantics
 from evsplat.objectives import EventChange, Objective, RenderedSemantics
 
-_EVENTS = ReadIf("event_weight", "above 0", lambda weight: weight != 0.0)
 _RENDERED = ReadIf("semantics", "rendered", lambda semantics: semantics == "rendered")
 
 
@@ -88,15 +88,15 @@ class PaperConfig:
 
     event_weight: Weight = 0.1
     """w_ev, for the resolution-independent form ``sum / sqrt(N)`` (A15)."""
-    event_start: Annotated[Nominal, _EVENTS] = 1_000
+    event_start: Annotated[Nominal, WITH_EVENTS] = 1_000
     """First nominal iteration; before, both renders show the same unfitted body (A16)."""
-    event_floor: Annotated[float, AtLeast(0), _EVENTS] = 0.03
+    event_floor: Annotated[float, AtLeast(0), WITH_EVENTS] = 0.03
     """Absolute floor of both norms (A16)."""
-    event_eps: Annotated[float, Above(0), _EVENTS] = 1e-5
+    event_eps: Annotated[float, Above(0), WITH_EVENTS] = 1e-5
     """Added to linear luminance before the logarithm (A11)."""
-    event_weight_by_activity: Annotated[bool, _EVENTS] = True
+    event_weight_by_activity: Annotated[bool, WITH_EVENTS] = True
     """Weigh pairs by their share of active pixels, within 0.25 to 4 of the median (A17)."""
-    event_min_active: Annotated[float, AtLeast(0), _EVENTS] = 0.001
+    event_min_active: Annotated[float, AtLeast(0), WITH_EVENTS] = 0.001
     """Pairs with a smaller share of active pixels are left out (A16)."""
 
     l1_weight: Weight = 0.8

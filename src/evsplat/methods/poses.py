@@ -12,7 +12,7 @@ from evsplat.body.smoothing import MotionNoise, SplineError, motion_noise, smoot
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError
-from evsplat.methods.settings import Nominal, NotNegative, Weight
+from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, NotNegative, Weight
 from evsplat.models.pose_spline import PoseSpline
 
 logger = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ LEAST_STD_RAD, LEAST_STD_M = 0.02, 0.01
 """Expected errors of noisy poses, however little they jitter: what was fitted to pictures errs by
 more, and that changes slowly."""
 
-
+_NOT_ALWAYS = ReadIf("pose.refine", "auto or never", lambda refine: refine != "always")
 _REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "never")
 
 
@@ -37,7 +37,7 @@ class PoseSettings:
     """Take out of the given key poses what looks like noise."""
     refine: When
     """Learn a residual of the poses, a cubic B-spline in time, from pictures and events."""
-    between: bool
+    between: Annotated[bool, _NOT_ALWAYS]
     """Where poses are taken as exact, learn how the person moves between them: such a residual that
     is zero at every key pose."""
     noisy_rad: NotNegative
@@ -51,7 +51,7 @@ class PoseSettings:
     """Error expected of a joint, radians per axis; null = the jitter, at least 0.02."""
     std_m: Annotated[float, Above(0), _REFINED] | None
     """Error expected of the root's place, metres per axis; null = its jitter, at least 0.01."""
-    events_of_held_out: bool
+    events_of_held_out: Annotated[bool, WITH_EVENTS, WITH_WINDOWS]
     """Let events around held-out frames correct the poses there; needs
     ``policy.held_out_events``. The pictures of those frames stay unseen and nothing else is learned
     there."""

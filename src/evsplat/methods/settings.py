@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from evsplat.config import Above, AtLeast, Within
+from evsplat.config import Above, AtLeast, ReadIf, Within
 from evsplat.gaussians import DensifyLimits, Part
 
 NOMINAL_ITERATIONS = 15_000
@@ -32,6 +32,10 @@ def weight_at(weight: Weight, nominal: float) -> float:
         if nominal >= start:
             value = later
     return value
+
+
+WITH_EVENTS = ReadIf("event_weight", "above 0", lambda weight: weight != 0.0)
+WITH_WINDOWS = ReadIf("event_term", "windows", lambda term: term == "windows")
 
 
 @dataclass(frozen=True)

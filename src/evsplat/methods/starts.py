@@ -20,7 +20,6 @@ from evsplat.gaussians.initialise import (
     nearest_spacing,
     random_cube,
 )
-from evsplat.methods.settings import Positive
 
 MOST_SAMPLES = 20_000
 """Upper bound of the automatic number of samples of the person."""
@@ -41,7 +40,7 @@ class HumanStart:
     count: Annotated[int, AtLeast(1)] | None
     """Number of surface samples. 3DGS-Avatar takes 50,000; null = as many as ``spacing_px`` asks
     for, at most 20,000, since a person of 4,000 pixels needs no 50,000 Gaussians."""
-    spacing_px: Positive
+    spacing_px: Annotated[float, Above(0), ReadIf("count", "null", lambda n: n is None)]
     """Mean distance of neighbouring samples on the screen when ``count`` is null."""
 
 

@@ -27,13 +27,13 @@ def motion_px(camera: Camera, track: BodyTrack, frame: Frame) -> float:
 
 
 def renders_for(motion: float, px_per_render: float, most: int) -> int:
-    """An odd number of renders, so that one lies in the middle of the exposure.
+    """An odd number of renders, at most ``most``, so that one lies in the middle of the exposure.
 
     At least 3, but where ``most`` is 1: then the sharp middle stands for the blurry frame.
     """
     if most < 3:
         return 1
-    wanted = max(3.0, min(motion / px_per_render, float(most)))
+    wanted = max(3.0, min(motion / px_per_render, float(most - 1 + most % 2)))
     return 2 * int((wanted - 1) / 2 + 0.5) + 1
 
 
