@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from evsplat.capture import load_capture
 from evsplat.export import run as exporting
@@ -14,7 +15,11 @@ from ..small_model import built
 @pytest.fixture
 def reconstruction(tiny_capture):
     capture = load_capture(tiny_capture())
-    model = built("evsplat", capture, "scene.backdrop_stride_px=4", "lamps=2").model
+    settings = ("human.count=150", "scene.backdrop_stride_px=4", "lamps=2")
+    model = built("evsplat", capture, *settings).model
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():  # colours that tell a person from its negative
+        model.gaussians.colour_logits.normal_(generator=generator)
     return capture, GaussianReconstruction("evsplat", model)
 
 
