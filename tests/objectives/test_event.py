@@ -2,6 +2,7 @@
 
 import math
 
+import h5py
 import pytest
 import torch
 
@@ -115,3 +116,20 @@ def test_pairs_never_cross_held_out_frames(tiny_capture):
     steps = {(mids.index(a), mids.index(b)) for a, b in pairs}
     assert steps == {(i, i + 1) for i in (*range(6), *range(10, 16))}
     assert len(pairs) == len(objective.weights)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_papers_term_takes_events_without_polarity(tiny_capture, seed):
+    """Where all pixels only brighten, sizes and signed changes say the same."""
+    path = tiny_capture(seed=seed)
+    with h5py.File(path / "events.h5", "r+") as file:
+        file["events/p"][:] = 1
+    signed = EventChange(seen(path), start=0)
+    pair = next(iter(signed.weights))
+    changed = signed._map(*pair)
+    signed.events.close()
+    with h5py.File(path / "events.h5", "r+") as file:
+        file["events/p"][:] = 0
+    blind = EventChange(seen(path), start=0)
+    assert changed.any() and (changed == blind._map(*pair)).all()
+    assert signed.weights == blind.weights
