@@ -116,7 +116,6 @@ def test_failures_are_recorded_kept_and_tried_again_only_when_asked(tiny_capture
 def test_a_person_without_scene_can_be_measured_before_the_background(tiny_capture, tmp_path):
     row = {"name": "alone", "method": "avatar3dgs", "backdrop": True}
     settings = list(SMALL["avatar3dgs"])
-    settings.append("loss.perceptual=none")
     capture = tiny_capture("one")
     suite = write_suite(tmp_path / "suite.yaml", {"one": capture}, row | {"settings": settings})
     folder = BenchFolder(tmp_path / "out")
