@@ -1,7 +1,7 @@
 """How large and entangled the package is, and which settings of a method do nothing.
 
-Prints a table, and one JSON object as the last line. ``--inert`` takes many minutes: it trains a
-tiny capture with each setting changed in turn, and compares losses and the final picture exactly.
+Prints a table and, last, one JSON object. ``--inert`` takes many minutes: it trains a tiny capture
+with each setting changed in turn, and compares losses and the final picture exactly.
 """
 
 import argparse
@@ -131,8 +131,8 @@ def verdict(setting: Setting, capture: Path, method: str, before: str) -> str:
 
 
 def effects(folder: Path, method: str) -> dict[str, list[str]]:
-    """Settings by verdict; what is inert with exact poses is tried with noisy ones."""
-    said = {setting.name: "inert" for setting in leaves(method)}
+    """Settings by verdict, all but the number of steps; inert ones are tried with noisy poses."""
+    said = {s.name: "live" if s.name.endswith("iterations") else "inert" for s in leaves(method)}
     for jitter_rad in (0.0, 0.05):
         capture = tiny_capture(folder, jitter_rad=jitter_rad)
         before = fingerprint(trained(capture, method))
