@@ -76,7 +76,7 @@ def measure(curve: str, value: int) -> float:
     if curve == "recording":
         with tempfile.TemporaryDirectory() as folder:
             trainer = build_on(repeated_demo(value, Path(folder)), None, None, 2)
-            for frame in trainer.capture.frames:
+            for frame in trainer.capture.train_frames:
                 trainer.capture.image(frame)
             return timed(trainer.step, 40).median
     static: Splats | None = None

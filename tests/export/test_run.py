@@ -37,7 +37,8 @@ def test_splats_draw_what_the_reconstruction_draws(reconstruction, parts):
             )
             for layer in layers
         ]
-        drawn = render(one[0], camera, static=one[1] if len(one) == 2 else None)
+        still = one[1] if len(one) == 2 else None
+        drawn = render(one[0], camera, static=still, low_pass=model.low_pass)
         torch.testing.assert_close(
             drawn.image[0, ..., :3].clamp(0, 1), want.rgb[time], atol=1e-5, rtol=0
         )

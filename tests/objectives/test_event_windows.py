@@ -22,14 +22,14 @@ class Recording:
         self.stream, self.has_polarity = stream, has_polarity
         self.time_range_us = (int(stream.t[0]), int(stream.t[-1]) + 1)
         self.stretches_us = (self.time_range_us,)
-        self.open_us = (ALWAYS,)
+        self.readable_us = (ALWAYS,)
 
     def between(self, start: int, end: int) -> EventStream:
-        assert any(low <= start and end <= high for low, high in self.open_us)
+        assert any(low <= start and end <= high for low, high in self.readable_us)
         return self.stream.between(start, end)
 
-    def open_around(self, time: int) -> tuple[int, int]:
-        return next(span for span in self.open_us if span[0] <= time <= span[1])
+    def readable_around(self, time: int) -> tuple[int, int]:
+        return next(span for span in self.readable_us if span[0] <= time <= span[1])
 
 
 def scene(seed: int, on: float = 0.3, off: float = 0.2):

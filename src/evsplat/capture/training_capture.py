@@ -40,7 +40,7 @@ class TrainingCapture:
 
     Of a held-out frame that is its camera, its time and (by the policy) its key pose. Truth, dense
     poses and novel views are seen of no frame. To ask for anything hidden is a `HeldOutError`;
-    nothing is left out silently, so that whoever reads events chooses windows within `open_around`.
+    nothing is left out silently: whoever reads events chooses windows within `readable_around`.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class TrainingCapture:
     def events(self) -> EventStore | None:
         """The events that are seen, on the camera's clock; None where the capture has none."""
         events = self._source.events
-        return None if events is None else events.opened(self._open_us)
+        return None if events is None else events.restricted_to(self._readable_us)
 
     @property
     def contrast_threshold(self) -> tuple[float, float] | None:
@@ -226,8 +226,8 @@ class TrainingCapture:
         return capture, self._masker(capture)
 
     @property
-    def _open_us(self) -> tuple[tuple[int, int], ...]:
-        return (ALWAYS,) if self.policy.held_out_events else open_spans(self.frames)
+    def _readable_us(self) -> tuple[tuple[int, int], ...]:
+        return (ALWAYS,) if self.policy.held_out_events else readable_spans(self.frames)
 
     def _kept_keys(self, times_us: np.ndarray) -> np.ndarray:
         edges = np.array(held_out_spans(self.frames), dtype=np.int64).reshape(-1)
@@ -273,7 +273,7 @@ def held_out_spans(frames: Sequence[Frame]) -> tuple[Span, ...]:
     return tuple(merged)
 
 
-def open_spans(frames: Sequence[Frame]) -> tuple[Span, ...]:
+def readable_spans(frames: Sequence[Frame]) -> tuple[Span, ...]:
     """Stretches between `held_out_spans`, in order of time; all of time where none is held out."""
     edges = [ALWAYS[0]]
     for start, end in held_out_spans(frames):

@@ -5,15 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 from tqdm import tqdm
 
 from evsplat.body.pose_files import PoseSequence, read_poses
 from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
-from evsplat.capture.write import CaptureWriter
+from evsplat.capture.write import CaptureWriter, read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import open_recording
-from evsplat.files import read_json
 from evsplat.footage import Footage, open_footage
 from evsplat.importers.base import (
     GUIDE,
@@ -22,7 +21,6 @@ from evsplat.importers.base import (
     exposure_around,
     human_mask,
     need,
-    table,
 )
 from evsplat.importers.smpl import add_body, chosen_poses
 
@@ -180,20 +178,7 @@ class Folder(Importer):
                     f"{GUIDE}."
                 )
             return {"K": K}
-        entry = table(read_json(path), str(path), "one camera as in capture.json")
-        for key, size in (("width", footage.width), ("height", footage.height)):
-            if entry.get(key, size) != size:
-                raise DataError(
-                    f"{path}: {key}: found {entry[key]}, expected {size} as the pictures have."
-                )
-        lens = entry.get("distortion") or {}
-        return {
-            "K": _matrix(entry, "K", 3, path),
-            "world_to_camera": _matrix(entry, "world_to_camera", 4, path)
-            if "world_to_camera" in entry
-            else None,
-            "distortion": lens.get("coefficients") if isinstance(lens, dict) else lens,
-        }
+        return read_camera(path, footage.width, footage.height)
 
     def _add_events(self, source: Path, writer: CaptureWriter, size: tuple[int, int]) -> list[str]:
         path = self.events or next(iter(sorted(source.glob("events.*"))), None)
@@ -212,16 +197,6 @@ class Folder(Importer):
             clock_offset_us=self.clock_offset_us,
         )
         return list(recording.notes)
-
-
-def _matrix(entry: Any, key: str, size: int, path: Path) -> Float[np.ndarray, "N N"]:
-    try:
-        matrix = np.array(entry.get(key), dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (size, size):
-        raise DataError(f"{path}: {key}: expected {size}x{size} numbers.")
-    return matrix
 
 
 def _camera_poses(motion: "PoseSequence | BodyFile") -> dict[int, np.ndarray]:

@@ -28,8 +28,8 @@ class EventWindows(Stateless):
     times of other objectives one more is asked for, at random before or after the exposure, within
     ``reach`` intervals of the training frames, so that the gaps between exposures teach as well.
     All pixels count: where there is no event, nothing changed. Nothing is asked of times whose
-    events may not be read (`EventStore.open_around`): there the gap is on one side only, and what
-    is looked at around a window ends with it.
+    events may not be read (`EventStore.readable_around`): there the gap is on one side only, and
+    what is looked at around a window ends with it.
 
     Events that nothing caused are allowed for: differences weigh by the noise of their time
     (`EventNoise`), and hot pixels do not count.
@@ -71,7 +71,7 @@ class EventWindows(Stateless):
             return ()
         draw = torch.rand(2, generator=self.generator).tolist()
         start, end = frame.exposure_us
-        low, high = self.events.open_around(frame.mid_us)
+        low, high = self.events.readable_around(frame.mid_us)
         before = min(self.reach_us, start - max(low, self.range_us[0]))
         after = min(self.reach_us, min(high, self.range_us[1]) - end)
         if max(before, after) < 1:
@@ -97,7 +97,7 @@ class EventWindows(Stateless):
 
     def readable(self, step: Step) -> slice:
         """The part of a step's times between which events may be read, by the events' clock."""
-        low, high = self.events.open_around(step.frame.mid_us)
+        low, high = self.events.readable_around(step.frame.mid_us)
         late = [time + self._late_us for time in step.times_us]
         return slice(bisect_left(late, low), bisect_right(late, high))
 
@@ -114,7 +114,7 @@ class EventWindows(Stateless):
         """
         offset = self.sensor.offset_us
         late = [time + self._late_us for time in step.times_us[kept]]
-        low, high = self.events.open_around(step.frame.mid_us)
+        low, high = self.events.readable_around(step.frame.mid_us)
         # A sensor compares logarithms of light, before any transfer curve of a camera.
         brightness = torch.log(luminance(step.linear[kept]) + self.eps)
         reach = max(_RATE_US, self.ramp_us)

@@ -103,7 +103,13 @@ def test_every_network_and_attribute_gets_a_gradient(tiny_capture):
     fields = [
         value
         for splats in (layers.human, layers.scene)
-        for value in (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.channels)
+        for value in (
+            splats.means,
+            splats.quaternions,
+            splats.scales,
+            splats.opacities,
+            splats.channels,
+        )
     ]
     generator = torch.Generator().manual_seed(0)
     sum((f * torch.randn(f.shape, generator=generator)).sum() for f in fields).backward()
