@@ -3,8 +3,8 @@
     python benchmarks/viewer.py                # poses and cameras per second, 100,000 Gaussians
     python benchmarks/viewer.py --training     # what watching costs a training; 4 minutes
 
-Pictures go all the way: changed wish, drawing, JPEG, web socket, and are counted by a client that
-speaks viser's protocol. The peer is a screen that shows 15 pictures per second.
+Pictures go all the way: changed request, drawing, JPEG, web socket, and are counted by a client
+that speaks viser's protocol. The peer is a screen that shows 15 pictures per second.
 
 The training is watched in turns by a client whose camera never rests. Each turn is compared with
 those before and after it, in steps per second and in the training's own processor time per step,
@@ -37,8 +37,8 @@ from evsplat.config import override
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.shipped import demo_capture
 from evsplat.training.run import GaussianReconstruction, Run
+from evsplat.view.request import Motion
 from evsplat.view.server import Viewer
-from evsplat.view.wish import Motion
 
 WANTED_HZ = 15.0
 SIDE_PX = 512

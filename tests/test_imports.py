@@ -16,7 +16,6 @@ RANK = {name: int(layer) for layer, names in ROWS for name in re.findall("`(.+?)
 # Files that import each other in a circle, in functions or for types.
 CIRCLES = [
     {"cli.demo", "cli.main", "cli.train", "cli.viewer_process"},
-    {"view.panel", "view.pose_panel", "view.save_panel"},
 ]
 # `Capture` shows what is held out as well: these need it, or make a `TrainingCapture` of it.
 SEE_EVERYTHING = set(

@@ -17,9 +17,9 @@ from PIL import Image  # noqa: E402
 
 from evsplat.capture import load_capture  # noqa: E402
 from evsplat.training.run import GaussianReconstruction, Run  # noqa: E402
+from evsplat.view.request import Motion  # noqa: E402
 from evsplat.view.server import Viewer  # noqa: E402
 from evsplat.view.subject import Subject  # noqa: E402
-from evsplat.view.wish import Motion  # noqa: E402
 
 from ..export.clouds import read_ply, read_spz  # noqa: E402
 from ..small_model import built, small_config  # noqa: E402

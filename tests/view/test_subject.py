@@ -11,8 +11,8 @@ from evsplat.capture import load_capture
 from evsplat.film.looks import Look
 from evsplat.training.run import GaussianReconstruction, Run
 from evsplat.view.posing import HeldPose, PoseSlider, turned
+from evsplat.view.request import Motion
 from evsplat.view.subject import Subject
-from evsplat.view.wish import Motion
 
 from ..small_model import built, small_config
 

@@ -4,7 +4,13 @@ import pytest
 import torch
 
 from evsplat.capture import load_capture
-from evsplat.view.memory import NETWORKS, Remembering, Turns, remembering, set_rough
+from evsplat.view.network_cache import (
+    NETWORKS,
+    CachedNetwork,
+    Turns,
+    set_rough,
+    with_cached_networks,
+)
 
 from ..small_model import built
 
@@ -21,7 +27,7 @@ class Counting(torch.nn.Module):
 
 def test_the_same_question_is_asked_once():
     network = Counting()
-    memory = Remembering(network, Turns(4, (0, None)))
+    memory = CachedNetwork(network, Turns(4, (0, None)))
     x = torch.rand(4, 3)
     assert torch.equal(memory(x, 2.0), x * 2)
     assert torch.equal(memory(x.clone(), 2.0), x * 2)
@@ -34,7 +40,7 @@ def test_the_same_question_is_asked_once():
 @pytest.mark.parametrize("count", [8, 10])
 def test_rough_answers_are_renewed_in_turns_and_then_exact(count):
     network = Counting()
-    memory = Remembering(network, Turns(4, (0, None)))
+    memory = CachedNetwork(network, Turns(4, (0, None)))
     x, scale = torch.rand(count, 3), torch.tensor(2.0)
     first = memory(x, scale)
     kept = first.clone()
@@ -55,7 +61,7 @@ def test_rough_answers_are_renewed_in_turns_and_then_exact(count):
 
 
 def test_an_exact_answer_has_nothing_of_older_questions():
-    memory = Remembering(Counting(), Turns(4, (0, None)))
+    memory = CachedNetwork(Counting(), Turns(4, (0, None)))
     x, scale = torch.rand(8, 3), torch.tensor(2.0)
     memory(x, scale)
     memory.rough = True
@@ -82,7 +88,7 @@ def model(tiny_capture):
 def test_a_remembering_model_poses_and_colours_as_the_model_does(model):
     model, capture = model
     assert set(NETWORKS) <= {name for name, _ in model.named_modules()}
-    twin = remembering(model)
+    twin = with_cached_networks(model)
     cameras = list(capture.cameras.values())
     times = [frame.mid_us for frame in capture.frames[:3]]
     for time_us in (times[0], times[1], times[0]):
@@ -92,7 +98,7 @@ def test_a_remembering_model_poses_and_colours_as_the_model_does(model):
                 expected, found = (getattr(layers, part) for layers in seen)
                 assert torch.equal(found.means, expected.means)
                 assert torch.equal(found.channels, expected.channels)
-    assert not any(isinstance(module, Remembering) for module in model.modules())
+    assert not any(isinstance(module, CachedNetwork) for module in model.modules())
 
 
 @torch.no_grad()
@@ -100,7 +106,7 @@ def test_a_model_in_its_first_steps_can_be_shown(model):
     model, capture = model
     model.non_rigid_start = 1_000
     camera, time_us = next(iter(capture.cameras.values())), capture.frames[0].mid_us
-    found = remembering(model).at([time_us], camera.center())
+    found = with_cached_networks(model).at([time_us], camera.center())
     expected = model.at([time_us], camera.center())
     assert torch.equal(found.human.means, expected.human.means)
 
@@ -108,7 +114,7 @@ def test_a_model_in_its_first_steps_can_be_shown(model):
 @torch.no_grad()
 def test_drafts_come_to_be_exact_and_are_near_it_before(model):
     model, capture = model
-    twin = remembering(model)
+    twin = with_cached_networks(model)
     cameras = list(capture.cameras.values())
     first = twin.at([capture.frames[0].mid_us], cameras[0].center())
     time_us, centre = capture.frames[3].mid_us, cameras[1].center()
