@@ -19,7 +19,7 @@ from typing import Any
 
 from evsplat.capture import load_capture
 from evsplat.capture.derive import derived_capture
-from evsplat.evaluation.evaluator import evaluate_run
+from evsplat.evaluation.run import evaluate_run
 from evsplat.training import train
 
 AVATAR_DB, HUGS_BELOW_AVATAR_DB = 28.0, 1.5

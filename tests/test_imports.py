@@ -15,7 +15,6 @@ ROWS = re.findall(r"^\| (\d+) \| (`.+?`) \|", (ROOT / "ARCHITECTURE.md").read_te
 RANK = {name: int(layer) for layer, names in ROWS for name in re.findall("`(.+?)`", names)}
 # Files that import each other in a circle, in functions or for types.
 CIRCLES = [
-    {"cli.demo", "cli.main", "cli.train", "cli.viewer_process"},
     {"view.panel", "view.pose_panel", "view.save_panel"},
 ]
 # `Capture` shows what is held out as well: these need it, or make a `TrainingCapture` of it.

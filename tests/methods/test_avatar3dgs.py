@@ -11,7 +11,7 @@ from evsplat.cli.summary import summary_table
 from evsplat.config import override
 from evsplat.models.drawing import draw
 from evsplat.errors import ConfigError, DataError
-from evsplat.evaluation.evaluator import evaluate_run
+from evsplat.evaluation.run import evaluate_run
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.avatar3dgs import AvatarConfig
 from evsplat.methods.backdrop import OnMedianBackground

@@ -1,8 +1,9 @@
 """From any recording that evsplat reads to one that it writes, piece by piece."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -10,6 +11,7 @@ from evsplat.errors import ConfigError
 from evsplat.events.recording import EventRecording, open_recording
 from evsplat.events.stream import EventStream
 from evsplat.events.write import write_events
+from evsplat.options import ReadOptions
 
 
 @dataclass(frozen=True)
@@ -39,42 +41,28 @@ class Conversion:
 def convert_recording(
     source: Path | str,
     out: Path | str,
+    options: ReadOptions | None = None,
     *,
     from_zero: bool = False,
     to: str | None = None,
     format: str | None = None,
-    width: int | None = None,
-    height: int | None = None,
-    repair: bool = False,
-    columns: Sequence[str] | Mapping[str, str] | None = None,
-    time_unit: str | None = None,
+    **changes: Any,
 ) -> Conversion:
     """Read any recording and write it as another; memory does not grow with its length.
 
     Args:
         source: The recording to read.
         out: The file to write; the suffix chooses the format as in `write_events`.
+        options: As `open_recording` takes them, which also takes ``format``.
         from_zero: Let the first event be at 0.
         to: Format to write, whatever the suffix.
-        format: Options of `open_recording`, as are all that follow.
-        width: Columns of the sensor.
-        height: Rows of the sensor.
-        repair: Repair what can be repaired.
-        columns: Which column is which.
-        time_unit: What times are in.
+        format: Format of the source.
+        changes: Fields of `ReadOptions`.
     """
     source, out = Path(source), Path(out)
     if out.exists() and source.exists() and out.samefile(source):
         raise ConfigError(f"{out}: is the recording itself; write to another file.")
-    recording = open_recording(
-        source,
-        format=format,
-        width=width,
-        height=height,
-        repair=repair,
-        columns=columns,
-        time_unit=time_unit,
-    )
+    recording = open_recording(source, options, format=format, **changes)
     times: list[int] = []
     pieces = _watched(recording, from_zero, times)
     count = write_events(out, pieces, format=to, width=recording.width, height=recording.height)

@@ -16,9 +16,9 @@ from evsplat.events.formats.base import (
     ByteReader,
     Damage,
     RawEvents,
-    ReadOptions,
     Source,
 )
+from evsplat.options import ReadOptions
 
 MAGIC = b"#!AER-DAT2.0"
 _CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f]")

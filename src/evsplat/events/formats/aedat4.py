@@ -18,11 +18,11 @@ from evsplat.events.formats.base import (
     ByteReader,
     Damage,
     RawEvents,
-    ReadOptions,
     RecordedFrame,
     Source,
 )
 from evsplat.events.formats.flatbuffer import FlatbufferError, Table
+from evsplat.options import ReadOptions
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 _MAX_HEADER_BYTES = 16 << 20

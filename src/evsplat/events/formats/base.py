@@ -4,7 +4,7 @@ import gzip
 import os
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -40,17 +40,6 @@ class RecordedFrame:
     """(H, W) grey or (H, W, 3) RGB, uint8."""
     exposure_us: tuple[int, int]
     """Start and end of the exposure on the clock of the events."""
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """What the caller says about a recording; None where the file is to tell."""
-
-    width: int | None = None
-    height: int | None = None
-    repair: bool = False
-    columns: tuple[str, ...] | Mapping[str, str] | None = None
-    time_unit: str | None = None
 
 
 class Source(ABC):

@@ -16,11 +16,11 @@ from evsplat.events.formats.base import (
     BLOCK_EVENTS,
     Damage,
     RawEvents,
-    ReadOptions,
     Source,
 )
 from evsplat.events.formats.columns import match_names
 from evsplat.events.formats.table import Table, table_order
+from evsplat.options import ReadOptions
 
 _READ_BYTES = 1 << 22
 # Deflate packs at most 1032 to 1.

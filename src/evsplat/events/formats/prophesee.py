@@ -14,10 +14,10 @@ from evsplat.events.formats.base import (
     ByteReader,
     Damage,
     RawEvents,
-    ReadOptions,
     Source,
 )
 from evsplat.events.formats.words import WordDecoder
+from evsplat.options import ReadOptions
 
 _MAX_HEADER_LINES = 1000
 _MAX_LINE_BYTES = 4096

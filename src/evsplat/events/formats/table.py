@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import RawEvents, ReadOptions
+from evsplat.events.formats.base import RawEvents
 from evsplat.events.formats.columns import guess_time_unit, to_microseconds, to_whole
+from evsplat.options import ReadOptions
 
 _ORDERS = {4: ("txyp", "xytp", "xypt"), 3: ("txy", "xyt")}
 NO_POLARITY = "polarity is 0 throughout: the recording says that pixels changed, not how"

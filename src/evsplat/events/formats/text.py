@@ -11,12 +11,12 @@ from evsplat.events.formats.base import (
     ByteReader,
     Damage,
     RawEvents,
-    ReadOptions,
     Source,
 )
 from evsplat.events.formats.columns import guess_time_unit, match_names
 from evsplat.events.formats.table import NO_POLARITY, table_order, to_polarity
 from evsplat.events.formats.text_layout import MAX_LINE_BYTES, inspect_text
+from evsplat.options import ReadOptions
 
 _READ_BYTES = 1 << 22
 _MIN_LINE_BYTES = 6
