@@ -16,7 +16,7 @@ from evsplat.calibration import SensorEstimate
 from evsplat.capture import Policy, TrainingCapture, estimate_sensor
 from evsplat.config import Above, AtLeast, ReadIf, Within
 from evsplat.errors import ConfigError
-from evsplat.gaussians import GaussianSet
+from evsplat.gaussians import FEATURE_DIM, GaussianSet
 from evsplat.methods.base import (
     Composition,
     HeldOut,
@@ -68,6 +68,8 @@ UNKNOWN_THRESHOLD = 0.2
 """Contrast threshold to start from where neither the capture nor its frames tell one."""
 CONSTANT_SHARE = 0.3
 """Share of the training before learning rates begin to fall."""
+SCENE_NETWORK_RATE = 1e-3
+"""Learning rate of the network of a random cube's colours."""
 CLIP = 0.1
 """Largest gradient norm of the networks together."""
 
@@ -226,6 +228,7 @@ def build(
         shading=config.shading,
         lamps=config.lamps,
         self_shadow=config.self_shadow,
+        scene_network=config.scene.kind == "random_cube",
         residual=poses.spline,
         residual_start=config.pose.start,
     ).to(device)
@@ -283,11 +286,12 @@ def build(
 def _start(
     config: EvsplatConfig, capture: TrainingCapture, track: BodyTrack, generator: torch.Generator
 ) -> GaussianSet:
-    """Discs on the body and behind it, each with a colour of its own."""
+    """Discs on the body and behind it; random points get features for a network of their colour."""
+    features = FEATURE_DIM if config.scene.kind == "random_cube" else None
     human = human_start(
-        config.human, CLOSED_SURFACE, capture, track, generator, LABEL, feature_dim=None
+        config.human, CLOSED_SURFACE, capture, track, generator, LABEL, feature_dim=features
     )
-    scene, _ = scene_start(config.scene, capture, track, generator, -LABEL, feature_dim=None)
+    scene, _ = scene_start(config.scene, capture, track, generator, -LABEL, feature_dim=features)
     return GaussianSet(human, scene)
 
 
@@ -298,7 +302,7 @@ def _learning(rates: DiscRates, model: DiscModel) -> Learning:
             "scales_log": rates.scales_log,
             "quaternions": 1e-3,
             "opacity_logits": rates.opacity_logits,
-            "colour_logits": rates.colour_logits,
+            model.gaussians.colour: rates.colour_logits,
         },
         means=rates.means,
         final=rates.final,
@@ -307,6 +311,7 @@ def _learning(rates: DiscRates, model: DiscModel) -> Learning:
     )
     parts = (
         (model.deformation, rates.non_rigid, True),
+        (model.scene_colour, SCENE_NETWORK_RATE, True),
         (model.residual, rates.pose, False),
         (model.shading, rates.shading, False),
         (model.shadow, rates.shadow, False),

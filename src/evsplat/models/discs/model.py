@@ -1,12 +1,13 @@
 """A closed surface of flat discs in the light of a room: the model of method `evsplat`.
 
-Each Gaussian has a colour of its own, and the person's hang on the nearest point of the body's
-surface; networks are asked only for what the pose bends beyond that. Light falls on the person from
-lamps, which it hides from the scene and from itself.
+Each Gaussian has a colour of its own (in a scene of random points a network gives it), and the
+person's hang on the nearest point of the body's surface; networks are asked only for what the pose
+bends beyond that. Light falls on the person from lamps, which it hides from the scene and itself.
 """
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -22,13 +23,27 @@ from evsplat.models.discs.surface import NearestSurface
 from evsplat.models.drawing import Drawing, draw
 from evsplat.models.layers import Layers, SceneShadow, human_splats, scene_splats
 from evsplat.models.model import PosedModel, RowCache
+from evsplat.models.networks.colour import SceneColour, scene_rgb
 from evsplat.models.networks.deformation import PoseDeformation, draw_pose_noise
 from evsplat.models.pose_spline import PoseSpline
+from evsplat.render import PinholeCamera, rows_in_view
 
 NORMAL_SAMPLES = 20_000
 """Points of the body's surface among which a Gaussian finds its normal and its bones."""
 CASTERS = 400
 """Points of the body that hide lights."""
+_DIRECTION_DROPOUT = 0.5
+"""Share of the steps that hide the view direction from the scene's network."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """Camera that colours are seen from."""
+
+    center: Float[Tensor, "3"]
+    hide_direction: bool = False
+    shown: PinholeCamera | None = None
+    """Only this camera's picture is asked for."""
 
 
 class DiscModel(PosedModel):
@@ -49,10 +64,16 @@ class DiscModel(PosedModel):
         shading: bool,
         lamps: int,
         self_shadow: bool,
+        scene_network: bool = False,
         residual: PoseSpline | None = None,
         residual_start: float = 0.0,
     ) -> None:
-        """Start at ``gaussians``, which have an attribute ``colour_logits``.
+        """Start at ``gaussians``, whose colours are their own.
+
+        With ``scene_network`` those of the scene are a network's, for points that start with random
+        colours: a network learns at all of them what it is told of some, and that a view direction
+        matters. It is told of the direction in half of the steps. The person's are then the first
+        three of their features.
 
         ``frame_times_us``: mid-exposures of the training frames, for where the person goes.
         ``width`` of the non-rigid network, used from nominal iteration ``non_rigid_start`` on.
@@ -64,6 +85,7 @@ class DiscModel(PosedModel):
         self.non_rigid_start, self.pose_noise = non_rigid_start, pose_noise
         self.low_pass = low_pass
         self.deformation = PoseDeformation(body, width=width, feature_dim=0)
+        self.scene_colour = SceneColour() if scene_network else None
         self.residual, self.residual_start = residual, residual_start
         self.sensor: nn.Module | None = None
         """Learned properties of the event camera, set by a method that learns any."""
@@ -111,9 +133,10 @@ class DiscModel(PosedModel):
         *,
         hard_semantics: bool = False,
     ) -> Layers:
-        """All Gaussians in world space; their colours are the same for every camera."""
+        """All Gaussians in world space; own colours are the same for every camera."""
         rotations, bones = self.pose(times_us)
-        return self._layers(bones, rotations, slice(None), hard_semantics=hard_semantics)
+        view = _View(camera_center)
+        return self._layers(bones, rotations, slice(None), view, hard_semantics=hard_semantics)
 
     def training_drawing(
         self,
@@ -132,7 +155,12 @@ class DiscModel(PosedModel):
         joints = rotations.shape[1]
         rotations = rotations + draw_pose_noise(joints, self.pose_noise, generator, self.device)
         nearest = min(range(len(times_us)), key=lambda t: abs(times_us[t] - frame.mid_us))
-        layers = self._layers(bones, rotations, slice(nearest, nearest + 1), hard_semantics=False)
+        view = _View(camera.center())
+        if self.scene_colour is not None:
+            hidden = float(torch.rand((), generator=generator)) < _DIRECTION_DROPOUT
+            view = _View(camera.center(), hidden, camera)
+        lit_at = slice(nearest, nearest + 1)
+        layers = self._layers(bones, rotations, lit_at, view, hard_semantics=False)
         return draw(layers, camera, center_gradients=True)
 
     def following(self, track: BodyTrack) -> "DiscModel":
@@ -148,6 +176,7 @@ class DiscModel(PosedModel):
         bones: Float[Tensor, "T J 4 4"],
         rotations: Float[Tensor, "#T J 3 3"],
         lit_at: slice,
+        view: "_View",
         *,
         hard_semantics: bool,
     ) -> Layers:
@@ -159,7 +188,7 @@ class DiscModel(PosedModel):
         means, scene_means = gaussians.of_parts(gaussians.means)
         scales_log, scene_scales_log = gaussians.of_parts(gaussians.scales_log)
         quaternions, scene_quaternions = gaussians.of_parts(gaussians.quaternions)
-        colours, scene_colours = gaussians.of_parts(gaussians.get_parameter("colour_logits"))
+        colours, scene_colours = gaussians.of_parts(gaussians.get_parameter(gaussians.colour))
         opacities, scene_opacities = gaussians.of_parts(gaussians.opacities())
         labels = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
         semantics, scene_semantics = gaussians.of_parts(labels)
@@ -170,20 +199,41 @@ class DiscModel(PosedModel):
             centers, scales, turned = means[None], scales_log.exp()[None], quaternions[None]
         world, transforms = skin(centers, self.surface.weights(means)[None], bones)
         casters = None if self.shadow is None else self.shadow.place(bones)
-        rgb = colours.sigmoid()[None] * self._light(world, transforms, casters, lit_at)
+        scene_scales = scene_scales_log.exp()
+        rgb = colours[:, :3].sigmoid()[None] * self._light(world, transforms, casters, lit_at)
         return Layers(
             human_splats(world, turned, scales, opacities, rgb, semantics, transforms),
             scene_splats(
                 scene_means,
                 scene_quaternions,
-                scene_scales_log.exp(),
+                scene_scales,
                 scene_opacities,
-                scene_colours.sigmoid(),
+                self._scene_rgb(scene_colours, scene_means, scene_scales, view),
                 scene_semantics,
             ),
             transforms,
             self._scene_shadow(casters),
             self.low_pass,
+        )
+
+    def _scene_rgb(
+        self,
+        colours: Float[Tensor, "S C"],
+        means: Float[Tensor, "S 3"],
+        scales: Float[Tensor, "S 3"],
+        view: "_View",
+    ) -> Float[Tensor, "S 3"]:
+        """Colours of the scene; those by the network may be black outside of the picture."""
+        if self.scene_colour is None:
+            return colours.sigmoid()
+        rows = None if view.shown is None else rows_in_view(means, scales, view.shown)
+        return scene_rgb(
+            self.scene_colour,
+            colours,
+            means,
+            view.center,
+            hide_direction=view.hide_direction,
+            rows=rows,
         )
 
     def _light(

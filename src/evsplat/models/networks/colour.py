@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -67,6 +67,29 @@ class SceneColour(nn.Module):
     ) -> Float[Tensor, "N 3"]:
         """SRGB in [0, 1]; ``directions`` are unit vectors from the camera in the world, or zero."""
         return self.mlp(beside_basis(directions, features, values_first=True))[0].sigmoid()
+
+
+def scene_rgb(
+    network: nn.Module,
+    features: Float[Tensor, "S 32"],
+    means: Float[Tensor, "S 3"],
+    camera_center: Float[Tensor, "3"],
+    *,
+    hide_direction: bool,
+    rows: Int[Tensor, " V"] | None,
+) -> Float[Tensor, "S 3"]:
+    """Colours of a scene by a `SceneColour`, of some ``rows`` or of all; the others are black.
+
+    ``hide_direction``: the network sees no view direction in this step.
+    """
+    count = len(means)
+    if rows is not None:
+        features, means = features.index_select(0, rows), means.detach().index_select(0, rows)
+    directions = view_directions(means[None], camera_center)[0]
+    if hide_direction:
+        directions = torch.zeros_like(directions)
+    rgb: Tensor = network(features, directions)
+    return rgb if rows is None else rgb.new_zeros(count, 3).index_copy(0, rows, rgb)
 
 
 def beside_basis(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack, skin
@@ -16,7 +16,13 @@ from evsplat.gaussians import GaussianSet
 from evsplat.models.drawing import Drawing, draw
 from evsplat.models.layers import Layers, human_splats, scene_splats
 from evsplat.models.model import PosedModel, RowCache
-from evsplat.models.networks.colour import HumanColour, SceneColour, view_directions, view_jitter
+from evsplat.models.networks.colour import (
+    HumanColour,
+    SceneColour,
+    scene_rgb,
+    view_directions,
+    view_jitter,
+)
 from evsplat.models.networks.deformation import PoseDeformation, draw_pose_noise
 from evsplat.models.networks.skinning_network import SkinningNetwork
 from evsplat.models.networks.skinning_turns import SkinningTurns
@@ -228,7 +234,6 @@ class PaperModel(PosedModel):
         opacities, scene_opacities = gaussians.of_parts(gaussians.opacities())
         scene_scales = scene_scales_log.exp()
         in_view = None if shown is None else rows_in_view(scene_means, scene_scales, shown)
-        hidden = noise is not None and noise.hide_scene_direction
         return Layers(
             human_splats(
                 human_means,
@@ -244,7 +249,14 @@ class PaperModel(PosedModel):
                 scene_quaternions,
                 scene_scales,
                 scene_opacities,
-                self._scene_rgb(scene_features, scene_means, in_view, camera_center, hidden),
+                scene_rgb(
+                    self.scene_colour,
+                    scene_features,
+                    scene_means,
+                    camera_center,
+                    hide_direction=noise is not None and noise.hide_scene_direction,
+                    rows=in_view,
+                ),
                 scene_semantics,
             ),
             transforms[:, people],
@@ -267,21 +279,3 @@ class PaperModel(PosedModel):
             means, scales_log, quaternions, seen
         )
         return deformed
-
-    def _scene_rgb(
-        self,
-        features: Float[Tensor, "S F"],
-        means: Float[Tensor, "S 3"],
-        rows: Int[Tensor, " V"] | None,
-        camera_center: Float[Tensor, "3"],
-        hide_direction: bool,
-    ) -> Float[Tensor, "S 3"]:
-        """Colours of the scene, of some ``rows`` of it or of all; the others are black."""
-        count = len(means)
-        if rows is not None:
-            features, means = features.index_select(0, rows), means.detach().index_select(0, rows)
-        directions = view_directions(means[None], camera_center)[0]
-        if hide_direction:
-            directions = torch.zeros_like(directions)
-        rgb: Tensor = self.scene_colour(features, directions)
-        return rgb if rows is None else rgb.new_zeros(count, 3).index_copy(0, rows, rgb)
