@@ -18,7 +18,7 @@ from typing import Any
 
 from evsplat.capture import load_capture
 from evsplat.capture.derive import derived_capture
-from evsplat.evaluation.evaluator import evaluate_run
+from evsplat.evaluation.run import evaluate_run
 from evsplat.training import train
 
 PROMISED_DB = {"avatar3dgs": 28.0}

@@ -23,11 +23,11 @@ import numpy as np
 
 from evsplat.capture import load_capture
 from evsplat.footage import open_footage
+from evsplat.options import SynthesisSettings
 from evsplat.pictures.files import read_image
 from evsplat.synthesis.exposure import ExposureMean, plan_exposures
 from evsplat.synthesis.flow import FlowInterpolator
 from evsplat.synthesis.interpolate import Blend, Interpolator, Picture
-from evsplat.synthesis.settings import synthesis_settings
 from evsplat.synthesis.super_slomo import SuperSloMo
 from evsplat.weights import MissingWeights
 
@@ -100,7 +100,7 @@ def blur(path: Path, kinds: dict[str, Interpolator]) -> dict[str, float]:
     frames = capture.frames
     times = np.array([frame.mid_us for frame in frames])
     lengths = {frame.exposure_us[1] - frame.exposure_us[0] for frame in frames}
-    settings = synthesis_settings(exposure_us=min(lengths), upsample=FACTOR)
+    settings = SynthesisSettings(exposure_us=min(lengths), upsample=FACTOR)
     plan = plan_exposures(times, settings)
     fractions = [step / FACTOR for step in range(1, FACTOR)]
     pictures = [picture(read_image(frame.sharp).astype(np.float32)) for frame in frames]

@@ -25,7 +25,7 @@ import torch
 from rasterize import make_scene, person_over_scene, timed, with_gradient
 from step import build_on
 
-from evsplat.cli.demo import demo_capture
+from evsplat.shipped import demo_capture
 from evsplat.render import Splats, render
 
 CURVES = {

@@ -22,20 +22,18 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from evsplat.events import SensorSettings, SensorSimulator
+from evsplat.events import SensorSettings, SensorSimulator, sensor_settings
 from evsplat.pictures import decode
 
 STEP_US = 1_000
 CLEAN = SensorSettings(response="lin-log")
-EVERYTHING = SensorSettings(
+EVERYTHING = sensor_settings(
+    "dvxplorer",
     response="lin-log",
-    contrast_mismatch=0.15,
     cutoff_hz=200.0,
     leak_hz=1.0,
-    leak_spread=0.1,
     shot_hz=10.0,
     refractory_us=100.0,
-    hot_pixel_fraction=1e-3,
     hot_pixel_hz=100.0,
 )
 

@@ -77,8 +77,11 @@ def homes(method: str) -> list[str]:
 
 
 def tiny_capture(folder: Path, *, jitter_rad: float) -> Path:
-    """The capture of the tests, its poses jittered."""
+    """The capture of the tests, its poses jittered and its thresholds not those of a guess."""
     path = conftest.write_tiny_capture(folder / f"tiny-{jitter_rad}")
+    metadata = json.loads((path / "capture.json").read_text("utf-8"))
+    metadata["events"]["contrast_threshold"] = [0.31, 0.27]
+    (path / "capture.json").write_text(json.dumps(metadata), "utf-8")
     body = dict(np.load(path / "body.npz"))
     noise = np.random.default_rng(0).normal(0, jitter_rad, body["poses"].shape)
     np.savez(path / "body.npz", **body | {"poses": np.float32(body["poses"] + noise)})

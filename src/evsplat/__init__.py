@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from evsplat.benching.run import bench
     from evsplat.capture import load_capture
-    from evsplat.cli.demo import demo
-    from evsplat.evaluation import evaluate_run as evaluate
-    from evsplat.evaluation.report import write_report
+    from evsplat.cli.runs import demo
+    from evsplat.evaluation.run import evaluate_run as evaluate
+    from evsplat.evaluation.run import write_report
     from evsplat.events.convert import convert_recording as convert
     from evsplat.export import export_run, render_run
     from evsplat.footage.simulate import simulate
@@ -72,8 +72,8 @@ _LAZY = {
     "Policy": "evsplat.capture:Policy",
     "bench": "evsplat.benching.run:bench",
     "convert": "evsplat.events.convert:convert_recording",
-    "demo": "evsplat.cli.demo:demo",
-    "evaluate": "evsplat.evaluation:evaluate_run",
+    "demo": "evsplat.cli.runs:demo",
+    "evaluate": "evsplat.evaluation.run:evaluate_run",
     "export_run": "evsplat.export:export_run",
     "import_capture": "evsplat.importers:import_capture",
     "inspect": "evsplat.inspection:inspect",
@@ -87,7 +87,7 @@ _LAZY = {
     "synthesize": "evsplat.synthesis:synthesize",
     "train": "evsplat.training:train",
     "view_run": "evsplat.view:view_run",
-    "write_report": "evsplat.evaluation.report:write_report",
+    "write_report": "evsplat.evaluation.run:write_report",
 }
 
 

@@ -13,7 +13,7 @@ from evsplat.cli.main import _gathered
 from evsplat.shipped import demo_capture
 
 VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "masks")
-VERBS += ("restore", "train", "evaluate", "report", "render", "export")
+VERBS += ("restore", "settings", "train", "evaluate", "report", "render", "view", "export", "bench")
 
 
 def _outcome(capsys, *arguments):
@@ -103,7 +103,7 @@ def test_ctrl_c_is_code_130_and_says_how_to_go_on(capsys, monkeypatch, tmp_path)
     import evsplat.training
     from evsplat.training import Stopped
 
-    def interrupted(capture, **options):
+    def interrupted(capture, options, **_):
         raise Stopped(tmp_path / "my run")
 
     monkeypatch.setattr(evsplat.training, "train", interrupted)
@@ -114,14 +114,14 @@ def test_ctrl_c_is_code_130_and_says_how_to_go_on(capsys, monkeypatch, tmp_path)
 
 
 def test_ctrl_c_during_evaluation_says_that_the_training_is_safe(capsys, monkeypatch, tmp_path):
-    import evsplat.evaluation
+    import evsplat.evaluation.run
     import evsplat.training
 
     def interrupted(run, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(evsplat.training, "train", lambda capture, **options: tmp_path)
-    monkeypatch.setattr(evsplat.evaluation, "evaluate_run", interrupted)
+    monkeypatch.setattr(evsplat.training, "train", lambda capture, options, **_: tmp_path)
+    monkeypatch.setattr(evsplat.evaluation.run, "evaluate_run", interrupted)
     code, _, stderr = _outcome(capsys, "train", "capture")
     assert code == 130
     assert f"evsplat evaluate {tmp_path}" in stderr

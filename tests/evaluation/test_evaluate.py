@@ -1,8 +1,7 @@
 """The evaluator on small captures, whole and with parts missing."""
 
 import json
-import sys
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,8 @@ from PIL import Image
 
 from evsplat.capture import Policy, load_capture
 from evsplat.capture.policy import policy_of
-from evsplat.evaluation import evaluate, evaluate_run
+from evsplat.evaluation import evaluate
+from evsplat.evaluation import run as evaluation_run
 from evsplat.evaluation.event_maps import chosen_pairs
 from evsplat.evaluation.protocols import METRICS, PSNR_CEILING_DB, REGIONS
 from evsplat.methods.trivial import MedianBackground
@@ -196,10 +196,8 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
         gaussians={"human": 10, "scene": 20},
         policy=Policy(held_out_events=True),
     )
-    module = ModuleType("evsplat.training.run")
-    module.load_run = lambda path, **_: trained
-    monkeypatch.setitem(sys.modules, "evsplat.training.run", module)
-    metrics = evaluate_run(out)
+    monkeypatch.setattr(evaluation_run, "load_run", lambda path, **_: trained)
+    metrics = evaluation_run.evaluate_run(out)
     assert json.loads((out / "metrics.json").read_text()) == metrics
     facts = ["capture", "method", "iteration", "train_seconds", "device", "gaussians"]
     assert list(metrics)[:6] == facts and metrics["iteration"] == 1200

@@ -4,9 +4,8 @@ import base64
 import io
 import json
 import re
-import sys
 from html.parser import HTMLParser
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -16,9 +15,8 @@ from PIL import Image
 from evsplat.capture import Policy, load_capture
 from evsplat.config import to_dict
 from evsplat.errors import DataError
-from evsplat.evaluation import evaluate
+from evsplat.evaluation import evaluate, run
 from evsplat.evaluation.protocols import METRICS
-from evsplat.evaluation.report import write_report
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
@@ -178,14 +176,12 @@ def test_page_of_a_method_without_training_or_truth_or_events(tiny_capture, tmp_
 
 def test_report_needs_an_evaluation(tiny_capture, tmp_path, monkeypatch):
     capture = load_capture(tiny_capture())
-    run = SimpleNamespace(capture=capture, reconstruction=TruthWithNoise(capture))
-    module = ModuleType("evsplat.training.run")
-    module.load_run = lambda path: run
-    monkeypatch.setitem(sys.modules, "evsplat.training.run", module)
+    trained = SimpleNamespace(capture=capture, reconstruction=TruthWithNoise(capture))
+    monkeypatch.setattr(run, "load_run", lambda path: trained)
     with pytest.raises(DataError, match="evsplat evaluate"):
-        write_report(tmp_path)
+        run.write_report(tmp_path)
     evaluated(capture.path, tmp_path)
-    path = write_report(tmp_path)
+    path = run.write_report(tmp_path)
     assert path == tmp_path / "report.html" and path.stat().st_size > 10_000
 
 

@@ -10,7 +10,7 @@ import torch
 from evsplat.capture import load_capture
 from evsplat.cli.summary import summary_table
 from evsplat.errors import ConfigError, DataError
-from evsplat.evaluation.evaluator import evaluate_run
+from evsplat.evaluation.run import evaluate_run
 from evsplat.methods import TRAINABLE
 from evsplat.methods.avatar3dgs import AvatarConfig
 from evsplat.methods.backdrop import OnMedianBackground

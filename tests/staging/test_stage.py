@@ -258,10 +258,10 @@ def test_what_ships_has_its_licences():
         ({"frames": 500}, "500 are asked for"),
         ({"start_s": 60}, "gives 0 frames"),
         ({"exposure_ms": 50}, "shorten the exposure"),
-        ({"width": 4}, "width is 4, expected 16 to 4096"),
-        ({"fps": float("nan")}, "fps is nan"),
+        ({"width": 4}, "--width 4: expected an integer within 16 and 4096"),
+        ({"fps": float("nan")}, "--fps nan"),
         ({"camera": "crane"}, "one of static, orbit, handheld"),
-        ({"colour": "red"}, "no setting 'colour'"),
+        ({"colour": "red"}, "colour: no such option"),
     ],
 )
 def test_bad_settings_get_one_sentence_and_leave_nothing(tmp_path, changes, said):

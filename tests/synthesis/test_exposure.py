@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from evsplat.errors import ConfigError
+from evsplat.options import SynthesisSettings
+from evsplat.options.declare import given
 from evsplat.synthesis.exposure import ExposureMean, plan_exposures
-from evsplat.synthesis.settings import synthesis_settings
 
 TIMES = np.arange(11) * 10_000
 
@@ -24,10 +25,10 @@ def random_light(count, seed):
 
 @pytest.mark.parametrize("count", [1, 3, 5, 9])
 def test_k_subframes_are_the_plain_mean_of_k(count):
-    settings = synthesis_settings(upsample=4, subframes=count) if count > 1 else None
+    settings = SynthesisSettings(upsample=4, subframes=count) if count > 1 else None
     if settings is None:
         with pytest.raises(ConfigError, match="not blurry"):
-            plan_exposures(TIMES, synthesis_settings(upsample=4, subframes=1))
+            plan_exposures(TIMES, SynthesisSettings(upsample=4, subframes=1))
         return
     light = random_light(41, seed=count)
     done = means(TIMES, settings, light)
@@ -40,7 +41,7 @@ def test_k_subframes_are_the_plain_mean_of_k(count):
 def test_full_duty_counts_the_ends_half():
     """Eight sub-frames per gap, exposure one gap long: the trapezoid of nine around the middle."""
     light = random_light(81, seed=0)
-    done = means(TIMES, synthesis_settings(upsample=8, duty=1.0), light)
+    done = means(TIMES, SynthesisSettings(upsample=8, duty=1.0), light)
     assert [exposure.source for exposure, _ in done] == list(range(1, 10))
     weights = np.array([0.5, 1, 1, 1, 1, 1, 1, 1, 0.5]) / 8
     for exposure, mean in done:
@@ -58,7 +59,7 @@ def test_any_exposure_of_uneven_times_is_the_integral_in_float64(seed):
     """Overlapping exposures too: each is the integral of the piecewise constant light."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.integers(5000, 15_000, 20))
-    settings = synthesis_settings(upsample=int(rng.integers(1, 6)), exposure_us=31_000)
+    settings = SynthesisSettings(upsample=int(rng.integers(1, 6)), exposure_us=31_000)
     plan = plan_exposures(times, settings)
     light = random_light(len(plan.subframe_us), seed)
     middles = (plan.subframe_us[1:] + plan.subframe_us[:-1]) / 2
@@ -76,7 +77,7 @@ def test_any_exposure_of_uneven_times_is_the_integral_in_float64(seed):
 
 def test_lower_rate_takes_the_pictures_nearest_to_even_times():
     times = np.round(np.arange(240) * 1e6 / 240).astype(int)
-    plan = plan_exposures(times, synthesis_settings(fps=25, duty=0.5, interpolation="none"))
+    plan = plan_exposures(times, SynthesisSettings(fps=25, duty=0.5, interpolation="none"))
     middles = times[[exposure.source for exposure in plan.exposures]]
     wanted = middles[0] + np.arange(len(middles)) * 40_000
     assert np.abs(middles - wanted).max() <= 2084
@@ -88,7 +89,7 @@ def test_lower_rate_takes_the_pictures_nearest_to_even_times():
 def test_spacing_stays_even_to_the_last_frame(count):
     """The end of the footage may not draw the last frame nearer."""
     times = np.round(np.arange(count) * 1e6 / 60).astype(int)
-    plan = plan_exposures(times, synthesis_settings(fps=15, duty=0.9, upsample=4))
+    plan = plan_exposures(times, SynthesisSettings(fps=15, duty=0.9, upsample=4))
     assert set(np.diff([exposure.source for exposure in plan.exposures])) == {4}
 
 
@@ -103,9 +104,9 @@ def test_spacing_stays_even_to_the_last_frame(count):
 )
 def test_settings_that_do_not_fit_the_footage_are_refused(changes, words):
     with pytest.raises(ConfigError, match=words):
-        plan_exposures(TIMES, synthesis_settings(**changes))
+        plan_exposures(TIMES, SynthesisSettings(**changes))
     with pytest.raises(ConfigError, match="at least 2"):
-        plan_exposures(TIMES[:1], synthesis_settings())
+        plan_exposures(TIMES[:1], SynthesisSettings())
 
 
 @pytest.mark.parametrize(
@@ -113,20 +114,20 @@ def test_settings_that_do_not_fit_the_footage_are_refused(changes, words):
     [
         ({"recipe": "zju"}, "zju-mocap-blur"),
         ({"interpolation": "slow"}, "flow, super-slomo, none"),
-        ({"duty": -1.0}, "duty -1"),
-        ({"duty": 0.5, "subframes": 3}, "duty and subframes"),
+        ({"duty": -1.0}, "--duty -1: expected a number above 0"),
+        ({"duty": 0.5, "subframes": 3}, "--duty and --subframes"),
         ({"sensor": "evk"}, "evk4"),
-        ({"contrast": 0.0}, "contrast_on"),
-        ({"upsampel": 2}, "Did you mean upsample"),
-        ({"read_noise": 2.0}, "read_noise 2"),
-        ({"upsample": 0}, "upsample 0"),
+        ({"contrast": 0.0}, "--contrast 0"),
+        ({"upsampel": 2}, "did you mean upsample"),
+        ({"read_noise": 2.0}, "--read-noise 2"),
+        ({"upsample": 0}, "--upsample 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(changes, words):
     with pytest.raises(ConfigError, match=words):
-        synthesis_settings(**changes)
+        given(SynthesisSettings, None, changes)
 
 
 def test_length_given_replaces_the_length_of_the_recipe():
-    settings = synthesis_settings("zju-mocap-blur", subframes=5)
+    settings = SynthesisSettings("zju-mocap-blur", subframes=5)
     assert settings.duty is None and settings.subframes == 5 and settings.upsample == 8

@@ -12,7 +12,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.events import count_map
 from evsplat.inspection import inspect_capture
 from evsplat.pictures.files import read_image, write_image
-from evsplat.synthesis import RECIPES, synthesize
+from evsplat.synthesis import SynthesisSettings, synthesize
 
 Factory = Callable[..., Path]
 FPS, WIDTH, HEIGHT = 1000, 40, 12
@@ -334,7 +334,7 @@ def test_existing_capture_is_replaced_only_when_asked(tmp_path, posed):
 
 def test_recipes_are_the_papers():
     for recipe in ("zju-mocap-blur", "mmhpsd-blur"):
-        settings = RECIPES[recipe]
+        settings = SynthesisSettings(recipe=recipe)
         assert settings.interpolation == "super-slomo" and settings.transfer == "power"
         assert settings.upsample == 8 and settings.duty == 1.0 and settings.split == "modulo"
 

@@ -12,6 +12,8 @@ from evsplat.benching.folder import BenchFolder
 from evsplat.benching.suite import Suite, SuiteCapture, SuiteRow, check_names
 from evsplat.errors import ConfigError
 from evsplat.files import read_json
+from evsplat.options import BenchOptions
+from evsplat.options.declare import given
 from evsplat.shipped import demo_capture
 
 
@@ -33,28 +35,24 @@ class Plan:
 
 
 def make_plan(
-    suite: Suite,
-    folder: BenchFolder,
-    *,
-    captures: Sequence[Path | str] = (),
-    iterations: int | None = None,
-    max_minutes: float | None = None,
-    seeds: Sequence[int] = (),
-    only: Sequence[str] = (),
+    suite: Suite, folder: BenchFolder, options: BenchOptions | None = None, **changes: Any
 ) -> Plan:
-    """Cells of a suite; what is given replaces what the suite says.
+    """Cells of a suite; what options or ``changes`` give replaces what the suite says.
 
     A time limit replaces the suite's number of steps unless a number is given as well.
 
     Raises:
         ConfigError: A row does not exist, or a number is out of range.
     """
-    if captures:
-        named = tuple(SuiteCapture(Path(path).resolve().name, str(path)) for path in captures)
+    options = given(BenchOptions, options, changes)
+    iterations, seeds, only = options.iterations, options.seeds, options.only
+    if options.captures:
+        paths = [Path(path) for path in options.captures]
+        named = tuple(SuiteCapture(path.resolve().name, str(path)) for path in paths)
         check_names("capture", [capture.name for capture in named], "--captures")
         suite = replace(suite, captures=named)
-    if max_minutes is not None:
-        suite = replace(suite, max_minutes=max_minutes, iterations=iterations)
+    if options.max_minutes is not None:
+        suite = replace(suite, max_minutes=options.max_minutes, iterations=iterations)
     elif iterations is not None:
         suite = replace(suite, iterations=iterations)
     if seeds:
@@ -63,11 +61,6 @@ def make_plan(
         suite = replace(suite, rows=tuple(_chosen(suite.rows, only)))
     if not suite.captures:
         raise ConfigError(f"suite {suite.name} names no captures; give some with --captures.")
-    if suite.iterations is not None and suite.iterations < 1:
-        raise ConfigError(f"iterations is {suite.iterations}, expected at least 1.")
-    if suite.max_minutes is not None and suite.max_minutes <= 0:
-        raise ConfigError(f"max_minutes is {suite.max_minutes:g}, expected a time above 0.")
-
     sources: dict[str, CaptureSource] = {}
     missing: dict[str, str] = {}
     for capture in suite.captures:

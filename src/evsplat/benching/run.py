@@ -6,7 +6,7 @@ import signal
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 
@@ -19,6 +19,8 @@ from evsplat.benching.progress import Progress
 from evsplat.benching.suite import read_suite
 from evsplat.errors import ConfigError
 from evsplat.files import read_json, write_json
+from evsplat.options import BenchOptions
+from evsplat.options.declare import given
 from evsplat.render import choose_device
 
 
@@ -41,63 +43,30 @@ class Stopped(KeyboardInterrupt):
         self.folder = folder
 
 
-def bench(
-    suite: Path | str,
-    *,
-    out: Path | str | None = None,
-    captures: Sequence[Path | str] = (),
-    iterations: int | None = None,
-    max_minutes: float | None = None,
-    seeds: Sequence[int] = (),
-    only: Sequence[str] = (),
-    jobs: int | None = None,
-    ray: str | None = None,
-    cpus_per_cell: int | None = None,
-    gpus_per_cell: float | None = None,
-    device: str = "auto",
-    retry: bool = False,
-) -> Path:
+def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any) -> Path:
     """Run every cell of a suite that has no record yet; gives the results folder.
 
-    ``suite`` is the name of one that ships or a YAML file (docs/bench.md); ``out`` is
-    ``bench/<suite>`` by default. ``captures`` replace those of the suite; ``iterations``,
-    ``max_minutes`` (of each cell; the schedule is shortened to be finished by then) and ``seeds``
-    replace its numbers; ``only`` are names of rows. Cells run in ``jobs`` processes on this
-    machine, which share its cores, or on the Ray cluster at ``ray`` (``local`` starts one), each
-    with ``cpus_per_cell`` and ``gpus_per_cell``. A cell that failed stays so unless ``retry``.
+    ``suite`` is the name of one that ships or a YAML file (docs/bench.md); ``changes`` are fields
+    of `BenchOptions`: ``bench("stage", max_minutes=3)``. A time limit replaces the suite's number
+    of steps. A cell that failed stays so unless ``retry``.
 
     Raises:
         ConfigError: The suite or an option is wrong, or the folder holds cells that were asked for
             otherwise.
         Stopped: Ctrl-C; the same call goes on.
     """
+    options = given(BenchOptions, options, changes)
     plan_suite = read_suite(suite)
-    folder = BenchFolder(Path(out) if out is not None else Path("bench") / plan_suite.name)
-    plan = make_plan(
-        plan_suite,
-        folder,
-        captures=captures,
-        iterations=iterations,
-        max_minutes=max_minutes,
-        seeds=seeds,
-        only=only,
-    )
+    folder = BenchFolder(Path(options.out or Path("bench") / plan_suite.name))
+    plan = make_plan(plan_suite, folder, options)
     if not plan.cells:
         raise ConfigError("\n".join(plan.missing.values()))
     with exclusive(folder.lock_of("bench"), wait=False):
         # What a killed bench left half made.
         for half in folder.captures.glob(".*"):
             shutil.rmtree(half, ignore_errors=True)
-        todo = left_to_do(plan, folder, retry=retry)
-        executor = _executor(
-            folder,
-            len(todo),
-            jobs=jobs,
-            ray=ray,
-            cpus=cpus_per_cell,
-            gpus=gpus_per_cell,
-            device=device,
-        )
+        todo = left_to_do(plan, folder, retry=options.retry)
+        executor = _executor(folder, len(todo), options)
         try:
             _run(plan, todo, folder, executor)
         except KeyboardInterrupt:
@@ -121,36 +90,20 @@ def _run(plan: Plan, todo: Sequence[Cell], folder: BenchFolder, executor: Execut
             progress.ended(cell, read_json(folder.record_of(cell.id)))
 
 
-def _executor(
-    folder: BenchFolder,
-    cells: int,
-    *,
-    jobs: int | None,
-    ray: str | None,
-    cpus: int | None,
-    gpus: float | None,
-    device: str,
-) -> Executor:
-    """Where to run ``cells`` cells, after a look at the options."""
-    for name, value in (("--jobs", jobs), ("--cpus-per-cell", cpus)):
-        if value is not None and value < 1:
-            raise ConfigError(f"{name} {value}: expected at least 1.")
-    if gpus is not None and gpus < 0:
-        raise ConfigError(f"--gpus-per-cell {gpus:g}: expected 0 or more.")
-    if ray is not None:
-        if jobs is not None:
-            raise ConfigError("--jobs is for this machine; on Ray --cpus-per-cell decides.")
+def _executor(folder: BenchFolder, cells: int, options: BenchOptions) -> Executor:
+    """Where to run ``cells`` cells."""
+    cpus, path = options.cpus_per_cell, folder.path.resolve()
+    if options.ray is not None:
         from evsplat.benching.ray_cluster import RayCluster
 
-        return RayCluster(folder.path.resolve(), ray, cpus or 1, gpus or 0, device)
-    if gpus is not None:
-        raise ConfigError("--gpus-per-cell is for --ray; here every process has one GPU.")
-    device = choose_device(device)
+        gpus = options.gpus_per_cell or 0
+        return RayCluster(path, options.ray, cpus or 1, gpus, options.device)
+    device = choose_device(options.device)
     cores = _cores()
     on_gpu = torch.cuda.device_count() if device == "cuda" else 0
-    jobs = jobs or max(1, min(on_gpu or cores // (cpus or 1), cells))
+    jobs = options.jobs or max(1, min(on_gpu or cores // (cpus or 1), cells))
     threads = cpus or max(1, cores // jobs)
-    return LocalPool(folder.path.resolve(), jobs, threads, device, on_gpu)
+    return LocalPool(path, jobs, threads, device, on_gpu)
 
 
 def _cores() -> int:

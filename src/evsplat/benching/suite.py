@@ -4,8 +4,9 @@ import re
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from typing import Annotated
 
-from evsplat.config import from_dict, load_yaml
+from evsplat.config import Above, AtLeast, from_dict, load_yaml
 from evsplat.errors import ConfigError
 from evsplat.staging import StageSettings
 
@@ -79,9 +80,9 @@ class Suite:
     captures: tuple[SuiteCapture, ...] = ()
     title: str = ""
     seeds: tuple[int, ...] = (0,)
-    iterations: int | None = None
+    iterations: Annotated[int | None, AtLeast(1)] = None
     """Training steps of every row; None: the method's own."""
-    max_minutes: float | None = None
+    max_minutes: Annotated[float | None, Above(0)] = None
     """Minutes of training of every cell; the schedule is shortened to be finished by then."""
     published: PublishedTable | None = field(default=None)
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from evsplat.errors import ConfigError
+from evsplat.options.declare import Use
 
-Use = Literal["training", "everything"]
 Masks = Literal["given", "estimated", "none"]
 
 

@@ -12,9 +12,9 @@ from importlib.util import find_spec
 from typing import Literal
 
 import evsplat
-from evsplat.cli.options import Flag
 from evsplat.cuda_support import Need, needs
 from evsplat.errors import DataError, WeightsError
+from evsplat.options.declare import Flag
 from evsplat.shipped import demo_capture
 
 _RESTORERS_WITH_WEIGHTS = ("nafnet", "mprnet", "efnet", "d2net", "e2vid")

@@ -1,30 +1,13 @@
 """``evsplat import``: turn a data set, or your own recording, into a capture."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 
-from evsplat.cli.options import Flag, option
-
-if TYPE_CHECKING:
-    from evsplat.importers import Blur, Importer
-
-_Source = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
-_Capture = Annotated[Path, tyro.conf.arg(metavar="CAPTURE")]
-_Smpl = Annotated[Path | None, option("PATH", default="EVSPLAT_BODY_MODELS")]
-_ARGUMENTS = """
-Args:
-    source: Folder of the data (docs/import.md shows each tree).
-    out: Capture to write.
-    smpl: Your SMPL model file, or the folder that holds it.
-    blur: Go on to the paper's version: blurry frames and simulated events. The sharp capture stays
-        beside it, with _sharp at the end of its name.
-    interpolation: How pictures between the frames are made for --blur.
-    weights: Checkpoint of Super SloMo for --blur.
-    overwrite: Replace a capture that is there.
-"""
+from evsplat.options.declare import FLAT, Flag, option
 
 
 def import_() -> None:
@@ -34,78 +17,76 @@ def import_() -> None:
     """
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Import:
+    """The import of a kind of source."""
+
+    source: Annotated[tyro.conf.Positional[Path], option("SOURCE")]
+    """Folder of the data (docs/import.md shows each tree)."""
+    out: Annotated[Path, option("CAPTURE")]
+    """Capture to write."""
+    smpl: Annotated[Path | None, option("PATH", default="EVSPLAT_BODY_MODELS")] = None
+    """Your SMPL model file, or the folder that holds it."""
+    overwrite: Flag = False
+    """Replace a capture that is there."""
+    options: Any
+    """The `Importer` of the kind."""
+
+    def __call__(self) -> None:
+        from evsplat.importers import run_importer
+
+        path = run_importer(
+            self.options,
+            self.source,
+            self.out,
+            smpl=self.smpl,
+            overwrite=self.overwrite,
+            blur=self.going_on(),
+        )
+        print(f"written: {path}\nlook at it with: evsplat inspect {path}")
+
+    def going_on(self) -> Any:
+        """The `Blur` that follows; None: the capture stays sharp."""
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ImportToBlur(_Import):
+    """The import of a data set that the paper makes blurry."""
+
+    blur: Flag = False
+    """Go on to the paper's version: blurry frames and simulated events. The sharp capture stays
+    beside it, with _sharp at the end of its name."""
+    interpolation: Annotated[
+        Literal["super-slomo", "flow"] | None, option("KIND", default="the recipe's")
+    ] = None
+    """How pictures between the frames are made for --blur."""
+    weights: Annotated[Path | None, option("FILE", default="in torch's hub folder")] = None
+    """Checkpoint of Super SloMo for --blur."""
+
+    def going_on(self) -> Any:
+        from evsplat.importers import Blur
+
+        return Blur(self.interpolation, self.weights) if self.blur else None
+
+
 def import_with_kinds() -> Callable[..., Any]:
     """`import_` with the kinds as subcommands; loading them takes seconds, so only when asked."""
     from evsplat.importers import KINDS
 
-    kinds = tuple(
-        Annotated[type(name, (_Done,), {}), tyro.conf.subcommand(name, constructor=_verb(kind))]
-        for name, kind in KINDS.items()
-    )
+    verbs = []
+    for name, kind in KINDS.items():
+        base = _ImportToBlur if kind.blur_recipe else _Import
+        options = ("options", Annotated[kind, FLAT])
+        verb = make_dataclass(kind.__name__, [options], bases=(base,), frozen=True, kw_only=True)
+        verb.__doc__ = kind.__doc__
+        verbs.append(Annotated[verb, tyro.conf.subcommand(name)])
 
-    def verb(*, kind: Any) -> None:
-        pass
+    def import_kind(*, kind: Any) -> None:
+        kind()
 
-    chosen = Union[kinds]  # type: ignore[valid-type] # noqa: UP007 - of a tuple
-    verb.__annotations__["kind"] = Annotated[chosen, tyro.conf.arg(name="")]
-    verb.__doc__ = import_.__doc__
+    chosen = Union[tuple(verbs)]  # type: ignore[valid-type] # noqa: UP007 - of a tuple
+    import_kind.__annotations__["kind"] = Annotated[chosen, FLAT]
+    import_kind.__doc__ = import_.__doc__
     prefixes = tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes
-    return tyro.conf.configure(*prefixes)(verb)
-
-
-class _Done:
-    """What the function of a kind gives to the parser: its work is done."""
-
-
-def _verb(kind: "type[Importer]") -> Callable[..., _Done]:
-    """The import of one kind as a function whose signature is its command line."""
-
-    def plain(
-        source: _Source,
-        /,
-        *,
-        out: _Capture,
-        options: Any,
-        smpl: _Smpl = None,
-        overwrite: Flag = False,
-    ) -> _Done:
-        return _run(options, source, out, smpl, overwrite, None)
-
-    def with_blur(
-        source: _Source,
-        /,
-        *,
-        out: _Capture,
-        options: Any,
-        smpl: _Smpl = None,
-        blur: Flag = False,
-        interpolation: Annotated[
-            Literal["super-slomo", "flow"] | None, option("KIND", default="the recipe's")
-        ] = None,
-        weights: Annotated[Path | None, option("FILE", default="in torch's hub folder")] = None,
-        overwrite: Flag = False,
-    ) -> _Done:
-        from evsplat.importers import Blur
-
-        going_on = Blur(interpolation, weights) if blur else None
-        return _run(options, source, out, smpl, overwrite, going_on)
-
-    chosen: Callable[..., _Done] = with_blur if kind.blur_recipe else plain
-    chosen.__annotations__["options"] = Annotated[kind, tyro.conf.arg(name="")]
-    chosen.__doc__ = f"{kind.__doc__}\n{_ARGUMENTS}"
-    return chosen
-
-
-def _run(
-    importer: "Importer",
-    source: Path,
-    out: Path,
-    smpl: Path | None,
-    overwrite: bool,
-    blur: "Blur | None",
-) -> _Done:
-    from evsplat.importers import run_importer
-
-    path = run_importer(importer, source, out, smpl=smpl, overwrite=overwrite, blur=blur)
-    print(f"written: {path}\nlook at it with: evsplat inspect {path}")
-    return _Done()
+    return tyro.conf.configure(*prefixes)(import_kind)

@@ -1,8 +1,5 @@
-"""Reading the command line, and turning what goes wrong into a message and an exit code."""
+"""Reading the command line: which verb, with which options."""
 
-import functools
-import logging
-import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,82 +7,62 @@ from typing import Any
 import tyro
 
 import evsplat
-from evsplat.cli.bench import bench
-from evsplat.cli.convert import convert
-from evsplat.cli.demo import demo
+from evsplat.cli import captures, runs
 from evsplat.cli.doctor import doctor
-from evsplat.cli.evaluate import evaluate
-from evsplat.cli.export import export
+from evsplat.cli.exits import exit_code
 from evsplat.cli.import_ import import_, import_with_kinds
-from evsplat.cli.inspect import inspect
-from evsplat.cli.masks import masks
-from evsplat.cli.render import render
-from evsplat.cli.report import report
-from evsplat.cli.restore import restore
-from evsplat.cli.settings import settings
-from evsplat.cli.simulate import simulate
-from evsplat.cli.stage import stage
-from evsplat.cli.synthesize import synthesize
-from evsplat.cli.train import train
-from evsplat.cli.view import view
-from evsplat.errors import EvsplatError
 
 _VERBS: dict[str, Callable[..., Any]] = {
-    verb.__name__.rstrip("_"): verb
-    for verb in (
-        *(demo, doctor, import_, convert, simulate, synthesize, stage, inspect),
-        *(masks, restore, settings, train, evaluate, report, render, view, export, bench),
-    )
+    "demo": runs.demo,
+    "doctor": doctor,
+    "import": import_,
+    "convert": captures.Convert,
+    "simulate": captures.Simulate,
+    "synthesize": captures.Synthesize,
+    "stage": captures.Stage,
+    "inspect": captures.Inspect,
+    "masks": captures.Masks,
+    "restore": captures.Restore,
+    "settings": runs.Settings,
+    "train": runs.Train,
+    "evaluate": runs.Evaluate,
+    "report": runs.Report,
+    "render": runs.Render,
+    "view": runs.View,
+    "export": runs.Export,
+    "bench": runs.Bench,
 }
+"""A function works as it is called; an object is called for its work."""
 _DESCRIPTION = (
     "A sharp 3D Gaussian person in a scene, from a blurry video and events.\n\n"
     "Start with 'evsplat demo'; 'evsplat VERB --help' tells more."
 )
-_CODE_BAD_INPUT = 2
-_CODE_INTERRUPTED = 130
-_CODE_NOBODY_READS = 141
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code.
-
-    0: done; 2: the input, the machine or an option is at fault (one message on stderr);
-    130: stopped by Ctrl-C; 141: the reader of a pipe went away.
-    """
+    """Run the command line and return the exit code, see `exit_code`."""
     arguments = _gathered(sys.argv[1:] if arguments is None else arguments)
     if arguments == ["--version"]:
         print(f"evsplat {evsplat.__version__}")
         return 0
-    logging.basicConfig(format="%(message)s")
-    logging.getLogger("evsplat").setLevel(logging.INFO)
     verbs = _VERBS
     if not arguments or arguments[0].startswith("-"):
         verbs = {name: _in_a_line(verb) for name, verb in _VERBS.items()}
     if arguments[:1] == ["import"]:
         verbs = {**_VERBS, "import": import_with_kinds()}
-    try:
-        try:
-            tyro.extras.subcommand_cli_from_dict(
-                verbs,
-                prog="evsplat",
-                description=_DESCRIPTION,
-                args=arguments or ["--help"],
-                config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
-            )
-        finally:
-            # A reader that went away is noticed here, not at the interpreter's end.
-            sys.stdout.flush()
-    except EvsplatError as error:
-        print(f"evsplat: {error}", file=sys.stderr)
-        return _CODE_BAD_INPUT
-    except KeyboardInterrupt as stop:
-        print(f"\nevsplat: {str(stop) or 'Stopped.'}", file=sys.stderr)
-        return _CODE_INTERRUPTED
-    except BrokenPipeError:
-        # Whoever reads, such as head, has enough. What is still buffered goes nowhere, quietly.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _CODE_NOBODY_READS
-    return 0
+
+    def work() -> None:
+        asked = tyro.extras.subcommand_cli_from_dict(
+            verbs,
+            prog="evsplat",
+            description=_DESCRIPTION,
+            args=arguments or ["--help"],
+            config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
+        )
+        if callable(asked):
+            asked()
+
+    return exit_code(work)
 
 
 def _gathered(arguments: Sequence[str]) -> list[str]:
@@ -106,12 +83,11 @@ def _gathered(arguments: Sequence[str]) -> list[str]:
     return kept if place is None else [*kept[:place], "--set", *settings, *kept[place:]]
 
 
-def _in_a_line(verb: Callable[..., Any]) -> Callable[..., Any]:
-    """The verb with the first line of its description alone, so that the list fits a screen."""
+def _in_a_line(verb: Callable[..., Any]) -> Callable[[], None]:
+    """A verb as the list of all shows it: the first line of its description, no options."""
 
-    @functools.wraps(verb)
-    def brief(*arguments: Any, **options: Any) -> Any:
-        return verb(*arguments, **options)
+    def brief() -> None:
+        pass
 
     brief.__doc__ = (verb.__doc__ or "").partition("\n")[0]
     return brief

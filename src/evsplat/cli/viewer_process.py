@@ -7,7 +7,8 @@ import sys
 import threading
 from pathlib import Path
 
-from evsplat.view import check_viewer
+from evsplat.cli.exits import exit_code
+from evsplat.view import check_viewer, view_run
 
 
 class ViewerProcess:
@@ -24,7 +25,7 @@ class ViewerProcess:
 
     def start(self, run: Path) -> None:
         """Begin to show a run."""
-        command = [sys.executable, "-m", __name__, str(run), "--port", str(self.port)]
+        command = [sys.executable, "-m", __name__, str(run), str(self.port)]
         # In a session of its own, so that Ctrl-C stops the training and not what shows its end. The
         # pipe is never written to: the system closes it when this process ends.
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
@@ -49,7 +50,5 @@ def _end_with_parent() -> None:
 
 
 if __name__ == "__main__":
-    from evsplat.cli.main import main
-
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    sys.exit(main(["view", *sys.argv[1:]]))
+    sys.exit(exit_code(lambda: view_run(sys.argv[1], port=int(sys.argv[2]))))

@@ -1,6 +1,6 @@
 """Measuring a reconstruction: protocols, trivial rows, tables and the report page."""
 
-from evsplat.evaluation.evaluator import evaluate, evaluate_run
+from evsplat.evaluation.evaluator import evaluate
 from evsplat.evaluation.protocols import (
     AVATAR_COMPAT,
     HUGS_COMPAT,
@@ -16,5 +16,4 @@ __all__ = [
     "STANDARD",
     "Protocol",
     "evaluate",
-    "evaluate_run",
 ]

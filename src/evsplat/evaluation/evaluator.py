@@ -1,7 +1,6 @@
 """One evaluator for all methods: figures, pictures and tables of a reconstruction's test frames."""
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from evsplat.capture import Capture, Frame, NovelView, Policy, TrainingCapture
-from evsplat.config import to_dict
 from evsplat.errors import DataError
 from evsplat.evaluation.event_maps import evaluate_event_maps
 from evsplat.evaluation.people import People
@@ -27,16 +25,13 @@ from evsplat.evaluation.protocols import (
     Protocol,
     Truth,
 )
-from evsplat.evaluation.tables import write_tables
 from evsplat.evaluation.tally import Tally, all_absent, without_reasons
-from evsplat.files import write_json
 from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
 from evsplat.names import file_stem
 from evsplat.pictures import error_map, to_bytes
 from evsplat.pictures.files import save_png
-from evsplat.render import choose_device
 from evsplat.similarity.lpips import load_lpips
 from evsplat.similarity.perceptual import PerceptualMetric
 from evsplat.similarity.st_lpips import load_st_lpips
@@ -114,42 +109,6 @@ def evaluate(
     result["weights"] = weights
     result["protocol_notes"] = {protocol.name: protocol.summary for protocol in protocols}
     return result
-
-
-def evaluate_run(
-    run_dir: Path | str, *, lpips_weights: Path | str | None = None, device: str = "auto"
-) -> dict[str, Any]:
-    """Measure a trained run and write metrics.json, metrics.md, metrics.tex and pictures/.
-
-    ``device`` is where it is drawn and compared, not where it was trained.
-    """
-    from evsplat.training.run import load_run
-
-    start = time.monotonic()
-    device = choose_device(device)
-    run = load_run(Path(run_dir), device=device)
-    measured = evaluate(
-        run.capture,
-        run.reconstruction,
-        out_dir=run.path,
-        lpips_weights=lpips_weights,
-        device=device,
-        human_only=run.human_only,
-    )
-    metrics = {
-        "capture": measured.pop("capture"),
-        "method": measured.pop("method"),
-        "iteration": run.iteration,
-        "train_seconds": run.train_seconds,
-        "device": run.device,
-        "gaussians": run.gaussians,
-        "evaluate_seconds": round(time.monotonic() - start, 1),
-        "policy": to_dict(run.policy),
-        **measured,
-    }
-    write_json(Path(run.path) / "metrics.json", metrics)
-    write_tables(Path(run.path), metrics)
-    return metrics
 
 
 class _TestFrames:

@@ -11,6 +11,7 @@ from evsplat.errors import ConfigError
 from evsplat.events.recording import EventRecording, open_recording
 from evsplat.events.stream import EventStream
 from evsplat.events.write import write_events
+from evsplat.options import ReadOptions
 
 
 @dataclass(frozen=True)
@@ -40,24 +41,28 @@ class Conversion:
 def convert_recording(
     source: Path | str,
     out: Path | str,
+    options: ReadOptions | None = None,
     *,
     from_zero: bool = False,
     to: str | None = None,
-    **options: Any,
+    format: str | None = None,
+    **changes: Any,
 ) -> Conversion:
     """Read any recording and write it as another; memory does not grow with its length.
 
     Args:
         source: The recording to read.
         out: The file to write; the suffix chooses the format as in `write_events`.
+        options: As `open_recording` takes them, which also takes ``format``.
         from_zero: Let the first event be at 0.
         to: Format to write, whatever the suffix.
-        options: Options of `open_recording`, such as ``repair`` or ``time_unit``.
+        format: Format of the source.
+        changes: Fields of `ReadOptions`.
     """
     source, out = Path(source), Path(out)
     if out.exists() and source.exists() and out.samefile(source):
         raise ConfigError(f"{out}: is the recording itself; write to another file.")
-    recording = open_recording(source, **options)
+    recording = open_recording(source, options, format=format, **changes)
     times: list[int] = []
     pieces = _watched(recording, from_zero, times)
     count = write_events(out, pieces, format=to, width=recording.width, height=recording.height)

@@ -1,16 +1,16 @@
 """Recordings of any format, recognised by their first bytes, read as event streams."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from evsplat.errors import ConfigError, DataError
+from evsplat.errors import DataError
 from evsplat.events.formats import find_format
-from evsplat.events.formats.base import Damage, ReadOptions, RecordedFrame, Source
+from evsplat.events.formats.base import Damage, RecordedFrame, Source
 from evsplat.events.formats.checks import checked
 from evsplat.events.stream import EventStream
-
-TIME_UNITS = ("s", "ms", "us", "ns")
+from evsplat.options import ReadOptions
+from evsplat.options.declare import given
 
 
 class EventRecording:
@@ -79,49 +79,33 @@ class EventRecording:
 
 def open_recording(
     path: Path | str,
+    options: ReadOptions | None = None,
     *,
     format: str | None = None,
-    width: int | None = None,
-    height: int | None = None,
-    repair: bool = False,
-    columns: Sequence[str] | Mapping[str, str] | None = None,
-    time_unit: str | None = None,
+    **changes: Any,
 ) -> EventRecording:
     """Open an event recording of any format that evsplat reads (docs/event-formats.md).
 
     Args:
-        path: The recording; its content names the format, not its suffix.
+        path: The recording; its format is told from its content, whatever its name.
+        options: What the file does not say, or says wrongly, and whether damage is repaired: what
+            was done is counted in ``notes``. Without ``repair`` each is a `DataError`.
         format: One of `evsplat.events.formats.FORMATS`; the content must agree.
-        width: Columns of the sensor, where the file does not say or says it wrongly.
-        height: Rows of the sensor, likewise.
-        repair: Read on where the file is cut, events are out of order, a time counter began again
-            or events lie beside the sensor; what was done is counted in ``notes``. Without it each
-            of these is a `DataError`.
-        columns: For text, the names of the columns in order, out of t, x, y, p and "-" for one to
-            pass over, or "mmhpsd". For .npz, HDF5: which key holds which, such as
+        changes: Fields of `ReadOptions`. Of .npz and HDF5 ``columns`` is the key of each, such as
             ``{"t": "stamps"}``.
-        time_unit: "s", "ms", "us" or "ns", where the file does not say.
 
     Raises:
         DataError: The file is missing, of no known format, or its header is damaged.
         ConfigError: An option is out of range.
     """
-    path = Path(path)
-    if time_unit is not None and time_unit not in TIME_UNITS:
-        raise ConfigError(f"time_unit is {time_unit!r}, expected one of {', '.join(TIME_UNITS)}.")
-    for name, value in (("width", width), ("height", height)):
-        if value is not None and not 0 < value <= 1 << 16:
-            raise ConfigError(f"{name} is {value}, expected 1 to 65536 pixels.")
+    path, options = Path(path), given(ReadOptions, options, changes)
     if not path.exists():
         raise DataError(f"{path}: file not found.")
     found = find_format(path, format)
-    if columns is not None and not isinstance(columns, Mapping):
-        columns = tuple(columns.split(",")) if isinstance(columns, str) else tuple(columns)
-    options = ReadOptions(width, height, repair, columns, time_unit)
-    damage = Damage(path, repair)
+    damage = Damage(path, options.repair)
     source = found.open(path, options, damage)
-    source.width = width or source.width
-    source.height = height or source.height
+    source.width = options.width or source.width
+    source.height = options.height or source.height
     if (source.width is None) != (source.height is None):
         raise DataError(f"{path}: only one of width and height is known; give both.")
     if not all(size is None or 0 < size <= 1 << 16 for size in (source.width, source.height)):
@@ -131,6 +115,12 @@ def open_recording(
     return EventRecording(path, found.name, source, damage)
 
 
-def read_events(path: Path | str, **options: Any) -> EventStream:
+def read_events(
+    path: Path | str,
+    options: ReadOptions | None = None,
+    *,
+    format: str | None = None,
+    **changes: Any,
+) -> EventStream:
     """All events of a recording in memory; options and errors are those of `open_recording`."""
-    return open_recording(path, **options).read()
+    return open_recording(path, options, format=format, **changes).read()

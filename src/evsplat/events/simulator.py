@@ -1,9 +1,8 @@
 """An event camera in software: pictures of linear light in, events out (see docs/simulator.md)."""
 
-import math
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -11,8 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.compiled import import_error, native
+from evsplat.config import AtLeast, Within, check
 from evsplat.errors import BackendError, ConfigError, DataError
 from evsplat.events.stream import EventStream
+from evsplat.options.declare import Sensor, given
 from evsplat.pictures.light import luminance
 
 LOWEST_CONTRAST = 0.01
@@ -24,55 +25,41 @@ _LONGEST_STEP_US = 2**31
 class SensorSettings:
     """An event sensor; the defaults are an ideal one without noise."""
 
-    contrast_on: float = 0.2
+    contrast_on: Annotated[float, AtLeast(LOWEST_CONTRAST)] = 0.2
     """Change of log-intensity (natural logarithm) that makes an ON event: C+ of the paper."""
-    contrast_off: float = 0.2
-    """The same for OFF events, positive: C-."""
-    contrast_mismatch: float = 0.0
+    contrast_off: Annotated[float, AtLeast(LOWEST_CONTRAST)] = 0.2
+    """The same for OFF events, positive: C- of the paper."""
+    contrast_mismatch: Annotated[float, Within(0, 1)] = 0.0
     """Standard deviation between pixels of both thresholds, as a share of the threshold."""
     response: Literal["log", "lin-log"] = "log"
     """``log``: ln(Y + log_eps); ``lin-log``: v2e's, ln(255 Y) above 255 Y = 20, straight below."""
-    log_eps: float = 1e-3
+    log_eps: Annotated[float, AtLeast(1e-6)] = 1e-3
     """Added to linear light in [0, 1] before the logarithm; only read by ``log``."""
-    cutoff_hz: float = 0.0
+    cutoff_hz: Annotated[float, AtLeast(0)] = 0.0
     """Bandwidth of a pixel in full light; it falls with the light, to 7 % in the dark. 0: none."""
-    leak_hz: float = 0.0
+    leak_hz: Annotated[float, AtLeast(0)] = 0.0
     """ON events per pixel and second without any change of light."""
-    leak_spread: float = 0.0
+    leak_spread: Annotated[float, AtLeast(0)] = 0.0
     """Standard deviation between pixels of log10 of the leak rate, in decades."""
-    shot_hz: float = 0.0
+    shot_hz: Annotated[float, AtLeast(0)] = 0.0
     """Noise events (ON and OFF together) per pixel and second in the dark; a quarter of it in
     full light."""
-    refractory_us: float = 0.0
+    refractory_us: Annotated[float, AtLeast(0)] = 0.0
     """After an event a pixel sends none for so long; what would have come is lost."""
-    hot_pixel_fraction: float = 0.0
+    hot_pixel_fraction: Annotated[float, Within(0, 1)] = 0.0
     """Share of pixels that send events, ON and OFF alike, all the time."""
-    hot_pixel_hz: float = 0.0
+    hot_pixel_hz: Annotated[float, AtLeast(0)] = 0.0
     """Events per second of each hot pixel."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "response":
-                if value not in ("log", "lin-log"):
-                    raise ConfigError(f"response {value!r}: expected 'log' or 'lin-log'.")
-                continue
-            low = {"contrast_on": LOWEST_CONTRAST, "contrast_off": LOWEST_CONTRAST}
-            low["log_eps"] = 1e-6
-            high = {"contrast_mismatch": 1.0, "hot_pixel_fraction": 1.0}
-            least, most = low.get(field.name, 0.0), high.get(field.name, math.inf)
-            if not (math.isfinite(value) and least <= value <= most):
-                limit = f"at least {least:g}" + (
-                    f" and at most {most:g}" if field.name in high else ""
-                )
-                raise ConfigError(f"{field.name} {value:g}: expected a number, {limit}.")
+        check(self, "sensor")
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields as JSON values."""
+        """As JSON holds it."""
         return asdict(self)
 
 
-PRESETS: dict[str, SensorSettings] = {
+PRESETS: dict[Sensor, SensorSettings] = {
     "clean": SensorSettings(),
     "davis346": SensorSettings(
         contrast_on=0.36,
@@ -108,11 +95,12 @@ PRESETS: dict[str, SensorSettings] = {
 """Sensors by name; docs/simulator.md gives the source of each number."""
 
 
-def sensor_settings(preset: str = "clean", **changes: Any) -> SensorSettings:
+def sensor_settings(preset: Sensor = "clean", **changes: Any) -> SensorSettings:
     """A preset with some fields changed; those given as None stay."""
     if preset not in PRESETS:
         raise ConfigError(f"preset {preset!r}: expected one of {', '.join(PRESETS)}.")
-    return replace(PRESETS[preset], **{k: v for k, v in changes.items() if v is not None})
+    changed = {name: value for name, value in changes.items() if value is not None}
+    return given(SensorSettings, PRESETS[preset], changed)
 
 
 class SensorSimulator:

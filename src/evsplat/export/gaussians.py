@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +15,9 @@ from evsplat.export.cloud import SplatCloud, cloud_of, joined
 from evsplat.export.formats import write_gltf, write_ply, write_splat, write_spz
 from evsplat.film import camera_at
 from evsplat.methods.reconstruction import Parts, SplatReconstruction
+from evsplat.options.export import FileKind, UpAxis
 from evsplat.training.run import Run
 
-FileKind = Literal["ply", "spz", "splat", "gltf"]
-UpAxis = Literal["y", "z"]
 _AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 ALWAYS_Y_UP = {"spz": "right, up, back (RUB)", "gltf": "+Y up"}
 """Formats that define their axes."""
@@ -43,8 +42,6 @@ def instant_of(
     ``time_s`` counts seconds from the first frame's mid-exposure, ``frame`` names a frame, whose
     mid-exposure is taken. Colours are seen by ``camera``, or by the camera of the nearest frame.
     """
-    if time_s is not None and frame is not None:
-        raise ConfigError("--time and --frame both say when; give one of them.")
     frames = sorted(capture.frames, key=lambda f: f.mid_us)
     chosen = frames[len(frames) // 2]
     first, last = frames[0].mid_us, frames[-1].mid_us

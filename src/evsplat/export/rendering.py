@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -9,13 +10,14 @@ from PIL import Image
 from tqdm import tqdm
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.events import SensorSettings
+from evsplat.events import PRESETS
 from evsplat.film.events import copy_events, event_picture, event_pictures, simulate_film
-from evsplat.film.film import Film
 from evsplat.film.kept import KeptPictures, Shot, plan_of
 from evsplat.film.looks import Look, depth_colours
 from evsplat.film.scene import Scene, recorded_by
 from evsplat.methods.trivial import nearest_in_time
+from evsplat.options import Film
+from evsplat.options.declare import given
 from evsplat.pictures import to_bytes
 from evsplat.pictures.video import write_animation, write_pictures, write_video
 from evsplat.training.run import load_run
@@ -29,16 +31,16 @@ Picture = UInt8[np.ndarray, "H W C"]
 
 def render_run(
     run: Path | str,
+    film: Film | None = None,
     *,
     out: Path | str | None = None,
     events_out: Path | str | None = None,
     device: str = "auto",
-    film: Film | None = None,
-    **options: object,
+    **changes: Any,
 ) -> Path:
     """Draw a run's reconstruction and return the file or folder that was written.
 
-    What is drawn is a `Film`, whose fields can be given as ``options``. An ``out`` that ends in
+    What is drawn is a `Film`, whose fields can be given as ``changes``. An ``out`` that ends in
     .mp4, .webp or .gif becomes a video or animation, any other a folder of PNG files; without it
     ``run/renders/`` receives it. ``events_out`` takes the simulated events of ``show="events"``,
     in any format that `evsplat.events.write_events` knows.
@@ -46,9 +48,7 @@ def render_run(
     Pictures are kept beside the result in ``NAME.partial`` until it is complete: when stopped, the
     same call goes on from there.
     """
-    if film is not None and options:
-        raise ConfigError(f"give a film or its fields, not both: {', '.join(options)}.")
-    film = film or Film(**options)  # type: ignore[arg-type]
+    film = given(Film, film, changes)
     out = Path(run) / "renders" / film.file_name() if out is None else Path(out)
     ours = out.parent == Path(run) / "renders"
     _check_output(film, out, events_out, ours=ours)
@@ -101,7 +101,7 @@ def _write(
     shots = scene.shots
     names = [shot.name for shot in shots]
     if film.show == "events":
-        settings = film.sensor or SensorSettings()
+        settings = PRESETS[film.sensor]
         store = simulate_film(kept, shots, settings)
         if events_out is not None:
             copy_events(store, events_out, shots, settings)

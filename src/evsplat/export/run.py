@@ -2,7 +2,7 @@
 
 import logging
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError, DataError
@@ -11,8 +11,6 @@ from evsplat.export.clip import export_clip
 from evsplat.export.cloud import cloud_of
 from evsplat.export.gaussians import (
     ALWAYS_Y_UP,
-    FileKind,
-    UpAxis,
     cloud_at,
     facts_of,
     file_rotation,
@@ -21,13 +19,14 @@ from evsplat.export.gaussians import (
     splat_source,
     write_file,
 )
-from evsplat.methods.reconstruction import Parts
+from evsplat.options import ExportOptions
+from evsplat.options.declare import given
+from evsplat.options.export import FileKind, Kind
 from evsplat.training.run import Run, load_run
 
 logger = logging.getLogger(__name__)
 
-Kind = Literal[FileKind, "html", "avatar"]
-_SUFFIXES: dict[str, tuple[str, ...]] = {
+_SUFFIXES: dict[Kind, tuple[str, ...]] = {
     "ply": (".ply",),
     "spz": (".spz",),
     "splat": (".splat",),
@@ -39,21 +38,9 @@ _SUFFIXES: dict[str, tuple[str, ...]] = {
 
 
 def export_run(
-    run: Path | str,
-    kind: Kind,
-    *,
-    out: Path | str | None = None,
-    time_s: float | None = None,
-    frame: str | None = None,
-    canonical: bool = False,
-    parts: Parts | None = None,
-    camera: str | None = None,
-    up: UpAxis | None = None,
-    motion: str | None = None,
-    fps: float = 24.0,
-    device: str = "auto",
+    run: Path | str, kind: Kind, options: ExportOptions | None = None, **changes: Any
 ) -> Path:
-    """Write a run as ``kind`` and return the file.
+    """Write a run as ``kind`` and return the file; ``changes`` are fields of `ExportOptions`.
 
     ``ply``, ``spz``, ``splat`` and ``gltf`` hold the Gaussians of one instant: ``time_s`` (seconds
     from the first mid-exposure) or the mid-exposure of ``frame``, else the middle of the recording;
@@ -71,52 +58,38 @@ def export_run(
     """
     if kind not in _SUFFIXES:
         raise ConfigError(f"{kind}: unknown format; choose one of {', '.join(_SUFFIXES)}.")
-    moving = kind in ("html", "avatar")
-    _refuse(moving and (time_s is not None or frame is not None), kind, "--time and --frame")
-    _refuse(moving and canonical, kind, "--canonical")
-    _refuse(moving and up is not None, kind, "--up")
-    _refuse(kind != "avatar" and motion is not None, kind, "--motion")
-    if canonical and (time_s is not None or frame is not None):
-        raise ConfigError(
-            "--canonical is the person at rest, at no time; leave out --time, --frame."
-        )
-    if parts == "scene" and (canonical or kind == "avatar"):
-        raise ConfigError("--parts scene: the scene has no rest pose and no skeleton; use human.")
-    target = _checked(out, kind)
-    loaded = load_run(Path(run), device=device)
+    options = given(ExportOptions, options, changes)
+    parts, camera = options.parts, options.camera
+    _check_use(kind, options)
+    target = _checked(options.out, kind)
+    loaded = load_run(Path(run), device=options.device)
     folder = loaded.path / "exports"
     if kind == "avatar":
-        return export_avatar(loaded, target or folder / "avatar", parts or "human", camera, motion)
+        page = target or folder / "avatar"
+        return export_avatar(loaded, page, parts or "human", camera, options.motion)
     if kind == "html":
-        return export_clip(loaded, target or folder / "clip.html", parts or "all", camera, fps)
-    return _export_instant(loaded, kind, target, time_s, frame, canonical, parts, camera, up)
+        page = target or folder / "clip.html"
+        return export_clip(loaded, page, parts or "all", camera, options.fps)
+    return _export_instant(loaded, kind, target, options)
 
 
-def _export_instant(
-    run: Run,
-    kind: FileKind,
-    target: Path | None,
-    time_s: float | None,
-    frame: str | None,
-    canonical: bool,
-    parts: Parts | None,
-    camera: str | None,
-    up: UpAxis | None,
-) -> Path:
-    capture = run.capture
+def _export_instant(run: Run, kind: FileKind, target: Path | None, options: ExportOptions) -> Path:
+    capture, parts = run.capture, options.parts
     facts = facts_of(run)
-    if canonical:
-        gaussians = at_rest(run, camera)
+    if options.canonical:
+        gaussians = at_rest(run, options.camera)
         cloud = cloud_of(gaussians.at_rest())
-        rotation = file_rotation(rest_track(gaussians.body), kind, up)
+        rotation = file_rotation(rest_track(gaussians.body), kind, options.up)
         label, when = (
             "canonical",
             "at rest, colours as their mean over the training frames, without known light",
         )
         facts |= {"pose": "canonical"}
     else:
-        rotation = file_rotation(load_body_track(capture), kind, up)
-        instant = instant_of(capture, time_s=time_s, frame=frame, camera=camera)
+        rotation = file_rotation(load_body_track(capture), kind, options.up)
+        instant = instant_of(
+            capture, time_s=options.time_s, frame=options.frame, camera=options.camera
+        )
         cloud = cloud_at(splat_source(run), instant, parts or "all")
         which = "" if parts in (None, "all") else f"{parts}-"
         label = f"{which}{instant.label}"
@@ -126,7 +99,7 @@ def _export_instant(
         target = run.path / "exports" / f"{label}{_SUFFIXES[kind][0]}"
     write_file(target, kind, cloud, rotation, facts)
     people = int((cloud.semantic > 0.5).sum())
-    upright = "y" if kind in ALWAYS_Y_UP else up
+    upright = "y" if kind in ALWAYS_Y_UP else options.up
     logger.info(
         "%d Gaussians (person %d, scene %d) %s; metres, %s.",
         len(cloud),
@@ -138,12 +111,23 @@ def _export_instant(
     return target
 
 
-def _refuse(given: bool, kind: str, options: str) -> None:
-    if given:
-        raise ConfigError(f"{options}: format {kind} has no use for it; leave it out.")
+def _check_use(kind: Kind, options: ExportOptions) -> None:
+    """Refuse options that a format has no use for."""
+    moving = kind in ("html", "avatar")
+    unused = {
+        "--time and --frame": moving and (options.time_s, options.frame) != (None, None),
+        "--canonical": moving and options.canonical,
+        "--up": moving and options.up is not None,
+        "--motion": kind != "avatar" and options.motion is not None,
+    }
+    for names, given_in_vain in unused.items():
+        if given_in_vain:
+            raise ConfigError(f"{names}: format {kind} has no use for it; leave it out.")
+    if options.parts == "scene" and (options.canonical or kind == "avatar"):
+        raise ConfigError("--parts scene: the scene has no rest pose and no skeleton; use human.")
 
 
-def _checked(out: Path | str | None, kind: str) -> Path | None:
+def _checked(out: Path | str | None, kind: Kind) -> Path | None:
     if out is None:
         return None
     path = Path(out)

@@ -9,10 +9,10 @@ from evsplat.film.camera_path import (
     swing,
     through,
 )
-from evsplat.film.film import Film
 from evsplat.film.looks import SHOWN, Look
 from evsplat.film.motion import load_motion_of, place_motion
 from evsplat.film.scene import Scene, rendered_instants
+from evsplat.options import Film
 
 __all__ = [
     "PATHS",

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -11,10 +11,10 @@ from jaxtyping import Float, UInt16
 from evsplat.capture import Camera
 from evsplat.errors import ConfigError
 from evsplat.methods.reconstruction import Parts, Reconstruction, WithDepth
+from evsplat.options.film import Shown
 from evsplat.pictures import decode, encode, luminance
 from evsplat.pictures.colours import colours
 
-Shown = Literal["rgb", "semantic", "depth", "events"]
 SHOWN: tuple[Shown, ...] = get_args(Shown)
 
 Exposure = np.ndarray

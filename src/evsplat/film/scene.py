@@ -19,11 +19,11 @@ from evsplat.film.camera_path import (
     read_camera_path,
     swing,
 )
-from evsplat.film.film import Film
 from evsplat.film.kept import Shot
 from evsplat.film.motion import load_motion_of
 from evsplat.methods.reconstruction import Posable, Reconstruction
 from evsplat.methods.trivial import nearest_in_time
+from evsplat.options import Film
 
 _HELD_SECONDS = 4.0
 

@@ -1,7 +1,7 @@
 """Turning other people's data sets, and your own recording, into captures."""
 
 import logging
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from evsplat.importers.neuman import Neuman
 from evsplat.importers.people_snapshot import PeopleSnapshot
 from evsplat.importers.zju_mocap import ZjuMocap
 from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
+from evsplat.options.declare import given
 
 __all__ = ["KINDS", "Blur", "Importer", "import_capture", "run_importer"]
 
@@ -70,13 +71,8 @@ def import_capture(
     if kind not in KINDS:
         near = get_close_matches(kind, KINDS, 1, cutoff=0.0)[0]
         raise ConfigError(f"{kind!r} is no kind of source; did you mean {near!r}?")
-    known = [field.name for field in fields(KINDS[kind])]
-    for name in options:
-        if name not in known:
-            near = get_close_matches(name, known, 1, cutoff=0.0)[0]
-            raise ConfigError(f"{name!r} is no option of {kind}; did you mean {near!r}?")
     chosen = (Blur() if blur else None) if isinstance(blur, bool) else blur
-    importer = KINDS[kind](**options)
+    importer = given(KINDS[kind], None, options)
     return run_importer(importer, source, out, smpl=smpl, overwrite=overwrite, blur=chosen)
 
 

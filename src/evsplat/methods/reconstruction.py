@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -10,9 +10,8 @@ from torch import Tensor
 from evsplat.body import BodyTrack
 from evsplat.camera import Camera
 from evsplat.models.at_rest import SkinnedGaussians
+from evsplat.options.declare import Parts
 from evsplat.render import Splats
-
-Parts = Literal["all", "human", "scene"]
 
 
 @dataclass(frozen=True, eq=False)

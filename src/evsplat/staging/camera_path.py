@@ -1,7 +1,5 @@
 """Where the camera is, at every instant: on a tripod, on an arc round the person, or in a hand."""
 
-from typing import Literal
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -9,8 +7,7 @@ from numpy.typing import ArrayLike
 
 from evsplat.body import axis_angle_to_matrix
 from evsplat.camera import Camera
-
-CameraMotion = Literal["static", "orbit", "handheld"]
+from evsplat.options.stage import CameraMotion
 
 TARGET = (0.0, 0.0, 0.98)
 """What every camera looks at: the middle of a standing person, metres."""

@@ -1,6 +1,6 @@
 """From sharp footage to captures: blur by averaging in linear light, events by simulation."""
 
+from evsplat.options import RECIPES, SynthesisSettings
 from evsplat.synthesis.pipeline import synthesize
-from evsplat.synthesis.settings import RECIPES, SynthesisSettings, synthesis_settings
 
-__all__ = ["RECIPES", "SynthesisSettings", "synthesis_settings", "synthesize"]
+__all__ = ["RECIPES", "SynthesisSettings", "synthesize"]

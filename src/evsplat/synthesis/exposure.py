@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from evsplat.errors import ConfigError
-from evsplat.synthesis.settings import DEFAULT_DUTY, SynthesisSettings
+from evsplat.options import SynthesisSettings
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,8 @@ def _length_us(settings: SynthesisSettings, period_us: float, spacing_us: float)
         return settings.exposure_us
     if settings.subframes is not None:
         return settings.subframes * spacing_us
-    return (DEFAULT_DUTY if settings.duty is None else settings.duty) * period_us
+    assert settings.duty is not None
+    return settings.duty * period_us
 
 
 def _spaced(

@@ -3,6 +3,7 @@
 import functools
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +15,23 @@ from tqdm import tqdm
 import evsplat
 from evsplat.capture import CaptureWriter
 from evsplat.errors import ConfigError, DataError
-from evsplat.events import simulate_events
+from evsplat.events import SensorSettings, sensor_settings, simulate_events
 from evsplat.footage import TimedPicture, open_footage
+from evsplat.options import SynthesisSettings
+from evsplat.options.declare import given
 from evsplat.pictures.light import Transfer, decode, encode
 from evsplat.synthesis.capture_source import CaptureSource
 from evsplat.synthesis.exposure import Exposure, ExposureMean, Plan, plan_exposures
 from evsplat.synthesis.footage_source import FootageSource
 from evsplat.synthesis.interpolate import Interpolator, Picture
-from evsplat.synthesis.settings import SynthesisSettings, synthesis_settings
 from evsplat.synthesis.source import RecordedEvents, Source
 
 
 def synthesize(
     source: Path | str,
     out: Path | str,
+    settings: SynthesisSettings | None = None,
     *,
-    recipe: str | None = None,
     source_fps: float | None = None,
     body: Path | str | None = None,
     camera: Path | str | None = None,
@@ -47,14 +49,14 @@ def synthesize(
     Args:
         source: Video file, folder of pictures, or a capture whose frames are sharp.
         out: New capture folder.
-        recipe: A name of `RECIPES`.
+        settings: How frames and events are made.
         source_fps: Rate at which footage was shot; needed for a folder of pictures.
         body: body.npz on the clock of the footage (a capture has its own).
         camera: JSON file with one camera as in capture.json (a capture has its own).
         weights: Super SloMo's checkpoint.
         overwrite: Replace a capture at ``out``.
         progress: Show a progress bar.
-        changes: Fields of `SynthesisSettings` that differ from the recipe.
+        changes: Fields of ``settings`` to change, such as ``recipe="mmhpsd-blur"``.
 
     Returns:
         ``out``.
@@ -64,7 +66,7 @@ def synthesize(
         DataError: a source that cannot be read, or ``out`` exists.
         WeightsError, BackendError: the interpolation asked for cannot run.
     """
-    settings = synthesis_settings(recipe, **changes)
+    settings = given(SynthesisSettings, settings, changes)
     source, out = Path(source), Path(out)
     opened = _open(source, source_fps, body, camera)
     interpolator = _interpolator(settings, weights)
@@ -78,7 +80,7 @@ def synthesize(
         subframes = making.subframes(progress)
         events = recorded
         if settings.events == "simulate":
-            sensor = settings.sensor_settings
+            sensor = _sensor(settings)
             events = RecordedEvents(
                 simulate_events(subframes, sensor, settings.seed),
                 (sensor.contrast_on, sensor.contrast_off),
@@ -95,7 +97,7 @@ def synthesize(
                 simulated=events.simulated,
             )
         opened.complete(writer, making.frames)
-        writer.provenance |= _provenance(opened, settings, plan, recipe, interpolator)
+        writer.provenance |= _provenance(opened, settings, plan, interpolator)
     return out
 
 
@@ -201,6 +203,12 @@ def _interpolator(settings: SynthesisSettings, weights: Path | str | None) -> In
     return FlowInterpolator()
 
 
+def _sensor(settings: SynthesisSettings) -> SensorSettings:
+    """The simulated sensor."""
+    contrast = settings.contrast
+    return sensor_settings(settings.sensor, contrast_on=contrast, contrast_off=contrast)
+
+
 def _picture(pixels: np.ndarray, transfer: Transfer) -> Picture:
     coded = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
     return Picture(coded, np.atleast_3d(_light_of_values(pixels.dtype, transfer)[pixels]))
@@ -217,7 +225,6 @@ def _provenance(
     source: Source,
     settings: SynthesisSettings,
     plan: Plan,
-    recipe: str | None,
     interpolator: Interpolator | None,
 ) -> dict[str, Any]:
     """Every parameter, so that the capture can be made again."""
@@ -235,10 +242,9 @@ def _provenance(
         f"picture, {kind}); {events}",
         "synthesis": {
             "evsplat": evsplat.__version__,
-            "recipe": recipe,
-            **settings.to_dict(),
+            **asdict(settings),
             "exposure_us": exposure_us,
-            "sensor_settings": settings.sensor_settings.to_dict(),
+            "sensor_settings": _sensor(settings).to_dict(),
             "interpolation_weights_sha256": getattr(interpolator, "sha256", None),
         },
         "source": source.describe(),

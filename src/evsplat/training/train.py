@@ -5,8 +5,9 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -14,13 +15,14 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from evsplat.capture import load_capture
-from evsplat.capture.policy import Use
+from evsplat.capture import Capture, load_capture
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
 from evsplat.errors import ConfigError, DataError
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, Purpose, method_config
 from evsplat.methods.settings import Weight
+from evsplat.options import TrainOptions
+from evsplat.options.declare import given
 from evsplat.render import choose_device
 from evsplat.training.checkpoint import (
     check_fits,
@@ -54,105 +56,107 @@ class Stopped(KeyboardInterrupt):
         self.run = run
 
 
+@dataclass(frozen=True)
+class _Start:
+    """What a training begins with."""
+
+    folder: RunFolder
+    method: str
+    settings: MethodConfig
+    seed: int
+    checkpoint: Path | None
+    """Of a training that goes on."""
+
+
 def train(
     capture_path: Path | str,
+    options: TrainOptions | None = None,
     *,
-    method: str | None = None,
-    out: Path | str | None = None,
-    device: str = "auto",
-    iterations: int | None = None,
-    max_minutes: float | None = None,
-    resume: bool = False,
-    config: Path | str | None = None,
-    overrides: Sequence[str] = (),
-    use: Use | None = None,
-    threads: int | None = None,
-    seed: int | None = None,
-    device_memory_gb: float | None = None,
     on_start: Callable[[Path], None] | None = None,
+    **changes: Any,
 ) -> Path:
-    """Train ``method`` on a capture and return the run folder.
+    """Train a method on a capture and return the run folder.
 
-    Without ``method`` it is that of ``config``, or else `evsplat.methods.DEFAULT_METHOD`.
-    ``iterations`` scales every schedule. ``max_minutes`` stops gracefully; without ``iterations``
-    it also shortens the schedule so that it is finished in time. The cheap fits before the first
-    step count as training. ``resume`` goes on from the last
-    checkpoint in ``out``. ``config`` is a run's config.yaml; ``overrides`` are ``key=value``
-    settings over it; ``use="everything"`` is short for ``policy.use=everything``: all frames train
-    and none is held out. ``device_memory_gb`` bounds the pictures and event maps kept on a GPU (a
-    quarter of its free memory by default); the rest is copied ahead of its use. ``on_start`` is
-    called with the run folder before the first step. Raises `Stopped` on Ctrl-C after saving.
+    ``changes`` are fields of `TrainOptions`: ``train("my_capture", max_minutes=10)``. Without
+    ``iterations`` the schedule is shortened to be finished within ``max_minutes``. The cheap fits
+    before the first step count as training. ``use="everything"`` is short for the setting
+    ``policy.use=everything``. ``on_start`` is called with the run folder before the first step.
+
+    Raises:
+        Stopped: Ctrl-C; the step is finished and saved.
+        ConfigError: An option or a setting is unknown or out of range, or ``out`` is not empty.
+        DataError: The capture, or the run to go on with, is not what it should be.
     """
-    device = choose_device(device)
-    if iterations is not None and iterations < 1:
-        raise ConfigError(f"--iterations {iterations}: expected at least 1.")
-    if max_minutes is not None and max_minutes <= 0:
-        raise ConfigError(f"--max-minutes {max_minutes:g}: expected a time above 0.")
-    if device_memory_gb is not None and device_memory_gb < 0:
-        raise ConfigError(f"--device-memory-gb {device_memory_gb:g}: expected 0 or more.")
-    if threads is not None:
-        if threads < 1:
-            raise ConfigError(f"--threads {threads}: expected at least 1.")
-        torch.set_num_threads(threads)
+    options = given(TrainOptions, options, changes)
+    device = choose_device(options.device)
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
     capture = load_capture(Path(capture_path))
-    if resume:
-        if out is None:
-            raise ConfigError("--resume needs --out RUN, the run to go on with.")
-        if config is not None or overrides or seed is not None or use is not None:
-            raise ConfigError(
-                "--resume takes the run's own settings; leave out --config, --set, --seed and "
-                "--use."
-            )
-        folder = RunFolder(Path(out))
-        method, settings, facts = read_config(folder)
-        seed = int(facts["seed"])
-    else:
-        where = str(config) if config is not None else "--set"
-        values = load_yaml(config) if config is not None else {}
-        named = values.pop("method", None)
-        method = method or named or DEFAULT_METHOD
-        folder = RunFolder(Path(out)) if out is not None else new_run_folder(capture, method)
-        if folder.path.exists() and any(folder.path.iterdir()):
-            raise ConfigError(
-                f"{folder.path}: the folder is not empty; pass --resume to go on with that run, "
-                "or another --out."
-            )
-        values = override(values, overrides)
-        if use is not None:
-            values.setdefault("policy", {})["use"] = use
-        settings = method_config(method, values, where=where)
-        seed = 0 if seed is None else seed
-
-    checkpoint = latest_checkpoint(folder.checkpoints) if resume else None
+    start = _resumed(options) if options.resume else _new(capture, options)
+    iterations, max_minutes = options.iterations, options.max_minutes
     started = time.perf_counter()
-    seen = seen_by_training(capture, settings)
-    purpose: Purpose = "train" if checkpoint is None else "resume"
-    composition = TRAINABLE[method].build(settings, seen, seed, device=device, purpose=purpose)
+    seen = seen_by_training(capture, start.settings)
+    purpose: Purpose = "train" if start.checkpoint is None else "resume"
+    composition = TRAINABLE[start.method].build(
+        start.settings, seen, start.seed, device=device, purpose=purpose
+    )
     clock = Clock(
-        iterations or settings.iterations,
+        iterations or start.settings.iterations,
         None if max_minutes is None else 60 * max_minutes,
         shrink=max_minutes is not None and iterations is None,
         seconds=time.perf_counter() - started,
     )
-    cache_bytes = None if device_memory_gb is None else int(1e9 * device_memory_gb)
+    cache_gb = options.device_memory_gb
+    cache_bytes = None if cache_gb is None else int(1e9 * cache_gb)
     trainer = Trainer(composition, composition.capture or seen, clock, cache_bytes=cache_bytes)
-    if checkpoint is not None:
-        tensors, state = load_checkpoint(checkpoint)
-        check_fits(trainer.model, tensors, checkpoint)
+    folder = start.folder
+    if start.checkpoint is not None:
+        tensors, state = load_checkpoint(start.checkpoint)
+        check_fits(trainer.model, tensors, start.checkpoint)
         trainer.load_state(tensors, state)
         if iterations is None and max_minutes is None:
             clock.iterations = state["clock"]["iterations"]
         folder.truncate_log(clock.iteration)
     else:
         folder.path.mkdir(parents=True, exist_ok=True)
-        save_yaml(folder.config, settings, method=method)
-        write_facts(folder, capture, method, device, seed)
-        logger.info("%s", schedule_table(settings, composition.weights))
+        save_yaml(folder.config, start.settings, method=start.method)
+        write_facts(folder, capture, start.method, device, start.seed)
+        logger.info("%s", schedule_table(start.settings, composition.weights))
         logger.info("%s", seen.terms.sentence)
     if on_start is not None:
         on_start(folder.path)
     _loop(trainer, folder)
     return folder.path
+
+
+def _resumed(options: TrainOptions) -> _Start:
+    """The run of ``options.out`` at its last checkpoint, with its own settings."""
+    assert options.out is not None
+    folder = RunFolder(Path(options.out))
+    method, settings, facts = read_config(folder)
+    seed = int(facts["seed"])
+    return _Start(folder, method, settings, seed, latest_checkpoint(folder.checkpoints))
+
+
+def _new(capture: Capture, options: TrainOptions) -> _Start:
+    """A new run with the settings that are asked for."""
+    config = options.config
+    values = {} if config is None else load_yaml(config)
+    named = values.pop("method", None)
+    method = options.method or named or DEFAULT_METHOD
+    out = options.out
+    folder = new_run_folder(capture, method) if out is None else RunFolder(Path(out))
+    if folder.path.exists() and any(folder.path.iterdir()):
+        raise ConfigError(
+            f"{folder.path}: the folder is not empty; pass --resume to go on with that run, or "
+            "another --out."
+        )
+    values = override(values, options.overrides)
+    if options.use is not None:
+        values.setdefault("policy", {})["use"] = options.use
+    where = "--set" if config is None else str(config)
+    settings = method_config(method, values, where=where)
+    return _Start(folder, method, settings, options.seed or 0, None)
 
 
 def schedule_table(settings: MethodConfig, weights: dict[str, Weight]) -> str:

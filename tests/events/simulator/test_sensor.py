@@ -140,11 +140,11 @@ def test_pictures_that_cannot_be_used_leave_the_sensor_as_it_was() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"contrast_on": 0.0}, "contrast_on 0: expected a number, at least 0.01"),
-        ({"contrast_off": float("nan")}, "contrast_off nan"),
-        ({"shot_hz": -1.0}, "shot_hz -1: expected a number, at least 0"),
-        ({"hot_pixel_fraction": 1.5}, "at most 1"),
-        ({"response": "gamma"}, "expected 'log' or 'lin-log'"),
+        ({"contrast_on": 0.0}, "contrast_on is 0.0; expected a number of at least 0.01"),
+        ({"contrast_off": float("nan")}, "contrast_off is nan"),
+        ({"shot_hz": -1.0}, "shot_hz is -1.0; expected a number of at least 0"),
+        ({"hot_pixel_fraction": 1.5}, "within 0 and 1"),
+        ({"response": "gamma"}, "expected one of log, lin-log"),
     ],
 )
 def test_settings_out_of_range_are_refused(changes: dict, message: str) -> None:

@@ -7,7 +7,8 @@ from importlib import import_module
 from pathlib import Path
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.events.formats.base import Damage, ReadOptions, Source, is_gzipped, peek
+from evsplat.events.formats.base import Damage, Source, is_gzipped, peek
+from evsplat.options import ReadOptions
 
 _HEAD_BYTES = 4096
 

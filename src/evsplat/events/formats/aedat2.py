@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import ByteReader, Damage, RawEvents, ReadOptions, Source
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
+from evsplat.options import ReadOptions
 
 MAGIC = b"#!AER-DAT2.0"
 _CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f]")

@@ -18,10 +18,10 @@ from evsplat.events.formats.base import (
     ByteReader,
     Damage,
     RawEvents,
-    ReadOptions,
     RecordedFrame,
     Source,
 )
+from evsplat.options import ReadOptions
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 _MAX_HEADER_BYTES = 16 << 20

@@ -5,7 +5,7 @@ import os
 import re
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,17 +43,6 @@ class RecordedFrame:
     """(H, W) grey or (H, W, 3) RGB, uint8."""
     exposure_us: tuple[int, int]
     """Start and end of the exposure on the clock of the events."""
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """The caller's statements about a recording; None where the file decides."""
-
-    width: int | None = None
-    height: int | None = None
-    repair: bool = False
-    columns: tuple[str, ...] | Mapping[str, str] | None = None
-    time_unit: str | None = None
 
 
 class Source(ABC):

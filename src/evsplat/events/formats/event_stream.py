@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import ByteReader, Damage, RawEvents, ReadOptions, Source
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
 from evsplat.events.formats.words import WordDecoder
+from evsplat.options import ReadOptions
 
 MAGIC = b"Event Stream"
 _KINDS = {1: "es_dvs", 2: "es_atis"}

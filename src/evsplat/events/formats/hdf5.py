@@ -17,11 +17,11 @@ from evsplat.events.formats.base import (
     BLOCK_EVENTS,
     Damage,
     RawEvents,
-    ReadOptions,
     Source,
     broken_as_data_error,
 )
 from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
+from evsplat.options import ReadOptions
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _PLACES = ("events", "CD/events", "/")

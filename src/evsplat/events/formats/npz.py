@@ -12,11 +12,11 @@ from evsplat.events.formats.base import (
     BLOCK_EVENTS,
     Damage,
     RawEvents,
-    ReadOptions,
     Source,
     broken_as_data_error,
 )
 from evsplat.events.formats.table import Table, match_names, table_order
+from evsplat.options import ReadOptions
 
 _READ_BYTES = 1 << 22
 # Deflate packs at most 1032 to 1.

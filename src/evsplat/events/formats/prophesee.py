@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import ByteReader, Damage, RawEvents, ReadOptions, Source
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
 from evsplat.events.formats.words import WordDecoder
+from evsplat.options import ReadOptions
 
 _MAX_HEADER_LINES = 1000
 _MAX_LINE_BYTES = 4096

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import Damage, RawEvents, ReadOptions, Source, peek
+from evsplat.events.formats.base import Damage, RawEvents, Source, peek
 from evsplat.events.formats.words import WordDecoder
+from evsplat.options import ReadOptions
 
 ROS1_MAGIC = b"#ROSBAG V2.0"
 _ARRAY_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import RawEvents, ReadOptions
+from evsplat.events.formats.base import RawEvents
+from evsplat.options import ReadOptions
 
 NAMES = {
     "t": ("t", "ts", "time", "times", "timestamp", "timestamps", "tE"),

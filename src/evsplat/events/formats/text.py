@@ -7,7 +7,7 @@ import numpy as np
 
 from evsplat import compiled
 from evsplat.errors import BackendError, DataError
-from evsplat.events.formats.base import ByteReader, Damage, RawEvents, ReadOptions, Source
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
 from evsplat.events.formats.table import (
     NO_POLARITY,
     guess_time_unit,
@@ -16,6 +16,7 @@ from evsplat.events.formats.table import (
     to_polarity,
 )
 from evsplat.events.formats.text_layout import MAX_LINE_BYTES, inspect_text
+from evsplat.options import ReadOptions
 
 _READ_BYTES = 1 << 22
 _MIN_LINE_BYTES = 6

@@ -1,0 +1,287 @@
+"""Verbs that make captures and event recordings, or look at them; ``import`` is in `import_`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional
+
+from evsplat.errors import ConfigError, DataError
+from evsplat.options import ReadOptions, StageSettings, SynthesisSettings
+from evsplat.options.declare import (
+    FLAT,
+    CaptureFolder,
+    Device,
+    Flag,
+    Sensor,
+    Threads,
+    Transfer,
+    Use,
+    option,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert:
+    """Read any event recording and write it as HDF5, .npz, .csv or EVT 2 (.raw).
+
+    What is read: docs/event-formats.md.
+    """
+
+    recording: Annotated[Positional[Path], option("IN")]
+    """AEDAT4, AEDAT2, RAW, DAT, HDF5, .npz, text, .es or a ROS bag."""
+    out: Annotated[Positional[Path], option("OUT")]
+    """The file to write."""
+    from_zero: Flag = False
+    """Let the first event be at 0."""
+    to: Annotated[
+        Literal["hdf5", "npz", "csv", "evt2"] | None, option("FORMAT", default="by OUT's suffix")
+    ] = None
+    """Format to write."""
+    reading: Annotated[ReadOptions, FLAT]
+
+    def __call__(self) -> None:
+        from evsplat.events.convert import convert_recording
+
+        conversion = convert_recording(
+            self.recording, self.out, self.reading, from_zero=self.from_zero, to=self.to
+        )
+        print(conversion.summary)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Write the events that an event camera would have sent, seeing a video."""
+
+    source: Annotated[Positional[Path], option("SOURCE")]
+    """A video, or a folder of pictures in the order of their names;
+    200 a second or more, as light is taken to change evenly between two."""
+    out: Annotated[Path, option("FILE")]
+    """Event file to write, such as events.h5."""
+    preset: Sensor = "clean"
+    """Event camera; clean has no noise (docs/simulator.md)."""
+    contrast: Annotated[float | None, option("C", default="the preset's")] = None
+    """Threshold of both polarities, in natural logarithm of light."""
+    overrides: Annotated[
+        tuple[str, ...], option("[KEY=VALUE ...]", default="none", name="set")
+    ] = ()
+    """Sensor settings to change, such as shot_hz=5 or contrast_off=0.3."""
+    source_fps: Annotated[float | None, option("HZ", default="the video's own")] = None
+    """Rate at which the pictures were taken; a folder needs it."""
+    transfer: Transfer = "power"
+    """From coded values to light: exponent 2.2, sRGB's curve, or as they are."""
+    seed: int = 0
+    """Seed of everything random in the sensor."""
+
+    def __call__(self) -> None:
+        from evsplat.config import from_dict, override, to_dict
+        from evsplat.events import SensorSettings, sensor_settings
+        from evsplat.footage.simulate import simulate
+
+        preset = sensor_settings(self.preset, contrast_on=self.contrast, contrast_off=self.contrast)
+        values = override(to_dict(preset), self.overrides)
+        count = simulate(
+            self.source,
+            self.out,
+            settings=from_dict(SensorSettings, values, where="--set"),
+            fps=self.source_fps,
+            transfer=self.transfer,
+            seed=self.seed,
+        )
+        print(f"written: {self.out} ({count:,} events)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthesize:
+    """Make a capture of sharp footage: blur and events (docs/synthesize.md)."""
+
+    source: Annotated[Positional[Path], option("SOURCE")]
+    """Video, folder of pictures, or capture with sharp frames."""
+    out: Annotated[Path, option("CAPTURE")]
+    """New capture folder."""
+    settings: Annotated[SynthesisSettings, FLAT]
+    weights: Annotated[Path | None, option("FILE", default="in torch's hub")] = None
+    """Super SloMo's checkpoint."""
+    source_fps: Annotated[float | None, option("HZ", default="the video's")] = None
+    """Rate of shooting."""
+    body: Annotated[Path | None, option("NPZ", default="none")] = None
+    """Poses as in body.npz."""
+    camera: Annotated[Path | None, option("JSON", default="a nominal one")] = None
+    """Camera as in capture.json."""
+    overwrite: Flag = False
+    """Replace a capture at CAPTURE."""
+
+    def __call__(self) -> None:
+        from evsplat.synthesis import synthesize
+
+        path = synthesize(
+            self.source,
+            self.out,
+            self.settings,
+            weights=self.weights,
+            source_fps=self.source_fps,
+            body=self.body,
+            camera=self.camera,
+            overwrite=self.overwrite,
+        )
+        print(f"written: {path}\nlook at it with: evsplat inspect {path}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """Film a synthetic person in a room, with complete ground truth.
+
+    Blur and events are made from at least 1000 pictures per second.
+    """
+
+    out: Annotated[Positional[Path | None], option("CAPTURE", default="")] = None
+    """New capture folder."""
+    settings: Annotated[StageSettings, FLAT]
+    threads: Threads = None
+    list: Flag = False
+    """Say which characters and motions ship."""
+
+    def __call__(self) -> None:
+        from evsplat import staging
+
+        if self.list:
+            print(f"characters: {', '.join(staging.characters())}")
+            print(f"motions: {', '.join(staging.motions())}")
+        elif self.out is None:
+            raise ConfigError("stage needs a folder for the capture: evsplat stage my_capture.")
+        else:
+            print(f"capture: {staging.stage(self.out, self.settings, threads=self.threads)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspect:
+    """Validate a capture, or look into an event recording; sum it up and draw it.
+
+    Draws frames, events, posed body, time and clocks, where there are any.
+    """
+
+    capture: Annotated[Positional[Path], option("CAPTURE")]
+    """Capture folder (docs/capture-format.md), or an event file of any format."""
+    out: Annotated[Path | None, option("FOLDER", default="inspect/CAPTURE")] = None
+    """Folder for the pictures."""
+    repair: Flag = False
+    """Read on where an event file is damaged."""
+
+    def __call__(self) -> None:
+        from evsplat.inspection import inspect
+
+        out = self.out or Path("inspect") / self.capture.resolve().name
+        report = inspect(self.capture, out, repair=self.repair)
+        if not report.usable:
+            raise DataError(report.summary)
+        print(report.summary)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Masks:
+    """Find the person in each frame: soft masks for baselines and evaluation.
+
+    Training of this project's own methods needs none.
+    """
+
+    capture: CaptureFolder
+    out: Annotated[Path | None, option("FOLDER", default="CAPTURE-masked")] = None
+    """The new capture, with these masks in place of any it had."""
+    in_place: Flag = False
+    """Add the masks to the capture itself, if it has no others."""
+    method: Annotated[Literal["background", "silhouette", "rvm"], option(name="with")] = (
+        "background"
+    )
+    """Difference to a static background, posed body, or RobustVideoMatting."""
+    threshold: Annotated[float | None, option("T", default="from the noise")] = None
+    """For background: least difference, 0 to 1."""
+    margin: Annotated[float | None, option("PIXELS", default="0")] = None
+    """For silhouette: widen the body for clothes and hair."""
+    weights: Annotated[Path | None, option("FILE", default="EVSPLAT_RVM, or torch's cache")] = None
+    """For rvm: the network's TorchScript file, which you bring."""
+    use: Use = "training"
+    """What masks of training frames are made from; everything looks at held-out ones too."""
+
+    def __call__(self) -> None:
+        from evsplat.capture import Policy
+        from evsplat.masks import mask_capture
+
+        options: dict[str, Any] = {}
+        for name, keyword, owner in (
+            ("threshold", "threshold", "background"),
+            ("margin", "margin_px", "silhouette"),
+            ("weights", "weights", "rvm"),
+        ):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if owner != self.method:
+                raise ConfigError(
+                    f"--{name} belongs to --with {owner}, not to {self.method}; leave it out."
+                )
+            options[keyword] = value
+        if self.in_place and self.out is not None:
+            raise ConfigError("give --out or --in-place, not both.")
+        out = None if self.in_place else self.out or _beside(self.capture, "masked")
+        policy = Policy(use=self.use)
+        written = mask_capture(self.capture, out, method=self.method, policy=policy, **options)
+        print(f"written: {written}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Restore:
+    """Write a new capture whose frames are sharp at mid-exposure.
+
+    For methods that do not model blur. All but the frames stays as it is.
+    """
+
+    capture: CaptureFolder
+    out: Annotated[Path | None, option("FOLDER", default="CAPTURE-NAME")] = None
+    """The new capture."""
+    method: Annotated[
+        Literal["edi", "nafnet", "mprnet", "efnet", "d2net", "e2vid", "pienet"],
+        option("NAME", name="with"),
+    ] = "edi"
+    """edi (event double integral), or a network: of pictures (nafnet, mprnet), of events (e2vid,
+    pienet) or of both (efnet, d2net); docs/restore.md."""
+    contrast_threshold: Annotated[
+        tuple[float, float] | None, option("C+ C-", default="the capture's, or estimated")
+    ] = None
+    """For edi: log-intensity change per brighter and darker event."""
+    weights: Annotated[Path | None, option("FILE", default="EVSPLAT_NAME, or torch's cache")] = None
+    """For networks but pienet: the published checkpoint, which you bring."""
+    device: Device = "auto"
+    """For networks: where they run."""
+    use: Use = "training"
+    """What training frames are restored from; everything looks at held-out frames too."""
+
+    def __call__(self) -> None:
+        from evsplat.capture import Policy
+        from evsplat.restore import restore_capture
+
+        is_network = self.method != "edi"
+        options: dict[str, Any] = {}
+        for name, fits in (
+            ("contrast_threshold", not is_network),
+            ("weights", is_network and self.method != "pienet"),
+            ("device", is_network),
+        ):
+            value = getattr(self, name)
+            if value is None or (value == "auto" and not fits):
+                continue
+            if not fits:
+                raise ConfigError(
+                    f"--{name.replace('_', '-')} means nothing to --with {self.method}; "
+                    "leave it out."
+                )
+            options[name] = value
+        out = self.out or _beside(self.capture, self.method)
+        policy = Policy(use=self.use)
+        written = restore_capture(self.capture, out, method=self.method, policy=policy, **options)
+        print(f"written: {written}")
+
+
+def _beside(capture: Path, ending: str) -> Path:
+    """Folder beside a capture, named after it."""
+    folder = capture.resolve()
+    return folder.with_name(f"{folder.name}-{ending}")

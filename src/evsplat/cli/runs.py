@@ -1,0 +1,223 @@
+"""Verbs that make runs, measure them and show them."""
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from evsplat.cli.summary import print_summary
+from evsplat.options import BenchOptions, ExportOptions, Film, TrainOptions
+from evsplat.options.declare import (
+    FLAT,
+    CaptureFolder,
+    Device,
+    Flag,
+    NewRun,
+    Port,
+    RunFolder,
+    Threads,
+    option,
+)
+from evsplat.options.export import Kind
+from evsplat.shipped import demo_capture
+
+
+def demo(
+    *,
+    out: NewRun = None,
+    max_minutes: Annotated[
+        float, option("M", "Minutes of training; evaluation and report come on top.")
+    ] = 6.0,
+    device: Annotated[Device, option(help="Where to compute.")] = "auto",
+    threads: Threads = None,
+) -> None:
+    """Train on the packaged capture, evaluate it and write a report.
+
+    A synthetic dancer, 72 ms of blur per frame, with events and ground truth.
+    """
+    options = TrainOptions(out=out, max_minutes=max_minutes, device=device, threads=threads)
+    Train(capture=demo_capture(), options=options)()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Print every setting of a method with its meaning, range and default.
+
+    This is a configuration: change it for 'evsplat train CAPTURE --config FILE'.
+    """
+
+    method: Annotated[str | None, option("NAME", default="evsplat")] = None
+    """Name of the method."""
+
+    def __call__(self) -> None:
+        from evsplat.config_docs import explained_yaml
+        from evsplat.methods import DEFAULT_METHOD, method_config
+
+        method = self.method or DEFAULT_METHOD
+        print(explained_yaml(method_config(method, {}, where="defaults"), method=method), end="")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a method on a capture, then evaluate it and write report.html.
+
+    Ctrl-C finishes the step, saves a checkpoint and says how to resume.
+    """
+
+    capture: CaptureFolder
+    options: Annotated[TrainOptions, FLAT]
+    evaluate: Flag = True
+    """Skip the evaluation and the report at the end."""
+    view: Flag = False
+    """Show the run in the browser while it is trained, and afterwards until Ctrl-C."""
+    port: Port = 8080
+
+    def __call__(self) -> None:
+        from evsplat.cli.viewer_process import ViewerProcess
+        from evsplat.training import Stopped, train
+
+        viewer = ViewerProcess(self.port) if self.view else None
+        try:
+            run = train(self.capture, self.options, on_start=viewer.start if viewer else None)
+            if self.evaluate:
+                self._evaluate(run)
+            else:
+                print(f"run: {run}")
+            if viewer:
+                viewer.wait()
+        except Stopped as stop:
+            again = ["evsplat", "train", str(self.capture), "--out", str(stop.run), "--resume"]
+            raise KeyboardInterrupt(f"Stopped and saved. Go on with: {shlex.join(again)}") from None
+        finally:
+            if viewer:
+                viewer.close()
+
+    def _evaluate(self, run: Path) -> None:
+        try:
+            Evaluate(run=run, device=self.options.device)()
+        except KeyboardInterrupt:
+            command = shlex.join(["evsplat", "evaluate", str(run)])
+            raise KeyboardInterrupt(
+                f"Stopped; the training is finished and saved. Go on with: {command}"
+            ) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Measure a run on its test frames: metrics.json, tables, pictures, report.html."""
+
+    run: RunFolder
+    lpips_weights: Annotated[Path | None, option("FILE", default="torch hub cache")] = None
+    """Backbone weights for LPIPS; without any it stays empty, with the reason."""
+    device: Device = "auto"
+    """Where to draw and compare."""
+
+    def __call__(self) -> None:
+        from evsplat.evaluation.run import evaluate_run, write_report
+
+        metrics = evaluate_run(self.run, lpips_weights=self.lpips_weights, device=self.device)
+        print_summary(metrics, run=self.run, report=write_report(self.run))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write report.html of an evaluated run again."""
+
+    run: Annotated[Positional[Path], option("RUN")]
+    """Run folder with metrics.json (made by 'evsplat evaluate')."""
+
+    def __call__(self) -> None:
+        from evsplat.evaluation.run import write_report
+
+        print(f"report: {write_report(self.run)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Film a run, the recording or another motion, as video or pictures.
+
+    When stopped, the same command goes on where it was. More: docs/render.md.
+    """
+
+    run: RunFolder
+    film: Annotated[Film, FLAT]
+    events: Annotated[Path | None, option("FILE", default="no")] = None
+    """Write its events as well, such as to events.h5."""
+    out: Annotated[Path | None, option("PATH", default="in RUN/renders")] = None
+    """NAME.mp4, .webp or .gif, or a new folder for PNG."""
+    device: Device = "auto"
+    """Where to draw."""
+
+    def __call__(self) -> None:
+        from evsplat.export import render_run
+
+        written = render_run(
+            self.run, self.film, out=self.out, events_out=self.events, device=self.device
+        )
+        print(f"written: {written}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Show a run in the browser: any time, any viewpoint, beside its input or another."""
+
+    run: RunFolder
+    other: Annotated[Positional[Path | None], option("RUN2", default="no comparison")] = None
+    """A second run of the same capture to compare with."""
+    port: Port = 8080
+    host: Annotated[str, option("ADDRESS", default="127.0.0.1, this machine alone")] = "127.0.0.1"
+    """Which network to listen at; 0.0.0.0 lets other machines in."""
+    device: Device = "auto"
+    """Where to draw."""
+
+    def __call__(self) -> None:
+        from evsplat.view import view_run
+
+        view_run(self.run, self.other, port=self.port, host=self.host, device=self.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a run as a file for other programs, in metres: docs/export.md.
+
+    ply, spz, splat and gltf hold the Gaussians of one instant.
+
+    html is a page that plays the recording in 3D.
+
+    avatar is a page with a person to play and to pose.
+    """
+
+    run: RunFolder
+    kind: Annotated[Positional[Kind], option("KIND")]
+    """ply, spz, splat, gltf, html or avatar."""
+    options: Annotated[ExportOptions, FLAT]
+
+    def __call__(self) -> None:
+        from evsplat.export import export_run
+
+        print(f"written: {export_run(self.run, self.kind, self.options)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Run a suite of captures x methods x seeds; write tables and a page.
+
+    What is finished stays; the same command goes on after Ctrl-C, a crash or kill.
+    """
+
+    suite: Annotated[Positional[str], option("SUITE")]
+    """ablation, mmhpsd-blur, stage, zju-mocap-blur or a YAML file (docs/bench.md)."""
+    options: Annotated[BenchOptions, FLAT]
+
+    def __call__(self) -> None:
+        from evsplat.benching.run import Stopped, bench
+
+        try:
+            folder = bench(self.suite, self.options)
+        except Stopped as stop:
+            command = shlex.join(["evsplat", *sys.argv[1:]])
+            raise KeyboardInterrupt(f"{stop} Go on with: {command}") from None
+        print(f"tables: {folder / 'tables.md'}\npage:   {folder / 'index.html'}")

@@ -1,0 +1,106 @@
+"""How options are declared, made of what a caller gives, and checked."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+import tyro
+
+from evsplat.config import AtLeast, Range, expected
+from evsplat.errors import ConfigError
+
+Options = TypeVar("Options")
+
+FLAT = tyro.conf.arg(name="")
+"""Marks a parameter of a verb whose fields are the options themselves."""
+
+
+def option(
+    metavar: str | None = None,
+    help: str | None = None,
+    *,
+    default: str | None = None,
+    name: str | None = None,
+    alias: str | None = None,
+    read_as: Any = None,
+) -> Any:
+    """Annotation of an option: its placeholder, help and, in words, what happens without it.
+
+    ``name`` and ``alias`` are what it is called on the command line where that is not the field,
+    ``read_as`` the type of what stands there.
+    """
+
+    def hint(value: str) -> str:
+        shown = value.removesuffix(".0") if default is None else default
+        return shown and f"(default: {shown})"
+
+    return tyro.conf.arg(
+        name=name,
+        metavar=metavar,
+        help=help,
+        help_behavior_hint=hint,
+        aliases=None if alias is None else (alias,),
+        constructor=read_as,
+    )
+
+
+Flag = Annotated[bool, option(default="")]
+CaptureFolder = Annotated[
+    tyro.conf.Positional[Path], option("CAPTURE", "Capture folder (docs/capture-format.md).")
+]
+RunFolder = Annotated[
+    tyro.conf.Positional[Path], option("RUN", "Run folder written by 'evsplat train'.")
+]
+Port = Annotated[int, option("PORT", "Where to listen.", default="8080, or the next free one")]
+Threads = Annotated[int | None, AtLeast(1), option("N", "CPU threads.", default="all cores")]
+NewRun = Annotated[
+    Path | None, option("RUN", "Folder of the run.", default="runs/CAPTURE/METHOD/TIME")
+]
+Device = Literal["auto", "cpu", "cuda"]
+Use = Literal["training", "everything"]
+Parts = Literal["all", "human", "scene"]
+Sensor = Literal["clean", "davis346", "dvxplorer", "evk4"]
+Transfer = Literal["power", "srgb", "linear"]
+"""The same as `evsplat.pictures.Transfer`, which loads torch."""
+
+
+def given(kind: type[Options], options: Options | None, changes: Mapping[str, Any]) -> Options:
+    """``options``, or the defaults of ``kind``, with some fields changed.
+
+    Raises:
+        ConfigError: No field has that name (the nearest is named), or a value is out of range.
+    """
+    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    for name in changes:
+        if name not in known:
+            near = get_close_matches(name, known, 1, cutoff=0.0)[0]
+            raise ConfigError(f"{name}: no such option; did you mean {near}?")
+    return kind(**changes) if options is None else replace(options, **changes)  # type: ignore[type-var]
+
+
+def check_options(options: Any) -> None:
+    """Raise a `ConfigError` that names the first option out of its range or choices."""
+    kind = type(options)
+    plain, marked = get_type_hints(kind), get_type_hints(kind, include_extras=True)
+    for name, hint in plain.items():
+        value, marks = getattr(options, name), getattr(marked[name], "__metadata__", ())
+        if value is None:
+            continue
+        choices = [word for part in (hint, *get_args(hint)) for word in _words(part)]
+        ranges = [mark for mark in marks if isinstance(mark, Range)]
+        fits = not choices or value in choices
+        if isinstance(value, float) and not math.isfinite(value):
+            fits = False
+        if not fits or not all(value in allowed for allowed in ranges):
+            said = next((mark.name for mark in marks if getattr(mark, "name", None)), name)
+            shown = f"{value:g}" if isinstance(value, float) else value
+            wanted = expected(marked[name]).removesuffix(" or null")
+            raise ConfigError(f"--{said.replace('_', '-')} {shown}: expected {wanted}.")
+
+
+def _words(hint: Any) -> tuple[Any, ...]:
+    """Choices of a ``Literal``; nothing of another type."""
+    return get_args(hint) if get_origin(hint) is Literal else ()

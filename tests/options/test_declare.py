@@ -1,0 +1,93 @@
+"""Options of the verbs: checked where they are made, named as on the command line."""
+
+import subprocess
+import sys
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal
+
+import pytest
+import tyro
+
+from evsplat import options
+from evsplat.config import AtLeast
+from evsplat.errors import ConfigError
+from evsplat.options.declare import FLAT, Flag, check_options, given, option
+
+CLASSES = [kind for name, kind in vars(options).items() if name[0].isupper() and name != "RECIPES"]
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A lamp."""
+
+    watts: Annotated[float, AtLeast(1), option("W")] = 40.0
+    """Power."""
+    count: Annotated[int | None, AtLeast(1), option("N", default="as many as fit")] = None
+    """Number of bulbs."""
+    colour: Literal["warm", "cold"] = "warm"
+    """Colour."""
+    turn_deg: Annotated[float, option("DEG", name="turn", alias="--yaw")] = 0.0
+    """Turn."""
+    dimmed: Flag = False
+    """Dim it."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"watts": 0.5}, "--watts 0.5: expected a number of at least 1."),
+        ({"watts": float("nan")}, "--watts nan"),
+        ({"count": 0}, "--count 0: expected an integer of at least 1."),
+        ({"colour": "blue"}, "--colour blue: expected one of warm, cold."),
+        ({"turn_deg": float("inf")}, "--turn inf"),
+        ({"wats": 3}, "wats: no such option; did you mean watts?"),
+    ],
+)
+@pytest.mark.parametrize("start", [None, Lamp(watts=60)])
+def test_bad_values_are_one_sentence_with_the_options_name(changes, message, start):
+    with pytest.raises(ConfigError) as raised:
+        given(Lamp, start, changes)
+    assert message in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_changes_are_made_to_what_is_given_or_to_the_defaults():
+    assert given(Lamp, None, {"count": 3}) == Lamp(count=3)
+    assert given(Lamp, Lamp(watts=60), {"count": 3}) == Lamp(watts=60, count=3)
+
+
+def test_a_verb_gets_them_as_one_value_under_their_names(capsys):
+    def verb(*, lamp: Annotated[Lamp, FLAT]) -> Lamp:
+        return lamp
+
+    words = "--watts 60 --yaw 3 --dimmed --colour cold".split()
+    assert tyro.cli(verb, args=words) == Lamp(60, None, "cold", 3, True)
+    assert tyro.cli(verb, args=["--turn", "3"]) == Lamp(turn_deg=3)
+    with pytest.raises(SystemExit):
+        tyro.cli(verb, args=["--help"])
+    text = capsys.readouterr().out
+    assert "Power. (default: 40)" in text and "(default: as many as fit)" in text
+
+
+@pytest.mark.parametrize("kind", CLASSES, ids=lambda kind: kind.__name__)
+def test_defaults_are_in_range(kind):
+    assert fields(kind()) and kind() == given(kind, None, {})
+
+
+def test_options_load_no_torch():
+    probe = "import sys, evsplat.options; print('torch' in sys.modules, 'numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
+    assert done.stdout == "False False\n", done.stderr
+
+
+def test_a_recipe_fills_in_what_is_not_given():
+    recipe = options.SynthesisSettings(recipe="mmhpsd-blur", interpolation="flow", subframes=5)
+    assert (recipe.interpolation, recipe.duty, recipe.contrast) == ("flow", None, 0.2)
+    assert options.SynthesisSettings().duty == 0.75
+
+
+def test_a_picture_of_one_side_is_square():
+    assert options.StageSettings(width=96).size == (96, 96)
+    assert options.StageSettings(width=96, height=64).size == (96, 64)
