@@ -254,3 +254,41 @@ def test_pose_residuals_of_a_spline_turn_joints_about_their_own_axes(tiny_captur
         mean = curve(1e-6 * np.array(frames)).mean(0)
         found.append(unit * (curve(1e-6 * np.array(times)) - mean))
     assert_posed(model, times, *found)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_random_points_take_their_colours_from_a_network_that_sees_the_direction(
+    tiny_capture, seed
+):
+    torch.manual_seed(seed)
+    cube = ("scene.kind=random_cube", "scene.cube_count=800")
+    model, capture, times, center = model_of(tiny_capture(), *cube)
+    with torch.no_grad():
+        model.gaussians.features.normal_()
+    frame = capture.train_frames[0]
+    whole = model.at(times, center)
+    rows = model.gaussians.features[model.gaussians.human, :3].sigmoid()
+    assert model.shading is not None and whole.human.channels.shape[:2] == (2, len(rows))
+    assert not torch.allclose(whole.scene.channels, model.at(times, center + 1).scene.channels)
+    # A step may leave rows out of view black, but none that the picture shows.
+    hidden, black = set(), 0
+    for draw_seed in range(8):
+        model.nominal.zero_()  # the person as at the start
+        generator = torch.Generator().manual_seed(draw_seed)
+        camera = capture.camera(frame)
+        step = model.training_drawing(times, frame, camera, generator)
+        scene = step.layers.scene.channels[0, :, 3:6]
+        drawn = step.output.static_radii[0] > 0
+        assert (scene[drawn] > 0).all()
+        black = max(black, int((scene == 0).all(-1).sum()))
+        known = torch.allclose(scene[drawn], whole.scene.channels[0, drawn, :3], atol=1e-5)
+        hidden.add(not known)
+    assert black > 100
+    assert hidden == {True, False}  # the direction is shown in some steps and hidden in others
+    sum(picture.square().mean() for picture in step.rgb).backward()
+    silent = [
+        name
+        for name, value in model.scene_colour.named_parameters()
+        if value.numel() and (value.grad is None or not value.grad.any())
+    ]
+    assert silent == []
