@@ -230,7 +230,7 @@ def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, An
         key, equals, text = assignment.partition("=")
         if not equals or not key:
             raise ConfigError(
-                f"--set {assignment}: expected KEY=VALUE, such as --set event.start=1000."
+                f"--set {assignment}: expected KEY=VALUE, such as --set event_start=1000."
             )
         try:
             value = _parse_yaml(text)

@@ -29,7 +29,7 @@ class TrainOptions:
     overrides: Annotated[
         tuple[str, ...], option("[KEY=VALUE ...]", default="none", name="set")
     ] = ()
-    """Settings to change, such as event.weight=0.2; see docs/settings.md."""
+    """Settings to change, such as event_weight=0.2; see docs/settings.md."""
     threads: Threads = None
     device_memory_gb: Annotated[
         float | None, AtLeast(0), option("GB", default="a quarter of the free")
