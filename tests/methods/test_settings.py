@@ -186,7 +186,7 @@ FORMER = {
 """Settings that a config.yaml of the version before had and a method has no more."""
 
 
-@pytest.mark.parametrize("method", TRAINABLE)
+@pytest.mark.parametrize("method", FORMER)
 def test_every_setting_of_the_version_before_says_what_became_of_it(method):
     names = f"{FORMER_BODY} {FORMER[method]}".split()
     for name in names:
@@ -198,7 +198,7 @@ def test_every_setting_of_the_version_before_says_what_became_of_it(method):
         assert "unknown setting" not in said and "\n" not in said
 
 
-@pytest.mark.parametrize("method", TRAINABLE)
+@pytest.mark.parametrize("method", FORMER)
 def test_what_a_setting_was_renamed_to_is_there(method):
     kind = TRAINABLE[method].config
     there = {setting.name for setting in settings(kind())}
@@ -206,7 +206,7 @@ def test_what_a_setting_was_renamed_to_is_there(method):
     assert {word.removeprefix("renamed to ") for word in words} <= there
 
 
-@pytest.mark.parametrize("method", TRAINABLE)
+@pytest.mark.parametrize("method", FORMER)
 def test_a_configuration_of_the_version_before_is_refused(method):
     old: dict[str, Any] = {"optimisation": {"iterations": 15_000, "rates": {"means": 3e-4}}}
     told = ["optimisation.iterations: renamed to iterations"]
