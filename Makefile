@@ -19,7 +19,7 @@ view: $(STAMP)
 	$(BIN)/evsplat view "$(RUN)" $(VIEW_OPTIONS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest $(TEST_OPTIONS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(TEST_OPTIONS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

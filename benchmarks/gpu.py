@@ -151,7 +151,7 @@ class Bench:
         """A training step of method `paper` with everything on, at two sizes."""
         found: Results = {}
         for name, human, scene, renders in (("2", 20_000, 30_000, 2), ("5", 20_000, 30_000, 5)):
-            trainer = build_on(capture, human, scene, renders, self.device)
+            trainer = build_on(capture, human, scene, renders, device=self.device)
             found[f"step_{name}_renders_ms"] = self._timed(trainer.step, repeats=30, warm_up=10)
         return found
 

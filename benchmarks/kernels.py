@@ -2,7 +2,7 @@
 
 python benchmarks/kernels.py [--points N] [--size PX] [--threads T] [--repeats R]
 
-All but the search are forward and backward. `benchmarks/deform.py` times the networks' layers,
+All but the search are forward and backward. `benchmarks/networks.py` times the networks' layers,
 `benchmarks/rasterize.py` the rasteriser. The last line is JSON with a unit in each key.
 """
 
@@ -21,7 +21,8 @@ from scipy.spatial import cKDTree
 
 from evsplat import body
 from evsplat.body import body as skin_module
-from evsplat.deform import colour, encodings, non_rigid, shading, skinning_network
+from evsplat.models.discs import shading
+from evsplat.models.networks import colour, non_rigid, one_blob, skinning_network
 from evsplat.neighbours import nearest
 from evsplat.objectives import event, isometry, semantic
 from evsplat.pictures import light
@@ -99,10 +100,10 @@ def picture_cases(size: int) -> dict[str, tuple[Call, Call]]:
 
 
 def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
-    """What lies before and behind the networks' layers, which `benchmarks/deform.py` times."""
+    """What lies before and behind the networks' layers, which `benchmarks/networks.py` times."""
     times = 2
     positions = torch.rand(points, 3).requires_grad_()
-    blob = encodings.OneBlobEncoding()
+    blob = one_blob.OneBlobEncoding()
     blob_upstream = torch.randn(points, blob.dim)
     softmax = skinning_network.HierarchicalSoftmax(body.default_body().parents.tolist())
     logits = torch.randn(points, softmax.logits).requires_grad_()
@@ -112,7 +113,7 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
     world, feature = torch.randn(times, points, 3), torch.randn(times, points, 16)
     feature.requires_grad_()
 
-    def one_blob() -> None:
+    def encode() -> None:
         torch.autograd.grad(blob(positions), positions, blob_upstream)
 
     def tree_softmax() -> None:
@@ -128,7 +129,7 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
 
     joints = softmax(logits).shape[-1]
     return {
-        "one_blob": (one_blob, in_torch(one_blob, encodings)),
+        "one_blob": (encode, in_torch(encode, one_blob)),
         "skinning_softmax": (tree_softmax, in_torch(tree_softmax, skinning_network)),
         "shape_change": (change_shape, in_torch(change_shape, non_rigid)),
         "view_basis": (view_basis, in_torch(view_basis, colour)),

@@ -62,7 +62,7 @@ def make_scene(size_px: int, count: int, channels: int, seed: int = 0) -> Scene:
     camera = SimpleNamespace(width=size_px, height=size_px, K=K, world_to_camera=torch.eye(4))
     splats = Splats(
         means=means[None],
-        quats=torch.randn(count, 4, generator=generator),
+        quaternions=torch.randn(count, 4, generator=generator),
         scales=scales,
         opacities=uniform(count, low=0.1, high=0.9),
         channels=uniform(1, count, channels),
@@ -98,7 +98,7 @@ def measure(scene: Scene, backend: str, repeats: int) -> tuple[Timing, Timing]:
     """Forward and forward+backward (to every input and the camera)."""
     fields = {
         name: getattr(scene.splats, name).clone().requires_grad_()
-        for name in ("means", "quats", "scales", "opacities", "channels")
+        for name in ("means", "quaternions", "scales", "opacities", "channels")
     }
     pose = scene.camera.world_to_camera.clone().requires_grad_()
     camera = SimpleNamespace(
@@ -123,7 +123,15 @@ def native_job(scene: Scene) -> _native.Render:
     s, camera = scene.splats, scene.camera
     size = (camera.height, camera.width)
     channels = s.channels.shape[-1]
-    fields = [s.means, s.quats[None], s.scales[None], s.opacities[None], s.channels, None, None]
+    fields = [
+        s.means,
+        s.quaternions[None],
+        s.scales[None],
+        s.opacities[None],
+        s.channels,
+        None,
+        None,
+    ]
     job = _native.Render(
         camera.width, camera.height, camera.K, camera.world_to_camera, 0.01, LOW_PASS, fields, [],
         None, 1, torch.get_num_threads(),
@@ -144,7 +152,7 @@ def stages(scene: Scene, repeats: int) -> tuple[dict[str, float], int]:
     for _ in range(repeats + 2):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
         job = native_job(scene)
-        fields = (s.means, s.quats[None], s.scales[None], s.opacities[None], s.channels)
+        fields = (s.means, s.quaternions[None], s.scales[None], s.opacities[None], s.channels)
         grads = [*map(torch.zeros_like, fields), None, None]
         job.backward(scene.image_grad, scene.alpha_grad, grads, [], torch.zeros(12), None)
         faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
@@ -220,7 +228,7 @@ def many_times(scene: TwoLayers, repeats: int) -> dict[str, float]:
 
         timing = timed(both, repeats)
         alpha = render(moving, scene.camera, static=fixed, low_pass=scene.low_pass).alpha
-        steps = alpha.grad_fn.job.patch_steps  # type: ignore[union-attr]
+        steps = alpha.grad_fn.kept.patch_steps  # type: ignore[union-attr]
         print(f"  {name}: {timing}, {steps} patch steps")
         return timing.best, steps
 

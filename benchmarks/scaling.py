@@ -25,8 +25,8 @@ import torch
 from rasterize import make_scene, person_over_scene, timed, with_gradient
 from step import build_on
 
-from evsplat.shipped import demo_capture
 from evsplat.render import Splats, render
+from evsplat.shipped import demo_capture
 
 CURVES = {
     "gaussians": (10_000, 30_000, 100_000, 300_000, 1_000_000),
@@ -76,7 +76,7 @@ def measure(curve: str, value: int) -> float:
     if curve == "recording":
         with tempfile.TemporaryDirectory() as folder:
             trainer = build_on(repeated_demo(value, Path(folder)), None, None, 2)
-            for frame in trainer.capture.frames:
+            for frame in trainer.capture.train_frames:
                 trainer.capture.image(frame)
             return timed(trainer.step, 40).median
     static: Splats | None = None

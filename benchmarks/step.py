@@ -1,6 +1,6 @@
-"""Where the time of a whole training step goes, method `paper`.
+"""Where the time of a whole training step goes.
 
-python benchmarks/step.py [--size PX] [--human N] [--scene N] [--renders T]
+python benchmarks/step.py [--method evsplat|paper] [--size PX] [--human N] [--scene N] [--renders T]
 
 Each part's forward time is that of its calls, its backward time that of the gradient nodes that
 its forward pass made; the stages of `render` are timed inside the native module. "rest" is what no
@@ -34,9 +34,13 @@ from torch import Tensor
 
 from evsplat import _native
 from evsplat.capture import Frame, load_capture
-from evsplat.deform import drawing, human_scene
-from evsplat.gaussians import ATTRIBUTES, GaussianSet
-from evsplat.methods import PaperConfig, compose
+from evsplat.gaussians import GaussianSet
+from evsplat.methods import TRAINABLE
+from evsplat.models import drawing
+from evsplat.models.discs import DiscModel
+from evsplat.models.discs import model as discs_model
+from evsplat.models.networks.mlp import PointMLP
+from evsplat.models.paper import model as paper_model
 from evsplat.objectives.base import Stateless, Step
 from evsplat.render import native as native_backend
 from evsplat.shipped import demo_capture
@@ -47,31 +51,36 @@ from evsplat.training.trainer import Trainer
 def main() -> None:
     """Print the table and one line of JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--method", choices=("evsplat", "paper"), default="evsplat")
     parser.add_argument("--size", type=int, default=512, help="image side, px")
     parser.add_argument("--human", type=int, default=20_000)
     parser.add_argument("--scene", type=int, default=30_000)
-    parser.add_argument("--renders", type=int, default=2, help="times per step")
-    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32")
+    parser.add_argument(
+        "--renders",
+        type=int,
+        help="of paper: times per step, 2 by default; of evsplat: the most in an exposure",
+    )
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--steps", type=int, default=20)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    trainer = build(
-        arguments.size, arguments.human, arguments.scene, arguments.renders, arguments.precision
-    )
+    folder = tempfile.TemporaryDirectory()
+    capture = resized_demo(arguments.size, Path(folder.name))
+    size = arguments.human, arguments.scene, arguments.renders
+    trainer = build_on(capture, *size, method=arguments.method)
     for _ in range(5):
         trainer.step()
 
     steps = [_timed(trainer.step) for _ in range(arguments.steps)]
     median, best = 1e3 * statistics.median(steps), 1e3 * min(steps)
-    gflop = _products(trainer, arguments.renders) / 1e9
+    renders, gflop = work(trainer, arguments.steps)
     peak = _peak() * arguments.threads
     limit = 1e3 * gflop / peak
     forward, backward, stages = measure(trainer, arguments.steps)
     counts = trainer.counts()
     print(
-        f"step {median:.1f} ms (best {best:.1f}): {arguments.size} px, {counts['human']} person "
-        f"and {counts['scene']} scene Gaussians, {arguments.renders} renders, "
+        f"{arguments.method}: step {median:.1f} ms (best {best:.1f}): {arguments.size} px, "
+        f"{counts['human']} person and {counts['scene']} scene Gaussians, {renders:.1f} renders, "
         f"{arguments.threads} thread(s)"
     )
     print(f"  {'part':22s} {'forward':>8s} {'backward':>8s} ms   share")
@@ -85,12 +94,12 @@ def main() -> None:
     print(f"  matrix products {gflop:.1f} GFLOP: {limit:.1f} ms at {peak:.0f} GFLOP/s")
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     results: dict[str, float | str] = {
+        "method": arguments.method,
         "image_px": arguments.size,
         "human": counts["human"],
         "scene": counts["scene"],
-        "renders": arguments.renders,
+        "renders": round(renders, 1),
         "threads": arguments.threads,
-        "precision": arguments.precision,
         "step_median_ms": round(median, 2),
         "step_best_ms": round(best, 2),
         "products_gflop": round(gflop, 2),
@@ -103,37 +112,32 @@ def main() -> None:
     print(json.dumps(results))
 
 
-    """A training on the demo capture, with pictures of that size."""
-    folder = tempfile.TemporaryDirectory()
-    _KEPT.append(folder)
-    return build_on(resized_demo(size, Path(folder.name)), human, scene, renders, precision)
-
-
 def build_on(
     path: Path,
     human: int | None,
     scene: int | None,
-    renders: int,
+    renders: int | None,
+    *,
+    method: str = "paper",
     device: str = "cpu",
 ) -> Trainer:
     """A training in the middle of its schedule, with everything switched on."""
-    config = PaperConfig()
-    config = dataclasses.replace(
-        config,
-        human=dataclasses.replace(config.human, count=human),
-        deform=dataclasses.replace(config.deform, precision=precision),
-        densify_human=dataclasses.replace(config.densify_human, max_count=human or 10_000),
-    )
+    chosen = TRAINABLE[method]
+    config = chosen.config()
+    config = dataclasses.replace(config, human=dataclasses.replace(config.human, count=human))
+    if human is not None:
+        densify = dataclasses.replace(config.densify, max_human=human)
+        config = dataclasses.replace(config, densify=densify)
+    if method == "evsplat" and renders is not None:
+        config = dataclasses.replace(config, most_renders=renders)
     capture = load_capture(path).for_training(config.policy)
-    composition = compose(config, capture, 0, device=device, fit=False)
-    composition.objectives.append(MoreTimes(renders))
-    composition.weights["more_times"] = 1e-6
+    composition = chosen.build(config, capture, 0, device=device, purpose="resume")
+    if method == "paper" and renders is not None:
+        composition.objectives.append(MoreTimes(renders))
+        composition.weights["more_times"] = 1e-6
     if scene is not None:
         composition.model.gaussians = with_scene_count(composition.model.gaussians, scene)
     return Trainer(composition, capture, Clock(100_000, fraction=0.4))
-
-
-_KEPT: list[tempfile.TemporaryDirectory[str]] = []
 
 
 def resized_demo(size: int, folder: Path) -> Path:
@@ -167,7 +171,7 @@ def with_scene_count(gaussians: GaussianSet, count: int) -> GaussianSet:
             [torch.randperm(scene, generator=generator) for _ in range(-(-count // scene))]
         )[:count]
     )
-    values = {name: getattr(gaussians, name).detach() for name in ATTRIBUTES}
+    values = {name: getattr(gaussians, name).detach() for name in gaussians.attributes}
     return GaussianSet(
         {name: value[human] for name, value in values.items()},
         {name: value[rows] for name, value in values.items()},
@@ -193,20 +197,57 @@ class MoreTimes(Stateless):
         }
 
 
+def work(trainer: Trainer, steps: int) -> tuple[float, float]:
+    """Means per step: rendered times, and the networks' matrix products in GFLOP, both ways."""
+    flop: list[float] = []
+    times: list[int] = []
+    model = trainer.model
+    draw = model.training_drawing
+
+    def counted(times_us: Sequence[int], *rest: Any) -> Any:
+        times.append(len(times_us))
+        return draw(times_us, *rest)
+
+    def count(mlp: PointMLP, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        each = mlp.both_weight.numel() + sum(weight.numel() for weight in mlp.weights)
+        products = len(inputs[0]) * mlp.point_weight.numel() + output[..., 0].numel() * each
+        # The product, its gradient to the inputs and that to the weights, two operations each.
+        flop.append(6.0 * products)
+
+    networks = [module for module in model.modules() if isinstance(module, PointMLP)]
+    hooks = [network.register_forward_hook(count) for network in networks]
+    model.training_drawing = counted
+    for _ in range(steps):
+        trainer.step()
+    del model.training_drawing
+    for hook in hooks:
+        hook.remove()
+    return sum(times) / steps, sum(flop) / steps / 1e9
+
+
 def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], dict[str, float]]:
     """Milliseconds per step: forward and backward by part, and the stages of render."""
     watch = Stopwatch()
     model = trainer.model
     watch.calls(model, "pose", "body pose")
-    watch.calls(model.pose_encoder, "forward", "pose encoder")
-    watch.calls(model.non_rigid.encoding, "forward", "position encoding")
-    watch.calls(model.non_rigid, "forward", "non-rigid network")
-    watch.calls(model.skinning, "forward", "skinning network")
-    watch.calls(human_scene, "skin", "blend skinning")
-    watch.calls(model.human_colour, "forward", "human colour")
-    watch.calls(model.scene_colour, "forward", "scene colour")
-    watch.calls(model, "at", "posing, rest")
+    watch.calls(model.deformation.pose_encoder, "forward", "pose encoder")
+    watch.calls(model.deformation.network.encoding, "forward", "position encoding")
+    watch.calls(model.deformation.network, "forward", "non-rigid network")
+    if isinstance(model, DiscModel):
+        watch.calls(model.surface, "normals", "nearest surface")
+        watch.calls(model.surface, "weights", "nearest surface")
+        watch.calls(discs_model, "skin", "blend skinning")
+        watch.calls(model, "_light", "light")
+        watch.calls(model.shadow, "lit", "shadow on the person")
+        watch.calls(model.shadow, "forward", "shadow on the scene")
+    else:
+        watch.calls(model.skinning, "forward", "skinning network")
+        watch.calls(paper_model, "skin", "blend skinning")
+        watch.calls(model.human_colour, "forward", "human colour")
+        watch.calls(model.scene_colour, "forward", "scene colour")
+    watch.calls(model, "_layers", "posing, rest")
     watch.calls(drawing, "render", "render")
+    watch.calls(model, "training_drawing", "drawing, rest")
     for objective in trainer.composition.objectives:
         watch.calls(objective, "loss", f"loss {type(objective).__name__}")
     watch.calls(trainer.optimiser, "step", "optimiser")
@@ -217,7 +258,7 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
         jobs.append(_native.Render(*inputs))
         return jobs[-1]
 
-    native_backend.native = SimpleNamespace(Render=keep)
+    native_backend.native = SimpleNamespace(Render=keep, rows_in_view=_native.rows_in_view)
     for _ in range(steps):
         trainer.step()
         watch.nodes.clear()
@@ -298,24 +339,6 @@ def _timed(call: Callable[[], object]) -> float:
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
-
-
-def _products(trainer: Trainer, renders: int) -> float:
-    """Floating-point operations of the networks' matrix products, forward and backward."""
-    model, counts = trainer.model, trainer.counts()
-    human, scene = counts["human"], counts["scene"]
-
-    def later(mlp: Any) -> int:
-        return sum(weight.numel() for weight in mlp.weights)
-
-    non_rigid, skinning = model.non_rigid.mlp, model.skinning.mlp
-    colour, backdrop = model.human_colour.mlp, model.scene_colour.mlp
-    rows = human * (non_rigid.point_weight.numel() + renders * later(non_rigid))
-    rows += human * (skinning.point_weight.numel() + later(skinning))
-    rows += human * colour.point_weight.numel()
-    rows += human * renders * (colour.both_weight.numel() + later(colour))
-    rows += scene * (backdrop.point_weight.numel() + later(backdrop))
-    return 6.0 * rows
 
 
 def _peak() -> float:

@@ -152,13 +152,13 @@ struct Sample {
             for (int k = 0; k < kRows; ++k) {
                 const size_t row = t * in.points + rows[k];
                 float by_scales[3];
-                now[k].add_gradient(by_after[k], grads.posed_quats + row * 4, by_scales, grads.transforms + row * 16);
+                now[k].add_gradient(by_after[k], grads.posed_quaternions + row * 4, by_scales, grads.transforms + row * 16);
                 for (int i = 0; i < 3; ++i) grads.posed_scales[row * 3 + i] += by_scales[i];
             }
         }
         for (int k = 0; k < kRows; ++k) {
             float by_scales[3];
-            at_rest[k].add_gradient(by_before[k], grads.quats + rows[k] * 4, by_scales, nullptr);
+            at_rest[k].add_gradient(by_before[k], grads.quaternions + rows[k] * 4, by_scales, nullptr);
             for (int i = 0; i < 3; ++i) grads.scales_log[rows[k] * 3 + i] += by_scales[i] * at_rest[k].scales[i];
         }
         return total;
@@ -172,11 +172,11 @@ struct Sample {
         const size_t row = rows[k];
         const float* log = in.scales_log + row * 3;
         const float scales[3] = {std::exp(log[0]), std::exp(log[1]), std::exp(log[2])};
-        return {in.quats + row * 4, scales, nullptr};
+        return {in.quaternions + row * 4, scales, nullptr};
     }
     Covariance posed(size_t time, int k) const {
         const size_t row = time * in.points + rows[k];
-        return {in.posed_quats + row * 4, in.posed_scales + row * 3, in.transforms + row * 16};
+        return {in.posed_quaternions + row * 4, in.posed_scales + row * 3, in.transforms + row * 16};
     }
 };
 
@@ -208,8 +208,8 @@ IsometryMeans isometry(const IsometryInputs& in, int threads, float* gradients) 
     const Layout layout(in.times);
     const size_t floats = layout.begin[7];
     const float share = float(1.0 / (double(in.samples) * kNeighbours * in.times));
-    const float* arrays[7] = {in.means,       in.quats,        in.scales_log, in.posed_means,
-                              in.posed_quats, in.posed_scales, in.transforms};
+    const float* arrays[7] = {in.means,       in.quaternions,        in.scales_log, in.posed_means,
+                              in.posed_quaternions, in.posed_scales, in.transforms};
     std::vector<IsometryMeans> sums(in.samples);
     constexpr size_t kPiece = 32;
     parallel_for(threads, (in.samples + kPiece - 1) / kPiece, [&](size_t piece) {
@@ -238,8 +238,8 @@ IsometryMeans isometry(const IsometryInputs& in, int threads, float* gradients) 
 void isometry_add(const IsometryInputs& in, const float* gradients, float by_centers, float by_covariances,
                   const IsometryGrads& grads) {
     const Layout layout(in.times);
-    float* arrays[7] = {grads.means,       grads.quats,        grads.scales_log, grads.posed_means,
-                        grads.posed_quats, grads.posed_scales, grads.transforms};
+    float* arrays[7] = {grads.means,       grads.quaternions,        grads.scales_log, grads.posed_means,
+                        grads.posed_quaternions, grads.posed_scales, grads.transforms};
     for (size_t s = 0; s < in.samples; ++s, gradients += layout.begin[7])
         layout.rows(in.rows + s * kRows, in.times, in.points, [&](int a, size_t to, size_t from) {
             const float by = a % 3 == 0 && a < 6 ? by_centers : by_covariances;

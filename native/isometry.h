@@ -13,14 +13,14 @@ constexpr int kNeighbours = 4;
 struct IsometryInputs {
     size_t samples, times, points;
     const int64_t* rows;
-    const float *means, *quats, *scales_log;
-    const float *posed_means, *posed_quats, *posed_scales, *transforms;  // transforms: (T, N, 16)
+    const float *means, *quaternions, *scales_log;
+    const float *posed_means, *posed_quaternions, *posed_scales, *transforms;  // transforms: (T, N, 16)
 };
 
 // Gradients of the two means: `means` of the first, the others of the second.
 struct IsometryGrads {
-    float *means, *quats, *scales_log;
-    float *posed_means, *posed_quats, *posed_scales, *transforms;
+    float *means, *quaternions, *scales_log;
+    float *posed_means, *posed_quaternions, *posed_scales, *transforms;
 };
 
 struct IsometryMeans {

@@ -78,7 +78,7 @@ INLINE void project_lanes(const View& view, const Gaussians& g, uint32_t i, uint
             for (int k = 0; k < 3; ++k) p.b[o][k] = p.a[o][k];
     }
 
-    const float* quat = g.quats + 4 * size_t(i);
+    const float* quat = g.quaternions + 4 * size_t(i);
     F qw = gather<4>(quat, n), qx = gather<4>(quat + 1, n), qy = gather<4>(quat + 2, n), qz = gather<4>(quat + 3, n);
     p.inv_norm = 1.f / sqrt(qw * qw + qx * qx + qy * qy + qz * qz);
     p.qw = qw *= p.inv_norm, p.qx = qx *= p.inv_norm, p.qy = qy *= p.inv_norm, p.qz = qz *= p.inv_norm;
@@ -595,7 +595,7 @@ void project_backward(const View& view, const Gaussians& g, uint32_t begin, uint
     const int stride = slot_stride(channels);
     const float* r = view.r;
     F view_grad[12] = {};
-    const bool geometry = grads.means || grads.quats || grads.scales || grads.opacities || grads.linear ||
+    const bool geometry = grads.means || grads.quaternions || grads.scales || grads.opacities || grads.linear ||
                           grads.offset || grads.view;
     for (uint32_t i = begin; i < end; i += W) {
         const uint32_t n = end - i < uint32_t(W) ? end - i : uint32_t(W);
@@ -666,7 +666,7 @@ void project_backward(const View& view, const Gaussians& g, uint32_t begin, uint
             for (int k = 0; k < 3; ++k)
                 scatter_add(grads.scales + 3 * size_t(i) + k, 3, n, select(drawn, d_scale[k], zero));
 
-        if (grads.quats) {
+        if (grads.quaternions) {
             F d[3][3];
             for (int a = 0; a < 3; ++a)
                 for (int k = 0; k < 3; ++k) d[a][k] = p.b[0][a] * db_r[0][k] + p.b[1][a] * db_r[1][k];
@@ -682,7 +682,7 @@ void project_backward(const View& view, const Gaussians& g, uint32_t begin, uint
             const F along = q[0] * w + q[1] * x + q[2] * y + q[3] * z;
             const F unit[4] = {w, x, y, z};
             for (int k = 0; k < 4; ++k)
-                scatter_add(grads.quats + 4 * size_t(i) + k, 4, n,
+                scatter_add(grads.quaternions + 4 * size_t(i) + k, 4, n,
                             select(drawn, (q[k] - along * unit[k]) * p.inv_norm, zero));
         }
 

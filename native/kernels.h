@@ -32,7 +32,7 @@ struct View {
 
 // The Gaussians of one time. `linear` and `offset` may be null.
 struct Gaussians {
-    const float *means, *quats, *scales, *opacities, *linear, *offset;
+    const float *means, *quaternions, *scales, *opacities, *linear, *offset;
     uint32_t count;
 };
 
@@ -105,7 +105,7 @@ struct PairOfSums {
 
 // Gradients that are added to; each may be null.
 struct GaussianGrads {
-    float *means, *quats, *scales, *opacities, *values, *linear, *offset;
+    float *means, *quaternions, *scales, *opacities, *values, *linear, *offset;
     size_t value_stride;
     float* view;                  // (blocks, 12): rotation row-major, translation; written, not added
 };

@@ -31,7 +31,7 @@ using namespace evsplat;
 namespace {
 
 using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
-using Fields = std::vector<std::optional<In>>;  // means, quats, scales, opacities, channels, linear, offset
+using Fields = std::vector<std::optional<In>>;  // means, quaternions, scales, opacities, channels, linear, offset
 using Strided = nb::ndarray<const float, nb::device::cpu>;
 using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using OutFields = std::vector<std::optional<Out>>;
@@ -53,12 +53,12 @@ size_t step_of(const Array& a, size_t times, size_t count, size_t inner, const c
 }
 
 constexpr size_t kInner[] = {3, 4, 3, 1, 0, 9, 2};  // floats per Gaussian of each field; 0: the channels
-constexpr const char* kFieldNames[] = {"means", "quats", "scales", "opacities", "channels", "linear", "offset"};
+constexpr const char* kFieldNames[] = {"means", "quaternions", "scales", "opacities", "channels", "linear", "offset"};
 constexpr size_t kFields = 7, kMeans = 0, kChannels = 4;
 
 template <class T>
 FieldOf<T>& field_of(LayerOf<T>& l, size_t i) {
-    FieldOf<T>* fields[] = {&l.means, &l.quats, &l.scales, &l.opacities, &l.values, &l.linear, &l.offset};
+    FieldOf<T>* fields[] = {&l.means, &l.quaternions, &l.scales, &l.opacities, &l.values, &l.linear, &l.offset};
     return *fields[i];
 }
 

@@ -139,7 +139,7 @@ void change_shape(const ShapeChange& job, int threads, float* moved, float* scal
                     moved[row * 3 + c] = job.means[i * 3 + c] + by[c];
                     scales[row * 3 + c] = std::exp(job.scales_log[i * 3 + c] + by[3 + c]);
                 }
-                const Unit q(job.quats + i * 4);
+                const Unit q(job.quaternions + i * 4);
                 const float x = by[6], y = by[7], z = by[8];
                 float* r = rotations + row * 4;
                 r[0] = q.w - x * q.x - y * q.y - z * q.z;
@@ -152,11 +152,11 @@ void change_shape(const ShapeChange& job, int threads, float* moved, float* scal
 }
 
 void change_shape_backward(const ShapeChange& job, const float* scales, const ShapeGrad (&above)[4], int threads,
-                           float* changes, float* means, float* scales_log, float* quats) {
+                           float* changes, float* means, float* scales_log, float* quaternions) {
     const size_t rest = job.columns - kShapeChanges;
     in_pieces(job.points, threads, [&](size_t begin, size_t end) {
         for (size_t i = begin; i < end; ++i) {
-            const Unit q(job.quats + i * 4);
+            const Unit q(job.quaternions + i * 4);
             float mean[3] = {}, scale_log[3] = {}, unit[4] = {};
             for (size_t t = 0; t < job.times; ++t) {
                 const size_t row = t * job.points + i;
@@ -185,7 +185,7 @@ void change_shape_backward(const ShapeChange& job, const float* scales, const Sh
             const float along = unit[0] * q.w + unit[1] * q.x + unit[2] * q.y + unit[3] * q.z;
             const float direction[4] = {q.w, q.x, q.y, q.z};
             for (int c = 0; c < 3; ++c) means[i * 3 + c] = mean[c], scales_log[i * 3 + c] = scale_log[c];
-            for (int c = 0; c < 4; ++c) quats[i * 4 + c] = (unit[c] - along * direction[c]) * q.inverse_length;
+            for (int c = 0; c < 4; ++c) quaternions[i * 4 + c] = (unit[c] - along * direction[c]) * q.inverse_length;
         }
     });
 }

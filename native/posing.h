@@ -76,7 +76,7 @@ struct ShapeChange {
     size_t times, points;
     int columns;              // of `changes`: kShapeChanges and the feature
     const float* changes;     // (times, points, columns)
-    const float *means, *scales_log, *quats;  // (points, 3), (points, 3), (points, 4)
+    const float *means, *scales_log, *quaternions;  // (points, 3), (points, 3), (points, 4)
 };
 
 // moved = mean + offset, scale = exp(scale_log + change), rotation = (1, x, y, z) * normalised quat, and a
@@ -91,6 +91,6 @@ struct ShapeGrad {
 
 // Writes the gradients of the inputs; `scales` are the result.
 void change_shape_backward(const ShapeChange&, const float* scales, const ShapeGrad (&above)[4], int threads,
-                           float* changes, float* means, float* scales_log, float* quats);
+                           float* changes, float* means, float* scales_log, float* quaternions);
 
 }  // namespace evsplat

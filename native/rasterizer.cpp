@@ -137,7 +137,7 @@ class Lap {
 };
 
 Gaussians gaussians_at(const Layer& l, size_t t) {
-    return {l.means.at(t), l.quats.at(t), l.scales.at(t), l.opacities.at(t), l.linear.at(t), l.offset.at(t), l.count};
+    return {l.means.at(t), l.quaternions.at(t), l.scales.at(t), l.opacities.at(t), l.linear.at(t), l.offset.at(t), l.count};
 }
 
 // Projects a layer at one time and sorts its intersections into tiles. Gaussian 0 is called `first`.
@@ -468,7 +468,7 @@ void render_backward(const Scene& s, const Record& r, int threads, const OutputG
 
         const auto to_fields = [&](const Layer& layer, const LayerGrads& to, const Binned& d, size_t t) {
             GaussianGrads grads = {};
-            grads.means = to.means.at(t), grads.quats = to.quats.at(t), grads.scales = to.scales.at(t);
+            grads.means = to.means.at(t), grads.quaternions = to.quaternions.at(t), grads.scales = to.scales.at(t);
             grads.opacities = to.opacities.at(t), grads.linear = to.linear.at(t), grads.offset = to.offset.at(t);
             grads.values = to.values.data ? to.values.at(t) + c : nullptr;
             grads.value_stride = s.channels;

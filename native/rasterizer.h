@@ -26,7 +26,7 @@ struct FieldOf {
 
 template <class T>
 struct LayerOf {
-    FieldOf<T> means, quats, scales, opacities, values, linear, offset;
+    FieldOf<T> means, quaternions, scales, opacities, values, linear, offset;
 };
 
 struct Layer : LayerOf<const float> {

@@ -67,7 +67,7 @@ IsometryInputs isometry_inputs(const Index& rows, size_t times, size_t points) {
     return in;
 }
 
-// `arrays`: means, quats, scales_log, posed means, posed quats, posed scales, transforms.
+// `arrays`: means, quaternions, scales_log, posed means, posed quaternions, posed scales, transforms.
 template <class Array>
 void check_isometry(const std::vector<Array>& arrays, size_t times, size_t points) {
     require(arrays.size() == 7, "the arrays");
@@ -83,8 +83,8 @@ std::pair<double, double> py_isometry(Index rows, const std::vector<In>& arrays,
     check_isometry(arrays, times, points);
     IsometryInputs in = isometry_inputs(rows, times, points);
     require(gradients.size() == in.samples * isometry_floats(times), "the gradients");
-    in.means = arrays[0].data(), in.quats = arrays[1].data(), in.scales_log = arrays[2].data();
-    in.posed_means = arrays[3].data(), in.posed_quats = arrays[4].data(), in.posed_scales = arrays[5].data();
+    in.means = arrays[0].data(), in.quaternions = arrays[1].data(), in.scales_log = arrays[2].data();
+    in.posed_means = arrays[3].data(), in.posed_quaternions = arrays[4].data(), in.posed_scales = arrays[5].data();
     in.transforms = arrays[6].data();
     nb::gil_scoped_release release;
     const IsometryMeans means = isometry(in, threads, gradients.data());
@@ -178,17 +178,17 @@ void py_tree_softmax(In given, const std::array<Joints, 4>& tree, std::optional<
     tree_softmax(job, threads);
 }
 
-ShapeChange shape_change(const In& changes, const In& means, const In& scales_log, const In& quats) {
+ShapeChange shape_change(const In& changes, const In& means, const In& scales_log, const In& quaternions) {
     require(changes.ndim() == 3 && changes.shape(2) >= size_t(kShapeChanges), "the changes");
     const size_t points = changes.shape(1);
-    require(means.size() == points * 3 && scales_log.size() == points * 3 && quats.size() == points * 4, "the points");
+    require(means.size() == points * 3 && scales_log.size() == points * 3 && quaternions.size() == points * 4, "the points");
     return {changes.shape(0), points,            int(changes.shape(2)), changes.data(),
-            means.data(),     scales_log.data(), quats.data()};
+            means.data(),     scales_log.data(), quaternions.data()};
 }
 
-void py_change_shape(In changes, In means, In scales_log, In quats, Out moved, Out scales, Out rotations, Out feature,
+void py_change_shape(In changes, In means, In scales_log, In quaternions, Out moved, Out scales, Out rotations, Out feature,
                      int threads) {
-    const ShapeChange job = shape_change(changes, means, scales_log, quats);
+    const ShapeChange job = shape_change(changes, means, scales_log, quaternions);
     const size_t rows = job.times * job.points;
     require(moved.size() == rows * 3 && scales.size() == rows * 3 && rotations.size() == rows * 4 &&
                 feature.size() == rows * (job.columns - kShapeChanges),
@@ -197,14 +197,14 @@ void py_change_shape(In changes, In means, In scales_log, In quats, Out moved, O
     change_shape(job, threads, moved.data(), scales.data(), rotations.data(), feature.data());
 }
 
-void py_change_shape_backward(In changes, In means, In scales_log, In quats, In scales,
+void py_change_shape_backward(In changes, In means, In scales_log, In quaternions, In scales,
                               const std::vector<std::optional<Rows>>& above, Out changes_grad, Out means_grad,
-                              Out scales_grad, Out quats_grad, int threads) {
-    const ShapeChange job = shape_change(changes, means, scales_log, quats);
+                              Out scales_grad, Out quaternions_grad, int threads) {
+    const ShapeChange job = shape_change(changes, means, scales_log, quaternions);
     const size_t width[4] = {3, 3, 4, size_t(job.columns - kShapeChanges)};
     require(scales.size() == job.times * job.points * 3, "the scales");
     require(changes_grad.size() == changes.size() && means_grad.size() == means.size() &&
-                scales_grad.size() == scales_log.size() && quats_grad.size() == quats.size(),
+                scales_grad.size() == scales_log.size() && quaternions_grad.size() == quaternions.size(),
             "the gradients");
     require(above.size() == 4, "the results' gradients");
     ShapeGrad grads[4] = {};
@@ -219,7 +219,7 @@ void py_change_shape_backward(In changes, In means, In scales_log, In quats, In 
     }
     nb::gil_scoped_release release;
     change_shape_backward(job, scales.data(), grads, threads, changes_grad.data(), means_grad.data(),
-                          scales_grad.data(), quats_grad.data());
+                          scales_grad.data(), quaternions_grad.data());
 }
 
 SurfaceLight light_on(const In& transforms, const In& normals, const In& places, const In& coefficients,
@@ -296,9 +296,9 @@ void bind_step(nb::module_& m) {
           nb::arg("intensities"), nb::arg("lit").none(), nb::arg("above"), nb::arg("sums"), nb::arg("lit_grad").none(),
           nb::arg("threads"), "Gradients of coefficients, lamps and intensities in a row, and of the shares.");
     m.def("change_shape", &py_change_shape, nb::arg("changes"), nb::arg("means"), nb::arg("scales_log"),
-          nb::arg("quats"), nb::arg("moved"), nb::arg("scales"), nb::arg("rotations"), nb::arg("feature"),
+          nb::arg("quaternions"), nb::arg("moved"), nb::arg("scales"), nb::arg("rotations"), nb::arg("feature"),
           nb::arg("threads"), "Moves, scales and turns Gaussians by what a network says.");
     m.def("change_shape_backward", &py_change_shape_backward, nb::arg("changes"), nb::arg("means"),
-          nb::arg("scales_log"), nb::arg("quats"), nb::arg("scales"), nb::arg("above"), nb::arg("changes_grad"),
-          nb::arg("means_grad"), nb::arg("scales_grad"), nb::arg("quats_grad"), nb::arg("threads"));
+          nb::arg("scales_log"), nb::arg("quaternions"), nb::arg("scales"), nb::arg("above"), nb::arg("changes_grad"),
+          nb::arg("means_grad"), nb::arg("scales_grad"), nb::arg("quaternions_grad"), nb::arg("threads"));
 }

@@ -11,9 +11,15 @@ import h5py
 import hypothesis
 import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
+# Workers beside each other share the cores; processes that tests start take the same number.
+if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+    torch.set_num_threads(threads)
 # A busy machine is no failure.
 hypothesis.settings.register_profile("evsplat", deadline=None)
 hypothesis.settings.load_profile("evsplat")

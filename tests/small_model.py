@@ -1,11 +1,67 @@
-"""Settings under which a training step takes milliseconds."""
+"""Every method so small that a training step takes milliseconds."""
 
-SMALL_MODEL = (
-    "human.count=120",
-    "scene.prefit_steps=3",
-    "skinning_prefit_steps=3",
-    "deform.width=16",
-    "deform.colour_width=16",
-    "isometry_samples=64",
-    "densify_human.max_count=150",
+from pathlib import Path
+from typing import Any
+
+from evsplat.capture import Capture, load_capture
+from evsplat.config import override
+from evsplat.methods import TRAINABLE, Composition, Purpose, method_config
+
+_PERSON = ("human.count=120", "densify.max_human=150")
+_NETWORKS = (
+    "networks.width=16",
+    "networks.colour_width=16",
+    "terms.skinning_prefit_steps=3",
+    "terms.isometry_samples=64",
 )
+SMALL = {
+    "avatar3dgs": (*_PERSON, *_NETWORKS, "terms.perceptual=none"),
+    "avatar3dgs_semantic": (
+        *_PERSON,
+        "scene.backdrop_stride_px=4",
+        *_NETWORKS,
+        "terms.perceptual=none",
+    ),
+    "evsplat": (*_PERSON, "scene.prefit_steps=3", "width=16"),
+    "hugs": (
+        "human.count=80",
+        "scene.cube_count=600",
+        "channels=8",
+        "resolution=16",
+        "fit_steps=2",
+    ),
+    "paper": (*_PERSON, "scene.prefit_steps=3", *_NETWORKS),
+}
+"""Settings by method."""
+_UNREAD = {
+    "scene.kind=random_cube": ("scene.prefit_steps", "scene.backdrop_stride_px"),
+    "scene.kind=median_backdrop": ("scene.cube_count",),
+}
+
+
+def small(method: str, *settings: str) -> tuple[str, ...]:
+    """Settings of the small ``method`` with others over them, and none that these leave unread."""
+    unread = {name for one in settings for name in _UNREAD.get(one, ())}
+    return (*(one for one in SMALL[method] if one.partition("=")[0] not in unread), *settings)
+
+
+def small_config(method: str, *settings: str) -> Any:
+    """The configuration of the small ``method``."""
+    return method_config(method, override({}, small(method, *settings)), where="test")
+
+
+def built(
+    method: str,
+    capture: Capture | Path,
+    *settings: str,
+    seed: int = 0,
+    device: str = "cpu",
+    purpose: Purpose = "resume",
+) -> Composition:
+    """The small ``method`` put together, by default without the fits before the first step."""
+    if not isinstance(capture, Capture):
+        capture = load_capture(capture)
+    config = small_config(method, *settings)
+    return TRAINABLE[method].build(
+        config, capture.for_training(config.policy), seed, device=device, purpose=purpose
+    )

@@ -25,8 +25,9 @@ from evsplat.config import (
 )
 from evsplat.config_docs import save_yaml
 from evsplat.errors import ConfigError
-from evsplat.methods import TRAINABLE, PaperConfig, method_config
-from evsplat.methods.evsplat import EvsplatConfig
+from evsplat.methods import TRAINABLE, method_config
+from evsplat.methods.avatar3dgs import AvatarConfig
+from evsplat.methods.paper import PaperConfig
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class Lamps:
         ReadIf("lights", "above 0", lambda n: n > 0),
         ReadIf("deform.shading", "true", bool),
     ] = "white"
+    shading: Annotated[float, ReadIf("shading", "above 0", lambda s: s > 0)] = 0.5
     blur: Annotated[float, ReadIf("width", "above 1", lambda w: w > 1)] = 0.0
 
 
@@ -89,6 +91,7 @@ class Method:
     }
 
     pose_start: float = 0.0
+    shading: float = 0.0
     deform: Deform = field(default_factory=lambda: Deform(lamps=Lamps(width=0.2)))
     extra: Annotated[Lamps | None, ReadIf("deform.shading", "true", bool)] = None
     part: Annotated[Lamps, ReadIf("pose_start", "above 0", lambda s: s > 0)] = field(
@@ -163,8 +166,9 @@ def test_a_section_given_in_part_keeps_what_its_owner_set():
 
 
 def test_a_method_keeps_its_parts_when_one_setting_of_them_changes():
-    config = method_config("evsplat", {"deform": {"width": 16}}, where="test")
-    assert config.deform == replace(EvsplatConfig().deform, width=16)
+    config = method_config("avatar3dgs", {"networks": {"width": 16}}, where="test")
+    assert config.networks == replace(AvatarConfig().networks, width=16)
+    assert config.networks.pose_start == 5_000  # which its type alone would not give
 
 
 @pytest.mark.parametrize(
@@ -310,6 +314,11 @@ def test_any_configuration_in_range_survives_yaml(tmp_path_factory, config):
             "deform.lamps.colour is 'red', but nothing reads it unless deform.shading is true; "
             "leave it out or set deform.shading.",
         ),
+        (  # by a setting of the same name at the root
+            {"deform": {"lamps": {"shading": 0.1}}},
+            "deform.lamps.shading is 0.1, but nothing reads it unless shading is above 0; leave it "
+            "out or set shading.",
+        ),
         (  # read only with a setting that is not read itself
             {"deform": {"lamps": {"blur": 1.0}}},
             "deform.lamps.blur is 1.0, but nothing reads it unless deform.lamps.width is above 1; "
@@ -406,3 +415,9 @@ def test_conditions_name_settings_that_there_are(method):
     for setting in every.values():
         for name, condition in setting.conditions:
             assert condition.holds(every[name].value) in (True, False), (setting.name, name)
+        asked, waiting = set(), [setting.name]
+        while waiting:
+            new = {name for name, _ in every[waiting.pop()].conditions} - asked
+            asked |= new
+            waiting += new
+        assert setting.name not in asked

@@ -34,8 +34,8 @@ from evsplat.methods import DEFAULT_METHOD, TRAINABLE  # noqa: E402
 from evsplat.training.run import load_run  # noqa: E402
 from evsplat.training.train import train  # noqa: E402
 
-CONTAINERS = ("PosedHuman", "StaticScene", "PosedGaussians", "SecondCopies", "Splats", "Layers")
-"""Dataclasses that hold Gaussians between a model and the rasteriser, of today or planned."""
+CONTAINERS = ("Splats", "Layers")
+"""Dataclasses that hold Gaussians between a model and the rasteriser."""
 LONGEST_FUNCTION = 80
 TRAINING_STEPS = 8
 
@@ -63,14 +63,25 @@ def circles(*, of_folders: bool) -> list[list[str]]:
 
 
 def homes(method: str) -> list[str]:
-    """Modules that define a method's configuration, its sections and what these inherit."""
-    kinds = {kind for s in settings(TRAINABLE[method].config()) for kind in s.owner.__mro__[:-1]}
-    return sorted({kind.__module__ for kind in kinds})
+    """Modules in which defaults of a method stand: its own, and those of values that have some."""
+    kinds = {setting.owner for setting in settings(TRAINABLE[method].config())}
+    missing = dataclasses.MISSING
+    return sorted(
+        {
+            kind.__module__
+            for kind in kinds
+            for field in dataclasses.fields(kind)
+            if field.default is not missing or field.default_factory is not missing
+        }
+    )
 
 
 def tiny_capture(folder: Path, *, jitter_rad: float) -> Path:
-    """The capture of the tests, its poses jittered."""
+    """The capture of the tests, its poses jittered and its thresholds not those of a guess."""
     path = conftest.write_tiny_capture(folder / f"tiny-{jitter_rad}")
+    metadata = json.loads((path / "capture.json").read_text("utf-8"))
+    metadata["events"]["contrast_threshold"] = [0.31, 0.27]
+    (path / "capture.json").write_text(json.dumps(metadata), "utf-8")
     body = dict(np.load(path / "body.npz"))
     noise = np.random.default_rng(0).normal(0, jitter_rad, body["poses"].shape)
     np.savez(path / "body.npz", **body | {"poses": np.float32(body["poses"] + noise)})
@@ -80,7 +91,7 @@ def tiny_capture(folder: Path, *, jitter_rad: float) -> Path:
 def trained(capture: Path, method: str, *changes: str) -> Path:
     """Run folder of a short training."""
     out = Path(tempfile.mkdtemp(dir=capture.parent))
-    overrides = (f"optimisation.iterations={TRAINING_STEPS}", *changes)
+    overrides = (f"iterations={TRAINING_STEPS}", *changes)
     with contextlib.redirect_stderr(io.StringIO()):
         return train(capture, method=method, out=out, device="cpu", overrides=overrides)
 
@@ -132,7 +143,7 @@ def verdict(setting: Setting, capture: Path, method: str, before: str) -> str:
 
 def effects(folder: Path, method: str) -> dict[str, list[str]]:
     """Settings by verdict; what is inert with exact poses is tried with noisy ones."""
-    said = {setting.name: "inert" for setting in leaves(method)}
+    said = {s.name: "live" if s.name == "iterations" else "inert" for s in leaves(method)}
     for jitter_rad in (0.0, 0.05):
         capture = tiny_capture(folder, jitter_rad=jitter_rad)
         before = fingerprint(trained(capture, method))
@@ -146,7 +157,7 @@ def effects(folder: Path, method: str) -> dict[str, list[str]]:
 
 def measured(method: str, *, inert: bool) -> dict[str, Any]:
     """The table."""
-    folder = next(f for f in ("models", "deform") if (imports.SOURCE / f).is_dir())
+    folder = "models"
     files = {p: len(p.read_text("utf-8").splitlines()) for p in imports.SOURCE.rglob("*.py")}
     nodes = [(module, n) for module, tree in imports.FILES.items() for n in ast.walk(tree)]
     classes = {node.name for _, node in nodes if isinstance(node, ast.ClassDef)}

@@ -6,7 +6,7 @@ from numpy import ndarray
 from torch import Tensor
 
 Fields = list[Tensor | None]
-"""Means, quats, scales, opacities, channels, linear, 2-D offset."""
+"""Means, quaternions, scales, opacities, channels, linear, 2-D offset."""
 
 class Render:
     """One render of T times; keeps what its backward pass needs."""

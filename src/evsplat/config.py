@@ -89,7 +89,7 @@ class ReadIf:
     """Condition under which a setting, or all of a section, is read at all."""
 
     setting: str
-    """Field of the same section, or dotted name from the root of the configuration."""
+    """Another field of the same section, or else a name from the root of the configuration."""
     condition: str
     """Words for it that follow the setting's name and "is": "above 0"."""
     holds: Callable[[Any], bool]
@@ -135,7 +135,8 @@ def _settings(
         name, hint, value = prefix + field.name, hints[field.name], getattr(part, field.name)
         default = _default(field) if start is None else getattr(start, field.name)
         marks = [mark for mark in _marks(hint) if isinstance(mark, ReadIf)]
-        asked = [(prefix if m.setting in hints else "") + m.setting for m in marks]
+        beside = hints.keys() - {field.name}
+        asked = [(prefix if m.setting in beside else "") + m.setting for m in marks]
         conditions = (*around, *zip(asked, marks, strict=True))
         yield Setting(name, type(part), hint, value, default, conditions)
         if dataclasses.is_dataclass(value):
@@ -389,13 +390,17 @@ def _convert_dataclass(kind: Any, value: Any, where: str, key: str, start: Any) 
 def _unknown(
     kind: Any, values: dict[Any, Any], prefix: str, dropped: dict[str, str]
 ) -> Iterator[tuple[str, str | None]]:
-    """What is wrong with keys that a section, or one inside it, has not; the name that is near."""
+    """Faults of keys that a section, or one inside it, has not; the name that is near."""
     hints = get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind)]
     for name, item in values.items():
         full = f"{prefix}{name}"
         if full in dropped:
-            yield f"{full}: {dropped[full]}", None
+            parts = [f"{full}.{key}" for key in item] if isinstance(item, dict) else []
+            named = [part for part in parts if part in dropped]
+            # The section's own sentence serves those of its parts that have none.
+            rest = [full] if len(named) < max(len(parts), 1) else []
+            yield from ((f"{part}: {dropped[part]}", None) for part in [*named, *rest])
         elif name not in names:
             near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.3)
             yield f"unknown setting {full}", prefix + near[0] if near else None

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import yaml
 
-from ..small_model import SMALL_MODEL
+from ..small_model import SMALL
 
-PAPER = {"name": "paper", "method": "paper", "settings": list(SMALL_MODEL)}
+PAPER = {"name": "paper", "method": "paper", "settings": list(SMALL["paper"])}
 MEDIAN = {"name": "median", "method": "median_background"}
 
 

@@ -25,7 +25,7 @@ from evsplat.training import load_run
 from evsplat.training.checkpoint import latest_checkpoint
 from evsplat.training.trainer import Trainer
 
-from ..small_model import SMALL_MODEL
+from ..small_model import SMALL
 from .helpers import MEDIAN, PAPER, records, write_suite
 
 training = importlib.import_module("evsplat.training.train")
@@ -115,8 +115,7 @@ def test_failures_are_recorded_kept_and_tried_again_only_when_asked(tiny_capture
 
 def test_a_person_without_scene_can_be_measured_before_the_background(tiny_capture, tmp_path):
     row = {"name": "alone", "method": "avatar3dgs", "backdrop": True}
-    settings = [setting for setting in SMALL_MODEL if not setting.startswith("scene.")]
-    settings.append("loss.perceptual=none")
+    settings = list(SMALL["avatar3dgs"])
     capture = tiny_capture("one")
     suite = write_suite(tmp_path / "suite.yaml", {"one": capture}, row | {"settings": settings})
     folder = BenchFolder(tmp_path / "out")
@@ -161,7 +160,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tiny_capture, tmp_path):
 
 
 def test_a_cell_is_made_by_its_own_policy_and_says_so(tiny_capture, tmp_path):
-    settings = [*SMALL_MODEL, "event.weight=0"]
+    settings = [*SMALL["paper"], "event_weight=0"]
     rows = [
         {"name": name, "method": "paper", "restore": "edi", "settings": [*settings, *policy]}
         for name, policy in (

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evsplat.capture import Frame, Policy, load_body_track, load_capture
-from evsplat.capture.spans import held_out_spans, open_spans
+from evsplat.capture.training_capture import held_out_spans, readable_spans
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS
 from evsplat.masks import MASKERS
@@ -59,7 +59,7 @@ def test_of_overlapping_exposures_the_training_one_is_seen_whole():
 @given(st.text(".x", min_size=1, max_size=12), st.integers(0, 20_000), st.integers(-1, 12))
 def test_every_time_is_open_or_held_out_and_training_exposures_are_open(splits, longer_us, index):
     recorded = frames(splits, longer_us)
-    closed, opened = held_out_spans(recorded), open_spans(recorded)
+    closed, opened = held_out_spans(recorded), readable_spans(recorded)
     time = index * 37_000 + 11
     assert sum(start <= time < end for start, end in (*closed, *opened)) == 1
     for frame in recorded:
@@ -98,14 +98,14 @@ def test_events_are_read_within_open_stretches_only(tiny_capture):
     events, all_events = seen(whole).events, whole.events
     train = whole.train_frames
     last, following = train[6].exposure_us[1], train[7].exposure_us[0]
-    assert events.open_around(train[3].mid_us) == (LOW, last)
+    assert events.readable_around(train[3].mid_us) == (LOW, last)
     assert len(events.between(0, last)) == len(all_events.between(0, last)) > 0
     for start, end in ((last - 10, last + 1), (last, last + 1), (0, 700_000), (last, following)):
         with pytest.raises(HeldOutError, match="policy.held_out_events=true"):
             events.between(start, end)
     assert len(events.between(last + 5, last + 5)) == 0  # nothing is asked
     with pytest.raises(HeldOutError):
-        events.open_around(last + 10_000)
+        events.readable_around(last + 10_000)
     with pytest.raises(HeldOutError):
         events.rate(10)
     stretches = events.stretches_us

@@ -73,9 +73,9 @@ def test_folder_that_is_no_run_is_one_message_and_code_2(capsys, tmp_path, verb)
     ("options", "parts"),
     [
         (["--method", "papr"], ["papr", "Did you mean paper?"]),
-        (["--set", "event.wieght=0.2"], ["event.wieght", "Did you mean event.weight?"]),
-        (["--set", "optimisation.iterations=many"], ["optimisation.iterations", "'many'"]),
-        (["--set", "event.weight"], ["event.weight", "KEY=VALUE"]),
+        (["--set", "event_wieght=0.2"], ["event_wieght", "Did you mean event_weight?"]),
+        (["--set", "iterations=many"], ["iterations", "'many'"]),
+        (["--set", "event_weight"], ["event_weight", "KEY=VALUE"]),
         (["--config", "missing.yaml"], ["missing.yaml", "not found"]),
         (["--device", "cuda"], ["--device cuda", "--device cpu"]),
         (["--iterations", "0"], ["--iterations 0", "at least 1"]),

@@ -23,7 +23,7 @@ def random_splats(rng: np.random.Generator, count: int, times: int = 2) -> Splat
     channels = np.concatenate([rng.random((times, count, 3)), np.ones((times, count, 1))], axis=-1)
     return Splats(
         means=tensor(rng.normal(size=(times, count, 3))),
-        quats=tensor(rng.normal(size=(count, 4))),
+        quaternions=tensor(rng.normal(size=(count, 4))),
         scales=tensor(np.exp(rng.uniform(-6, -2, size=(count, 3)))),
         opacities=tensor(rng.random(count)),
         channels=tensor(channels),

@@ -3,30 +3,24 @@
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from evsplat.capture import load_capture
-from evsplat.config import override
 from evsplat.export import run as exporting
-from evsplat.methods import compose, method_config
 from evsplat.training.run import GaussianReconstruction
 
-from ..seen import seen
-
-SMALL = (
-    "human.count=150",
-    "deform.width=16",
-    "deform.colour_width=16",
-    "scene.backdrop_stride_px=4",
-)
+from ..small_model import built
 
 
 @pytest.fixture
 def reconstruction(tiny_capture):
     capture = load_capture(tiny_capture())
-    config = method_config("paper", override({}, (*SMALL, "deform.shadow_lights=2")), where="test")
-    return capture, GaussianReconstruction(
-        "paper", compose(config, seen(capture), 0, fit=False).model
-    )
+    settings = ("human.count=150", "scene.backdrop_stride_px=4", "lamps=2")
+    model = built("evsplat", capture, *settings).model
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():  # colours that tell a person from its negative
+        model.gaussians.colour_logits.normal_(generator=generator)
+    return capture, GaussianReconstruction("evsplat", model)
 
 
 @pytest.fixture
@@ -36,7 +30,7 @@ def run(reconstruction, tmp_path, monkeypatch):
     path = tmp_path / "run"
     path.mkdir()
     loaded = SimpleNamespace(
-        path=path, capture=capture, reconstruction=model, method="paper", iteration=7
+        path=path, capture=capture, reconstruction=model, method="evsplat", iteration=7
     )
     monkeypatch.setattr(exporting, "load_run", lambda *_, **__: loaded)
     return loaded

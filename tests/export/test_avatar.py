@@ -15,29 +15,21 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.capture import load_body_track, load_capture
-from evsplat.config import override
-from evsplat.models.at_rest import mean_at_rest
-from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.errors import DataError
 from evsplat.export import export_run
 from evsplat.export.avatar.figure import clip_of, figure_of, recorded_clip
 from evsplat.export.avatar.loss import measure_loss
 from evsplat.export.avatar.package import avatar_document
 from evsplat.export.cloud import cloud_of
-from evsplat.gaussians import PosedHuman
-from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.reconstruction import Bakeable
+from evsplat.models.at_rest import SkinnedGaussians, mean_at_rest
+from evsplat.render import Splats
 from evsplat.training.run import GaussianReconstruction
 
 from ..body.helpers import reference_bones
+from ..small_model import built
 from .clouds import covariances, read_ply
 
-SMALL = ("human.count=120", "deform.width=16", "deform.colour_width=16")
-SMALL_HUGS = {
-    "human": {"count": 80},
-    "triplane": {"resolution": 16, "channels": 8},
-    "scene": {"cube_count": 600},
-}
 SEEDS = pytest.mark.parametrize("seed", [0, 1, 2])
 
 
@@ -82,9 +74,10 @@ def test_mean_at_rest_undoes_any_skinning(seed):
         maps[:, :3] += 0.3 * rng.normal(size=(count, 3, 4))
         world = np.einsum("nij,nj->ni", maps[:, :3, :3], rest) + maps[:, :3, 3]
         signs = rng.choice([-1.0, 1.0], size=(count, 1))
-        given = (world, signs * quaternions, scales, colours[times_us[0]], maps)
-        human = PosedHuman(*(torch.from_numpy(values)[None] for values in given))
-        return SimpleNamespace(human=human, human_opacities=torch.ones(count))
+        given = (world, signs * quaternions, scales, np.ones(count), colours[times_us[0]])
+        human = Splats(*(torch.from_numpy(values)[None] for values in given))
+        human = replace(human, opacities=human.opacities[0])
+        return SimpleNamespace(human=human, transforms=torch.from_numpy(maps)[None])
 
     seen = []
     model = SimpleNamespace(
@@ -107,12 +100,9 @@ def test_mean_at_rest_undoes_any_skinning(seed):
 def test_a_model_without_pose_dependence_is_its_avatar(tiny_capture, method):
     """Before the non-rigid network is switched on skinning is all that moves; HUGS has no more."""
     capture = load_capture(tiny_capture())
-    values = SMALL_HUGS if method == "hugs" else override({}, SMALL)
-    if method == "evsplat":  # the person's own shadow is of its pose
-        values = override(values, ("deform.self_shadow=false",))
-    config = method_config(method, values, where="test")
-    seen = capture.for_training(config.policy)
-    model = TRAINABLE[method].build(config, seen, 0, fit=False).model
+    # The person's own shadow is of its pose.
+    settings = ("self_shadow=false",) if method == "evsplat" else ()
+    model = built(method, capture, *settings).model
     if method == "evsplat":
         with torch.no_grad():
             model.shading.coefficients.normal_(std=0.1)

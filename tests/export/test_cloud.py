@@ -25,7 +25,7 @@ def test_sheared_gaussians_keep_their_covariance(seed):
         linear = splats.linear[time].double().numpy()
         want = (
             linear
-            @ covariances(splats.quats.double().numpy(), splats.scales.numpy())
+            @ covariances(splats.quaternions.double().numpy(), splats.scales.numpy())
             @ linear.transpose(0, 2, 1)
         )
         got = covariances(cloud.quaternions, cloud.scales)

@@ -37,7 +37,8 @@ def test_splats_draw_what_the_reconstruction_draws(reconstruction, parts):
             )
             for layer in layers
         ]
-        drawn = render(one[0], camera, static=one[1] if len(one) == 2 else None)
+        still = one[1] if len(one) == 2 else None
+        drawn = render(one[0], camera, static=still, low_pass=model.low_pass)
         torch.testing.assert_close(
             drawn.image[0, ..., :3].clamp(0, 1), want.rgb[time], atol=1e-5, rtol=0
         )
@@ -114,7 +115,7 @@ def test_up_turns_the_world_and_says_how(run, up, axis):
         ("avatar", {"out": "a.ply"}, "ends in .html or is a folder"),
         ("avatar", {"motion": "swimming"}, "neither a file nor one of"),
         ("avatar", {"camera": "left"}, "only main, side"),
-        ("html", {"fps": 0.1}, "expected 1 to 120"),
+        ("html", {"fps": 0.1}, "--fps 0.1: expected a number within 1 and 120"),
     ],
 )
 def test_bad_options_are_one_sentence_and_write_nothing(run, kind, options, message):

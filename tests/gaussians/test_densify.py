@@ -3,20 +3,13 @@
 import pytest
 import torch
 
-from evsplat.gaussians import (
-    ATTRIBUTES,
-    DensifyConfig,
-    GaussianSet,
-    RowAdam,
-    ScreenStatistics,
-    densify,
-)
-from evsplat.gaussians.densify import rebuild, reset_opacities
+from evsplat.gaussians import DensifyLimits, GaussianSet, RowAdam, ScreenStatistics, densify
+from evsplat.gaussians.densify import rebuild
 from evsplat.gaussians.initialise import gaussians_at
 
 LIMITS = {
-    "human": DensifyConfig(start=0, end=10_000, prune_after=0, split_above_m=0.03),
-    "scene": DensifyConfig(
+    "human": DensifyLimits(start=0, end=10_000, prune_after=0, split_above_m=0.03),
+    "scene": DensifyLimits(
         start=0,
         end=10_000,
         prune_after=0,
@@ -43,10 +36,9 @@ def make_set(seed: int, humans: int = 40, scenes: int = 60) -> tuple[GaussianSet
         return values
 
     gaussians = GaussianSet(start(humans, 2.0), start(scenes, -2.0))
-    adam = RowAdam(
-        {name: getattr(gaussians, name) for name in ATTRIBUTES}, dict.fromkeys(ATTRIBUTES, 1e-3)
-    )
-    loss = sum((getattr(gaussians, name) ** 2).sum() for name in ATTRIBUTES)
+    names = gaussians.attributes
+    adam = RowAdam({name: getattr(gaussians, name) for name in names}, dict.fromkeys(names, 1e-3))
+    loss = sum((getattr(gaussians, name) ** 2).sum() for name in names)
     loss.backward()
     adam.step()
     return gaussians, adam
@@ -93,7 +85,7 @@ def test_children_of_a_split_are_smaller_and_inside_their_parent():
     gaussians, adam = make_set(1, humans=1, scenes=1)
     with torch.no_grad():
         gaussians.scales_log[0] = torch.log(torch.tensor([0.2, 0.1, 0.001]))
-    parent = {name: getattr(gaussians, name).detach()[0].clone() for name in ATTRIBUTES}
+    parent = {name: getattr(gaussians, name).detach()[0].clone() for name in gaussians.attributes}
     statistics = ScreenStatistics.zeros(2, torch.device("cpu"))
     statistics.seen += 1
     statistics.gradient_sum[0] = 1.0
@@ -110,18 +102,18 @@ def test_children_of_a_split_are_smaller_and_inside_their_parent():
 def test_moments_follow_their_rows_and_new_rows_start_without(seed):
     gaussians, adam = make_set(seed)
     count = len(gaussians)
-    before = {name: moments(adam, name).clone() for name in ATTRIBUTES}
+    before = {name: moments(adam, name).clone() for name in gaussians.attributes}
     generator = torch.Generator().manual_seed(seed)
     source = torch.randint(count, (count + 7,), generator=generator)
     fresh = torch.rand(len(source), generator=generator) < 0.3
     is_human = gaussians.human_mask()[source]
-    values = {name: getattr(gaussians, name).detach()[source] for name in ATTRIBUTES}
+    values = {name: getattr(gaussians, name).detach()[source] for name in gaussians.attributes}
     marks = values["semantic_logits"].clone()
     rebuild(gaussians, adam, values, source, fresh, is_human)
 
     order = torch.argsort((~is_human).int(), stable=True)
     assert torch.equal(gaussians.semantic_logits.detach(), marks[order])
-    for name in ATTRIBUTES:
+    for name in gaussians.attributes:
         expected = before[name][source[order]].clone()
         expected[fresh[order]] = 0
         assert torch.equal(moments(adam, name), expected), name
@@ -130,7 +122,7 @@ def test_moments_follow_their_rows_and_new_rows_start_without(seed):
 def test_optimiser_keeps_stepping_the_new_rows():
     gaussians, adam = make_set(0)
     source = torch.arange(10)
-    values = {name: getattr(gaussians, name).detach()[source] for name in ATTRIBUTES}
+    values = {name: getattr(gaussians, name).detach()[source] for name in gaussians.attributes}
     rebuild(gaussians, adam, values, source, torch.zeros(10, dtype=torch.bool), source < 4)
     before = gaussians.means.detach().clone()
     (gaussians.means**2).sum().backward()
@@ -143,7 +135,7 @@ def test_growth_stops_at_the_cap_and_takes_the_largest_gradients():
     statistics = ScreenStatistics.zeros(24, torch.device("cpu"))
     statistics.seen += 1
     statistics.gradient_sum[:20] = torch.linspace(3e-4, 9e-4, 20)
-    limits = {**LIMITS, "human": DensifyConfig(start=0, split_above_m=9.0, max_count=23)}
+    limits = {**LIMITS, "human": DensifyLimits(start=0, split_above_m=9.0, max_count=23)}
     marks = gaussians.semantic_logits.detach()[17:20].clone()
     densify(gaussians, adam, statistics, limits, 1_000, torch.Generator())
     assert gaussians.human_count == 23
@@ -168,12 +160,3 @@ def test_statistics_average_ndc_gradients_over_the_renders_that_drew_a_row():
     # Two renders share one mean loss, hence the factor 2 for each: 2 * 100 * 3e-6, 2 * 50 * 4e-6.
     assert statistics.mean_gradient().tolist() == pytest.approx([(6e-4 + 4e-4) / 2, 0.0])
     assert statistics.radius_px.tolist() == [9, 0]
-
-
-def test_opacity_reset_lowers_and_forgets():
-    gaussians, adam = make_set(4)
-    reset_opacities(gaussians, adam, gaussians.human)
-    assert float(gaussians.opacities().detach()[gaussians.human].max()) <= 0.01 + 1e-6
-    assert float(gaussians.opacities().detach()[gaussians.scene].min()) > 0.4
-    assert float(moments(adam, "opacity_logits")[gaussians.human].abs().max()) == 0
-    assert float(moments(adam, "opacity_logits")[gaussians.scene].abs().min()) > 0

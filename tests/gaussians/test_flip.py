@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from evsplat.body import Body, default_body
-from evsplat.gaussians import ATTRIBUTES, BodyFrames, GaussianSet, RowAdam, flip_labels
+from evsplat.gaussians import FEATURE_DIM, BodyFrames, GaussianSet, RowAdam, flip_labels
 from evsplat.gaussians.flip import REACH_M
 from evsplat.gaussians.initialise import gaussians_at
 
@@ -31,20 +31,29 @@ def frames_of(body: Body, seed: int) -> BodyFrames:
     return BodyFrames(body, body.canonical_to_world(rotations, translation))
 
 
-def start(points: torch.Tensor, semantic: float, feature: float) -> dict[str, torch.Tensor]:
+def start(
+    points: torch.Tensor, semantic: float, colour: float, feature_dim: int | None
+) -> dict[str, torch.Tensor]:
     values = gaussians_at(
-        points, torch.full_like(points, 0.01), opacity=0.5, semantic_logit=semantic
+        points,
+        torch.full_like(points, 0.01),
+        opacity=0.5,
+        semantic_logit=semantic,
+        feature_dim=feature_dim,
     )
-    values["features"] = torch.full((len(points), 32), feature)
-    return values
+    name = "features" if feature_dim else "colour_logits"
+    return values | {name: torch.full_like(values[name], colour)}
 
 
-def make(human: torch.Tensor, scene: torch.Tensor) -> tuple[GaussianSet, RowAdam]:
-    gaussians = GaussianSet(start(human, 2.0, 1.0), start(scene, -2.0, -1.0))
-    adam = RowAdam(
-        {name: getattr(gaussians, name) for name in ATTRIBUTES}, dict.fromkeys(ATTRIBUTES, 1e-3)
+def make(
+    human: torch.Tensor, scene: torch.Tensor, feature_dim: int | None = FEATURE_DIM
+) -> tuple[GaussianSet, RowAdam]:
+    gaussians = GaussianSet(
+        start(human, 2.0, 1.0, feature_dim), start(scene, -2.0, -1.0, feature_dim)
     )
-    sum((getattr(gaussians, name) ** 2).sum() for name in ATTRIBUTES).backward()
+    names = gaussians.attributes
+    adam = RowAdam({name: getattr(gaussians, name) for name in names}, dict.fromkeys(names, 1e-3))
+    sum((getattr(gaussians, name) ** 2).sum() for name in names).backward()
     adam.step()
     return gaussians, adam
 
@@ -83,19 +92,23 @@ def test_there_and_back_again_is_the_same_place(body, seed):
     assert back.max() < 0.02
 
 
-def test_features_are_those_of_the_nearest_row_of_the_new_class(body):
+@pytest.mark.parametrize("feature_dim", [FEATURE_DIM, None])
+def test_colours_are_those_of_the_nearest_row_of_the_new_class(body, feature_dim):
     frames = frames_of(body, 0)
-    gaussians, adam = make(body.canonical_vertices()[::500], torch.randn(6, 3))
+    gaussians, adam = make(body.canonical_vertices()[::500], torch.randn(6, 3), feature_dim)
+    name = gaussians.colour
+    assert name == ("features" if feature_dim else "colour_logits")
     with torch.no_grad():
         gaussians.semantic_logits[0] = -1.0
-        gaussians.features[gaussians.scene] = torch.arange(6.0)[:, None] * torch.ones(32)
+        colours = gaussians.get_parameter(name)
+        colours[gaussians.scene] = torch.arange(6.0)[:, None] * torch.ones(colours.shape[1])
     others = gaussians.means.detach()[gaussians.scene].clone()
     flip_labels(gaussians, adam, frames)
     (new,) = torch.nonzero(gaussians.semantic_logits[gaussians.scene] == -1.0)[:, 0].tolist()
     row = gaussians.human_count + new
     nearest = float(torch.cdist(gaussians.means.detach()[row][None], others).argmin())
-    assert (gaussians.features[row] == nearest).all()
-    (group,) = [g for g in adam.adam.param_groups if g["name"] == "features"]
+    assert (gaussians.get_parameter(name)[row] == nearest).all()
+    (group,) = [g for g in adam.adam.param_groups if g["name"] == name]
     assert (adam.adam.state[group["params"][0]]["exp_avg"][row] == 0).all()
 
 

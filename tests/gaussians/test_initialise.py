@@ -6,7 +6,6 @@ import torch
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Camera
 from evsplat.gaussians.initialise import (
-    COLOUR_LOGITS,
     backdrop_depth,
     facing,
     gaussians_at,
@@ -55,8 +54,10 @@ def test_backdrop_looks_like_the_median_from_the_camera_before_any_fit(seed):
     picture = torch.nn.functional.interpolate(coarse, (48, 64), mode="bilinear")[0].permute(1, 2, 0)
     depth = backdrop_depth(camera(), body_points(), up=torch.tensor([0.0, 0.0, 1.0]), margin=0.15)
     points, scales, colours = median_backdrop(camera(), picture, depth, stride=2, edge_points=500)
-    values = gaussians_at(points, scales, opacity=0.9, semantic_logit=-2.0, rgb_srgb=colours)
-    shown = torch.sigmoid(values["features"][:, COLOUR_LOGITS])
+    values = gaussians_at(
+        points, scales, opacity=0.9, semantic_logit=-2.0, rgb_srgb=colours, feature_dim=None
+    )
+    shown = torch.sigmoid(values["colour_logits"])
     assert torch.allclose(shown, colours.clamp(0.01, 0.99), atol=1e-5)
     drawn = render(
         Splats(points[None], values["quaternions"], scales, torch.full((len(points),), 0.9), shown),
@@ -64,6 +65,27 @@ def test_backdrop_looks_like_the_median_from_the_camera_before_any_fit(seed):
     )
     error = (drawn.image[0] - picture)[2:-2, 2:-2].abs()
     assert float(error.mean()) < 0.03
+
+
+@pytest.mark.parametrize("feature_dim", [32, None])
+def test_a_colour_is_told_to_networks_or_is_the_gaussians_own(feature_dim):
+    points, rgb = torch.randn(5, 3), 0.1 + 0.8 * torch.rand(5, 3)
+    given, grey = (
+        gaussians_at(
+            points,
+            torch.ones(5, 3),
+            opacity=0.5,
+            semantic_logit=1.0,
+            rgb_srgb=colours,
+            feature_dim=feature_dim,
+        )
+        for colours in (rgb, None)
+    )
+    assert ("features" in given, "colour_logits" in given) == (bool(feature_dim), not feature_dim)
+    name = "features" if feature_dim else "colour_logits"
+    assert given[name].shape == (5, feature_dim or 3)
+    assert torch.allclose(given[name][:, :3].sigmoid(), rgb, atol=1e-6)
+    assert not given[name][:, 3:].any() and not grey[name].any()
 
 
 def test_cube_is_uniform_and_spacing_is_that_of_a_lattice():

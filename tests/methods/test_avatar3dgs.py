@@ -1,6 +1,7 @@
 """Method `avatar3dgs` against what is known of 3DGS-Avatar, and as a user meets it."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -8,36 +9,26 @@ import torch
 
 from evsplat.capture import load_capture
 from evsplat.cli.summary import summary_table
-from evsplat.config import override
-from evsplat.models.drawing import draw
 from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation.run import evaluate_run
-from evsplat.methods import TRAINABLE, method_config
+from evsplat.methods import TRAINABLE
 from evsplat.methods.avatar3dgs import AvatarConfig
 from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.settings import weight_at
+from evsplat.models.drawing import draw
+from evsplat.models.networks import deformation
+from evsplat.models.networks.deformation import draw_pose_noise
 from evsplat.objectives import perceptual
 from evsplat.training import load_run, train
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 from evsplat.weights import MissingWeights
 
-SMALL = (
-    "human.count=120",
-    "deform.width=16",
-    "deform.colour_width=16",
-    "skinning_prefit_steps=2",
-    "isometry_samples=32",
-    "densify_human.max_count=150",
-    "loss.perceptual=none",
-)
+from ..small_model import built, small, small_config
 
 
-def composed(path, *settings: str, fit: bool = False):
-    config = method_config("avatar3dgs", override({}, (*SMALL, *settings)), where="test")
-    return TRAINABLE["avatar3dgs"].build(
-        config, load_capture(path).for_training(config.policy), 3, fit=fit
-    )
+def composed(path, *settings: str):
+    return built("avatar3dgs", path, *settings, seed=3)
 
 
 def trainer_of(path, *settings: str, steps: int = 60) -> Trainer:
@@ -53,32 +44,61 @@ def forget_masks(path, *names: str) -> None:
     (path / "capture.json").write_text(json.dumps(document))
 
 
-def test_settings_are_those_of_the_release():
-    config = AvatarConfig()
-    rates, loss, limits = config.optimisation.rates, config.loss, config.densify_human
-    extent = 3.469298553466797
-    assert rates.means == pytest.approx(1.6e-4 * extent, rel=0.02)
+def test_settings_are_those_of_the_release(tiny_capture):
+    config, extent = AvatarConfig(), 3.469298553466797
+    config = replace(config, human=replace(config.human, count=100))
+    config = replace(config, terms=replace(config.terms, perceptual="none"))
+    capture = load_capture(tiny_capture()).for_training(config.policy)
+    composition = TRAINABLE["avatar3dgs"].build(config, capture, 0, purpose="resume")
+    model, learning = composition.model, composition.learning
+
+    rows = learning.rows["gaussians"]
+    assert rows["means"].rate.start == pytest.approx(1.6e-4 * extent, rel=0.02)
+    starts = {"features": 1e-3, "opacity_logits": 0.05, "scales_log": 5e-3, "quaternions": 1e-3}
+    assert {name: rows[name].rate.start for name in starts} == starts
     # 1.6e-4 to 1.6e-6 over 30,000 steps, of which 15,000 are made: a tenth.
-    assert (rates.means_final, rates.constant, rates.gaussians_final) == (0.1, 0.0, 1.0)
-    assert (rates.features, rates.opacity_logits, rates.scales_log) == (1e-3, 0.05, 5e-3)
-    assert (rates.quaternions, rates.clip_networks, rates.latent_weight_decay) == (1e-3, 0.1, 0.05)
-    networks = (rates.skinning, rates.non_rigid, rates.pose_correction, rates.colour, rates.latents)
-    assert networks == (1e-4, 1e-3, 1e-4, 1e-3, 1e-3) and rates.final == 0.1
-    assert (loss.l1, loss.dssim, loss.alpha, loss.perceptual_weight) == (1.0, 0.0, 0.1, 0.01)
-    assert (loss.isometry_centers, loss.isometry_covariances) == (1.0, 100.0)
-    assert [weight_at(loss.skinning, n) for n in (0, 999, 1_000, 14_999)] == [10, 10, 0.1, 0.1]
+    assert rows["means"].rate.final == 0.1
+    assert {rows[name].rate.final for name in starts} == {1.0}
+    assert {row.rate.constant for row in rows.values()} == {0.0}
+    assert learning.clip == 0.1 and learning.human_start == 1_000
+    found = {id(p): network for network in learning.networks for p in network.parameters}
+    for part, rate, decay in (
+        (model.skinning, 1e-4, 0.0),
+        (model.deformation, 1e-3, 0.0),
+        (model.residual, 1e-4, 0.0),
+        (model.human_colour, 1e-3, 0.0),
+        (model.latents, 1e-3, 0.05),
+    ):
+        for parameter in part.parameters():
+            network = found[id(parameter)]
+            assert (network.rate.start, network.rate.final, network.rate.constant) == (rate, 0.1, 0)
+            assert (network.weight_decay, network.clipped) == (decay, True)
+
+    weights = composition.weights
+    assert (weights["l1"], weights["dssim"], weights["alpha"]) == (1.0, 0.0, 0.1)
+    assert config.terms.perceptual_weight == 0.01
+    assert (weights["isometry_centers"], weights["isometry_covariances"]) == (1.0, 100.0)
+    skinning = [weight_at(weights["skinning"], n) for n in (0, 999, 1_000, 14_999)]
+    assert skinning == [10, 10, 0.1, 0.1]
+    limits = composition.densify["human"]
     assert (limits.start, limits.end, limits.every) == (1_000, 10_000, 100)
     assert (limits.gradient, limits.prune_opacity) == (2e-4, 0.05)
     assert limits.split_above_m == pytest.approx(0.01 * extent, rel=0.02)
     assert (limits.prune_after, limits.prune_screen_px) == (3_000, 20)
     assert limits.prune_scale_m == pytest.approx(0.1 * extent, rel=0.02)
-    deform = config.deform
-    assert (deform.non_rigid_start, deform.pose_correction_start) == (3_000, 5_000)
-    assert (deform.pose_noise, deform.pose_noise_probability) == (0.1, 0.5)
-    assert (deform.width, deform.non_rigid_depth, deform.skinning_depth) == (128, 3, 4)
-    assert (deform.latent_dim, deform.colour_width) == (16, 64)
-    assert config.optimisation.iterations == 15_000
-    assert config.optimisation.human_start == 1_000
+    assert config.iterations == 15_000
+
+    assert (model.non_rigid_start, model.residual_start) == (3_000, 5_000)
+    assert (model.pose_noise, deformation._NOISE_PROBABILITY) == (0.1, 0.5)
+    generator = torch.Generator().manual_seed(0)
+    noises = [draw_pose_noise(3, 0.1, generator, torch.device("cpu")) for _ in range(400)]
+    drawn = torch.stack([noise for noise in noises if torch.is_tensor(noise)])
+    assert len(drawn) / 400 == pytest.approx(0.5, abs=0.1)
+    assert float(drawn.std()) == pytest.approx(0.1, rel=0.05)
+    networks = (model.deformation.network.mlp, model.skinning.mlp, model.human_colour.mlp)
+    assert [len(mlp.first_bias) for mlp in networks] == [128, 128, 64]
+    assert [len(mlp.weights) for mlp in networks] == [3, 4, 2]
+    assert model.latents.values.shape[1] == 16
 
 
 def test_the_person_alone_is_learned_from_pictures_that_are_black_elsewhere(tiny_capture):
@@ -112,9 +132,12 @@ def test_masks_that_the_policy_hides_are_not_looked_for(tiny_capture):
         composed(tiny_capture(), "policy.masks=none")
 
 
-def test_settings_of_a_scene_are_refused(tiny_capture):
-    with pytest.raises(ConfigError, match="deform.shadow_lights is 2.*has no scene"):
-        composed(tiny_capture(), "deform.shadow_lights=2")
+@pytest.mark.parametrize(
+    "setting", ["lamps=2", "scene.kind=random_cube", "semantic_weight=0.1", "event_weight=0.1"]
+)
+def test_settings_of_a_scene_and_of_events_are_refused(setting):
+    with pytest.raises(ConfigError, match=f"unknown setting {setting.partition('.')[0][:5]}"):
+        small_config("avatar3dgs", setting)
 
 
 def test_the_mask_term_is_the_distance_of_alpha_and_mask(tiny_capture):
@@ -127,9 +150,9 @@ def test_the_mask_term_is_the_distance_of_alpha_and_mask(tiny_capture):
     order = torch.randperm(len(capture.train_frames), generator=composition.generator)
     frame = capture.train_frames[int(order[-1])]
     camera = capture.camera(frame)
-    drawing = draw(model, model.at([frame.mid_us], camera.center()), camera)
+    drawing = draw(model.at([frame.mid_us], camera.center()), camera)
     assert torch.allclose(drawing.semantic[0], drawing.output.alpha[0], atol=1e-6)
-    expected = (drawing.output.alpha[0] - capture.person(frame).float()).abs().mean()
+    expected = (drawing.output.alpha[0] - capture.human(frame).float()).abs().mean()
     assert terms["alpha"] == pytest.approx(float(expected.detach()), rel=1e-4)
     drawing.semantic[0].sum().backward()
     assert bool((model.gaussians.opacity_logits.grad > 0).any())
@@ -137,7 +160,7 @@ def test_the_mask_term_is_the_distance_of_alpha_and_mask(tiny_capture):
 
 
 def test_the_schedule_freezes_the_person_then_deforms_then_corrects_poses(tiny_capture):
-    trainer = trainer_of(tiny_capture(), "densify_human.start=15000", steps=60)
+    trainer = trainer_of(tiny_capture(), "densify.start=15000", steps=60)
     model = trainer.model
     last = {name: value.detach().clone() for name, value in model.named_parameters()}
     first_moved: dict[str, float] = {}
@@ -153,60 +176,62 @@ def test_the_schedule_freezes_the_person_then_deforms_then_corrects_poses(tiny_c
     assert first_moved["gaussians.features"] == 1_000
     assert first_moved["skinning.mlp.weights.0"] == 0
     assert first_moved["human_colour.mlp.weights.0"] == 0
-    assert first_moved["non_rigid.mlp.weights.0"] == 3_000
-    assert first_moved["pose_encoder.root_weight"] == 3_000
-    assert first_moved["rotation_residuals"] == first_moved["translation_residuals"] == 5_000
-    assert first_moved["latents"] == 0
+    assert first_moved["deformation.network.mlp.weights.0"] == 3_000
+    assert first_moved["deformation.pose_encoder.root_weight"] == 3_000
+    assert first_moved["residual.rotations"] == first_moved["residual.translations"] == 5_000
+    assert first_moved["latents.values"] == 0
     still = {name for name, value in model.named_parameters() if value.numel()} - set(first_moved)
     assert all(name.startswith(("scene_colour", "gaussians.semantic")) for name in still), still
 
 
-def test_unseen_frames_are_treated_as_released_or_interpolated(tiny_capture):
+@pytest.mark.parametrize("method", ["avatar3dgs", "paper"])
+def test_unseen_frames_are_treated_as_released_or_interpolated(tiny_capture, method):
     path = tiny_capture()
     capture = load_capture(path)
     times = [frame.mid_us for frame in capture.train_frames]
     between = (times[2] + times[3]) // 2
     center = capture.camera(capture.frames[0]).center()
-    for rule in ("released", "interpolated"):
-        model = composed(path, f"deform.unseen_frames={rule}").model
-        model.nominal.fill_(10_000.0)
-        with torch.no_grad():
-            model.latents.normal_()
-            model.translation_residuals.normal_()
-            model.human_colour.mlp.weights[0].normal_()
-        given = model.track.at([between])[1]
-        moved = (
-            model.pose([between])[1][0]
-            - model.track.body.canonical_to_world(model.pose([between])[0], given)[0]
-        )
-        shift = moved[0, :3, 3]
-        around = model.translation_residuals[2:4].mean(0)
-        expected = torch.zeros(3) if rule == "released" else around
-        assert torch.allclose(shift, expected, atol=1e-5)
-        at_frame = model.pose(times[:1])[1][0, 0, :3, 3]
-        raw = model.track.body.canonical_to_world(
-            model.pose(times[:1])[0], model.track.at(times[:1])[1]
-        )[0, 0, :3, 3]
-        assert torch.allclose(at_frame - raw, model.translation_residuals[0], atol=1e-5)
-        # The colour of a frame that was not seen: its latent stands in for another one.
-        colours = model.at([between], center).human.rgb
-        other = model.latents[-1] if rule == "released" else model.latents[2:4].mean(0)
-        with torch.no_grad():
-            model.latents[:] = other
-        assert torch.allclose(model.at([between], center).human.rgb, colours, atol=1e-5)
+    model = built(method, path, "networks.pose_start=5000").model
+    model.nominal.fill_(10_000.0)
+    latents, shifts = model.latents.values, model.residual.translations
+    with torch.no_grad():
+        latents.normal_()
+        shifts.normal_()
+        model.human_colour.mlp.weights[0].normal_()
+
+    def moved(time: int) -> torch.Tensor:
+        """How far the root is from where the track has it."""
+        rotations, bones = model.pose([time])
+        given = model.track.body.canonical_to_world(rotations, model.track.at([time])[1])
+        return (bones - given)[0, 0, :3, 3]
+
+    expected = torch.zeros(3) if method == "avatar3dgs" else shifts[2:4].mean(0)
+    assert torch.allclose(moved(between), expected, atol=1e-5)
+    assert torch.allclose(moved(times[0]), shifts[0], atol=1e-5)
+    # The colour of a frame that was not seen: its latent stands in for another one.
+    colours = model.at([between], center).human.channels[..., :3]
+    with torch.no_grad():
+        latents[:] = latents[-1] if method == "avatar3dgs" else latents[2:4].mean(0)
+    again = model.at([between], center).human.channels[..., :3]
+    assert torch.allclose(again, colours, atol=1e-5)
 
 
 def test_a_resumed_run_equals_the_uninterrupted_one(tiny_capture):
     path = tiny_capture()
-    settings = ("deform.skinning_turns=1", "densify_human.every=1500")
-    whole = trainer_of(path, *settings, steps=16)
-    broken = trainer_of(path, *settings, steps=16)
-    for trainer, steps in ((whole, 12), (broken, 7)):
+
+    def trainer() -> Trainer:
+        """One that edits every second step, so that statistics are part of what is saved."""
+        composition = composed(path)
+        composition.densify["human"] = replace(composition.densify["human"], every=1_500)
+        return Trainer(composition, composition.capture, Clock(16))
+
+    whole, broken = trainer(), trainer()
+    for one, steps in ((whole, 12), (broken, 7)):
         for _ in range(steps):
-            assert trainer.step() is not None
-            trainer.clock.advance(0.1)
+            assert one.step() is not None
+            one.clock.advance(0.1)
     saved = broken.state()
-    resumed = trainer_of(path, *settings, steps=16)
+    resumed = trainer()
     resumed.load_state(*saved)
     for _ in range(5):
         resumed.step()
@@ -230,19 +255,18 @@ def test_the_perceptual_term_has_the_name_of_what_ran(tiny_capture, monkeypatch,
 
     monkeypatch.setattr(perceptual, "load_lpips", missing)
     monkeypatch.setattr(perceptual, "load_st_lpips", lambda **_: Distance())
-    trainer = trainer_of(tiny_capture(), "loss.perceptual=available")
+    trainer = trainer_of(tiny_capture(), "terms.perceptual=available")
     assert "No perceptual term lpips_vgg: LPIPS VGG16: no weights." in caplog.text
     assert trainer.composition.weights["st_lpips"] == 0.01
     assert trainer.step().terms["st_lpips"] > 0
     monkeypatch.setattr(perceptual, "load_st_lpips", missing)
-    without = trainer_of(tiny_capture("b"), "loss.perceptual=available")
+    without = trainer_of(tiny_capture("b"), "terms.perceptual=available")
     assert "st_lpips" not in without.step().terms
 
 
 def test_a_run_is_trained_read_back_measured_and_drawn(tiny_capture, tmp_path, monkeypatch):
-    out = train(
-        tiny_capture(), method="avatar3dgs", out=tmp_path / "run", iterations=10, overrides=SMALL
-    )
+    overrides, out = small("avatar3dgs"), tmp_path / "run"
+    out = train(tiny_capture(), method="avatar3dgs", out=out, iterations=10, overrides=overrides)
     metrics = evaluate_run(out, device="cpu")
     assert metrics["method"] == "avatar3dgs" and metrics["gaussians"]["scene"] == 0
     # Weights that only training needs are not read, and need not be there.
@@ -250,7 +274,7 @@ def test_a_run_is_trained_read_back_measured_and_drawn(tiny_capture, tmp_path, m
     settings.write_text(settings.read_text().replace("perceptual: none", "perceptual: lpips_vgg"))
     monkeypatch.setattr(perceptual, "load_lpips", None)
     run = load_run(out)
-    assert run.human_only and run.config.loss.perceptual == "lpips_vgg"
+    assert run.human_only and run.config.terms.perceptual == "lpips_vgg"
     frame = run.capture.test_frames[0]
     camera = run.capture.camera(frame)
     both = run.reconstruction.render(camera, [frame.mid_us])

@@ -8,25 +8,16 @@ import pytest
 
 from evsplat.calibration import ClockEstimate, SensorEstimate, ThresholdEstimate
 from evsplat.capture import TrainingCapture, load_capture
-from evsplat.methods import TRAINABLE, method_config
+from evsplat.methods import Purpose
 from evsplat.methods import evsplat as method
 from evsplat.objectives import EventChange, EventWindows
 from evsplat.training import train
 
-from ..seen import seen
-
-SMALL = {
-    "human": {"count": 60},
-    "deform": {"width": 16, "colour_width": 16},
-    "scene": {"prefit_steps": 1},
-    "skinning_prefit_steps": 1,
-}
+from ..small_model import built, small
 
 
-def thresholds(path, *, fit: bool = True) -> list[float]:
-    config = method_config("evsplat", SMALL, where="test")
-    composition = TRAINABLE["evsplat"].build(config, seen(path), 0, fit=fit)
-    return composition.model.sensor.logs.exp().tolist()
+def thresholds(path, *, purpose: Purpose = "train") -> list[float]:
+    return built("evsplat", path, purpose=purpose).model.sensor.logs.exp().tolist()
 
 
 def lag(late_us: float) -> ClockEstimate:
@@ -49,8 +40,7 @@ def test_a_clock_that_is_late_is_learned_from_there(
 ):
     found = None if late_us is None else SensorEstimate(lag(late_us), None)
     monkeypatch.setattr(method, "estimate_sensor", lambda capture: found)
-    config = method_config("evsplat", SMALL | {"windows": {"clock": choice}}, where="test")
-    sensor = TRAINABLE["evsplat"].build(config, seen(tiny_capture()), 0).model.sensor
+    sensor = built("evsplat", tiny_capture(), f"clock={choice}", purpose="train").model.sensor
     if start_us is None:
         assert sensor.offset_us is None
     else:
@@ -82,7 +72,8 @@ def test_without_one_training_frames_and_events_tell_it(tiny_capture, monkeypatc
     assert thresholds(path) == pytest.approx((0.31, 0.17), rel=1e-6)
     assert isinstance(looked_at[0], TrainingCapture)  # what is held out stays unseen
     looked_at.clear()
-    thresholds(path, fit=False)
+    thresholds(path, purpose="resume")
+    thresholds(path, purpose="draw")
     assert not looked_at  # a loaded model brings its own
 
 
@@ -104,8 +95,8 @@ def test_it_trains_on_what_is_there_and_says_so(tiny_capture, tmp_path, caplog, 
     else:
         metadata["events"] = None
         (path / "capture.json").write_text(json.dumps(metadata))
-    overrides = ("human.count=60", "scene.prefit_steps=1", "deform.width=16")
-    run = train(path, method="evsplat", out=tmp_path / "run", iterations=4, overrides=overrides)
+    run = tmp_path / "run"
+    train(path, method="evsplat", out=run, iterations=4, overrides=small("evsplat"))
     lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert ("event" in lines[-1]["terms"]) == (missing == "polarity")
     said = {"events": "has no events", "polarity": "events have no polarity"}[missing]
@@ -114,24 +105,6 @@ def test_it_trains_on_what_is_there_and_says_so(tiny_capture, tmp_path, caplog, 
 
 @pytest.mark.parametrize("term", ["windows", "paper"])
 def test_the_event_term_is_chosen(tiny_capture, term):
-    config = method_config("evsplat", {**SMALL, "event_term": term}, where="test")
-    objectives = method.compose(config, seen(tiny_capture()), 0).objectives
+    objectives = built("evsplat", tiny_capture(), f"event_term={term}").objectives
     assert any(isinstance(one, EventWindows) for one in objectives) == (term == "windows")
     assert any(isinstance(one, EventChange) for one in objectives) == (term == "paper")
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_papers_term_takes_events_without_polarity(tiny_capture, seed):
-    """Where all pixels only brighten, sizes and signed changes say the same."""
-    path = tiny_capture(seed=seed)
-    with h5py.File(path / "events.h5", "r+") as file:
-        file["events/p"][:] = 1
-    signed = method.paper_events(method.EventConfig(), load_capture(path))
-    pair = next(iter(signed.weights))
-    changed = signed._map(*pair)
-    signed.events.close()
-    with h5py.File(path / "events.h5", "r+") as file:
-        file["events/p"][:] = 0
-    blind = method.paper_events(method.EventConfig(), load_capture(path))
-    assert changed.any() and (changed == blind._map(*pair)).all()
-    assert signed.weights == blind.weights

@@ -1,27 +1,24 @@
 """Noisy poses in method `evsplat`: told, smoothed, corrected, and held-out pictures unseen."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from evsplat.capture import Capture, load_body_track, load_capture
-from evsplat.config import override
+from evsplat.capture import Capture, TrainingCapture, load_body_track, load_capture
 from evsplat.errors import ConfigError
-from evsplat.methods import TRAINABLE, method_config
-from evsplat.methods.poses import PoseConfig, prepare_poses
+from evsplat.methods.evsplat import EvsplatConfig
+from evsplat.methods.poses import Poses, prepare_poses
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
 from ..firewall.scrambled import scrambled
 from ..seen import seen
-from ..small_model import SMALL_MODEL
+from ..small_model import built, small_config
 
-SMALL = (
-    *SMALL_MODEL, "deform.shadow_lights=0", "exposure.most_renders=3",
-    "windows.start=0", "pose.start=0",
-)  # fmt: skip
+SETTINGS = ("lamps=0", "most_renders=3", "event_start=0", "pose.start=0")
 
 
 @pytest.fixture
@@ -36,31 +33,34 @@ def captures(tiny_capture):
 
 
 def composed(capture: Capture, *settings: str):
-    config = method_config("evsplat", override({}, (*SMALL, *settings)), where="test")
-    return TRAINABLE["evsplat"].build(config, capture.for_training(config.policy), 0)
+    return built("evsplat", capture, *SETTINGS, *settings, purpose="train")
+
+
+def prepared(capture: TrainingCapture, **settings) -> Poses:
+    return prepare_poses(replace(EvsplatConfig().pose, **settings), capture, announce=True)
 
 
 def test_noisy_poses_are_told_and_exact_ones_stay_at_every_key(captures, caplog):
     exact, noisy = captures
     with caplog.at_level(logging.INFO):
-        untouched = prepare_poses(PoseConfig(), seen(exact))
+        untouched = prepared(seen(exact))
     assert "taken as they are, corrected between keys only" in caplog.text
     assert untouched.spline is not None
     keys = untouched.track.times_us.tolist()
     assert untouched.spline.weights(keys).abs().max() < 1e-5
     assert set(untouched.priced_us).isdisjoint(keys)
-    assert prepare_poses(PoseConfig(between=False), seen(exact)).spline is None
+    assert prepared(seen(exact), between=False).spline is None
     assert np.array_equal(untouched.track.poses, load_body_track(exact).poses)
     caplog.clear()
     with caplog.at_level(logging.INFO):
-        found = prepare_poses(PoseConfig(), seen(noisy))
+        found = prepared(seen(noisy))
     assert "smoothed in time, corrected in training" in caplog.text
     truth = load_body_track(exact).poses
     before = np.abs(load_body_track(noisy).poses - truth).mean()
     assert np.abs(found.track.poses - truth).mean() < before
     assert found.spline is not None
     assert float(found.spline.joint_rad.max()) == pytest.approx(0.05, rel=0.5)
-    off = prepare_poses(PoseConfig(smooth="never", refine="never", between=False), seen(noisy))
+    off = prepared(seen(noisy), smooth="never", refine="never", between=False)
     assert off.spline is None
     assert np.array_equal(off.track.poses, load_body_track(noisy).poses)
 
@@ -81,7 +81,7 @@ def test_jitter_counts_against_what_lies_between_the_keys(
     poses = 0.3 * np.sin(phase) * (cycles > 0) + jitter * rng.normal(size=(count, *joints))
     np.savez(path / "body.npz", **body | {"poses": poses.astype(np.float32)})
     with caplog.at_level(logging.INFO):
-        found = prepare_poses(PoseConfig(), seen(path))
+        found = prepared(seen(path))
     assert ("are noisy: smoothed in time, corrected in training" in caplog.text) == noisy
     if noisy:
         assert found.spline is not None
@@ -111,7 +111,7 @@ def test_held_out_frames_move_their_poses_only(captures):
     changed = {
         name for name, value in model.state_dict().items() if not torch.equal(value, before[name])
     }
-    assert changed == {"rotation_residuals", "translation_residuals"}
+    assert changed == {"residual.rotations", "residual.translations"}
     assert torch.equal(count, trainer.statistics["gaussians"].seen)
 
 
@@ -131,11 +131,11 @@ def test_without_being_asked_held_out_events_teach_nothing(captures, tmp_path):
         return {name: value.clone() for name, value in state.items() if value.is_floating_point()}
 
     ours, theirs = learned(noisy), learned(load_capture(others))
-    assert ours["rotation_residuals"].abs().max() > 0
+    assert ours["residual.rotations"].abs().max() > 0
     assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
     # where they are asked for they do teach
     asked = [learned(capture, *INTERPOLATION) for capture in (noisy, load_capture(others))]
-    assert not torch.equal(asked[0]["rotation_residuals"], asked[1]["rotation_residuals"])
+    assert not torch.equal(asked[0]["residual.rotations"], asked[1]["residual.rotations"])
 
 
 def test_events_of_held_out_frames_need_a_policy_that_shows_them(captures):
@@ -143,14 +143,30 @@ def test_events_of_held_out_frames_need_a_policy_that_shows_them(captures):
         composed(captures[1], "pose.events_of_held_out=true")
 
 
+def test_events_of_held_out_frames_need_a_pose_that_is_learned(captures):
+    with pytest.raises(ConfigError, match="events_of_held_out is true, and nothing reads it"):
+        composed(captures[0], *INTERPOLATION, "pose.between=false")
+
+
+@pytest.mark.parametrize("setting", ["pose.std_rad=0.1", "pose.std_m=0.1"])
+def test_errors_expected_of_exact_poses_are_refused(captures, setting):
+    exact, noisy = captures
+    name = setting.partition("=")[0]
+    with pytest.raises(ConfigError, match=f"{name} is 0.1, and nothing reads it: .* as exact"):
+        composed(exact, setting)
+    spline = composed(noisy, setting).model.residual
+    found = spline.joint_rad.max() if name == "pose.std_rad" else spline.root_m
+    assert float(found) == pytest.approx(0.1)
+
+
 def test_a_spline_is_learned_where_it_is_asked_for(captures):
     composition = composed(captures[1])
     assert composition.held_out is None
-    assert composition.model.pose_spline is not None
-    assert composition.weights["pose_prior"] == PoseConfig().prior
-    assert composed(captures[0], "pose.between=false").model.pose_spline is None
+    assert composition.model.residual is not None
+    assert composition.weights["pose_prior"] == EvsplatConfig().pose.prior
+    assert composed(captures[0], "pose.between=false").model.residual is None
 
 
 def test_an_unknown_choice_is_named():
     with pytest.raises(ConfigError, match="pose.smooth"):
-        method_config("evsplat", override({}, ("pose.smooth=sometimes",)), where="test")
+        small_config("evsplat", "pose.smooth=sometimes")

@@ -6,23 +6,18 @@ import pytest
 import torch
 
 from evsplat.capture import load_capture
-from evsplat.config import override
-from evsplat.models.drawing import _places, draw
 from evsplat.errors import ConfigError
-from evsplat.methods import compose, method_config
-from evsplat.render import render
+from evsplat.models.drawing import _places, draw, shadowed_scene
+from evsplat.render import LOW_PASS, Splats, render
 
-from ..seen import seen
-
-SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16", "deform.shadow_lights=2")
+from ..small_model import built, small_config
 
 
 @pytest.fixture
-def posed(tiny_capture):
-    """A model with shadows, posed at two times, and the camera."""
+def shadowed(tiny_capture):
+    """A model with shadows, its layers at two times, and the camera."""
     capture = load_capture(tiny_capture())
-    config = method_config("paper", override({}, SMALL), where="test")
-    model = compose(config, seen(capture), 0, fit=False).model
+    model = built("evsplat", capture, "lamps=2").model
     camera = capture.camera(capture.train_frames[0])
     times = [frame.mid_us for frame in capture.train_frames[:2]]
     return model, model.at(times, camera.center()), camera
@@ -31,57 +26,69 @@ def posed(tiny_capture):
 @pytest.mark.parametrize("low_pass", [0.3, 0.1])
 def test_pictures_have_the_low_pass_of_the_model(tiny_capture, low_pass):
     capture = load_capture(tiny_capture())
-    settings = override({}, ("human.count=150", f"deform.low_pass={low_pass}"))
-    config = method_config("paper", settings, where="test")
-    model = compose(config, seen(capture), 0, fit=False).model
+    model = built("evsplat", capture, "lamps=0", f"low_pass={low_pass}").model
     frame = capture.train_frames[0]
     camera = capture.camera(frame)
     with torch.no_grad():
-        posed = model.at([frame.mid_us], camera.center())
-        drawn = draw(model, posed, camera).output.image
-        layers = posed.moving(), posed.static()
+        layers = model.at([frame.mid_us], camera.center())
+        drawn = draw(layers, camera).output.image
         wanted, other = (
-            render(layers[0], camera, static=layers[1], low_pass=px2).image
+            render(layers.human, camera, static=layers.scene, low_pass=px2).image
             for px2 in (low_pass, 0.2)
         )
     assert torch.equal(drawn, wanted) and not torch.allclose(drawn, other, atol=1e-3)
 
 
-def test_a_low_pass_wider_than_the_usual_is_refused(tiny_capture):
-    config = method_config("paper", override({}, ("deform.low_pass=0.4",)), where="test")
-    with pytest.raises(ConfigError, match="low_pass is 0.4; it takes px.2 above 0 and up to 0.3"):
-        compose(config, seen(tiny_capture()), 0, fit=False)
+@pytest.mark.parametrize("method", ["avatar3dgs", "avatar3dgs_semantic", "hugs", "paper"])
+def test_other_methods_have_the_low_pass_of_3dgs(tiny_capture, method):
+    capture = load_capture(tiny_capture())
+    model = built(method, capture).model
+    frame = capture.train_frames[0]
+    layers = model.at([frame.mid_us], capture.camera(frame).center(), hard_semantics=True)
+    assert model.low_pass == layers.low_pass == LOW_PASS == 0.3
 
 
-def test_without_any_share_of_the_light_nothing_changes(posed):
-    model, gaussians, camera = posed
+def test_a_low_pass_wider_than_the_usual_is_refused():
+    with pytest.raises(ConfigError, match="low_pass is 0.4; expected a number above 0 and .* 0.3"):
+        small_config("evsplat", "low_pass=0.4")
+
+
+def test_without_any_share_of_the_light_nothing_changes(shadowed):
+    model, layers, camera = shadowed
     with torch.no_grad():
         model.shadow.share_logits.fill_(-50.0)
-        dark = draw(model, gaussians, camera)
-        plain = render(gaussians.moving(), camera, static=gaussians.static())
+        dark = draw(layers, camera)
+        plain = render(layers.human, camera, static=layers.scene, low_pass=layers.low_pass)
     for time in range(2):
         assert torch.allclose(dark.rgb[time], plain.image[time, ..., :3], atol=2e-6)
         assert torch.allclose(dark.semantic[time], plain.image[time, ..., 3], atol=2e-6)
     assert torch.equal(dark.output.radii, plain.radii)
 
 
-def test_a_shadow_darkens_the_scene_and_leaves_the_person(posed, monkeypatch):
-    model, gaussians, camera = posed
+def darker(scene: Splats, factor: float) -> Splats:
+    """The scene with its colours times ``factor``."""
+    rgb, semantic = scene.channels.split((3, 1), -1)
+    return replace(scene, channels=torch.cat([factor * rgb, semantic], -1))
+
+
+def test_a_shadow_darkens_the_scene_and_leaves_the_person(shadowed):
+    _, layers, camera = shadowed
     factors = torch.tensor([0.25, 0.75])[:, None, None]
-    monkeypatch.setattr(
-        model.shadow, "forward", lambda body, places, lamps: factors.expand(-1, *places.shape[:2])
-    )
+    layers = replace(layers, shadow=lambda places: factors.expand(-1, *places.shape[:2]))
     with torch.no_grad():
-        drawn = draw(model, gaussians, camera)
+        drawn = draw(layers, camera)
+        files = shadowed_scene(layers)
         for time, factor in enumerate((0.25, 0.75)):
-            scene = replace(gaussians.scene, rgb=factor * gaussians.scene.rgb)
-            darker = replace(gaussians, scene=scene)
-            want = render(darker.moving(), camera, static=darker.static()).image[time, ..., :3]
-            assert torch.allclose(drawn.rgb[time], want, atol=2e-6)
+            scene = darker(layers.scene, factor)
+            want = render(layers.human, camera, static=scene, low_pass=layers.low_pass).image[time]
+            assert torch.allclose(drawn.rgb[time], want[..., :3], atol=2e-6)
+            assert torch.allclose(drawn.semantic[time], want[..., 3], atol=2e-6)
+            # For files each Gaussian has the shadow in its colour.
+            assert torch.allclose(files.channels[time], scene.channels[0])
 
 
-def test_places_of_a_slanted_plane_are_on_it(posed):
-    _, _, camera = posed
+def test_places_of_a_slanted_plane_are_on_it(shadowed):
+    _, _, camera = shadowed
     turn = torch.linalg.qr(torch.randn(3, 3))[0]
     turn = turn * torch.linalg.det(turn)
     pose = torch.eye(4)
@@ -104,8 +111,10 @@ def test_places_of_a_slanted_plane_are_on_it(posed):
     assert torch.allclose(back[0], torch.tensor([1.0, 1.0]), atol=1e-3)
 
 
-def test_lights_get_a_gradient_from_the_picture(posed):
-    model, gaussians, camera = posed
-    torch.stack(draw(model, gaussians, camera).rgb).sum().backward()
-    for name, parameter in model.shadow.named_parameters():
-        assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
+def test_lights_get_a_gradient_from_the_picture(shadowed):
+    model, layers, camera = shadowed
+    torch.stack(draw(layers, camera).rgb).sum().backward()
+    for part in (model.shadow, model.lamps):
+        for name, parameter in part.named_parameters():
+            if not name.startswith("own"):  # of shadows on the person, which is not lit yet
+                assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name

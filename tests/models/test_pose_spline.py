@@ -29,6 +29,16 @@ def make(seed: int = 0, knot_us: float = 93_000, joints: int = 4) -> tuple[PoseS
     return spline, BSpline(knots * 1e-6, points, 3)
 
 
+def residual(
+    spline: PoseSpline, times: list[int], points: torch.Tensor, root: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Turns and shifts at ``times`` with control points (K, J, 3), and (K, 3) of the root."""
+    with torch.no_grad():
+        spline.rotations.copy_(points)
+        spline.translations.copy_(points[:, 0] if root is None else root)
+        return spline.residual(times)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_values_and_bends_are_scipys(seed):
     spline, scipys = make(seed, knot_us=[40_000, 93_000, 5_000_000][seed])
@@ -47,23 +57,23 @@ def test_values_and_bends_are_scipys(seed):
 def test_the_mean_over_frames_is_zero_and_a_constant_says_nothing(seed):
     spline, scipys = make(seed)
     points = torch.tensor(scipys.c, dtype=torch.float32)
-    assert spline.rotation(points, FRAMES).mean(0).abs().max() < 1e-6
-    assert spline.translation(points[:, 0], FRAMES).mean(0).abs().max() < 1e-7
+    turns, shifts = residual(spline, FRAMES, points)
+    assert turns.mean(0).abs().max() < 1e-6
+    assert shifts.mean(0).abs().max() < 1e-7
     times = list(range(0, 1_000_000, 70_000))
-    assert torch.allclose(
-        spline.rotation(points + 3.0, times), spline.rotation(points, times), atol=1e-5
-    )
+    moved, given = (residual(spline, times, points + more)[0] for more in (3.0, 0.0))
+    assert torch.allclose(moved, given, atol=1e-5)
 
 
 def test_units_still_joints_and_held_ends():
     spline, scipys = make(1)
     points = torch.tensor(scipys.c, dtype=torch.float32)
-    found = spline.rotation(points, [200_000])
+    found, shifts = residual(spline, [200_000], points, points[:, 2])
     assert (found[:, 1] == 0).all()
     plain = (spline.weights([200_000]) @ points.flatten(1)).view(1, -1, 3)
     assert torch.allclose(found[:, 2], 0.5 * plain[:, 2], atol=1e-6)
-    assert torch.allclose(spline.translation(points[:, 2], [200_000]), 0.02 * plain[:, 2])
-    ends = spline.rotation(points, [-50_000, 10_000, 990_000, 2_000_000])
+    assert torch.allclose(shifts, 0.02 * plain[:, 2])
+    ends, _ = residual(spline, [-50_000, 10_000, 990_000, 2_000_000], points)
     assert torch.equal(ends[0], ends[1]) and torch.equal(ends[2], ends[3])
 
 
@@ -72,11 +82,9 @@ def test_the_price_is_that_of_scipys_curve():
     times = np.array([10_000, 210_000, 400_000, 610_000, 800_000, 990_000])
     points = torch.tensor(scipys.c, dtype=torch.float32)
     root = points[:, 0].flip(0)
-    model = SimpleNamespace(
-        pose_spline=spline, pose_correction_active=True,
-        rotation_residuals=points, translation_residuals=root,
-    )  # fmt: skip
-    found = PosePrior(times.tolist()).loss(SimpleNamespace(model=model))["pose_prior"]
+    residual(spline, [], points, root)
+    model = SimpleNamespace(residual=spline, residual_active=True)
+    found = PosePrior(times.tolist()).loss(SimpleNamespace(model=model))["pose_prior"].detach()
     gap, seconds, frames = 0.196, times * 1e-6, np.array(FRAMES) * 1e-6
     prices = []
     curves = [BSpline(scipys.t, scipys.c[:, joint], 3) for joint in (0, 2, 3)]
@@ -87,7 +95,7 @@ def test_the_price_is_that_of_scipys_curve():
         bend = curve(seconds, 2)
         prices.append((value**2).mean() + float(stiff) * gap * (bend**2).mean())
     assert float(found) == pytest.approx(np.mean(prices), rel=1e-4)
-    model.pose_correction_active = False
+    model.residual_active = False
     assert PosePrior(times.tolist()).loss(SimpleNamespace(model=model)) == {}
 
 
@@ -104,16 +112,16 @@ def test_held_at_keys_it_is_scipys_curve_less_the_cubic_through_its_keys(seed):
     free = BSpline(1e-6 * knots, rng.normal(size=(spline.count, 2, 3)), 3)
     through = CubicSpline(1e-6 * keys, free(1e-6 * keys))
     points = torch.tensor(free.c, dtype=torch.float32)
-    assert spline.rotation(points, keys.tolist()).abs().max() < 1e-5
+    assert residual(spline, keys.tolist(), points)[0].abs().max() < 1e-5
     times = rng.integers(10_000, 990_001, size=40)
     seconds = 1e-6 * times
     expected = free(seconds) - through(seconds)
     assert np.abs(expected).max() > 0.3
-    assert np.allclose(spline.rotation(points, times.tolist()), expected, atol=1e-4)
+    assert np.allclose(residual(spline, times.tolist(), points)[0], expected, atol=1e-4)
     bend = torch.einsum("tk,kjc->tjc", spline.weights(times.tolist(), derivative=2), points)
     expected = free(seconds, 2) - through(seconds, 2)
     assert np.allclose(bend, expected, atol=1e-4 * np.abs(expected).max())
-    outside = spline.rotation(points, [-5_000, 2_000_000])
+    outside, _ = residual(spline, [-5_000, 2_000_000], points)
     assert outside.abs().max() < 1e-5
 
 
@@ -137,21 +145,23 @@ def test_gradients_are_those_of_finite_differences():
         knot_frames=1.5, joint_rad=0.3, root_m=0.1, stiff=False,
     )  # fmt: skip
     rng = np.random.default_rng(3)
-    shape = spline.count, len(body.parents), 3
-    points = torch.tensor(0.5 * rng.normal(size=shape), dtype=torch.float32)
+    points = spline.rotations
+    torch.nn.init.normal_(points, std=0.5, generator=torch.Generator().manual_seed(3))
     drawn = [90_000, 500_000]
     base, shift = track.at(drawn)
     look = torch.tensor(rng.normal(size=(2, len(body.parents), 3)), dtype=torch.float32)
 
-    def value(points):
-        turned = base @ axis_angle_to_matrix(spline.rotation(points, drawn))
+    def value():
+        turned = base @ axis_angle_to_matrix(spline.residual(drawn)[0])
         return (joints_of(body, turned, shift) * look).sum()
 
-    direction = torch.tensor(rng.normal(size=shape), dtype=torch.float32)
-    points.requires_grad_()
-    (gradient,) = torch.autograd.grad(value(points), points)
+    direction = torch.tensor(rng.normal(size=points.shape), dtype=torch.float32)
+    (gradient,) = torch.autograd.grad(value(), points)
     with torch.no_grad():
-        ahead, behind = value(points + 0.01 * direction), value(points - 0.01 * direction)
+        points += 0.01 * direction
+        ahead = value()
+        points -= 0.02 * direction
+        behind = value()
     assert float((gradient * direction).sum()) == pytest.approx(
         float(ahead - behind) / 0.02, rel=2e-3
     )
@@ -173,14 +183,12 @@ def test_known_errors_of_key_poses_are_found_again(seed):
         given, motion_noise(given), times.tolist(),
         knot_frames=1, joint_rad=0.03, root_m=0.01, stiff=False,
     )  # fmt: skip
-    points = torch.zeros(spline.count, len(body.parents), 3, requires_grad=True)
-    shifts = torch.zeros(spline.count, 3, requires_grad=True)
-    adam = torch.optim.Adam([points, shifts], lr=0.2)
+    adam = torch.optim.Adam(spline.parameters(), lr=0.2)
 
     def error(drawn):
         rotations, transl = given.at(drawn)
-        turned = rotations @ axis_angle_to_matrix(spline.rotation(points, drawn))
-        found = joints_of(body, turned, transl + spline.translation(shifts, drawn))
+        turns, shifts = spline.residual(drawn)
+        found = joints_of(body, rotations @ axis_angle_to_matrix(turns), transl + shifts)
         return found - joints_of(body, *truth.at(drawn))
 
     keys = times.tolist()

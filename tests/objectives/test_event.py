@@ -2,11 +2,10 @@
 
 import math
 
+import h5py
 import pytest
 import torch
 
-from evsplat.errors import ConfigError
-from evsplat.methods.paper import EventConfig, paper_events
 from evsplat.objectives import EventChange, event_loss
 from evsplat.pictures import decode, encode, log_brightness_change
 
@@ -109,24 +108,28 @@ def test_compiled_loss_of_no_number_is_none():
     assert bool(event_loss(change, torch.ones(20, 30)).isnan())
 
 
-@pytest.mark.parametrize("across_gaps", [False, True])
-def test_pairs_cross_held_out_frames_only_where_that_is_asked_for(tiny_capture, across_gaps):
+def test_pairs_never_cross_held_out_frames(tiny_capture):
     capture = seen(tiny_capture(frames=20), held_out_events=True)
-    objective = EventChange(
-        capture, start=0, floor=0.03, eps=1e-5, across_gaps=across_gaps, weight_by_activity=True,
-        min_active=0.0,
-    )  # fmt: skip
+    objective = EventChange(capture, start=0, min_active=0.0)
     mids = [frame.mid_us for frame in capture.frames]
     pairs = {objective.times(frame, 1.0) for frame in capture.train_frames}
     steps = {(mids.index(a), mids.index(b)) for a, b in pairs}
-    within = {(i, i + 1) for i in (*range(6), *range(10, 16))}
-    # the last frame before the gap looks ahead over it, or back; so does the last of all
-    assert steps == (within | {(6, 10)} if across_gaps else within)
+    assert steps == {(i, i + 1) for i in (*range(6), *range(10, 16))}
     assert len(pairs) == len(objective.weights)
 
 
-def test_pairs_across_held_out_frames_need_a_policy_that_shows_their_events(tiny_capture):
-    config, path = EventConfig(across_gaps=True), tiny_capture(frames=20)
-    with pytest.raises(ConfigError, match="policy.held_out_events=true as well"):
-        paper_events(config, seen(path))
-    assert paper_events(config, seen(path, held_out_events=True)).partner
+@pytest.mark.parametrize("seed", range(3))
+def test_the_papers_term_takes_events_without_polarity(tiny_capture, seed):
+    """Where all pixels only brighten, sizes and signed changes say the same."""
+    path = tiny_capture(seed=seed)
+    with h5py.File(path / "events.h5", "r+") as file:
+        file["events/p"][:] = 1
+    signed = EventChange(seen(path), start=0)
+    pair = next(iter(signed.weights))
+    changed = signed._map(*pair)
+    signed.events.close()
+    with h5py.File(path / "events.h5", "r+") as file:
+        file["events/p"][:] = 0
+    blind = EventChange(seen(path), start=0)
+    assert changed.any() and (changed == blind._map(*pair)).all()
+    assert signed.weights == blind.weights

@@ -32,6 +32,7 @@ def test_times_are_stratified_with_the_middle_among_them(count, seed):
 def test_the_number_of_renders_is_odd_and_follows_the_motion(motion, expected):
     assert renders_for(motion, 3.0, 7) == expected
     assert renders_for(motion, 3.0, 1) == 1
+    assert renders_for(motion, 3.0, 6) == min(expected, 5)
 
 
 @pytest.mark.parametrize("seed", range(3))

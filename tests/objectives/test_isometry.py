@@ -29,13 +29,12 @@ def make_step(seed: int, count: int = 60, turn: float = 0.7, stretch: float = 1.
     moved = gaussians.means.detach() @ matrix[:3, :3].T + matrix[:3, 3]
     human = SimpleNamespace(
         means=moved[None],
-        transforms=matrix.expand(1, count, 4, 4),
-        quaternions=gaussians.quaternions.detach()[None],
+        quats=gaussians.quaternions.detach()[None],
         scales=gaussians.scales_log.detach().exp()[None],
     )
     return SimpleNamespace(
         model=SimpleNamespace(gaussians=gaussians),
-        posed=SimpleNamespace(human=human),
+        layers=SimpleNamespace(human=human, transforms=matrix.expand(1, count, 4, 4)),
         generator=generator,
     )
 
@@ -67,8 +66,8 @@ def test_neighbours_are_searched_again_when_rows_changed_though_their_number_did
     with torch.no_grad():
         for value in gaussians.parameters():
             value[:] = value[order]
-    human = shuffled.posed.human
-    human.means, human.quaternions = human.means[:, order], human.quaternions[:, order]
+    human = shuffled.layers.human
+    human.means, human.quats = human.means[:, order], human.quats[:, order]
     human.scales = human.scales[:, order]
     stale = float(objective.loss(shuffled)["isometry_centers"])
     objective.rows_changed()

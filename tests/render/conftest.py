@@ -65,7 +65,7 @@ def random_scene(
     matrices = torch.eye(3) + 0.2 * normal(times, count, 3, 3) if linear else None
     splats = Splats(
         means=means,
-        quats=normal(*lead, count, 4),
+        quaternions=normal(*lead, count, 4),
         scales=scales,
         opacities=opacities,
         channels=normal(times, count, channels),

@@ -48,7 +48,7 @@ def test_pictures_of_a_moving_layer_are_bit_for_bit_those_without(
     backdrop, jobs = Backdrop(), []
     for time in (0, 1, 2, 3, 0):
         assert_same(at(moving, time), camera, static, backdrop, background=background)
-        jobs.append(backdrop.job)
+        jobs.append(backdrop.kept)
     assert_same(moving, camera, static, backdrop, background=background)
     assert None not in jobs
 
@@ -77,7 +77,7 @@ def test_whatever_changes_the_layer_or_the_camera_begins_anew(layers):
     backdrop = Backdrop()
     show = dict(static=static, backdrop=backdrop)
     assert_same(at(moving, 0), camera, **show)
-    for name in ("means", "quats", "scales", "opacities", "channels"):
+    for name in ("means", "quaternions", "scales", "opacities", "channels"):
         changed = replace(static, **{name: getattr(static, name) * 0.9 + 0.01})
         assert_same(at(moving, 1), camera, static=changed, backdrop=backdrop)
     assert_same(at(moving, 2), camera, **show)
@@ -101,7 +101,7 @@ def test_without_a_static_layer_there_is_nothing_to_keep(layers):
     moving, _, camera = layers(7)
     backdrop = Backdrop()
     assert_same(moving, camera, None, backdrop)
-    assert backdrop.job is None
+    assert backdrop.kept is None
 
 
 def test_there_are_no_gradients(layers):

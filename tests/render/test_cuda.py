@@ -13,7 +13,7 @@ from .gsplat_on_cpu import install
 
 GRADIENT_BOUND = 1e-3
 MILD = 5
-"""How much longer than wide the longest Gaussians are; for needles see the test of their own."""
+"""Length by width of the longest Gaussians; needles have a test of their own."""
 CASES = {
     "plain": dict(seed=0),
     "whole tiles": dict(seed=1, width=64, height=48),
@@ -29,14 +29,14 @@ CASES = {
 
 @pytest.fixture(params=["stand-in", "gpu"])
 def device(request, monkeypatch):
-    """Where tensors of the backend go: the GPU, or the CPU with gsplat's kernels in torch."""
+    """Device of the backend: the GPU, or the CPU with gsplat's kernels in torch."""
     if request.param == "gpu":
         missing = cuda_support.what_is_missing()
         if missing is not None:
             pytest.skip(f"needs an NVIDIA GPU with gsplat: {missing}")
         return "cuda"
     gsplat = install(monkeypatch)
-    backends = api._BACKENDS | {"gsplat": lambda *inputs: cuda.draw(gsplat, *inputs)}
+    backends = api._BACKENDS | {"gsplat": lambda job: cuda.draw(gsplat, job)}
     monkeypatch.setattr(api, "_BACKENDS", backends)
     return "cpu"
 
@@ -114,7 +114,7 @@ def test_needles_lose_digits_in_float32(device, random_scene, all_gradients):
     assert max(errors.values()) < 5e-2, errors
 
 
-@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "linear"])
+@pytest.mark.parametrize("field", ["means", "quaternions", "scales", "opacities", "linear"])
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e38])
 def test_a_broken_gaussian_is_not_drawn_and_harms_no_other(field, bad, device, random_scene):
     splats, camera = random_scene(10, linear=True)
@@ -130,7 +130,7 @@ def test_a_broken_gaussian_is_not_drawn_and_harms_no_other(field, bad, device, r
     if out.radii[0, 50] == 0:
         assert torch.equal(out.image, expected.image)
     else:
-        assert bad == 1e38 and field in ("opacities", "quats")
+        assert bad == 1e38 and field in ("opacities", "quaternions")
     (gradient,) = torch.autograd.grad(out.image.sum(), means)
     others = torch.arange(200) != 50
     assert torch.isfinite(gradient[0, others]).all()
@@ -140,7 +140,7 @@ def test_equal_depths_keep_the_order_of_the_gaussians(device, camera):
     count = 300
     splats = Splats(
         means=torch.tensor([[[0.0, 0, 1.0]]]).expand(1, count, 3),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
         scales=torch.full((count, 3), 0.2),
         opacities=torch.full((count,), 0.02),
         channels=torch.arange(count).float()[None, :, None],

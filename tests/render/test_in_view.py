@@ -1,4 +1,4 @@
-"""What is left out of a picture, against what the rasteriser draws."""
+"""Rows left out of a picture, against those that the rasteriser draws."""
 
 from types import SimpleNamespace
 

@@ -76,7 +76,9 @@ def test_a_long_needle_keeps_its_digits(camera, all_gradients):
     angle = torch.tensor(0.8)
     splats = Splats(
         means=torch.tensor([[[0.02, -0.01, 1.0]]]),
-        quats=torch.stack([torch.cos(angle / 2), angle * 0, angle * 0, torch.sin(angle / 2)])[None],
+        quaternions=torch.stack([torch.cos(angle / 2), angle * 0, angle * 0, torch.sin(angle / 2)])[
+            None
+        ],
         scales=torch.tensor([[2.0, 1e-4, 1e-4]]),
         opacities=torch.tensor([0.8]),
         channels=torch.ones(1, 1, 1),
@@ -92,7 +94,7 @@ def test_gradients_survive_behind_an_opaque_wall(camera):
     """0.9985 opaque over the whole image: what is behind weighs 1e-3 and still has its gradient."""
     splats = Splats(
         means=torch.tensor([[[0.0, 0, 1.0], [0.05, 0.02, 1.5], [0, 0, 2.0]]]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4),
         scales=torch.tensor([[30.0, 30, 0.01], [0.1, 0.05, 0.1], [5, 5, 5]]),
         opacities=torch.tensor([0.9985, 0.7, 0.6]),
         channels=torch.rand(1, 3, 3, generator=torch.Generator().manual_seed(0)),
@@ -101,7 +103,7 @@ def test_gradients_survive_behind_an_opaque_wall(camera):
     def gradient(backend, dtype):
         leaves = {
             name: getattr(splats, name).to(dtype).clone().requires_grad_()
-            for name in ("means", "quats", "scales", "opacities", "channels")
+            for name in ("means", "quaternions", "scales", "opacities", "channels")
         }
         image = render(Splats(**leaves), camera, backend=backend).image
         # Smooth weights: with random ones, sums near zero would measure the rounding of the light
@@ -120,7 +122,7 @@ def test_gradients_survive_behind_an_opaque_wall(camera):
 def one_gaussian(opacity=0.7, sigma=0.1):
     return Splats(
         means=torch.tensor([[[0.0, 0, 1.0]]]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]),
         scales=torch.full((1, 3), sigma),
         opacities=torch.tensor([opacity]),
         channels=torch.tensor([[[2.0]]]),
@@ -174,7 +176,7 @@ def test_compositing_stops_before_the_transmittance_reaches_the_limit(backend, c
     """Two layers leave 0.04^2 = 1.6e-3; a third, at 6.4e-5, and all behind are left out."""
     splats = Splats(
         means=torch.tensor([[[0.0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, 4]]]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).expand(4, 4),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(4, 4),
         scales=torch.full((4, 3), 1e3),
         opacities=torch.full((4,), 0.96),
         channels=torch.eye(4)[None],
@@ -190,7 +192,7 @@ def test_equal_depths_keep_the_order_of_the_gaussians(backend, camera):
     count = 300
     splats = Splats(
         means=torch.tensor([[[0.0, 0, 1.0]]]).expand(1, count, 3),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
         scales=torch.full((count, 3), 0.2),
         opacities=torch.full((count,), 0.02),
         channels=torch.arange(count).float()[None, :, None],
@@ -217,7 +219,7 @@ def test_crowded_tiles_are_sorted_by_depth(depths, camera):
         depth = (4 * depth).round() / 4
     splats = Splats(
         means=torch.stack([0 * depth, 0 * depth, depth], -1)[None],
-        quats=torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
         scales=torch.full((count, 3), 100.0),
         opacities=torch.full((count,), 0.005),
         channels=torch.rand(1, count, 2, generator=generator),
@@ -285,7 +287,7 @@ def test_times_are_independent_renders(random_scene):
     together = render(splats, camera)
     for t in range(3):
         one = Splats(
-            splats.means[t : t + 1], splats.quats[t], splats.scales[t], splats.opacities[t],
+            splats.means[t : t + 1], splats.quaternions[t], splats.scales[t], splats.opacities[t],
             splats.channels[t : t + 1], splats.linear[t : t + 1],
         )  # fmt: skip
         alone = render(one, camera)
@@ -320,7 +322,7 @@ def test_gradient_of_alpha_alone_needs_no_image_gradient(random_scene):
         means = splats.means.to(dtype).requires_grad_()
         others = {
             name: getattr(splats, name).to(dtype)
-            for name in ("quats", "scales", "opacities", "channels")
+            for name in ("quaternions", "scales", "opacities", "channels")
         }
         out = render(Splats(means=means, **others), camera, backend=backend)
         return torch.autograd.grad(out.alpha.sum(), means)[0]
@@ -343,7 +345,7 @@ def test_no_gaussians_leave_the_background(camera):
         assert gradient.tolist() == [33 * 41, 33 * 41]
 
 
-@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "linear"])
+@pytest.mark.parametrize("field", ["means", "quaternions", "scales", "opacities", "linear"])
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e38])
 def test_a_broken_gaussian_is_not_drawn_and_harms_no_other(field, bad, random_scene):
     splats, camera = random_scene(10, linear=True)
@@ -359,7 +361,7 @@ def test_a_broken_gaussian_is_not_drawn_and_harms_no_other(field, bad, random_sc
         if out.radii[0, 50] == 0:
             assert torch.equal(out.image, expected.image)
         else:
-            assert field == "quats" and bad == 1e38
+            assert field == "quaternions" and bad == 1e38
     (gradient,) = torch.autograd.grad(out.image.sum(), means)
     others = torch.arange(200) != 50
     assert torch.isfinite(gradient[0, others]).all()
@@ -369,7 +371,7 @@ def test_gaussians_at_and_behind_the_camera_are_not_drawn(camera):
     depths = torch.tensor([0.0, -1.0, 0.0099, 0.011])
     splats = Splats(
         means=torch.stack([0 * depths, 0 * depths, depths], -1)[None],
-        quats=torch.tensor([[1.0, 0, 0, 0]]).expand(4, 4),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(4, 4),
         scales=torch.full((4, 3), 1e-3),
         opacities=torch.full((4,), 0.5),
         channels=torch.ones(1, 4, 1),
@@ -384,16 +386,16 @@ def test_unusable_requests_say_why(random_scene, monkeypatch):
     with pytest.raises(BackendError, match="float32"):
         doubles = {
             name: getattr(splats, name).double()
-            for name in ("means", "quats", "scales", "opacities", "channels")
+            for name in ("means", "quaternions", "scales", "opacities", "channels")
         }
         render(Splats(**doubles), camera)
     with pytest.raises(BackendError, match="Unknown render backend 'fast'"):
         render(splats, camera, backend="fast")
     with pytest.raises(BackendError, match="meta"):
-        names = ("means", "quats", "scales", "opacities", "channels")
+        names = ("means", "quaternions", "scales", "opacities", "channels")
         render(Splats(**{name: getattr(splats, name).to("meta") for name in names}), camera)
-    with pytest.raises(BackendError, match=r"quats has shape \(2, 200, 3\)"):
-        render(replace(splats, quats=splats.quats[..., :3]), camera)
+    with pytest.raises(BackendError, match=r"quaternions has shape \(2, 200, 3\)"):
+        render(replace(splats, quaternions=splats.quaternions[..., :3]), camera)
     with pytest.raises(
         BackendError, match=r"means has shape \(2, 200, 3\), expected .* T = 1 or 3"
     ):

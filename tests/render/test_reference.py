@@ -14,7 +14,7 @@ def brute_force(splats, camera, background):
     """
     view = camera.world_to_camera.numpy().astype(np.float64)
     K = camera.K.numpy().astype(np.float64)
-    quats = splats.quats.numpy().astype(np.float64)
+    quaternions = splats.quaternions.numpy().astype(np.float64)
     to_camera, shift = view[:3, :3], view[:3, 3]
 
     def project(point):
@@ -28,7 +28,7 @@ def brute_force(splats, camera, background):
             continue
         steps = 1e-6 * np.eye(3)
         jacobian = np.stack([(project(mean + d) - project(mean - d)) / 2e-6 for d in steps], -1)
-        shape = Rotation.from_quat(quats[i], scalar_first=True).as_matrix()
+        shape = Rotation.from_quat(quaternions[i], scalar_first=True).as_matrix()
         shape = shape @ np.diag(splats.scales[i].double().numpy())
         if splats.linear is not None:
             shape = splats.linear[0, i].double().numpy() @ shape
@@ -68,7 +68,7 @@ def test_reference_equals_brute_force_compositing(seed, random_scene):
     assert inside.sum() > 20 and (local[:, 2] < 0).sum() > 1
     splats = Splats(
         splats.means[:, keep].double(),
-        splats.quats[0, keep].double(),
+        splats.quaternions[0, keep].double(),
         splats.scales[0, keep].double(),
         splats.opacities[0, keep].double(),
         splats.channels[:, keep].double(),

@@ -82,8 +82,8 @@ def test_result_does_not_depend_on_the_number_of_threads(two_layers, all_gradien
 def test_nothing_moving_or_nothing_static_is_drawn_as_one_layer(two_layers):
     moving, static, camera = two_layers(30)
     none = Splats(
-        static.means[:, :0], static.quats[:, :0], static.scales[:, :0], static.opacities[:, :0],
-        static.channels[:, :0],
+        static.means[:, :0], static.quaternions[:, :0], static.scales[:, :0],
+        static.opacities[:, :0], static.channels[:, :0],
     )  # fmt: skip
     alone = render(static, camera).image
     assert torch.equal(render(none, camera, static=static).image, alone)
@@ -99,8 +99,8 @@ def test_what_does_not_fit_the_moving_layer_is_refused(two_layers):
         render(moving, camera, static=replace(static, means=static.means.expand(2, -1, -1)))
     with pytest.raises(BackendError, match="static has 2 channels, but splats has 3"):
         render(moving, camera, static=replace(static, channels=static.channels[..., :2]))
-    with pytest.raises(BackendError, match="static.quats has shape"):
-        render(moving, camera, static=replace(static, quats=static.quats[..., :3]))
+    with pytest.raises(BackendError, match="static.quaternions has shape"):
+        render(moving, camera, static=replace(static, quaternions=static.quaternions[..., :3]))
     with pytest.raises(BackendError, match=r"static.means is torch.float64"):
         doubled = [None if value is None else value.double() for value in vars(static).values()]
         render(moving, camera, static=Splats(*doubled))

@@ -19,8 +19,8 @@ from evsplat.restore.e2vid import E2VidNetwork, RecurrentUNet
 from evsplat.restore.efnet import TwoStages, event_mask, symmetric_cumulative
 from evsplat.restore.mprnet import ThreeStages
 from evsplat.restore.nafnet import LocalMean, NafUNet
+from evsplat.restore.network import in_tiles
 from evsplat.restore.pwcnet import PwcNet, _costs, warped
-from evsplat.restore.tiles import in_tiles
 from evsplat.weights import MissingWeights
 
 from ..seen import seen

@@ -7,28 +7,20 @@ import pytest
 import torch
 
 from evsplat.errors import DataError
-from evsplat.methods import TRAINABLE, compose, method_config
 from evsplat.render import api, cuda
 from evsplat.training.bad_steps import MAX_BAD_STEPS
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
 from ..seen import seen
+from ..small_model import built
 from .foreign_device import NAME, NEEDS_DATA, Descent, ForeignDevice, HostWaits, drawing
 
-SMALL = {
-    "human": {"count": 120},
-    "deform": {"width": 16, "colour_width": 16},
-    "isometry_samples": 64,
-}
 
-
-def quick(capture_path, **options):
+def quick(capture_path):
     """A trainer on the CPU in the middle of its schedule, without the fits before it."""
-    capture = seen(capture_path)
-    settings = method_config("paper", SMALL | options, where="test")
-    composition = compose(settings, capture, 0, fit=False)
-    return Trainer(composition, capture, Clock(100, fraction=0.5))
+    composition = built("paper", capture_path)
+    return Trainer(composition, seen(capture_path), Clock(100, fraction=0.5))
 
 
 def without_native(monkeypatch):
@@ -138,19 +130,16 @@ class Here:
 def foreign(monkeypatch):
     """The device, and a trainer factory for it with gsplat's functions as shapes."""
 
-    def make(capture_path, method="paper", **settings):
+    def make(capture_path, method, *settings):
         capture = seen(capture_path)
         camera = capture.camera(capture.frames[0])
         gsplat = drawing(camera.width, camera.height)
-        backends = api._BACKENDS | {"gsplat": lambda *inputs: cuda.draw(gsplat, *inputs)}
+        backends = api._BACKENDS | {"gsplat": lambda job: cuda.draw(gsplat, job)}
         monkeypatch.setattr(api, "_BACKENDS", backends)
         monkeypatch.setattr(api, "_BACKEND_OF_DEVICE", {NAME: "gsplat"})
         monkeypatch.setattr(torch.optim, "Adam", Descent)
         torch.__future__.set_overwrite_module_params_on_conversion(True)
-        composition = TRAINABLE[method].build(
-            method_config(method, {**SMALL, **settings}, where="test"), capture, 0,
-            device=NAME, fit=False,
-        )  # fmt: skip
+        composition = built(method, capture_path, *settings, device=NAME)
         trainer = Trainer(composition, capture, Clock(100, fraction=0.5))
         trainer.data = Here({})
         return trainer
@@ -161,34 +150,32 @@ def foreign(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("method", "settings"),
     [
-        {},
-        {
-            "method": "evsplat",
-            "deform": SMALL["deform"]
-            | {"shading": True, "shadow_lights": 2, "self_shadow": True, "networks_once": True},
-        },
-        {"deform": SMALL["deform"] | {"pose_correction_start": 0}},
+        ("paper", ()),
+        ("evsplat", ("lamps=2",)),
+        ("evsplat", ("lamps=2", "pose.refine=always", "clock=always")),
+        ("paper", ("networks.pose_start=0",)),
         pytest.param(
-            {"loss": {"perceptual": "st_lpips"}},
+            "paper",
+            ("terms.perceptual=st_lpips",),
             marks=pytest.mark.skipif(
                 importlib.util.find_spec("stlpips_pytorch") is None,
                 reason="the weights of ST-LPIPS come with the extra `perceptual`",
             ),
         ),
     ],
-    ids=["paper", "evsplat", "what can be switched on", "perceptual"],
+    ids=["paper", "evsplat", "evsplat with all", "paper with all", "perceptual"],
 )
-def test_a_step_stays_on_its_device_and_never_waits(settings, foreign, tiny_capture):
+def test_a_step_stays_on_its_device_and_never_waits(method, settings, foreign, tiny_capture):
     device, make = foreign
-    trainer = make(tiny_capture(width=64, height=48), **settings)
+    trainer = make(tiny_capture(width=64, height=48), method, *settings)
     trainer.previous_nominal = trainer.clock.nominal  # densification does wait
     trainer.step()  # what is made once, such as the levels of the skeleton
     device.may_wait = False
     report = trainer.step()
     named = {"l1", "dssim", "event", "semantic"}
-    if settings.get("method") != "evsplat":  # its person hangs on the body's own weights
+    if method != "evsplat":  # its person hangs on the body's own weights
         named |= {"skinning", "isometry_centers"}
     assert named <= {*report.names}
     assert report.measured.device.type == NAME

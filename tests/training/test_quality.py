@@ -19,7 +19,7 @@ def test_150_steps_beat_both_trivial_answers_in_full_frame_and_on_the_person(
         demo_capture_path,
         out=tmp_path / "run",
         iterations=150,
-        overrides=("human.count=4000", "densify_human.max_count=4000", "scene.prefit_steps=100"),
+        overrides=("human.count=4000", "densify.max_human=4000", "scene.prefit_steps=100"),
     )
     capture = load_capture(demo_capture_path)
     sources = {

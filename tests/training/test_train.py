@@ -13,12 +13,10 @@ import torch
 import yaml
 from safetensors.torch import save_file
 
-from evsplat.capture import Policy
 from evsplat.cli import main
 from evsplat.config import load_yaml
 from evsplat.errors import BackendError, ConfigError, DataError
 from evsplat.files import read_json
-from evsplat.methods import PaperConfig, compose
 from evsplat.training import load_run, train
 from evsplat.training.bad_steps import MAX_BAD_STEPS
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
@@ -27,14 +25,7 @@ from evsplat.training.run import RunFolder, read_config
 from evsplat.training.trainer import Trainer
 
 from ..seen import seen
-from ..small_model import SMALL_MODEL
-
-SMALL = (
-    *SMALL_MODEL,
-    # Everything that the schedule switches on is on early, so that few steps meet all of it.
-    "deform.non_rigid_start=3000",
-    "event.start=1000",
-)
+from ..small_model import built, small
 
 # The same call in a process of its own that saves after every step.
 SCRIPT = """
@@ -49,7 +40,7 @@ module.train(sys.argv[1], out=sys.argv[2], iterations=int(sys.argv[3]), resume=s
 def start(
     capture: Path, out: Path, iterations: int, *, resume: bool = False, method: str = "paper"
 ) -> subprocess.Popen:
-    settings = (method,) if resume else (method, *SMALL)
+    settings = (method,) if resume else (method, *small(method))
     command = [sys.executable, "-c", SCRIPT, capture, out, iterations, int(resume), *settings]
     return subprocess.Popen(
         [str(part) for part in command],
@@ -120,7 +111,9 @@ def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(tiny_capture,
     capture = tiny_capture(frames=10)
     runs = {}
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
-        out = train(capture, out=tmp_path / name, iterations=6, overrides=SMALL, seed=seed)
+        out = train(
+            capture, out=tmp_path / name, iterations=6, overrides=small("evsplat"), seed=seed
+        )
         runs[name] = final_tensors(out)["model.gaussians.means"]
     assert torch.equal(runs["a"], runs["b"])
     assert not torch.equal(runs["a"], runs["c"])
@@ -136,7 +129,7 @@ def test_every_semantics_mode_trains_and_only_learning_modes_move_labels(
         method="paper",
         out=tmp_path / mode,
         iterations=12,
-        overrides=(*SMALL, f"semantics={mode}", "optimisation.semantics_window=[0, 15000]"),
+        overrides=small("paper", f"semantics={mode}"),
     )
     labels = final_tensors(out)["model.gaussians.semantic_logits"]
     moved = bool((labels.abs() != 2.0).any())
@@ -149,11 +142,7 @@ def test_random_cube_is_selectable(tiny_capture, tmp_path):
         method="paper",
         out=tmp_path / "run",
         iterations=6,
-        overrides=(
-            *SMALL,
-            "scene.kind=random_cube",
-            "scene.cube_count=300",
-        ),
+        overrides=small("paper", "scene.kind=random_cube", "scene.cube_count=300"),
     )
     run = load_run(out)
     assert run.gaussians["scene"] > 0
@@ -162,10 +151,9 @@ def test_random_cube_is_selectable(tiny_capture, tmp_path):
 
 
 def test_non_finite_steps_are_skipped_counted_and_finally_stop(tiny_capture, caplog):
-    capture = seen(tiny_capture(frames=10))
-    config = PaperConfig(skinning_prefit_steps=1)
-    composition = compose(config, capture, 0, fit=False)
-    trainer = Trainer(composition, capture, Clock(100))
+    capture = tiny_capture(frames=10)
+    composition = built("paper", capture)
+    trainer = Trainer(composition, seen(capture), Clock(100))
     assert trainer.step() is not None
     before = composition.model.skinning.mlp.weights[0].detach().clone()
     with torch.no_grad():
@@ -188,7 +176,7 @@ def test_wrong_calls_are_refused_before_anything_is_written(tiny_capture, tmp_pa
         ({"max_minutes": -1.0}, ConfigError, "--max-minutes -1"),
         ({"device": "cuda"}, BackendError, "--device cuda"),
         ({"device": "gpu"}, ConfigError, "expected auto, cpu or cuda"),
-        ({"overrides": ("event.wieght=1",)}, ConfigError, "Did you mean event.weight"),
+        ({"overrides": ("event_wieght=1",)}, ConfigError, "Did you mean event_weight"),
         ({"resume": True}, DataError, "not a run folder"),
     ]
     for arguments, kind, message in calls:
@@ -204,7 +192,7 @@ def test_wrong_calls_are_refused_before_anything_is_written(tiny_capture, tmp_pa
 @pytest.mark.parametrize("change", ["lacks", "holds the unknown"])
 def test_a_checkpoint_of_another_version_is_named(tiny_capture, tmp_path, change):
     capture = tiny_capture(frames=10)
-    out = train(capture, out=tmp_path / "run", iterations=2, overrides=SMALL)
+    out = train(capture, out=tmp_path / "run", iterations=2, overrides=small("evsplat"))
     path = latest_checkpoint(RunFolder(out).checkpoints)
     tensors, state = load_checkpoint(path)
     if change == "lacks":
@@ -223,7 +211,9 @@ def test_a_checkpoint_of_another_version_is_named(tiny_capture, tmp_path, change
 
 
 def test_a_damaged_checkpoint_is_named(tiny_capture, tmp_path):
-    out = train(tiny_capture(frames=10), out=tmp_path / "run", iterations=2, overrides=SMALL)
+    out = train(
+        tiny_capture(frames=10), out=tmp_path / "run", iterations=2, overrides=small("evsplat")
+    )
     path = latest_checkpoint(RunFolder(out).checkpoints)
     assert path is not None
     path.write_bytes(path.read_bytes()[:1000])
@@ -248,14 +238,14 @@ def test_the_method_is_the_one_asked_for_or_that_of_the_config(
         out=tmp_path / "run",
         iterations=1,
         config=config,
-        overrides=SMALL,
+        overrides=small(expected),
     )
     assert read_config(RunFolder(out))[0] == expected
 
 
 def test_a_run_folder_holds_what_it_was_made_with(tiny_capture, tmp_path):
     capture = tiny_capture(frames=10)
-    out = train(capture, out=tmp_path / "run", iterations=2, overrides=SMALL)
+    out = train(capture, out=tmp_path / "run", iterations=2, overrides=small("evsplat"))
     facts = json.loads((out / "versions.json").read_text())
     assert facts["packages"]["torch"] == torch.__version__
     assert facts["seed"] == 0 and facts["threads"] >= 1
@@ -269,14 +259,14 @@ def test_everything_trains_where_it_is_asked_for_and_no_figure_is_made(
     tiny_capture, tmp_path, capsys
 ):
     path, out = tiny_capture(frames=10), tmp_path / "run"
-    settings = [f"--set={setting}" for setting in SMALL]
+    settings = [f"--set={setting}" for setting in small("paper")]
     command = ["train", str(path), "--out", str(out), "--iterations", "12", "--method", "paper"]
     assert main([*command, "--use", "everything", *settings]) == 0
     assert "No test figures. Every frame and every event trained" in capsys.readouterr().out
     assert load_yaml(out / "config.yaml")["policy"]["use"] == "everything"
     run = load_run(out)
     assert len(run.capture.train_frames) == 10 and run.policy.use == "everything"
-    assert len(run.reconstruction.model.latents) == 10
+    assert len(run.reconstruction.model.latents.values) == 10
     metrics = read_json(out / "metrics.json")
     assert metrics["per_frame"] == [] and metrics["policy"]["use"] == "everything"
     assert metrics["protocols"]["standard"]["full"]["psnr"] is None
@@ -286,13 +276,24 @@ def test_everything_trains_where_it_is_asked_for_and_no_figure_is_made(
     assert "--use" in capsys.readouterr().err
 
 
-def test_a_run_from_before_the_policy_says_that_it_saw_events_of_held_out_frames(
-    tiny_capture, tmp_path
-):
-    out = train(
-        tiny_capture(frames=10), method="paper", out=tmp_path / "run", iterations=2, overrides=SMALL
-    )
+def test_a_run_of_the_version_before_says_what_became_of_its_settings(tiny_capture, tmp_path):
+    overrides = small("evsplat")
+    capture, out = tiny_capture(frames=10), tmp_path / "run"
+    train(capture, out=out, iterations=2, overrides=overrides)
     config = load_yaml(out / "config.yaml")
-    del config["policy"]
+    config["deform"] = {"width": config.pop("width"), "shadow_lights": config.pop("lamps")}
+    config["optimisation"] = {"iterations": config.pop("iterations")}
+    config["windows"] = {"start": config.pop("event_start")}
     (out / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
-    assert load_run(out).policy == Policy(held_out_events=True)
+    for read in (lambda: load_run(out), lambda: train(capture, out=out, resume=True)):
+        with pytest.raises(ConfigError) as error:
+            read()
+        told, advice = str(error.value).split("\n")
+        for part in (
+            f"{out / 'config.yaml'}: ",
+            "deform.shadow_lights: renamed to lamps",
+            "optimisation.iterations: renamed to iterations",
+            "windows: its settings are event_start, ",
+        ):
+            assert part in told
+        assert "versions.json beside it names it" in advice and "train again" in advice

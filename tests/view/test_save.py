@@ -16,15 +16,13 @@ import zstandard  # noqa: E402
 from PIL import Image  # noqa: E402
 
 from evsplat.capture import load_capture  # noqa: E402
-from evsplat.config import override  # noqa: E402
-from evsplat.methods import compose, method_config  # noqa: E402
 from evsplat.training.run import GaussianReconstruction, Run  # noqa: E402
+from evsplat.view.request import Motion  # noqa: E402
 from evsplat.view.server import Viewer  # noqa: E402
 from evsplat.view.subject import Subject  # noqa: E402
-from evsplat.view.wish import Motion  # noqa: E402
 
 from ..export.clouds import read_ply, read_spz  # noqa: E402
-from ..seen import seen  # noqa: E402
+from ..small_model import built, small_config  # noqa: E402
 
 SIDE = 48
 
@@ -75,13 +73,12 @@ class Browser:
 @pytest.fixture(name="run")
 def _run(tiny_capture):
     capture = load_capture(tiny_capture())
-    values = override({}, ("human.count=60", "deform.width=16", "deform.colour_width=16"))
-    config = method_config("paper", values, where="test")
-    model = compose(config, seen(capture), 0, fit=False).model
+    config = small_config("evsplat", "human.count=60")
+    model = built("evsplat", capture, "human.count=60").model
     counts = {"human": model.gaussians.human_count, "scene": model.gaussians.scene_count}
-    made = GaussianReconstruction("paper", model)
+    made = GaussianReconstruction("evsplat", model)
     facts = (capture, made, 7, 0.0, "cpu", counts, False)
-    return Run(Path("none"), config, "paper", config.policy, *facts)
+    return Run(Path("none"), config, "evsplat", config.policy, *facts)
 
 
 def in_browser(run, port, act):

@@ -171,7 +171,7 @@ def _trained(
     iterations = cell.iterations
     if cell.max_minutes is not None and iterations is not None:
         # As a setting it is the length of a schedule that the time limit may still shorten.
-        settings, iterations = (*settings, f"optimisation.iterations={iterations}"), None
+        settings, iterations = (*settings, f"iterations={iterations}"), None
     go = partial(
         train,
         capture,

@@ -53,7 +53,7 @@ class SuiteRow:
     """Measure it before the median of the training frames: for a person without a scene, of whom
     black says nothing on a full frame."""
     settings: tuple[str, ...] = ()
-    """Settings of the method as for ``--set``: ``event.weight=0``."""
+    """Settings of the method as for ``--set``: ``event_weight=0``."""
     published: Published | None = None
 
     @property

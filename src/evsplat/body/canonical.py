@@ -40,7 +40,7 @@ class Legs:
     left: int
     right: int
     smpl: bool
-    """Whether the skeleton is one of the SMPL family."""
+    """True for a skeleton of the SMPL family."""
 
 
 def find_legs(parents: Sequence[int], joint_names: Sequence[str]) -> Legs | None:

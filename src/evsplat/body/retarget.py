@@ -15,7 +15,7 @@ from evsplat.body.tree import topological_order
 from evsplat.errors import DataError
 
 COLLAR_SHARE = 0.12
-"""How far a collar bone goes along with its upper arm where the source has no collar bones."""
+"""Share of the upper arm's turn that a collar bone takes where the source has no collar bones."""
 _ALIGNED = {"upper_arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot"}
 """Parts that take the source's bone direction, and where their bone ends."""
 _ABOVE = {"forearm": "upper_arm", "shin": "thigh"}
@@ -25,7 +25,7 @@ _FLOOR_FRAMES = 60
 
 @dataclass(frozen=True, eq=False)
 class SkeletonMotion:
-    """What a skeleton did: turns of its joints since the zero pose, and where its root was.
+    """Motion of a skeleton: turns of its joints since the zero pose, and places of its root.
 
     T times, J joints. A joint without a rotation of its own (the end of a limb) repeats its
     parent's. The zero pose is any upright pose whose joints are known; it faces along an axis.
@@ -44,7 +44,7 @@ class SkeletonMotion:
     world_from_source: Float[np.ndarray, "3 3"]
     """Rotation from the axes of the source to those of the world."""
     source: str = "motion"
-    """What messages name it by."""
+    """Name in messages."""
 
     def joints(self) -> Float[np.ndarray, "T J 3"]:
         """Joints in the world at each time, by forward kinematics."""

@@ -1,4 +1,4 @@
-"""Which joint of a skeleton is what: limbs by the names of common rigs, trunk by the tree."""
+"""Anatomy of a skeleton's joints: limbs by the names of common rigs, trunk by the tree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,9 +30,9 @@ class Skeleton:
 
     root: int
     spine: tuple[int, ...]
-    """From the joint after the root up to the chest, where the arms branch off."""
+    """Joints after the root up to the chest, where the arms branch off."""
     neck: tuple[int, ...]
-    """From the joint after the chest up to the head; may be empty."""
+    """Joints after the chest up to the head; may be empty."""
     limbs: dict[str, int]
     """``left_thigh`` and so on: `LIMBS` of both sides, with ``toe`` and ``collar`` where present.
 

@@ -17,6 +17,7 @@ from evsplat.calibration.thresholds import ThresholdEstimate, estimate_threshold
 
 __all__ = [
     "ClockEstimate",
+    "EventSource",
     "Exposure",
     "FramePair",
     "NoiseEstimate",
@@ -37,7 +38,7 @@ MOST_PAIRS = 60
 
 @dataclass(frozen=True)
 class SensorEstimate:
-    """What frames tell about the events that were recorded with them."""
+    """Clock and thresholds of events, estimated from the frames recorded with them."""
 
     clock: ClockEstimate
     thresholds: ThresholdEstimate | None

@@ -1,9 +1,9 @@
-"""What frames and events both say about the change of brightness between two frames."""
+"""Change of brightness between two frames, as the frames and as the events show it."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ DARKEST, BRIGHTEST = 0.02, 0.98
 SHORTEST_GAP_US = 20_000
 """Frames that follow each other faster are skipped: little changes between them."""
 HISTORY_US = 100_000
-"""How far back the last event of a pixel is looked for."""
+"""Time before a pair in which the last event of a pixel is looked for."""
 MOST_EVENTS = 10_000
 """About a pair of frames; of more a part is taken."""
 
@@ -35,7 +35,7 @@ class EventSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """What a frame says of the brightness."""
+    """Brightness of a frame."""
 
     log_luminance: Float[np.ndarray, "H W"]
     """Natural logarithm of linear luminance."""
@@ -54,20 +54,20 @@ class FramePair:
     change: Float[np.ndarray, "H W"]
     usable: Bool[np.ndarray, "H W"]
     recorded_us: Span
-    """Around the pair, when events were recorded and may be read; no others are asked for."""
+    """Stretch around the pair in which events were recorded and may be read; the only one read."""
 
     @property
     def span_us(self) -> tuple[int, int]:
-        """When events can contribute to the change."""
+        """Time in which events contribute to the change."""
         return min(self.before_us[0], self.after_us[0]), max(self.before_us[1], self.after_us[1])
 
     @property
     def gap_us(self) -> float:
-        """From mid-exposure to mid-exposure."""
+        """Time between the two mid-exposures."""
         return (sum(self.after_us) - sum(self.before_us)) / 2
 
     def recorded_at(self, lag_us: float) -> bool:
-        """Whether all events of the pair are there that come ``lag_us`` later than it."""
+        """True where all events of the pair are there that come ``lag_us`` later than it."""
         start, end = self.span_us
         return start + lag_us >= self.recorded_us[0] and end + lag_us <= self.recorded_us[1]
 
@@ -76,7 +76,7 @@ def exposure(
     image: Float[Tensor, "..."],
     span_us: tuple[int, int],
     *,
-    transfer: Transfer | Literal["linear"] = "power",
+    transfer: Transfer = "power",
 ) -> Exposure:
     """Brightness of a picture (H, W) or (H, W, 3) with coded values in [0, 1].
 
@@ -84,7 +84,7 @@ def exposure(
     pictures in a DAVIS recording.
     """
     rgb = image if image.ndim == 3 else image[..., None].expand(-1, -1, 3)
-    linear = rgb if transfer == "linear" else decode(rgb, transfer)
+    linear = decode(rgb, transfer)
     usable = (rgb > DARKEST).all(-1) & (rgb < BRIGHTEST).all(-1)
     # The clamp only keeps the logarithm finite: such pixels are not usable.
     return Exposure(
@@ -107,9 +107,9 @@ def pair(before: Exposure, after: Exposure, recorded_us: Span) -> FramePair:
 def pair_indices(
     spans_us: Sequence[tuple[int, int]], most: int, *, stretch: Sequence[Span] | None = None
 ) -> list[tuple[int, int]]:
-    """Which frames to pair: next to each other but `SHORTEST_GAP_US` apart, evenly spread.
+    """Pairs of frames next to each other but `SHORTEST_GAP_US` apart, evenly spread.
 
-    ``stretch`` says of each frame in which stretch of time it lies; pairs lie in one.
+    ``stretch`` is the stretch of time of each frame; pairs lie in one.
     """
     middle = np.array([(start + end) / 2 for start, end in spans_us])
     after = np.searchsorted(middle, middle + SHORTEST_GAP_US)
@@ -179,7 +179,7 @@ class PairEvents:
 def _level_steps(
     pixel: Int64[np.ndarray, "N"], brighter: Bool[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N"]:
-    """By how many thresholds each event lifts the most likely level.
+    """Thresholds by which each event lifts the most likely level.
 
     An event comes when a whole threshold has been passed. Until the next one the level lies up to
     a threshold further in the same direction, half of it on average; a plain sum of polarities

@@ -1,4 +1,4 @@
-"""By how much the events' clock lags the frames', from how well both agree on what changed."""
+"""Lag of the events' clock behind the frames', from how well both agree on the changes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,32 +11,30 @@ from evsplat.calibration.brightness import EventSource, FramePair, PairEvents
 SEARCH_US = 100_000
 """Lags up to here, either way, are tried."""
 LEAST_PIXELS = 300
-"""With fewer active pixels a correlation says nothing."""
+"""Fewer active pixels give no correlation."""
 LEAST_CORRELATION = 0.3
-_GROUPS = 8
-
-
 MOST_LAG_US = 4_000
-"""Events are late by a few ms by their nature; clocks that differ by more are told."""
+"""Events are late by a few ms by their nature; clocks that differ by more are reported."""
+_GROUPS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class ClockEstimate:
-    """How well frames and events agree, by the shift between their clocks."""
+    """Agreement of frames and events by the shift between their clocks."""
 
     lag_us: float
     """Events are stamped this much later than the frames: subtract it from their times."""
     spread_us: float
     """Standard error of ``lag_us`` over the recording (jackknife over groups of frames)."""
     correlation: float
-    """Of log luminance change and signed event count, over pixels with events, at ``lag_us``."""
+    """Pearson's, of log luminance change and signed event count at ``lag_us``."""
     lags_us: Float[np.ndarray, "L"]
     correlations: Float[np.ndarray, "L"]
-    """At each of ``lags_us``; what a curve of it shows."""
+    """The correlation at each of ``lags_us``."""
 
     @property
     def differs(self) -> bool:
-        """Whether events and frames are surely not on one clock."""
+        """True where events and frames are not on one clock, beyond doubt."""
         return abs(self.lag_us) > max(MOST_LAG_US, 3 * self.spread_us)
 
 
@@ -115,7 +113,7 @@ def _best(correlations: Float[np.ndarray, "L"]) -> int | None:
 
 
 def _vertex(lags_us: Float[np.ndarray, "L"], correlations: Float[np.ndarray, "L"]) -> float | None:
-    """Where a parabola through the five values about the largest has its top."""
+    """Lag at the top of a parabola through the five values about the largest."""
     best = _best(correlations)
     if best is None:
         return None

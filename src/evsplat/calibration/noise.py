@@ -99,7 +99,7 @@ def noise_of(events: EventStore) -> NoiseEstimate:
 
 
 def _has_support(chunk: EventStream, width: int, height: int) -> np.ndarray:
-    """Whether another event lies in the nine pixels around, in the same or a neighbouring slice.
+    """True for events with another one in the nine pixels around, in the same or a next slice.
 
     Slices of half of `SUPPORT_US`, so that the time between is at most `SUPPORT_US` and a pixel's
     own second event counts as well.

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from evsplat.calibration.brightness import EventSource, FramePair, PairEvents
 
 LEAST_EVENTS = 300
-"""Of either polarity; with fewer a threshold is not fitted."""
+"""Least events of either polarity that a threshold is fitted to."""
 _HUBER = 1.345
 _ITERATIONS = 30
 
@@ -21,7 +21,7 @@ class ThresholdEstimate:
     plus: float
     minus: float
     residual: float
-    """What is left of the change of a pixel: a robust standard deviation in log intensity."""
+    """Robust standard deviation of a pixel's change from the fit, in log intensity."""
     pixels: int
     """Pixels with events, over all pairs of frames, that the fit is made of."""
 

@@ -1,4 +1,4 @@
-"""What was recorded: the capture on disk, its cameras and frames, and the validator."""
+"""Captures: recordings on disk, read, checked and written; what of them a training may see."""
 
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile

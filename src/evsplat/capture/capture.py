@@ -6,7 +6,7 @@ from pathlib import Path
 
 from evsplat.capture.policy import Policy
 from evsplat.capture.read import CaptureReader
-from evsplat.capture.training_capture import FindsPeople, TrainingCapture
+from evsplat.capture.training_capture import HumanFinder, TrainingCapture
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 
@@ -24,9 +24,9 @@ class Capture(CaptureReader):
     def for_training(
         self,
         policy: Policy,
-        masker: Callable[[TrainingCapture], FindsPeople] | None = None,
+        masker: Callable[[TrainingCapture], HumanFinder] | None = None,
     ) -> TrainingCapture:
-        """What methods, restorers, maskers and calibration may see: the only thing they are given.
+        """The part that methods, restorers, maskers and calibration may see; they get no other.
 
         ``masker`` makes what finds people for ``policy.masks=estimated``.
         """

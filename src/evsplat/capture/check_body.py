@@ -103,7 +103,7 @@ class _Check:
         return array
 
     def pose_words(self, key: str, index: tuple[int, ...]) -> str:
-        """In words which pose and joint an index means."""
+        """Pose and joint of an index, in words."""
         if key not in ("poses", "transl"):
             return ""
         times = self.arrays.get("times_us")

@@ -66,11 +66,11 @@ def _check_sensor(metadata: Metadata, entry: EventsEntry, findings: Findings) ->
 
 
 def _check_layout(path: Path, file: h5py.File, findings: Findings) -> bool:
-    """Whether all data sets are there, one-dimensional and equally long."""
+    """True where all data sets are there, one-dimensional and equally long."""
     before = findings.error_count()
     names = [f"events/{column}" for column in _COLUMNS]
     for name in [*names, "ms_to_idx", "t_offset"]:
-        found = _what_is(file, name)
+        found = _wrong_entry(file, name)
         if found:
             findings.error(path, name, found, "a data set", "Write the file anew.")
     if findings.error_count() > before:
@@ -104,8 +104,8 @@ def _check_layout(path: Path, file: h5py.File, findings: Findings) -> bool:
     return findings.error_count() == before
 
 
-def _what_is(file: h5py.File, name: str) -> str:
-    """What is there in words, "" where it is a data set as it should be."""
+def _wrong_entry(file: h5py.File, name: str) -> str:
+    """Description of a wrong entry of the file; "" where it is a data set as it should be."""
     try:
         found = file.get(name)
         return "" if isinstance(found, h5py.Dataset) and found.shape is not None else "nothing"
@@ -131,7 +131,7 @@ def _check_filters(path: Path, name: str, data: h5py.Dataset, findings: Findings
 def _check_clock(
     metadata: Metadata, entry: EventsEntry, file: h5py.File, findings: Findings
 ) -> None:
-    """Whether the recording covers the exposures, on the camera's clock."""
+    """Findings where the recording does not cover the exposures, on the camera's clock."""
     t = file["events/t"]
     if len(t) == 0:
         findings.warning(

@@ -42,7 +42,7 @@ class Derivation:
         self._stems = {name: _stem(entry["image"]) for name, entry in self._entries.items()}
 
     def entry(self, frame: Frame) -> dict[str, Any]:
-        """What capture.json says of a frame, to be changed in place."""
+        """Entry of a frame in capture.json, to be changed in place."""
         return self._entries[frame.name]
 
     def set_picture(self, frame: Frame, key: str, picture: Float[Tensor, "..."]) -> None:
@@ -83,9 +83,9 @@ def derived_capture(
 def training_frames_first(
     capture: Capture, seen: TrainingCapture, make: Callable[[TrainingCapture, Frames], Made]
 ) -> Made:
-    """What ``make`` gives of all frames: of training frames from what they may know, ``seen``.
+    """Results of ``make`` for all frames: for training frames from what they may know, ``seen``.
 
-    Held-out frames, which no training opens, come after them and from everything.
+    Those of held-out frames, which no training opens, come after them and from everything.
     """
     yield from make(seen, seen.train_frames)
     everything = capture.for_training(Policy(use="everything"))

@@ -23,13 +23,13 @@ class Distortion:
     coefficients: tuple[float, ...]
 
     def distort(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Where the lens puts what a pinhole camera sees at ``pixels``."""
+        """Pixels of the lens for what a pinhole camera sees at ``pixels``."""
         return self._to_pixels(_distort(self._to_rays(pixels), self.coefficients))
 
     def undistort(
         self, pixels: Float[np.ndarray, "*batch 2"], *, iterations: int = 50
     ) -> Float[np.ndarray, "*batch 2"]:
-        """Where a pinhole camera sees what the lens put at ``pixels``; NaN where none is found.
+        """Pixels of a pinhole camera for what the lens put at ``pixels``; NaN where none is found.
 
         Fixed-point iteration as in OpenCV; a result that does not distort back to within 0.1
         pixel (the model folds over itself at strong distortion) is NaN.

@@ -41,7 +41,7 @@ class Fields:
         self.findings.error(self.file, self.field(key), found, expected, remedy)
 
     def has(self, key: str) -> bool:
-        """Whether the key has a value; a finding where it has none."""
+        """True where the key has a value; a finding where it has none."""
         there = self.value.get(key) is not None
         if not there and self.is_object:
             found = "null" if key in self.value else "nothing"
@@ -124,7 +124,7 @@ class Fields:
 
 
 def is_whole(value: Any) -> bool:
-    """Whether a JSON value is an integer that a double holds exactly."""
+    """True for a JSON integer that a double holds exactly."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return number and abs(value) <= _LARGEST and int(value) == value
 

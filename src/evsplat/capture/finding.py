@@ -1,4 +1,4 @@
-"""What the validator found wrong: always the file, the field, what is there and what to do."""
+"""Faults that the validator found: the file, the field, what is there and what to do."""
 
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -16,7 +16,7 @@ class Finding:
     """An error makes the capture unusable, a warning does not."""
     file: Path
     field: str
-    """Where in the file, e.g. ``frames[3].exposure_us``; empty for the file as a whole."""
+    """Place in the file, e.g. ``frames[3].exposure_us``; empty for the file as a whole."""
     found: str
     expected: str
     remedy: str
@@ -33,15 +33,15 @@ class Findings:
     items: list[Finding] = field(default_factory=list)
 
     def error(self, file: Path, field: str, found: str, expected: str, remedy: str) -> None:
-        """Note an error."""
+        """Add an error to the findings."""
         self.items.append(Finding("error", file, field, found, expected, remedy))
 
     def warning(self, file: Path, field: str, found: str, expected: str, remedy: str) -> None:
-        """Note a warning."""
+        """Add a warning to the findings."""
         self.items.append(Finding("warning", file, field, found, expected, remedy))
 
     def error_count(self) -> int:
-        """How many errors were noted so far."""
+        """Count of the errors so far."""
         return sum(item.severity == "error" for item in self.items)
 
 

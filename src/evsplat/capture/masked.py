@@ -7,7 +7,7 @@ from evsplat.capture.metadata import Frame
 from evsplat.capture.training_capture import TrainingCapture
 from evsplat.errors import ConfigError, DataError
 
-PERSON_ABOVE = 0.5
+HUMAN_ABOVE = 0.5
 """Share of a pixel above which it is the person's."""
 
 
@@ -36,16 +36,16 @@ class MaskedCapture(TrainingCapture):
     """
 
     def __init__(self, capture: TrainingCapture, method: str) -> None:
-        """For ``method``; raises as `require_masks`."""
+        """The capture as ``method`` sees it; raises as `require_masks`."""
         require_masks(capture, method)
         super().__init__(capture._source, capture.policy, capture._masker)
 
     def image(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
         """The blurry picture of a training frame, black outside of the person."""
-        return super().image(frame) * self.person(frame)[..., None]
+        return super().image(frame) * self.human(frame)[..., None]
 
-    def person(self, frame: Frame | str) -> Bool[Tensor, "H W"]:
+    def human(self, frame: Frame | str) -> Bool[Tensor, "H W"]:
         """The person's pixels in a training frame."""
         mask = self.mask(frame)
         assert mask is not None
-        return mask > PERSON_ABOVE
+        return mask > HUMAN_ABOVE

@@ -1,4 +1,4 @@
-"""What capture.json says, as checked values."""
+"""Content of capture.json, as checked values."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +64,7 @@ class EventsEntry:
 
 @dataclass(frozen=True, eq=False)
 class Metadata:
-    """All of capture.json."""
+    """All that capture.json holds."""
 
     path: Path
     name: str

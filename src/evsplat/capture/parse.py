@@ -251,7 +251,7 @@ class _Parser:
         return start, end
 
     def check_frames(self, frames: list[Frame]) -> None:
-        """What only shows in all frames together: names, order, overlap, splits."""
+        """Findings that need all frames together: names, order, overlap, splits."""
         first_of: dict[str, int] = {}
         last_of: dict[str, Frame] = {}
         overlaps = []

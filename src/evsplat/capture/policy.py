@@ -1,4 +1,4 @@
-"""What a training may know of what is held out from it: data that stands beside every figure."""
+"""Policy of a training: its view of what is held out from it, stated beside every figure."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -11,7 +11,7 @@ Masks = Literal["given", "estimated", "none"]
 
 @dataclass(frozen=True)
 class Policy:
-    """What a method may see; written to config.yaml, metrics.json, reports and tables.
+    """The data that a method may see; written to config.yaml, metrics.json, reports and tables.
 
     A held-out interval runs from the end of the last training exposure before a held-out frame to
     the start of the next training exposure after it. Of it nothing is seen but the frame's camera,
@@ -44,7 +44,7 @@ class Policy:
 
     @property
     def departures(self) -> tuple[str, ...]:
-        """What differs from `STRICT_TERMS`, in words for the title of a row."""
+        """Differences from `STRICT_TERMS`, in words for the title of a row."""
         said = {
             "use": "trained on everything",
             "held_out_events": "events of held-out intervals seen",
@@ -58,7 +58,7 @@ class Policy:
 
     @property
     def sentence(self) -> str:
-        """All of it for a reader of figures."""
+        """The whole policy, for a reader of figures."""
         if self.use == "everything":
             return "Every frame and every event trained; nothing was held out."
         events = (
@@ -88,10 +88,10 @@ STRICT_TERMS = (
     "Where a row says nothing else, training saw no picture, mask or event of a held-out interval, "
     "contrast thresholds and poses were given, and no masks."
 )
-"""What all rows of a table share."""
+"""Terms that all rows of a table share."""
 
 
 def policy_of(metrics: dict[str, Any]) -> Policy | None:
-    """The policy that a metrics.json or a bench record tells; None where it tells none."""
+    """The policy in a metrics.json or a bench record; None where it has none."""
     values = metrics.get("policy")
     return None if values is None else Policy(**values)

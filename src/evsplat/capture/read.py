@@ -16,14 +16,7 @@ from evsplat.capture.metadata import Frame, Metadata, NovelView
 from evsplat.capture.points import read_points
 from evsplat.errors import DataError
 from evsplat.events import EventStore
-from evsplat.pictures.files import (
-    ImageCache,
-    planar,
-    read_image,
-    to_grey,
-    to_rgb,
-    to_unit_range,
-)
+from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_rgb, to_unit_range
 
 IMAGE_CACHE_BYTES = 512 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
@@ -59,7 +52,7 @@ class CaptureReader:
 
     @property
     def train_frames(self) -> tuple[Frame, ...]:
-        """Frames for training."""
+        """Frames that a training sees."""
         return tuple(frame for frame in self.frames if frame.split == "train")
 
     @property
@@ -82,17 +75,17 @@ class CaptureReader:
         return Camera(camera.width, camera.height, camera.K, frame.world_to_camera)
 
     def is_distorted(self, camera: str) -> bool:
-        """Whether the lens of a camera distorts, which reading pictures and events undoes."""
+        """True where the lens of a camera distorts, which reading pictures and events undoes."""
         return camera in self._metadata.distortions
 
     @property
     def is_static_camera(self) -> bool:
-        """Whether all frames come from one camera that stands still."""
+        """True where all frames come from one camera that stands still."""
         one = len({frame.camera for frame in self.frames}) == 1
         return one and all(frame.world_to_camera is None for frame in self.frames)
 
     def image(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
-        """The blurry picture."""
+        """The blurry picture of a frame."""
         frame = self._frame(frame)
         return to_rgb(self._picture(frame.image, frame.camera))
 
@@ -132,17 +125,17 @@ class CaptureReader:
 
     @property
     def events_simulated(self) -> bool:
-        """Whether the events were computed rather than recorded."""
+        """True where the events were computed rather than recorded."""
         return self._metadata.events is not None and self._metadata.events.simulated
 
     @property
     def clock_offset_us(self) -> int:
-        """What was added to the event file's times to bring them to the camera's clock."""
+        """Microseconds added to the event file's times to bring them to the camera's clock."""
         return 0 if self._metadata.events is None else self._metadata.events.clock_offset_us
 
     @property
     def has_body(self) -> bool:
-        """Whether body and poses are given."""
+        """True where body and poses are given."""
         return bool(self._metadata.body_model)
 
     @functools.cached_property

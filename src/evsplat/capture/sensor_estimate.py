@@ -25,7 +25,7 @@ def estimate_sensor(capture: TrainingCapture) -> SensorEstimate | None:
     first, last = capture.events.time_range_us
     frames = capture.train_frames
     spans = [frame.exposure_us for frame in frames]
-    stretch = [capture.events.open_around(frame.mid_us) for frame in frames]
+    stretch = [capture.events.readable_around(frame.mid_us) for frame in frames]
     pairs = []
     for both in pair_indices(spans, MOST_PAIRS, stretch=stretch):
         start, end = stretch[both[0]]

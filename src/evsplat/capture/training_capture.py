@@ -1,10 +1,11 @@
-"""`TrainingCapture`: of a recording, what a training may see; everything else raises."""
+"""`TrainingCapture`: the part of a recording that a training may see; all else raises."""
 
 import functools
-import itertools
+from bisect import bisect_left, bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import accumulate, groupby
 from pathlib import Path
 from typing import Protocol
 
@@ -17,16 +18,15 @@ from evsplat.capture.body_file import BodyFile
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.policy import Policy
 from evsplat.capture.read import CaptureReader
-from evsplat.capture.spans import held_out_spans, open_spans
 from evsplat.errors import DataError, HeldOutError
-from evsplat.events import ALWAYS, EventStore
+from evsplat.events import ALWAYS, EventStore, Span
 
 _KEPT_MASKS = 64
 """Estimated masks kept in memory; the least recently used one goes first."""
 
 
-class FindsPeople(Protocol):
-    """What finds the person in frames (`evsplat.masks.Masker`)."""
+class HumanFinder(Protocol):
+    """Finder of the person in frames (`evsplat.masks.Masker`)."""
 
     def masks(
         self, capture: "TrainingCapture", frames: Sequence[Frame]
@@ -36,18 +36,18 @@ class FindsPeople(Protocol):
 
 
 class TrainingCapture:
-    """What methods, restorers, maskers and calibration see of a capture, by a `Policy`.
+    """The part of a capture that methods, restorers, maskers and calibration see, by a `Policy`.
 
     Of a held-out frame that is its camera, its time and (by the policy) its key pose. Truth, dense
     poses and novel views are seen of no frame. To ask for anything hidden is a `HeldOutError`;
-    nothing is left out silently, so that whoever reads events chooses windows within `open_around`.
+    nothing is left out silently: whoever reads events chooses windows within `readable_around`.
     """
 
     def __init__(
         self,
         source: CaptureReader,
         policy: Policy,
-        masker: "Callable[[TrainingCapture], FindsPeople] | None" = None,
+        masker: "Callable[[TrainingCapture], HumanFinder] | None" = None,
     ) -> None:
         """See `Capture.for_training`."""
         self._source = source.with_nothing_held_out() if policy.use == "everything" else source
@@ -95,21 +95,21 @@ class TrainingCapture:
 
     @functools.cached_property
     def _runs(self) -> dict[str, tuple[Frame, ...]]:
-        """By the name of each training frame, those about it up to the next held-out ones."""
+        """Frames about each training frame, by its name, up to the next held-out ones."""
         ordered = sorted(self.frames, key=lambda frame: frame.mid_us)
         runs: dict[str, tuple[Frame, ...]] = {}
-        for split, group in itertools.groupby(ordered, key=lambda frame: frame.split):
+        for split, group in groupby(ordered, key=lambda frame: frame.split):
             run = tuple(group)
             runs |= {frame.name: run for frame in run if split == "train"}
         return runs
 
     def camera(self, frame: Frame | str) -> Camera:
-        """See `Capture.camera`."""
+        """The pinhole camera of any frame, held out or not (`Capture.camera`)."""
         return self._source.camera(self._name(frame))
 
     @property
     def is_static_camera(self) -> bool:
-        """See `Capture.is_static_camera`."""
+        """True where all frames come from one camera that stands still."""
         return self._source.is_static_camera
 
     def image(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
@@ -117,7 +117,7 @@ class TrainingCapture:
         return self._source.image(self._seen(frame, "picture"))
 
     def has_mask(self, frame: Frame | str) -> bool:
-        """Whether `mask` gives one; False where the policy shows none."""
+        """True where `mask` gives one; False where the policy shows none."""
         own = self.frame(self._name(frame))
         if self.policy.masks == "estimated":
             return own.split == "train"
@@ -141,7 +141,7 @@ class TrainingCapture:
     def events(self) -> EventStore | None:
         """The events that are seen, on the camera's clock; None where the capture has none."""
         events = self._source.events
-        return None if events is None else events.opened(self._open_us)
+        return None if events is None else events.restricted_to(self._readable_us)
 
     @property
     def contrast_threshold(self) -> tuple[float, float] | None:
@@ -150,7 +150,7 @@ class TrainingCapture:
 
     @property
     def has_body(self) -> bool:
-        """See `Capture.has_body`."""
+        """True where body and poses are given."""
         return self._source.has_body
 
     @functools.cached_property
@@ -219,15 +219,15 @@ class TrainingCapture:
         return self._masks[name]
 
     @functools.cached_property
-    def _finder(self) -> "tuple[TrainingCapture, FindsPeople]":
-        """What finds people, and where: in pictures that no mask has changed."""
+    def _finder(self) -> "tuple[TrainingCapture, HumanFinder]":
+        """The finder of people and its capture, whose pictures no mask has changed."""
         assert self._masker is not None
         capture = TrainingCapture(self._source, replace(self.policy, masks="none"))
         return capture, self._masker(capture)
 
     @property
-    def _open_us(self) -> tuple[tuple[int, int], ...]:
-        return (ALWAYS,) if self.policy.held_out_events else open_spans(self.frames)
+    def _readable_us(self) -> tuple[tuple[int, int], ...]:
+        return (ALWAYS,) if self.policy.held_out_events else readable_spans(self.frames)
 
     def _kept_keys(self, times_us: np.ndarray) -> np.ndarray:
         edges = np.array(held_out_spans(self.frames), dtype=np.int64).reshape(-1)
@@ -240,3 +240,44 @@ class TrainingCapture:
             )
             kept[near[(near >= 0) & (near < len(times_us))]] = True
         return kept
+
+
+def held_out_spans(frames: Sequence[Frame]) -> tuple[Span, ...]:
+    """Held-out intervals, merged and in order of time, microseconds, ends exclusive.
+
+    Each runs from the end of the last training exposure before a held-out frame to the start of the
+    next training exposure after it; mid-exposures decide on before and after, since exposures may
+    overlap. Without a training frame on a side it has no end there. No training exposure reaches
+    into one, so that of overlapping exposures the training one is seen whole.
+    """
+    train = sorted((f for f in frames if f.split == "train"), key=lambda frame: frame.mid_us)
+    mids = [frame.mid_us for frame in train]
+    # Latest end of the first i training exposures, and earliest start of the others.
+    ends = list(accumulate((f.exposure_us[1] for f in train), max, initial=ALWAYS[0]))
+    starts = list(accumulate((f.exposure_us[0] for f in reversed(train)), min, initial=ALWAYS[1]))
+    starts.reverse()
+    spans = []
+    for frame in frames:
+        if frame.split == "train":
+            continue
+        start = ends[bisect_right(mids, frame.mid_us)]
+        end = starts[bisect_left(mids, frame.mid_us)]
+        if start < end:
+            spans.append((start, end))
+    merged: list[Span] = []
+    for start, end in sorted(spans):
+        if merged and start <= merged[-1][1]:
+            merged[-1] = merged[-1][0], max(end, merged[-1][1])
+        else:
+            merged.append((start, end))
+    return tuple(merged)
+
+
+def readable_spans(frames: Sequence[Frame]) -> tuple[Span, ...]:
+    """Stretches between `held_out_spans`, in order of time; all of time where none is held out."""
+    edges = [ALWAYS[0]]
+    for start, end in held_out_spans(frames):
+        edges += [start, end]
+    edges.append(ALWAYS[1])
+    pairs = zip(edges[::2], edges[1::2], strict=True)
+    return tuple((start, end) for start, end in pairs if start < end)

@@ -1,10 +1,10 @@
-"""Writing a capture as a whole: everything an importer or a simulator needs to say."""
+"""Writing a capture as a whole, piece by piece, and reading a camera for it."""
 
 import dataclasses
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -18,7 +18,7 @@ from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import write_json
+from evsplat.files import read_json, write_json
 from evsplat.names import checked_name
 from evsplat.pictures.files import image_size, write_image
 
@@ -293,6 +293,45 @@ class CaptureWriter:
             shutil.rmtree(replaced)
         else:
             self._root.rename(self.path)
+
+
+def read_camera(
+    path: Path, width: int, height: int, required: Collection[str] = ("K",)
+) -> dict[str, Any]:
+    """One camera as in capture.json, as arguments of `CaptureWriter.add_camera`.
+
+    ``width`` and ``height`` are those of its pictures; a file that says otherwise is a `DataError`,
+    as is one without the ``required`` keys.
+    """
+    entry = read_json(path)
+    missing = [key for key in required if not isinstance(entry, dict) or key not in entry]
+    if missing:
+        raise DataError(
+            f"{path}: {', '.join(missing)} missing, expected one camera as in capture.json "
+            "(docs/capture-format.md)."
+        )
+    for key, size in (("width", width), ("height", height)):
+        if entry.get(key, size) != size:
+            raise DataError(
+                f"{path}: {key}: found {entry[key]}, expected {size} as the pictures have."
+            )
+    lens = entry.get("distortion") or {}
+    pose = _matrix(path, entry, "world_to_camera", 4) if "world_to_camera" in entry else None
+    return {
+        "K": _matrix(path, entry, "K", 3),
+        "world_to_camera": pose,
+        "distortion": lens.get("coefficients") if isinstance(lens, dict) else lens,
+    }
+
+
+def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarray:
+    try:
+        matrix = np.array(entry[key], dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (size, size):
+        raise DataError(f"{path}: {key}: expected {size}x{size} numbers.")
+    return matrix
 
 
 def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:

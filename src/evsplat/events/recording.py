@@ -1,10 +1,8 @@
-"""Recordings of any format, opened by what their first bytes say and read as event streams."""
+"""Recordings of any format, recognised by their first bytes, read as event streams."""
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from evsplat.errors import DataError
 from evsplat.events.formats import find_format
@@ -41,7 +39,7 @@ class EventRecording:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know: assumptions made and, after a pass, what was repaired."""
+        """Notes for the user: assumptions made and, after a pass, what was repaired."""
         return [*self._source.notes, *self._damage.notes()]
 
     def chunks(self) -> Iterator[EventStream]:
@@ -72,11 +70,7 @@ class EventRecording:
                 parts.append(part)
             if end_us is not None and chunk.t[-1] >= end_us:
                 break
-        columns = []
-        for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
-            empty = np.zeros(0, dtype=dtype)
-            columns.append(np.concatenate([empty, *(getattr(part, name) for part in parts)]))
-        return EventStream(*columns)
+        return EventStream.joined(parts)
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Pictures recorded beside the events (AEDAT4 only), in order of the file."""
@@ -93,12 +87,12 @@ def open_recording(
     """Open an event recording of any format that evsplat reads (docs/event-formats.md).
 
     Args:
-        path: The recording; its format is told from its content, whatever its name.
-        options: What the file does not say, or says wrongly, and whether damage is repaired: what
-            was done is counted in ``notes``. Without ``repair`` each is a `DataError`.
+        path: The recording; its content names the format, not its suffix.
+        options: The caller's statements about it. With ``repair`` what was done is counted in
+            ``notes``; without it each damage is a `DataError`.
         format: One of `evsplat.events.formats.FORMATS`; the content must agree.
-        changes: Fields of `ReadOptions`. Of .npz and HDF5 ``columns`` is the key of each, such as
-            ``{"t": "stamps"}``.
+        changes: Fields of `ReadOptions`. For .npz and HDF5 ``columns`` says which key holds which,
+            such as ``{"t": "stamps"}``.
 
     Raises:
         DataError: The file is missing, of no known format, or its header is damaged.
@@ -122,11 +116,7 @@ def open_recording(
 
 
 def read_events(
-    path: Path | str,
-    options: ReadOptions | None = None,
-    *,
-    format: str | None = None,
-    **changes: Any,
+    path: Path | str, options: ReadOptions | None = None, **changes: Any
 ) -> EventStream:
     """All events of a recording in memory; options and errors are those of `open_recording`."""
-    return open_recording(path, options, format=format, **changes).read()
+    return open_recording(path, options, **changes).read()

@@ -39,8 +39,9 @@ class EventStore:
     ``pixel_lookup`` (H, W, 2), int32, maps a sensor pixel to the (x, y) of the undistorted image,
     -1 where it falls outside; those events are dropped from slices (but counted by ``len``).
 
-    ``open_us`` are the stretches of time that may be read, in order; what lies between them is held
-    out: to ask for it is a `HeldOutError`, and nothing that is told of the recording depends on it.
+    ``readable_us`` are the stretches of time that may be read, in order; what lies between them is
+    held out: to ask for it is a `HeldOutError`, and nothing that is said of the recording depends
+    on it.
     """
 
     def __init__(
@@ -50,14 +51,14 @@ class EventStore:
         height: int,
         clock_offset_us: int = 0,
         pixel_lookup: np.ndarray | None = None,
-        open_us: Sequence[Span] = (ALWAYS,),
+        readable_us: Sequence[Span] = (ALWAYS,),
     ) -> None:
         self.path = Path(path)
         self.width = width
         self.height = height
         self.clock_offset_us = clock_offset_us
         self._pixel_lookup = pixel_lookup
-        self._open_us = tuple(open_us)
+        self._readable_us = tuple(readable_us)
         self._file: h5py.File | None = None
         self._owner_pid = -1
         self._shift_us = 0
@@ -68,7 +69,7 @@ class EventStore:
 
     def __len__(self) -> int:
         """Count of events, without held-out ones."""
-        return sum(last - first for first, last in self._open_rows)
+        return sum(last - first for first, last in self._readable_rows)
 
     @property
     def time_range_us(self) -> Span:
@@ -78,30 +79,29 @@ class EventStore:
         (0, 0) where there are no events.
         """
         t: h5py.Dataset = self._open()["events/t"]
-        rows = [pair for pair in self._open_rows if pair[0] < pair[1]]
+        rows = [pair for pair in self._readable_rows if pair[0] < pair[1]]
         if not rows:
             return 0, 0
         return int(t[rows[0][0]]) + self._shift_us, int(t[rows[-1][1] - 1]) + self._shift_us + 1
 
     @property
     def stretches_us(self) -> tuple[Span, ...]:
-        """What of `time_range_us` may be read; one stretch where nothing is held out."""
+        """Stretches of `time_range_us` that may be read; one where nothing is held out."""
         start, end = self.time_range_us
-        within = ((max(first, start), min(last, end)) for first, last in self._open_us)
+        within = ((max(first, start), min(last, end)) for first, last in self._readable_us)
         return tuple((first, last) for first, last in within if first < last)
 
-    def open_around(self, time_us: int) -> Span:
+    def readable_around(self, time_us: int) -> Span:
         """The stretch of time that may be read and holds an instant, or ends with it."""
-        span = self._open_from(time_us)
+        span = self._readable_from(time_us)
         if span is None or time_us > span[1]:
             raise HeldOutError(f"{self.path}: {time_us} us lies in a held-out interval{_HIDDEN}")
         return span
 
-    def opened(self, open_us: Sequence[Span]) -> "EventStore":
-        """The same recording as it is seen where only ``open_us`` may be read."""
-        return EventStore(
-            self.path, self.width, self.height, self.clock_offset_us, self._pixel_lookup, open_us
-        )
+    def restricted_to(self, readable_us: Sequence[Span]) -> "EventStore":
+        """The same recording as it is seen where only ``readable_us`` may be read."""
+        size, lookup = (self.width, self.height), self._pixel_lookup
+        return EventStore(self.path, *size, self.clock_offset_us, lookup, readable_us)
 
     @property
     def has_polarity(self) -> bool:
@@ -110,7 +110,7 @@ class EventStore:
             stored: h5py.Dataset = self._open()["events/p"]
             blocks = [
                 (start, min(start + _POLARITY_BLOCK, last))
-                for first, last in self._open_rows
+                for first, last in self._readable_rows
                 for start in range(first, last, _POLARITY_BLOCK)
             ]
             self._has_polarity = not blocks or any(
@@ -125,7 +125,7 @@ class EventStore:
         read is out of order or outside of the sensor, so that a bad file is never used silently,
         and `HeldOutError` where the window reaches into a held-out interval.
         """
-        self._check_open(start_us, end_us)
+        self._check_readable(start_us, end_us)
         file = self._open()
         start, end = start_us - self._shift_us, end_us - self._shift_us
         first = self._index_at_ms(start // 1000)
@@ -154,7 +154,7 @@ class EventStore:
         recordings shorter than ``bins`` milliseconds get fewer bins. Raises `HeldOutError` where
         anything is held out.
         """
-        self._check_open(*self.time_range_us)
+        self._check_readable(*self.time_range_us)
         start, end = (time - self._shift_us for time in self.time_range_us)
         first_ms, last_ms = start // 1000, max(start // 1000 + 1, -(-end // 1000))
         edges_ms = np.unique(np.linspace(first_ms, last_ms, bins + 1).round().astype(np.int64))
@@ -185,11 +185,11 @@ class EventStore:
         return self._file
 
     @functools.cached_property
-    def _open_rows(self) -> list[tuple[int, int]]:
-        """First row and one past the last of each open stretch, of the file's columns."""
-        if self._open_us == (ALWAYS,):
+    def _readable_rows(self) -> list[tuple[int, int]]:
+        """First row and one past the last of each readable stretch, of the file's columns."""
+        if self._readable_us == (ALWAYS,):
             return [(0, int(self._open()["events/t"].shape[0]))]
-        return [(self._row_at(start), self._row_at(end)) for start, end in self._open_us]
+        return [(self._row_at(start), self._row_at(end)) for start, end in self._readable_us]
 
     def _row_at(self, time_us: int) -> int:
         """Row of the first event at or after a time."""
@@ -198,15 +198,15 @@ class EventStore:
         near = self._read(file, "events/t", first, self._index_at_ms(-(-time // 1000)))
         return first + int(np.searchsorted(near, time))
 
-    def _open_from(self, time_us: int) -> Span | None:
-        """The last open stretch that begins at or before a time."""
-        after = bisect_right(self._open_us, time_us, key=lambda span: span[0])
-        return self._open_us[after - 1] if after else None
+    def _readable_from(self, time_us: int) -> Span | None:
+        """The last readable stretch that begins at or before a time."""
+        after = bisect_right(self._readable_us, time_us, key=lambda span: span[0])
+        return self._readable_us[after - 1] if after else None
 
-    def _check_open(self, start_us: int, end_us: int) -> None:
+    def _check_readable(self, start_us: int, end_us: int) -> None:
         if start_us >= end_us:
             return
-        span = self._open_from(start_us)
+        span = self._readable_from(start_us)
         if span is None or end_us > span[1]:
             raise HeldOutError(
                 f"{self.path}: events from {start_us} to {end_us} us lie in a held-out interval, "
@@ -244,9 +244,4 @@ class EventStore:
         assert self._pixel_lookup is not None
         x, y = self._pixel_lookup[stream.y, stream.x].T
         keep = x >= 0
-        return EventStream(
-            stream.t[keep],
-            x[keep].astype(np.uint16),
-            y[keep].astype(np.uint16),
-            stream.p[keep],
-        )
+        return EventStream(stream.t, x.astype(np.uint16), y.astype(np.uint16), stream.p).take(keep)

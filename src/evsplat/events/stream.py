@@ -1,5 +1,6 @@
 """A slice of an event recording in memory."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,5 +27,18 @@ class EventStream:
     def between(self, start_us: int, end_us: int) -> "EventStream":
         """Events with ``start_us <= t < end_us``, as views of the same arrays."""
         first, last = np.searchsorted(self.t, [start_us, end_us], side="left")
-        part = slice(first, max(first, last))
-        return EventStream(self.t[part], self.x[part], self.y[part], self.p[part])
+        return self.take(slice(first, max(first, last)))
+
+    def take(self, which: np.ndarray | slice) -> "EventStream":
+        """The events of a slice, a mask or indices, in that order."""
+        return EventStream(self.t[which], self.x[which], self.y[which], self.p[which])
+
+    @staticmethod
+    def joined(parts: Sequence["EventStream"]) -> "EventStream":
+        """Consecutive parts as one stream; empty where there are none."""
+        kinds = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.int8}
+        columns = (
+            np.concatenate([np.zeros(0, kind), *(getattr(part, name) for part in parts)])
+            for name, kind in kinds.items()
+        )
+        return EventStream(*columns)

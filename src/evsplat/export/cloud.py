@@ -66,7 +66,7 @@ def cloud_of(splats: Splats, time: int = 0) -> SplatCloud:
     def at(values: Tensor) -> Tensor:
         return values[min(time, len(values) - 1)].detach().cpu().double()
 
-    quaternions, scales = at(splats.quats), at(splats.scales).abs()
+    quaternions, scales = at(splats.quaternions), at(splats.scales).abs()
     if splats.linear is not None:
         axes = at(splats.linear) @ quaternion_to_matrix(quaternions) * scales[:, None, :]
         axes = torch.nan_to_num(axes)

@@ -20,10 +20,10 @@ class TimedPicture:
     """One picture of a recording."""
 
     name: str
-    """Of the picture file, or its number in the video."""
+    """Stem of the picture file, or the number in the video."""
     time_us: int
     pixels: np.ndarray
-    """As stored, (H, W) or (H, W, 3), uint8 or uint16."""
+    """Pixels as stored, (H, W) or (H, W, 3), uint8 or uint16."""
 
 
 class Footage(Protocol):
@@ -59,7 +59,7 @@ class FolderFootage:
         self.times_us = times_of_rate(len(self._files), fps)
 
     def __iter__(self) -> Iterator[TimedPicture]:
-        """See `Footage`; a picture of another size is a `DataError`."""
+        """The pictures one after the other; a picture of another size is a `DataError`."""
         for file, time_us in zip(self._files, self.times_us, strict=True):
             pixels = read_image(file)
             if pixels.shape[:2] != (self.height, self.width):

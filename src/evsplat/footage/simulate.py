@@ -105,12 +105,7 @@ def _gathered(pieces: Iterable[EventStream]) -> Iterator[EventStream]:
     for piece in pieces:
         waiting.append(piece)
         if sum(map(len, waiting)) >= _PIECE_EVENTS:
-            yield _joined(waiting)
+            yield EventStream.joined(waiting)
             waiting = []
     if waiting:
-        yield _joined(waiting)
-
-
-def _joined(pieces: list[EventStream]) -> EventStream:
-    columns = ([getattr(piece, name) for piece in pieces] for name in ("t", "x", "y", "p"))
-    return EventStream(*map(np.concatenate, columns))
+        yield EventStream.joined(waiting)

@@ -48,7 +48,7 @@ class VideoFootage:
             )
 
     def __iter__(self) -> Iterator[TimedPicture]:
-        """See `Footage`."""
+        """The pictures one after the other, as they are decoded."""
         count = 0
         for time_us, frame in zip(self.times_us, self._decoded(), strict=False):
             yield TimedPicture(f"{count:06d}", int(time_us), _pixels(frame))

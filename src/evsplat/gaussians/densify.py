@@ -8,7 +8,7 @@ from torch import Tensor
 
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.devices import send
-from evsplat.gaussians.gaussian_set import Part, Rows, Shape, person_first
+from evsplat.gaussians.gaussian_set import Part, Rows, Shape, human_first
 from evsplat.gaussians.row_adam import RowAdam
 
 
@@ -40,18 +40,18 @@ class DensifyLimits:
 
 @dataclass
 class ScreenStatistics:
-    """Sizes and gradients on the screen since the last edit, one row per Gaussian."""
+    """Statistics of the renders since the last edit, one row per Gaussian."""
 
     gradient_sum: Float[Tensor, " N"]
     """Sum of the norms of the gradients of the 2-D centres, NDC units."""
     seen: Float[Tensor, " N"]
-    """In how many renders the Gaussian was drawn."""
+    """Number of renders in which the Gaussian was drawn."""
     radius_px: Float[Tensor, " N"]
-    """Largest 3-sigma radius."""
+    """Largest 3-sigma radius on the screen, pixels."""
 
     @classmethod
     def zeros(cls, count: int, device: torch.device) -> "ScreenStatistics":
-        """Nothing seen yet."""
+        """Statistics before the first render."""
         return cls(*(torch.zeros(count, device=device) for _ in range(3)))
 
     def to(self, device: torch.device) -> "ScreenStatistics":
@@ -88,7 +88,7 @@ class ScreenStatistics:
 
 @dataclass(frozen=True)
 class Edit:
-    """Numbers of Gaussians that one densification changed."""
+    """Numbers of Gaussians that one densification changed, for the log."""
 
     cloned: int = 0
     split: int = 0
@@ -149,7 +149,7 @@ def rebuild(
     ``values`` holds the new rows, ``source`` the old row each comes from, ``fresh`` whether its
     moments restart, ``is_human`` its class.
     """
-    order, human_count = person_first(is_human, torch.arange(len(source), device=source.device))
+    order, human_count = human_first(is_human, torch.arange(len(source), device=source.device))
     gaussians.set_rows({name: value[order] for name, value in values.items()}, human_count)
     parameters = {name: getattr(gaussians, name) for name in gaussians.attributes}
     optimiser.move_rows(parameters, source[order], fresh[order])
@@ -162,7 +162,7 @@ def _decide(
     limit: DensifyLimits,
     nominal: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which rows of one class are kept, cloned and split."""
+    """Masks of the rows of one class that are kept, cloned and split."""
     largest = shape.scales[rows].amax(-1)
     keep = shape.opacities[rows] >= limit.prune_opacity
     if nominal >= limit.prune_after:

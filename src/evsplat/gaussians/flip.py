@@ -27,7 +27,7 @@ class BodyFrames:
 
 
 def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames) -> int:
-    """Move every row whose soft label disagrees with its class; how many moved.
+    """Move every row whose soft label disagrees with its class; returns their number.
 
     Person to scene: see `to_world`. Scene to person: see `to_canonical`; beyond `REACH_M` the row
     stays in the scene and its logit returns to the boundary. The two classes have separate colour
@@ -94,7 +94,7 @@ def to_world(frames: BodyFrames, means: Float[Tensor, "M 3"]) -> Float[Tensor, "
 def to_canonical(
     frames: BodyFrames, points: Float[Tensor, "M 3"]
 ) -> tuple[Bool[Tensor, " M"], Float[Tensor, "K 4 4"]]:
-    """Which scene rows can be the person's, and transforms that place these K on it.
+    """Mask of the scene rows that can be the person's, and transforms that place these K on it.
 
     The nearest posed body vertex over all frames carries a row back; it lies within `REACH_M`.
     """

@@ -19,7 +19,7 @@ Part = Literal["human", "scene"]
 
 @dataclass(frozen=True)
 class Shape:
-    """What densification must know of ``N`` Gaussians as they are drawn; without gradient."""
+    """Geometry of ``N`` Gaussians as they are drawn, for densification; without gradient."""
 
     scales: Float[Tensor, "N 3"]
     """Standard deviations, metres."""
@@ -71,7 +71,7 @@ class Rows(nn.Module):
         return self.human if part == "human" else self.scene
 
     def holds(self, part: Part) -> bool:
-        """Whether Gaussians of this class can be in the set."""
+        """True if Gaussians of this class can be in the set."""
         return True
 
     def human_mask(self) -> Bool[Tensor, " N"]:
@@ -100,7 +100,7 @@ class OneClassRows(Rows):
         self.part: Part = part
 
     def holds(self, part: Part) -> bool:
-        """Whether it is the set's class."""
+        """True for the set's class."""
         return part == self.part
 
     def set_rows(self, values: Mapping[str, Tensor], human_count: int) -> None:
@@ -158,7 +158,7 @@ class GaussianSet(Rows):
         )
 
 
-def person_first(
+def human_first(
     is_human: Bool[Tensor, " N"], source: Int[Tensor, " N"]
 ) -> tuple[Int[Tensor, " N"], int]:
     """Order that brings the person's rows to the front (stable), and their number."""

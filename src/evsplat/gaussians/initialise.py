@@ -1,4 +1,4 @@
-"""Where Gaussians start: on the body's surface, in a random cube, or on the median backdrop."""
+"""Starts of Gaussians: on the body's surface, in a random cube, or on the median backdrop."""
 
 import math
 

@@ -1,6 +1,114 @@
 """Turning other people's data sets, and your own recording, into captures."""
 
+import logging
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import ConfigError
 from evsplat.importers.base import Importer
-from evsplat.importers.kinds import KINDS, Blur, import_capture, run_importer
+from evsplat.importers.folder import Folder
+from evsplat.importers.mmhpsd import Mmhpsd
+from evsplat.importers.neuman import Neuman
+from evsplat.importers.people_snapshot import PeopleSnapshot
+from evsplat.importers.zju_mocap import ZjuMocap
+from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
+from evsplat.options.declare import given
 
 __all__ = ["KINDS", "Blur", "Importer", "import_capture", "run_importer"]
+
+logger = logging.getLogger(__name__)
+
+KINDS: dict[str, type[Importer]] = {
+    "zju-mocap": ZjuMocap,
+    "mmhpsd": Mmhpsd,
+    "neuman": Neuman,
+    "people-snapshot": PeopleSnapshot,
+    "zju-mocap-blur": ZjuMocapBlur,
+    "folder": Folder,
+}
+
+
+@dataclass(frozen=True)
+class Blur:
+    """The step from an import to blurry frames; None: as the recipe of the paper says."""
+
+    interpolation: str | None = None
+    """"super-slomo" or "flow"."""
+    weights: Path | None = None
+    """Checkpoint of Super SloMo."""
+
+
+def import_capture(
+    kind: str,
+    source: Path | str,
+    out: Path | str,
+    *,
+    smpl: Path | str | None = None,
+    overwrite: bool = False,
+    blur: Blur | bool = False,
+    **options: Any,
+) -> Path:
+    """Turn a data set's sequence into a capture and give its folder (docs/import.md).
+
+    Args:
+        kind: One of `KINDS`.
+        source: The folder of one sequence.
+        out: The capture to write; it appears when it is whole and valid.
+        smpl: The user's SMPL file, or the folder that holds it; by default what the environment
+            variable EVSPLAT_BODY_MODELS leads to. Without a model the free body is used.
+        overwrite: Replace a capture that is there already.
+        blur: Go on to the paper's version of the data set, with blurry frames and simulated events
+            (`evsplat.synthesize`); the sharp capture stays beside it as ``<out>_sharp``.
+        options: Fields of the kind's class in `KINDS`.
+
+    Raises:
+        DataError: The source is not what the kind says it is.
+        ConfigError: An unknown kind or option, or a value out of range.
+    """
+    if kind not in KINDS:
+        near = get_close_matches(kind, KINDS, 1, cutoff=0.0)[0]
+        raise ConfigError(f"{kind!r} is no kind of source; did you mean {near!r}?")
+    chosen = (Blur() if blur else None) if isinstance(blur, bool) else blur
+    importer = given(KINDS[kind], None, options)
+    return run_importer(importer, source, out, smpl=smpl, overwrite=overwrite, blur=chosen)
+
+
+def run_importer(
+    importer: Importer,
+    source: Path | str,
+    out: Path | str,
+    *,
+    smpl: Path | str | None = None,
+    overwrite: bool = False,
+    blur: Blur | None = None,
+) -> Path:
+    """`import_capture` with the options as a checked object."""
+    source, out = Path(source), Path(out)
+    if blur is not None and importer.blur_recipe is None:
+        raise ConfigError(
+            f"the pictures of {type(importer).__name__} are not made blurry by a recipe of the "
+            "paper; import them and use 'evsplat synthesize'."
+        )
+    first = out if blur is None else out.with_name(f"{out.name}_sharp")
+    if blur is not None:
+        # an existing target is better found before the long work than after it
+        CaptureWriter(out, overwrite=overwrite)
+    with CaptureWriter(first, overwrite=overwrite) as writer:
+        notes = importer.write(source, writer, None if smpl is None else Path(smpl))
+    for note in notes:
+        logger.info("%s", note)
+    if blur is not None:
+        from evsplat.synthesis import synthesize
+
+        synthesize(
+            first,
+            out,
+            recipe=importer.blur_recipe,
+            weights=blur.weights,
+            overwrite=overwrite,
+            interpolation=blur.interpolation,
+        )
+    return out

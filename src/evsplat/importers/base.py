@@ -1,4 +1,4 @@
-"""What importers share: the options all have, finding files, checking numbers, cameras."""
+"""Parts that importers share: finding files, checking numbers, cameras, pictures, masks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from evsplat.pictures.files import image_size, read_image
 
 GUIDE = "docs/import.md shows the tree"
 SHARP_EXPOSURE_US = 1_000
-"""Where a data set does not say how long the shutter was open, its pictures are taken as sharp."""
+"""Exposure of pictures that are taken as sharp: the data set gives none."""
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 # Rotations of data sets are rounded; further off than this they are something else.
 _ROTATION_TOLERANCE = 1e-2
@@ -84,11 +84,28 @@ def rigid(
     return transform
 
 
+def add_picture(
+    writer: CaptureWriter,
+    name: str,
+    path: Path,
+    time_us: float,
+    shrink: int,
+    *,
+    camera: str = "main",
+    exposure_us: float = SHARP_EXPOSURE_US,
+    **details: Any,
+) -> None:
+    """Add a picture file, made smaller by ``shrink``, as the frame whose mid-exposure is given.
+
+    ``details`` are further arguments of `CaptureWriter.add_frame`.
+    """
+    exposure = exposure_around(time_us, exposure_us)
+    writer.add_frame(name, camera, picture(path, shrink), exposure, **details)
+
+
 def picture(path: Path, shrink: int = 1) -> np.ndarray | Path:
     """The pixels made smaller by the mean over squares, or the file itself where all stays."""
-    if shrink == 1:
-        return path
-    return shrunk(read_image(path), shrink)
+    return path if shrink == 1 else shrunk(read_image(path), shrink)
 
 
 def shrunk(pixels: np.ndarray, factor: int) -> np.ndarray:
@@ -100,11 +117,15 @@ def shrunk(pixels: np.ndarray, factor: int) -> np.ndarray:
     return means if pixels.dtype.kind == "f" else (means + 0.5).astype(pixels.dtype)
 
 
-def person_mask(path: Path, shrink: int, *, person_is: str = "nonzero") -> np.ndarray:
-    """(H, W) share of the person in [0, 1] of a label picture; a label is 0 on the background.
+def human_mask(
+    path: Path | None, shrink: int = 1, *, person_is: str = "nonzero"
+) -> np.ndarray | None:
+    """(H, W) share of the person in [0, 1] of a label picture; None where there is no file.
 
-    ``person_is`` "zero" turns the picture round (255 is the background there).
+    A label is 0 on the background; with ``person_is`` "zero" it is 0 on the person.
     """
+    if path is None or not path.exists():
+        return None
     labels = read_image(path)
     labels = labels if labels.ndim == 2 else labels.max(axis=2)
     person = labels == 0 if person_is == "zero" else labels != 0

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from evsplat.errors import DataError
@@ -23,16 +24,15 @@ _MODELS: dict[str, tuple[tuple[int, int, int, int], tuple[int | None, ...]]] = {
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What COLMAP found, in its own scale; pixel centres at 0.5 as in captures."""
+    """Cameras and points of COLMAP, in its own scale; pixel centres at 0.5 as in captures."""
 
     cameras: dict[str, SourceCamera]
-    """By the name of the picture."""
+    """Cameras by the name of the picture."""
     shared: bool
-    """Whether all pictures have the same intrinsics."""
-    points: np.ndarray
-    """(N, 3)."""
-    colours: np.ndarray
-    """(N, 3) in [0, 1]."""
+    """True where all pictures have the same intrinsics."""
+    points: Float[np.ndarray, "N 3"]
+    colours: Float[np.ndarray, "N 3"]
+    """Coded RGB in [0, 1]."""
 
 
 def read_colmap(folder: Path) -> Reconstruction:

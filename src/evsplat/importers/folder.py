@@ -5,24 +5,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 from tqdm import tqdm
 
 from evsplat.body.pose_files import PoseSequence, read_poses
 from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
-from evsplat.capture.write import CaptureWriter
+from evsplat.capture.write import CaptureWriter, read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import open_recording
-from evsplat.files import read_json
 from evsplat.footage import Footage, open_footage
 from evsplat.importers.base import (
     GUIDE,
     Importer,
     check_positive,
     exposure_around,
+    human_mask,
     need,
-    person_mask,
-    table,
 )
 from evsplat.importers.smpl import add_body, chosen_poses
 
@@ -46,7 +44,7 @@ class Folder(Importer):
     fps: float | None = None
     """Pictures per second; a video has its own."""
     exposure_us: float | None = None
-    """How long the shutter was open; not needed with SOURCE/exposures.txt."""
+    """Exposure time, microseconds; not needed with SOURCE/exposures.txt."""
     start_us: int = 0
     """Middle of the first exposure."""
     clock_offset_us: int = 0
@@ -54,7 +52,7 @@ class Folder(Importer):
     contrast: tuple[float, float] | None = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
     person: str | None = None
-    """Which of several people in the pose file."""
+    """Choice among several people in the pose file."""
     repair: bool = False
     """Read on where the event recording is damaged."""
 
@@ -78,13 +76,12 @@ class Folder(Importer):
         for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
             if index not in seen:
                 continue
-            mask = masks / f"{timed.name}.png"
             writer.add_frame(
                 timed.name,
                 "main",
                 timed.pixels,
                 (int(exposures[index, 0]), int(exposures[index, 1])),
-                mask=person_mask(mask, 1) if mask.exists() else None,
+                mask=human_mask(masks / f"{timed.name}.png"),
                 world_to_camera=views.get(index),
             )
         notes = self._add_events(source, writer, size)
@@ -181,20 +178,7 @@ class Folder(Importer):
                     f"{GUIDE}."
                 )
             return {"K": K}
-        entry = table(read_json(path), str(path), "one camera as in capture.json")
-        for key, size in (("width", footage.width), ("height", footage.height)):
-            if entry.get(key, size) != size:
-                raise DataError(
-                    f"{path}: {key}: found {entry[key]}, expected {size} as the pictures have."
-                )
-        lens = entry.get("distortion") or {}
-        return {
-            "K": _matrix(entry, "K", 3, path),
-            "world_to_camera": _matrix(entry, "world_to_camera", 4, path)
-            if "world_to_camera" in entry
-            else None,
-            "distortion": lens.get("coefficients") if isinstance(lens, dict) else lens,
-        }
+        return read_camera(path, footage.width, footage.height)
 
     def _add_events(self, source: Path, writer: CaptureWriter, size: tuple[int, int]) -> list[str]:
         path = self.events or next(iter(sorted(source.glob("events.*"))), None)
@@ -215,18 +199,8 @@ class Folder(Importer):
         return list(recording.notes)
 
 
-def _matrix(entry: Any, key: str, size: int, path: Path) -> Float[np.ndarray, "N N"]:
-    try:
-        matrix = np.array(entry.get(key), dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (size, size):
-        raise DataError(f"{path}: {key}: expected {size}x{size} numbers.")
-    return matrix
-
-
 def _camera_poses(motion: "PoseSequence | BodyFile") -> dict[int, np.ndarray]:
-    """Of a moving camera, by the index of the picture; empty where it stands."""
+    """Poses of a moving camera by the index of the picture; empty where it stands."""
     if isinstance(motion, BodyFile) or motion.world_to_camera is None:
         return {}
     return dict(zip(motion.frames.tolist(), motion.world_to_camera, strict=True))

@@ -17,24 +17,21 @@ from evsplat.events import EventStream, open_recording
 from evsplat.importers.base import (
     GUIDE,
     PICTURES,
-    SHARP_EXPOSURE_US,
     Importer,
     SourceCamera,
+    add_picture,
     check_positive,
     chosen_frames,
-    exposure_around,
     need,
     numbered,
     opencv_intrinsics,
-    picture,
 )
-from evsplat.importers.smpl import add_body, chosen_poses, unposed
+from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
 from evsplat.pictures.files import image_size
 from evsplat.safe_pickle import read_npz, read_pickle
 
 _FOCAL_PX, _CENTRE_PX, _CANVAS_PX = 1679.3, 641.0, 1280
-"""On the 800x1280 picture padded to a square; no distortion."""
-_JOINT_SAMPLES = 32
+"""Intrinsics of the 800x1280 picture padded to a square; no distortion."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,12 +69,7 @@ class Mmhpsd(Importer):
         times = []
         for number in tqdm(kept, desc="pictures", unit="frame", leave=False):
             time_us = round(number * 1e6 / self.fps)
-            writer.add_frame(
-                f"{number:04d}",
-                "main",
-                picture(pictures[number], self.shrink),
-                exposure_around(time_us, SHARP_EXPOSURE_US),
-            )
+            add_picture(writer, f"{number:04d}", pictures[number], time_us, self.shrink)
             times.append(time_us)
         notes = [self._add_events(layout, writer, kept, (width, height))]
         missing = len(pictures) - len(both)
@@ -135,7 +127,7 @@ class Mmhpsd(Importer):
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where an action's parts lie."""
+    """Folders and files of an action."""
 
     name: str
     action: str
@@ -208,9 +200,9 @@ def _joint_rotations(arrays: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _rest_joints(paths: list[Path]) -> np.ndarray | None:
-    """From the posed joints that both releases keep."""
+    """Joints at rest, from the posed joints that both releases keep."""
     samples = []
-    for path in paths[:: max(1, len(paths) // _JOINT_SAMPLES)]:
+    for path in some_of(paths):
         where = str(path)
         if path.suffix == ".npz":
             arrays: dict[str, Any] = read_npz(path, what="pose of MMHPSD")

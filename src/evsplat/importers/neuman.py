@@ -14,16 +14,14 @@ from evsplat.errors import DataError
 from evsplat.importers.base import (
     GUIDE,
     PICTURES,
-    SHARP_EXPOSURE_US,
     Importer,
     SourceCamera,
+    add_picture,
     check_positive,
     chosen_frames,
-    exposure_around,
+    human_mask,
     need,
     numbered,
-    person_mask,
-    picture,
 )
 from evsplat.importers.colmap import read_colmap
 from evsplat.importers.smpl import add_body, chosen_poses
@@ -72,12 +70,13 @@ class Neuman(Importer):
             pose[:3, 3] /= scale
             mask, turned = _mask(source, pictures[number])
             time_us = round(number * 1e6 / self.fps)
-            writer.add_frame(
+            add_picture(
+                writer,
                 pictures[number].stem,
-                "main",
-                picture(pictures[number], self.shrink),
-                exposure_around(time_us, SHARP_EXPOSURE_US),
-                mask=None if mask is None else person_mask(mask, self.shrink, person_is=turned),
+                pictures[number],
+                time_us,
+                self.shrink,
+                mask=human_mask(mask, self.shrink, person_is=turned),
                 world_to_camera=pose,
             )
             times.append(time_us)
@@ -141,12 +140,5 @@ def _mask(source: Path, image: Path) -> tuple[Path | None, str]:
     good = source / "4d_humans" / "sam_segmentations" / f"{image.stem}.png"
     if good.exists():
         return good, "nonzero"
-    own = next(
-        (
-            p
-            for s in (f"{image.name}.png", f"{image.stem}.png")
-            if (p := source / "segmentations" / s).exists()
-        ),
-        None,
-    )
-    return own, "zero"
+    own = [source / "segmentations" / f"{name}.png" for name in (image.name, image.stem)]
+    return next((path for path in own if path.exists()), None), "zero"

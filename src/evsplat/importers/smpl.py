@@ -25,6 +25,7 @@ from evsplat.errors import DataError, WeightsError
 
 _COEFFICIENTS = 10
 _COMPARED = ("shin", "foot", "upper_arm", "forearm", "hand")
+_JOINT_SAMPLES = 32
 _JOINTS = len(smpl_skeleton.NAMES)
 
 
@@ -105,6 +106,11 @@ def chosen_poses(sequence: PoseSequence, frames: Sequence[int]) -> PoseSequence:
     )
 
 
+def some_of(paths: list[Path]) -> list[Path]:
+    """Up to twice `_JOINT_SAMPLES` of the files, evenly spread, for `unposed`."""
+    return paths[:: max(1, len(paths) // _JOINT_SAMPLES)]
+
+
 def unposed(
     samples: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]],
 ) -> Float[np.ndarray, "24 3"]:
@@ -149,7 +155,7 @@ def _betas_of(file: Path, rest: np.ndarray) -> np.ndarray:
 def _limb_offset(
     motion: SkeletonMotion, body: Body, poses: np.ndarray, transl: np.ndarray
 ) -> Float[np.ndarray, "T 3"]:
-    """How far the source's limbs are from the body's, on average over knees, elbows and so on.
+    """Mean offset of the source's limbs from the body's, over knees, elbows and so on.
 
     Rigs disagree about where in a person the hip is, but not about these joints.
     """

@@ -17,26 +17,24 @@ from evsplat.files import read_json
 from evsplat.importers.base import (
     GUIDE,
     PICTURES,
-    SHARP_EXPOSURE_US,
     Importer,
     SourceCamera,
+    add_picture,
     check_positive,
     chosen_frames,
-    exposure_around,
+    human_mask,
     need,
     numbered,
     opencv_intrinsics,
-    person_mask,
     picture,
     rigid,
     table,
 )
-from evsplat.importers.smpl import add_body, chosen_poses, unposed
+from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
 from evsplat.safe_pickle import read_npy, read_npz
 
 FRAME_RANGES = {"377": (0, 570), "386": (0, 540), "387": (0, 540), "394": (0, 475)}
 """Frames that ARAH and 3DGS-Avatar use; of 392 and 393 they use all (method.md 1.14)."""
-_JOINT_SAMPLES = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,13 +90,14 @@ class ZjuMocap(Importer):
     ) -> None:
         name = f"{number:06d}"
         image = need(sequence.image(self.camera, number), f"the picture of frame {number}")
-        mask = sequence.mask(self.camera, number)
-        writer.add_frame(
+        add_picture(
+            writer,
             name,
-            self.camera,
-            picture(image, self.shrink),
-            exposure_around(time_us, SHARP_EXPOSURE_US),
-            mask=person_mask(mask, self.shrink) if mask.exists() else None,
+            image,
+            time_us,
+            self.shrink,
+            camera=self.camera,
+            mask=human_mask(sequence.mask(self.camera, number), self.shrink),
         )
         for other in self.novel_cameras:
             view = need(sequence.image(other, number), f"frame {number} of camera {other}")
@@ -116,7 +115,7 @@ class _Sequence:
     mask: Callable[[str, int], Path]
     poses: Path
     rest_joints: Callable[[list[int]], np.ndarray | None]
-    """The subject's joints at rest, where the data tells them."""
+    """The subject's joints at rest; None where the data has none."""
 
 
 def _open(source: Path) -> _Sequence:
@@ -208,9 +207,9 @@ def _arah_camera(document: dict[str, Any], name: str, where: str) -> SourceCamer
 
 
 def _rest_joints(paths: list[Path]) -> np.ndarray | None:
-    """From the posed joints that ARAH keeps."""
+    """Joints at rest, from the posed joints that ARAH keeps."""
     samples = []
-    for path in paths[:: max(1, len(paths) // _JOINT_SAMPLES)]:
+    for path in some_of(paths):
         arrays, where = read_npz(path, what="body parameters"), str(path)
         if "Jtr_posed" not in arrays:
             return None

@@ -20,13 +20,12 @@ from evsplat.importers.base import (
     PICTURES,
     Importer,
     SourceCamera,
+    add_picture,
     check_positive,
-    exposure_around,
+    human_mask,
     need,
     numbered,
     opencv_intrinsics,
-    person_mask,
-    picture,
     rigid,
     table,
 )
@@ -69,13 +68,14 @@ class ZjuMocapBlur(Importer):
         times = []
         for name in tqdm(moments, desc="pictures", unit="frame", leave=False):
             time_us = moments[name] * unit
-            mask = source / "masks" / f"{name}.png"
-            writer.add_frame(
+            add_picture(
+                writer,
                 name,
-                "main",
-                picture(frames[name], self.shrink),
-                exposure_around(time_us, exposure_us),
-                mask=person_mask(mask, self.shrink) if mask.exists() else None,
+                frames[name],
+                time_us,
+                self.shrink,
+                exposure_us=exposure_us,
+                mask=human_mask(source / "masks" / f"{name}.png", self.shrink),
                 world_to_camera=cameras[name].world_to_camera if moving else None,
             )
             times.append(round(time_us))

@@ -17,30 +17,29 @@ from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
 from evsplat.capture.validate import check_capture
-from evsplat.events import count_map
 from evsplat.files import atomic_path
 from evsplat.inspection.drawing import (
+    DETAIL_PX,
+    EVENT_WINDOW_US,
     Tile,
     draw_outline,
-    events_over,
+    event_tile,
     fit,
     sheet,
     short_number,
     to_picture,
 )
+from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings, sensor_lines
-from evsplat.inspection.timeline import draw_timeline
 
 CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
 SHOWN_FINDINGS = 12
-# Longer windows cover the person so densely that single edges cannot be told apart.
-EVENT_WINDOW_US = 20_000
 _OUTLINE, _OUTLINE_ENDS = (60, 255, 120), (255, 225, 80)
 
 
 @dataclass(frozen=True)
 class InspectReport:
-    """What `inspect_capture` found out."""
+    """Findings, summary and pictures of an inspection."""
 
     path: Path
     findings: tuple[Finding, ...]
@@ -50,7 +49,7 @@ class InspectReport:
 
     @property
     def usable(self) -> bool:
-        """Whether there are no errors (warnings are allowed)."""
+        """True without errors (warnings are allowed)."""
         return not any(finding.severity == "error" for finding in self.findings)
 
 
@@ -188,7 +187,7 @@ def _findings_text(findings: tuple[Finding, ...]) -> str:
 
 
 def _spread(frames: tuple[Frame, ...], count: int) -> tuple[Frame, ...]:
-    """At most ``count`` frames, evenly spread."""
+    """Frames evenly spread over the capture, at most ``count``."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
     return tuple(frames[i] for i in chosen)
 
@@ -212,15 +211,10 @@ def _contact_sheet(capture: Capture) -> Image.Image:
 def _events_sheet(capture: Capture) -> Image.Image:
     """Events in the middle of the exposure over the greyed picture."""
     assert capture.events is not None
-    tiles = []
-    for frame in _spread(capture.frames, DETAIL_FRAMES):
-        start = frame.mid_us - EVENT_WINDOW_US // 2
-        camera = capture.camera(frame)
-        stream = capture.events.between(start, start + EVENT_WINDOW_US)
-        counts = count_map(stream, camera.height, camera.width)
-        mixed = events_over(capture.image(frame), counts)
-        picture = to_picture(mixed, fit(camera.width, camera.height, 380))
-        tiles.append(Tile(picture, f"{_label(frame)}   {len(stream):,} events", frame.split))
+    tiles = [
+        event_tile(capture.events, capture.image(frame), frame.mid_us, _label(frame), frame.split)
+        for frame in _spread(capture.frames, DETAIL_FRAMES)
+    ]
     subtitle = f"{EVENT_WINDOW_US / 1000:g} ms about mid-exposure; red: brighter, blue: darker"
     return sheet(f"{capture.name}: events", subtitle, tiles, columns=4)
 
@@ -230,7 +224,7 @@ def _body_sheet(capture: Capture, track: BodyTrack) -> Image.Image:
     tiles = []
     for frame in _spread(capture.frames, DETAIL_FRAMES):
         camera = capture.camera(frame)
-        size = fit(camera.width, camera.height, 380)
+        size = fit(camera.width, camera.height, DETAIL_PX)
         picture = to_picture(capture.image(frame), size)
         large = _resized(camera, size)
         for time_us in frame.exposure_us:

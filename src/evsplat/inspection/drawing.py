@@ -1,4 +1,4 @@
-"""Small Pillow helpers: sheets of labelled tiles, outlines, colours."""
+"""Sheets of labelled tiles, outlines, lines and colours, drawn with Pillow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,12 +10,20 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import binary_dilation, binary_erosion
 from torch import Tensor
 
+from evsplat.calibration import EventSource
+from evsplat.events import count_map
+from evsplat.pictures import to_bytes
+
 PAPER, INK, FAINT = (255, 255, 255), (38, 43, 51), (128, 136, 148)
 TRAIN, TEST = (38, 124, 160), (226, 114, 38)
 BRIGHTER, DARKER = (235, 40, 40), (40, 90, 245)
 CURVE = (108, 92, 168)
 OVERSAMPLING = 2
 """Curves are drawn larger and reduced, because Pillow's lines have no soft edges."""
+# Longer windows cover the person so densely that single edges cannot be told apart.
+EVENT_WINDOW_US = 20_000
+DETAIL_PX = 380
+"""Longer side of the pictures of a detailed sheet."""
 _GAP, _LABEL_HEIGHT, _HEADER_HEIGHT, _BORDER = 10, 20, 62, 4
 
 
@@ -29,7 +37,7 @@ class Tile:
 
 
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own font."""
+    """Pillow's own font in pixels of height."""
     return ImageFont.load_default(size)
 
 
@@ -40,8 +48,7 @@ def split_colour(split: str) -> tuple[int, int, int]:
 
 def to_picture(image: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Image.Image:
     """8-bit picture of sRGB in [0, 1], resampled to ``size`` (width, height)."""
-    pixels = (image.clamp(0, 1) * 255 + 0.5).byte().numpy()
-    return Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
+    return Image.fromarray(to_bytes(image)).resize(size, Image.Resampling.LANCZOS)
 
 
 def fit(width: int, height: int, longest: int) -> tuple[int, int]:
@@ -87,7 +94,22 @@ def header(
         x -= 14
 
 
-def events_over(
+def event_tile(
+    events: EventSource,
+    image: Float[Tensor, "H W 3"],
+    middle_us: int,
+    label: str,
+    split: str = "",
+) -> Tile:
+    """Events of `EVENT_WINDOW_US` about a time over the greyed picture, counted in the label."""
+    height, width = image.shape[:2]
+    stream = events.between(middle_us - EVENT_WINDOW_US // 2, middle_us + EVENT_WINDOW_US // 2)
+    mixed = _events_over(image, count_map(stream, height, width))
+    picture = to_picture(mixed, fit(width, height, DETAIL_PX))
+    return Tile(picture, f"{label}   {len(stream):,} events", split)
+
+
+def _events_over(
     image: Float[Tensor, "H W 3"], counts: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
     """Signed event counts over the greyed picture: red where brighter, blue where darker."""
@@ -120,7 +142,7 @@ def round_ticks(start: int, end: int) -> list[int]:
 
 
 def short_number(value: float) -> str:
-    """1234567 as '1.2M'."""
+    """A number in short, such as 1234567 as '1.23M'."""
     for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
         if value >= size:
             return f"{value / size:.3g}{unit}"

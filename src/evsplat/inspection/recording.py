@@ -1,6 +1,6 @@
-"""`evsplat inspect` for a bare event recording: what is in it, and how it fits its frames."""
+"""`evsplat inspect` for a bare event recording: its content, and how it fits its frames."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +19,10 @@ from evsplat.calibration import (
     pair_indices,
 )
 from evsplat.errors import DataError
-from evsplat.events import EventRecording, EventStream, RecordedFrame, count_map, open_recording
-from evsplat.inspection.capture import (
-    EVENT_WINDOW_US,
-    InspectReport,
-    inspect_capture,
-    save_drawings,
-)
-from evsplat.inspection.drawing import Tile, events_over, fit, sheet, short_number, to_picture
-from evsplat.inspection.plot import draw_curve
+from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
+from evsplat.inspection.capture import InspectReport, inspect_capture, save_drawings
+from evsplat.inspection.drawing import EVENT_WINDOW_US, event_tile, sheet, short_number
+from evsplat.inspection.plots import draw_curve
 from evsplat.inspection.sensor import sensor_lines
 
 MOST_EVENTS = 20_000_000
@@ -97,7 +92,7 @@ def inspect_recording(
 
 @dataclass
 class _Totals:
-    """One pass over the recording."""
+    """Statistics of one pass over the recording."""
 
     width: int
     height: int
@@ -116,30 +111,27 @@ class _Totals:
     def of(cls, recording: EventRecording) -> "_Totals":
         width, height = _sensor_size(recording)
         meter = NoiseMeter(width, height)
-        gathered = _Gathered()
+        start = end = count = brighter = 0
+        kept: list[EventStream] = []
+        bins: list[Int64[np.ndarray, "B 2"]] = []
         for chunk in recording.chunks():
-            if len(chunk):
-                meter.add(chunk)
-                gathered.add(chunk)
-        if not gathered.parts:
+            if not len(chunk):
+                continue
+            meter.add(chunk)
+            start = start if count else int(chunk.t[0])
+            end = int(chunk.t[-1]) + 1
+            if sum(map(len, kept)) < MOST_EVENTS:
+                kept.append(chunk)
+            count += len(chunk)
+            brighter += int((chunk.p > 0).sum())
+            found = np.unique((chunk.t - start) // _RATE_BIN_US, return_counts=True)
+            bins.append(np.stack(found, axis=-1))
+        if not count:
             raise DataError(f"{recording.path}: holds no events; is it the right file?")
-        start, end = gathered.start_us, gathered.end_us
-        columns = (
-            np.concatenate([getattr(part, name) for part in gathered.parts]) for name in "txyp"
-        )
-        bins = np.concatenate(gathered.bins)
-        counts = np.bincount(bins[:, 0], bins[:, 1])
-        return cls(
-            width,
-            height,
-            meter.estimate(end - start),
-            gathered.count,
-            gathered.brighter,
-            start,
-            end,
-            counts / (_RATE_BIN_US / 1e6),
-            EventStream(*columns),
-        )
+        rows = np.concatenate(bins)
+        rate = np.bincount(rows[:, 0], rows[:, 1]) / (_RATE_BIN_US / 1e6)
+        noise, sample = meter.estimate(end - start), EventStream.joined(kept)
+        return cls(width, height, noise, count, brighter, start, end, rate, sample)
 
     def text(self, has_polarity: bool) -> str:
         seconds = (self.end_us - self.start_us) / 1e6
@@ -165,39 +157,13 @@ class _Totals:
         )
 
 
-@dataclass
-class _Gathered:
-    count: int = 0
-    brighter: int = 0
-    start_us: int = 0
-    end_us: int = 0
-    kept: int = 0
-    parts: list[EventStream] = field(default_factory=list)
-    bins: list[Int64[np.ndarray, "B 2"]] = field(default_factory=list)
-
-    def add(self, chunk: EventStream) -> None:
-        if not self.parts:
-            self.start_us = int(chunk.t[0])
-        self.count += len(chunk)
-        self.brighter += int((chunk.p > 0).sum())
-        self.end_us = int(chunk.t[-1]) + 1
-        self.bins.append(
-            np.stack(
-                np.unique((chunk.t - self.start_us) // _RATE_BIN_US, return_counts=True), axis=-1
-            )
-        )
-        if self.kept < MOST_EVENTS:
-            self.parts.append(chunk)
-            self.kept += len(chunk)
-
-
 def _size_text(recording: EventRecording, totals: _Totals) -> str:
     size = f"{totals.width}x{totals.height}"
     return size if recording.width else f"{size} as far as events reach"
 
 
 def _sensor_size(recording: EventRecording) -> tuple[int, int]:
-    """As the file says, or as far as events reach."""
+    """Width and height that the file gives, or as far as events reach."""
     if recording.width is not None and recording.height is not None:
         return recording.width, recording.height
     width = height = 0
@@ -276,24 +242,20 @@ def _events_sheet(
     lag_us: float,
 ) -> Image.Image:
     """Events over the frames of the same time or, without frames, over nothing."""
-    size = fit(totals.width, totals.height, 380)
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_TILES, len(frames))).astype(int))
     shown = [frames[k][0] for k in chosen]
     blank = torch.full((totals.height, totals.width, 3), 0.25)
     t = totals.sample.t
     instants = np.linspace(t[0], t[-1], 2 * _TILES + 1)[1::2]
-    grounds = [(blank, int(time)) for time in instants]
+    pictures_at = [(blank, int(time)) for time in instants]
     if shown:
-        grounds = [
+        pictures_at = [
             (_rgb(frame.image), round(sum(frame.exposure_us) / 2 + lag_us)) for frame in shown
         ]
-    tiles = []
-    for ground, middle in grounds:
-        stream = totals.sample.between(middle - EVENT_WINDOW_US // 2, middle + EVENT_WINDOW_US // 2)
-        counts = count_map(stream, totals.height, totals.width)
-        picture = to_picture(events_over(ground, counts), size)
-        seconds = (middle - totals.start_us) / 1e6
-        tiles.append(Tile(picture, f"{seconds:.3f} s   {len(stream):,} events", ""))
+    tiles = [
+        event_tile(totals.sample, picture, middle, f"{(middle - totals.start_us) / 1e6:.3f} s")
+        for picture, middle in pictures_at
+    ]
     over = "over the frames, the clock's lag taken out" if shown else "at eight instants"
     subtitle = f"{EVENT_WINDOW_US / 1000:g} ms of events {over}; red: brighter, blue: darker"
     return sheet(f"{name}: events", subtitle, tiles, columns=4)

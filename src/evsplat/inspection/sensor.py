@@ -1,4 +1,4 @@
-"""What is said of an event sensor's clock and thresholds, and when to warn."""
+"""Words for an event sensor's clock and thresholds, and the warning about the clock."""
 
 from evsplat.calibration import ClockEstimate, SensorEstimate
 from evsplat.capture.capture import Capture

@@ -40,8 +40,8 @@ class BackgroundDifference:
     channels of linear light darker by one factor) and lies near the posed body; the middle of the
     posed body is the person even where it looks like the background. Holes are closed and only the
     piece that covers most of the posed body is kept; of a capture without body poses, the largest
-    piece anywhere. What it finds in a blurry frame is as wide as
-    the blur; restored frames (`evsplat restore`) give tighter masks.
+    piece anywhere. A mask of a blurry frame is as wide as the blur; restored frames
+    (`evsplat restore`) give tighter ones.
     """
 
     name = "background"
@@ -85,14 +85,14 @@ class BackgroundDifference:
             )
 
     def provenance(self) -> dict[str, Any]:
-        """The threshold."""
+        """Threshold of the difference."""
         return {"threshold": round(self._threshold, 4)}
 
 
 def difference(
     image: Float[Tensor, "H W 3"], background: Float[Tensor, "H W 3"], threshold: float
 ) -> Bool[np.ndarray, "H W"]:
-    """Where a picture differs from the background by more than a shadow on it would."""
+    """Pixels that differ from the background by more than a shadow on it would."""
     differs = (image - background).abs().amax(-1) > threshold
     # A little light keeps the ratio of dark pixels, which is mostly noise, near one.
     ratio = (decode(image) + 0.002) / (decode(background) + 0.002)
@@ -105,9 +105,9 @@ def difference(
 def clean(
     differs: Bool[np.ndarray, "H W"], body: Bool[np.ndarray, "H W"] | None
 ) -> Bool[np.ndarray, "H W"]:
-    """What of the differences is the person whose bare body is ``body``; nothing out of view.
+    """The piece of the differences that is the person whose bare body is ``body``.
 
-    Where no body is given it is the largest piece.
+    None where the body is out of view; where no body is given it is the largest piece.
     """
     if body is None:
         person, weight = binary_opening(differs), np.ones_like(differs)

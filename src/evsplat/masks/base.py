@@ -1,4 +1,4 @@
-"""What finds the person in a capture's frames, and which ways there are."""
+"""The protocol of maskers, which find the person in frames, and all of them by name."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
@@ -26,7 +26,7 @@ class Masker(Protocol):
         ...
 
     def provenance(self) -> dict[str, Any]:
-        """How the masks were made, as JSON values."""
+        """Origin of the masks, as JSON values."""
         ...
 
 
@@ -35,4 +35,4 @@ MASKERS: dict[str, Callable[..., Masker]] = {
     "silhouette": PosedBody,
     "rvm": RobustVideoMatting,
 }
-"""By name; called with the capture and the masker's own options as keywords."""
+"""Maskers by name; called with the capture and the masker's own options as keywords."""

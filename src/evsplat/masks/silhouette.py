@@ -17,7 +17,7 @@ OVERSAMPLING = 4
 
 
 class PosedBody:
-    """Where the posed body is at mid-exposure, widened by a margin for clothes and hair."""
+    """The posed body at mid-exposure, widened by a margin for clothes and hair."""
 
     name = "silhouette"
 
@@ -46,7 +46,7 @@ class PosedBody:
             )
 
     def provenance(self) -> dict[str, Any]:
-        """The margin."""
+        """Margin in pixels."""
         return {"margin_px": self._margin_px}
 
 

@@ -3,7 +3,7 @@
 Numbers of the form 1.5 are sections of the reference that docs/baselines.md quotes.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import torch
@@ -45,16 +45,16 @@ class AvatarConfig:
 
     DROPPED: ClassVar[dict[str, str]] = AVATAR
 
-    policy: Policy = field(default_factory=lambda: Policy(masks="given"))
+    policy: Policy = Policy(masks="given")
     """Held-out data that training may see."""
     iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
     """Training steps; all schedules stretch with it."""
 
-    human: HumanStart = field(default_factory=HumanStart)
+    human: HumanStart = HumanStart(count=None, spacing_px=1.5)
     """Gaussians of the person at the start."""
-    densify: Densify = field(default_factory=lambda: Densify(max_human=60_000))
+    densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=60_000)
     """Growth and pruning."""
-    networks: Networks = field(default_factory=lambda: Networks(pose_start=5_000))
+    networks: Networks = Networks(pose_start=5_000)
     """Networks that move and colour the person."""
 
     l1_weight: Weight = 1.0
@@ -63,10 +63,10 @@ class AvatarConfig:
     """Weight of 1 - SSIM."""
     alpha_weight: Weight = 0.1
     """Weight of the mean absolute difference between the alpha picture and the mask."""
-    terms: AvatarTerms = field(default_factory=lambda: AvatarTerms(perceptual="available"))
+    terms: AvatarTerms = AvatarTerms(perceptual="available")
     """Other terms of the loss."""
 
-    rates: AvatarRates = field(default_factory=lambda: RELEASED_RATES)
+    rates: AvatarRates = RELEASED_RATES
     """Learning rates."""
 
 
@@ -124,7 +124,7 @@ def _boxes(capture: MaskedCapture) -> dict[str, tuple[int, int, int, int]]:
     """Tight pixel box (x0, y0, x1, y1) of the mask, per training frame that shows somebody."""
     boxes = {}
     for frame in capture.train_frames:
-        rows, columns = torch.nonzero(capture.person(frame), as_tuple=True)
+        rows, columns = torch.nonzero(capture.human(frame), as_tuple=True)
         if len(rows):
             x0, x1, y0, y1 = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
             boxes[frame.name] = (int(x0), int(y0), int(x1), int(y1))

@@ -6,7 +6,7 @@ of 0.62, so everything begins as the person and is dragged along by the skeleton
 learned (A1).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import torch
@@ -34,7 +34,7 @@ from evsplat.methods.base import (
     semantic_bounds,
     start_of_randomness,
 )
-from evsplat.methods.dropped import PAPER
+from evsplat.methods.dropped import AVATAR_SEMANTIC
 from evsplat.methods.settings import NOMINAL_ITERATIONS, Densify, Share, Weight
 from evsplat.methods.starts import (
     HumanStart,
@@ -53,20 +53,26 @@ from evsplat.objectives import RenderedSemantics
 class AvatarSemanticConfig:
     """All settings of method `avatar3dgs_semantic`."""
 
-    DROPPED: ClassVar[dict[str, str]] = PAPER
+    DROPPED: ClassVar[dict[str, str]] = AVATAR_SEMANTIC
 
-    policy: Policy = field(default_factory=Policy)
+    policy: Policy = Policy()
     """Held-out data that training may see."""
     iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
     """Training steps; all schedules stretch with it."""
 
-    human: HumanStart = field(default_factory=HumanStart)
+    human: HumanStart = HumanStart(count=None, spacing_px=1.5)
     """Gaussians of the person at the start."""
-    scene: SceneStart = field(default_factory=SceneStart)
+    scene: SceneStart = SceneStart(
+        kind="median_backdrop",
+        cube_count=100_000,
+        cube_half_side_m=None,
+        cube_max_count=150_000,
+        backdrop_stride_px=2,
+    )
     """Places of the scene's Gaussians at the start; nothing is fitted to them before training."""
-    densify: Densify = field(default_factory=lambda: Densify(max_human=60_000))
+    densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=60_000)
     """Growth and pruning."""
-    networks: Networks = field(default_factory=lambda: Networks(pose_start=5_000))
+    networks: Networks = Networks(pose_start=5_000)
     """Networks that move and colour the person."""
     scene_direction_dropout: Share = 0.5
     """How often a training step hides the view direction from the scene's colour; a static camera
@@ -81,14 +87,14 @@ class AvatarSemanticConfig:
     """Weight of the mean absolute difference to the recorded picture, sRGB."""
     dssim_weight: Weight = 0.0
     """Weight of 1 - SSIM."""
-    terms: AvatarTerms = field(default_factory=lambda: AvatarTerms(perceptual="available"))
+    terms: AvatarTerms = AvatarTerms(perceptual="available")
     """Other terms of the loss."""
     semantic_weight: Weight = 0.1
     """Weight of the rendered attribute's cross-entropy against the posed body's silhouette."""
     binarise_weight: Weight = ((0, 0.0), (5_000, 0.001), (10_000, 0.01))
     """Weight of the mean of m (1 - m), which pushes the attribute m to 0 or 1."""
 
-    rates: AvatarRates = field(default_factory=lambda: RELEASED_RATES)
+    rates: AvatarRates = RELEASED_RATES
     """Learning rates."""
 
 

@@ -33,6 +33,7 @@ LATENT_WEIGHT_DECAY = 0.05
 HUMAN_START = 1_000.0
 """Nominal iteration until which the person's Gaussians are frozen while skinning settles."""
 
+_POSES = ReadIf("networks.pose_start", "a number", lambda start: start is not None)
 _PERCEPTUAL = ReadIf("terms.perceptual", "not none", lambda name: name != "none")
 
 
@@ -111,7 +112,7 @@ class AvatarRates:
     """Both colour networks."""
     latents: NotNegative = 1e-3
     """Latents of frames."""
-    pose: NotNegative = 1e-4
+    pose: Annotated[float, AtLeast(0), _POSES] = 1e-4
     """Pose residuals, radians and metres."""
     final: Annotated[float, Above(0), Within(0, 1)] = 0.1
     """Factor that rates of centres and networks reach at the end, exponentially."""

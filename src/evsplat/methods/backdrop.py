@@ -20,7 +20,7 @@ class OnMedianBackground:
 
     @property
     def name(self) -> str:
-        """Of the method, and what it stands before."""
+        """Name of the method, and that it stands before the median."""
         return f"{self._person.name} on median background"
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:

@@ -43,19 +43,34 @@ _NETWORKS = {
     "loss": "its weights are l1_weight, dssim_weight and the section terms",
 }
 
+_SCENE = {
+    "deform.scene_direction_dropout": "renamed to scene_direction_dropout",
+    "loss.semantic": "renamed to semantic_weight",
+    "loss.binarise": "renamed to binarise_weight",
+}
+
 AVATAR = {**_RENAMED, **_NETWORKS, "loss.alpha": "renamed to alpha_weight"}
 """Of `avatar3dgs`."""
+
+AVATAR_SEMANTIC = {
+    **_RENAMED,
+    **_NETWORKS,
+    **_SCENE,
+    "semantics": "fixed: the rendered attribute teaches it",
+    "semantic_activity": _EVENTS["semantic_activity"],
+    "event": "avatar3dgs_semantic has no event term",
+    "scene.prefit_steps": "avatar3dgs_semantic fits nothing to the median before training",
+}
+"""Of `avatar3dgs_semantic`."""
 
 PAPER = {
     **_RENAMED,
     **_EVENTS,
     **_NETWORKS,
+    **_SCENE,
     "event": "its settings begin with event_, as event_weight",
-    "deform.scene_direction_dropout": "renamed to scene_direction_dropout",
-    "loss.semantic": "renamed to semantic_weight",
-    "loss.binarise": "renamed to binarise_weight",
 }
-"""Of `paper` and `avatar3dgs_semantic`."""
+"""Of `paper`."""
 
 EVSPLAT = {
     **_RENAMED,
@@ -107,5 +122,6 @@ HUGS = {
     "skinning_turns": "fixed at 4",
     "skinning_refresh": "fixed at 50",
     "optimisation.rates": "rates are the released ones, times rate_scale",
+    "optimisation": "its parts are iterations and rate_scale; the rest is fixed",
 }
 """Of `hugs`."""

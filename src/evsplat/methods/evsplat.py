@@ -6,7 +6,7 @@ own, the person's by how the surface is turned and where it stands; the person c
 """
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -15,6 +15,7 @@ from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate
 from evsplat.capture import Policy, TrainingCapture, estimate_sensor
 from evsplat.config import Above, AtLeast, ReadIf, Within
+from evsplat.errors import ConfigError
 from evsplat.gaussians import GaussianSet
 from evsplat.methods.base import (
     Composition,
@@ -32,6 +33,8 @@ from evsplat.methods.poses import PoseSettings, prepare_poses
 from evsplat.methods.prefit import fit_scene
 from evsplat.methods.settings import (
     NOMINAL_ITERATIONS,
+    WITH_EVENTS,
+    WITH_WINDOWS,
     Densify,
     Nominal,
     NotNegative,
@@ -68,9 +71,8 @@ CONSTANT_SHARE = 0.3
 CLIP = 0.1
 """Largest gradient norm of the networks together."""
 
-_EVENTS = ReadIf("event_weight", "above 0", lambda weight: weight != 0.0)
-_WINDOWS = ReadIf("event_term", "windows", lambda term: term == "windows")
 _LAMPS = ReadIf("lamps", "above 0", lambda lamps: lamps > 0)
+_SEVERAL = ReadIf("most_renders", "3 or more", lambda most: most > 2)
 _SHADING = ReadIf("shading", "true", lambda shading: bool(shading))
 
 
@@ -94,7 +96,7 @@ class DiscRates:
     """Light on the person."""
     shadow: Annotated[float, AtLeast(0), _LAMPS] = 1e-2
     """Places of the lamps and their shadows."""
-    sensor: Annotated[float, AtLeast(0), _EVENTS, _WINDOWS] = 1e-3
+    sensor: Annotated[float, AtLeast(0), WITH_EVENTS, WITH_WINDOWS] = 1e-3
     """Logarithms of the contrast thresholds, and the events' clock."""
     final: Annotated[float, Above(0), Within(0, 1)] = 0.1
     """Factor that every rate reaches at the end, exponentially from 0.3 of the training on."""
@@ -106,16 +108,23 @@ class EvsplatConfig:
 
     DROPPED: ClassVar[dict[str, str]] = EVSPLAT
 
-    policy: Policy = field(default_factory=Policy)
+    policy: Policy = Policy()
     """Held-out data that training may see."""
     iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
     """Training steps; all schedules stretch with it."""
 
-    human: HumanStart = field(default_factory=lambda: HumanStart(spacing_px=0.85))
+    human: HumanStart = HumanStart(count=None, spacing_px=0.85)
     """Discs of the person at the start."""
-    scene: FittedScene = field(default_factory=FittedScene)
+    scene: FittedScene = FittedScene(
+        kind="median_backdrop",
+        cube_count=100_000,
+        cube_half_side_m=None,
+        cube_max_count=150_000,
+        backdrop_stride_px=2,
+        prefit_steps=300,
+    )
     """Discs of the scene at the start."""
-    densify: Densify = field(default_factory=Densify)
+    densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=10_000)
     """Growth and pruning."""
 
     width: Annotated[int, AtLeast(1)] = 128
@@ -135,35 +144,45 @@ class EvsplatConfig:
     low_pass: Annotated[float, Above(0), Within(0, LOW_PASS)] = 0.1
     """Variance of the filter of a pixel, px^2; 3DGS and viewers of others take 0.3, the most."""
 
-    px_per_render: Positive = 3.0
+    px_per_render: Annotated[float, Above(0), _SEVERAL] = 3.0
     """Way of the body between neighbouring renders of an exposure, pixels."""
     most_renders: Annotated[int, AtLeast(1)] = 7
     """Upper bound of renders in an exposure, odd; 1 compares the sharp middle, as `paper` does."""
 
     event_weight: Weight = 0.2
     """Weight of the event term; 0 = without events."""
-    event_term: Annotated[Literal["windows", "paper"], _EVENTS] = "windows"
+    event_term: Annotated[Literal["windows", "paper"], WITH_EVENTS] = "windows"
     """``windows``: changes between any two rendered times, with their amplitude. ``paper``:
     normalised changes between neighbouring frames' middles (its eq. 8-9)."""
-    event_start: Annotated[Nominal, _EVENTS] = 750
+    event_start: Annotated[Nominal, WITH_EVENTS] = 750
     """First nominal iteration of the event term."""
-    event_eps: Annotated[float, Above(0), _EVENTS, _WINDOWS] = 0.004
+    event_eps: Annotated[float, Above(0), WITH_EVENTS, WITH_WINDOWS] = 0.004
     """Added to linear luminance: darker than this a sensor sees nothing."""
-    event_reach: Annotated[float, AtLeast(0), _EVENTS, _WINDOWS] = 0.5
+    event_reach: Annotated[float, AtLeast(0), WITH_EVENTS, WITH_WINDOWS] = 0.5
     """Reach of windows before or after an exposure, in intervals of the training frames."""
-    event_ramp_us: Annotated[int, AtLeast(0), _EVENTS, _WINDOWS] = 100_000
+    event_ramp_us: Annotated[int, AtLeast(0), WITH_EVENTS, WITH_WINDOWS] = 100_000
     """Between two events of one polarity that lie at most so far apart, brightness is taken to
     change evenly instead of all at once at the second; 0: all at once."""
-    event_noise_aware: Annotated[bool, _EVENTS, _WINDOWS] = True
+    event_noise_aware: Annotated[bool, WITH_EVENTS, WITH_WINDOWS] = True
     """Weigh differences by the sensor's background noise, and leave hot pixels out."""
-    contrast_weight: Annotated[Weight, _EVENTS, _WINDOWS] = 1.0
+    contrast_weight: Annotated[Weight, WITH_EVENTS, WITH_WINDOWS] = 1.0
     """Weight of the squared distance of the thresholds' logarithms from where they started."""
-    clock: Annotated[Literal["auto", "always", "never"], _EVENTS, _WINDOWS] = "auto"
+    clock: Annotated[Literal["auto", "always", "never"], WITH_EVENTS, WITH_WINDOWS] = "auto"
     """Learn by how much the events' clock is late, on top of the capture's own offset, starting at
     what training frames and events tell where that is over 4 ms and three standard errors.
     ``auto``: only there; ``always``: elsewhere from 0."""
 
-    pose: PoseSettings = field(default_factory=PoseSettings)
+    pose: PoseSettings = PoseSettings(
+        smooth="auto",
+        refine="auto",
+        between=True,
+        noisy_rad=0.006,
+        start=1_500,
+        prior=1e-3,
+        std_rad=None,
+        std_m=None,
+        events_of_held_out=False,
+    )
     """Errors of the given poses."""
 
     l1_weight: Weight = 0.8
@@ -177,7 +196,7 @@ class EvsplatConfig:
     semantic_band_px_at_256: Positive = 9.0
     """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
 
-    rates: DiscRates = field(default_factory=DiscRates)
+    rates: DiscRates = DiscRates()
     """Learning rates."""
 
 
@@ -307,9 +326,14 @@ def _held_out(
 ) -> HeldOut | None:
     """Poses at held-out frames from the events around them, where that is asked for."""
     frames = list(capture.held_out_frames)
-    if not config.pose.events_of_held_out or model.residual is None or not frames:
+    if not config.pose.events_of_held_out or not frames:
         return None
     config.policy.require_held_out_events("pose.events_of_held_out")
+    if model.residual is None:
+        raise ConfigError(
+            "pose.events_of_held_out is true, and nothing reads it: no residual of the poses of "
+            f"{capture.path} is learned; pass --set pose.refine=always as well, or leave it out."
+        )
     return HeldOut(
         frames,
         HeldOutWindows(windows, capture.train_frames),

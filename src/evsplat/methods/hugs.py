@@ -5,7 +5,7 @@ iterations are nominal ones of 15,000; the released code makes 14,999.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
@@ -55,18 +55,22 @@ class HugsConfig:
 
     DROPPED: ClassVar[dict[str, str]] = HUGS
 
-    policy: Policy = field(default_factory=lambda: Policy(masks="given"))
+    policy: Policy = Policy(masks="given")
     """Held-out data that training may see."""
     iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
     """Training steps; all schedules stretch with it."""
 
-    human: HumanStart = field(default_factory=HumanStart)
+    human: HumanStart = HumanStart(count=None, spacing_px=1.5)
     """Gaussians of the person at the start."""
-    scene: SceneStart = field(default_factory=lambda: SceneStart("random_cube"))
-    """Gaussians of the scene at the start."""
-    densify: Densify = field(
-        default_factory=lambda: Densify(start=3_000, end=15_000, max_human=20_000)
+    scene: SceneStart = SceneStart(
+        kind="random_cube",
+        cube_count=100_000,
+        cube_half_side_m=None,
+        cube_max_count=150_000,
+        backdrop_stride_px=2,
     )
+    """Gaussians of the scene at the start."""
+    densify: Densify = Densify(start=3_000, end=15_000, gradient=2e-4, max_human=20_000)
     """Growth and pruning; of the scene from iteration 500 on. Released: at most 524,288 Gaussians
     of the person and 2,097,152 of the scene."""
 

@@ -19,7 +19,7 @@ class Rate:
     """Share of the training before the decay begins."""
 
     def factor(self, nominal: float) -> float:
-        """Of ``start`` at a nominal iteration."""
+        """Share of ``start`` at a nominal iteration."""
         progress = nominal / NOMINAL_ITERATIONS
         falling = max(0.0, progress - self.constant) / (1 - self.constant)
         return float(self.final ** min(falling, 1.0))
@@ -27,7 +27,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class RowRate:
-    """How one attribute of a set of Gaussians learns."""
+    """Learning rate of one attribute of a set of Gaussians."""
 
     rate: Rate
     window: tuple[float, float] = (0.0, float("inf"))

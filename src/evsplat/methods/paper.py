@@ -3,7 +3,7 @@
 The numbers A1 to A32 name the open points of the paper's text that a setting decides.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import torch
@@ -35,6 +35,7 @@ from evsplat.methods.dropped import PAPER
 from evsplat.methods.prefit import fit_scene, fit_scene_colours
 from evsplat.methods.settings import (
     NOMINAL_ITERATIONS,
+    WITH_EVENTS,
     Densify,
     Nominal,
     Share,
@@ -44,7 +45,6 @@ from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start
 from evsplat.models.paper import Released, Semantics
 from evsplat.objectives import EventChange, Objective, RenderedSemantics
 
-_EVENTS = ReadIf("event_weight", "above 0", lambda weight: weight != 0.0)
 _RENDERED = ReadIf("semantics", "rendered", lambda semantics: semantics == "rendered")
 
 
@@ -54,18 +54,25 @@ class PaperConfig:
 
     DROPPED: ClassVar[dict[str, str]] = PAPER
 
-    policy: Policy = field(default_factory=Policy)
+    policy: Policy = Policy()
     """Held-out data that training may see."""
     iterations: Annotated[int, AtLeast(1)] = NOMINAL_ITERATIONS
     """Training steps; all schedules stretch with it."""
 
-    human: HumanStart = field(default_factory=HumanStart)
+    human: HumanStart = HumanStart(count=None, spacing_px=1.5)
     """Gaussians of the person at the start."""
-    scene: FittedScene = field(default_factory=FittedScene)
+    scene: FittedScene = FittedScene(
+        kind="median_backdrop",
+        cube_count=100_000,
+        cube_half_side_m=None,
+        cube_max_count=150_000,
+        backdrop_stride_px=2,
+        prefit_steps=300,
+    )
     """Gaussians of the scene at the start."""
-    densify: Densify = field(default_factory=Densify)
+    densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=10_000)
     """Growth and pruning."""
-    networks: Networks = field(default_factory=Networks)
+    networks: Networks = Networks()
     """Networks that move and colour the person."""
     scene_direction_dropout: Share = 0.5
     """How often a training step hides the view direction from the scene's colour; a static camera
@@ -81,29 +88,29 @@ class PaperConfig:
 
     event_weight: Weight = 0.1
     """w_ev, for the resolution-independent form ``sum / sqrt(N)`` (A15)."""
-    event_start: Annotated[Nominal, _EVENTS] = 1_000
+    event_start: Annotated[Nominal, WITH_EVENTS] = 1_000
     """First nominal iteration; before, both renders show the same unfitted body (A16)."""
-    event_floor: Annotated[float, AtLeast(0), _EVENTS] = 0.03
+    event_floor: Annotated[float, AtLeast(0), WITH_EVENTS] = 0.03
     """Absolute floor of both norms (A16)."""
-    event_eps: Annotated[float, Above(0), _EVENTS] = 1e-5
+    event_eps: Annotated[float, Above(0), WITH_EVENTS] = 1e-5
     """Added to linear luminance before the logarithm (A11)."""
-    event_weight_by_activity: Annotated[bool, _EVENTS] = True
+    event_weight_by_activity: Annotated[bool, WITH_EVENTS] = True
     """Weigh pairs by their share of active pixels, within 0.25 to 4 of the median (A17)."""
-    event_min_active: Annotated[float, AtLeast(0), _EVENTS] = 0.001
+    event_min_active: Annotated[float, AtLeast(0), WITH_EVENTS] = 0.001
     """Pairs with a smaller share of active pixels are left out (A16)."""
 
     l1_weight: Weight = 0.8
     """Weight of the mean absolute difference to the recorded picture, sRGB (A18)."""
     dssim_weight: Weight = 0.2
     """Weight of 1 - SSIM, the better variant of A18; the base method has L1 alone."""
-    terms: AvatarTerms = field(default_factory=AvatarTerms)
+    terms: AvatarTerms = AvatarTerms()
     """Other terms of the loss (A18)."""
     semantic_weight: Annotated[Weight, _RENDERED] = 0.1
     """Weight of the rendered attribute's cross-entropy against the posed body's silhouette."""
     binarise_weight: Annotated[Weight, _RENDERED] = ((0, 0.0), (5_000, 0.001), (10_000, 0.01))
     """Weight of the mean of m (1 - m), which pushes the attribute m to 0 or 1."""
 
-    rates: AvatarRates = field(default_factory=AvatarRates)
+    rates: AvatarRates = AvatarRates()
     """Learning rates."""
 
 

@@ -12,7 +12,7 @@ from evsplat.body.smoothing import MotionNoise, SplineError, motion_noise, smoot
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError
-from evsplat.methods.settings import Nominal, NotNegative, Weight
+from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, NotNegative, Weight
 from evsplat.models.pose_spline import PoseSpline
 
 logger = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ LEAST_STD_RAD, LEAST_STD_M = 0.02, 0.01
 """Expected errors of noisy poses, however little they jitter: what was fitted to pictures errs by
 more, and that changes slowly."""
 
-
+_NOT_ALWAYS = ReadIf("pose.refine", "auto or never", lambda refine: refine != "always")
 _REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "never")
 
 
@@ -33,25 +33,25 @@ _REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "nev
 class PoseSettings:
     """Errors of the given poses."""
 
-    smooth: When = "auto"
+    smooth: When
     """Take out of the given key poses what looks like noise."""
-    refine: When = "auto"
+    refine: When
     """Learn a residual of the poses, a cubic B-spline in time, from pictures and events."""
-    between: bool = True
+    between: Annotated[bool, _NOT_ALWAYS]
     """Where poses are taken as exact, learn how the person moves between them: such a residual that
     is zero at every key pose."""
-    noisy_rad: NotNegative = 0.006
+    noisy_rad: NotNegative
     """Jitter of key poses, radians per axis, from which poses count as noisy. With less they do if
     its variance is half or more of what a spline through the poses misses between them."""
-    start: Nominal = 1_500
+    start: Nominal
     """Nominal iteration from which the residual is learned."""
-    prior: Weight = 1e-3
+    prior: Weight
     """Weight of the residual's mean square in units of the errors expected."""
-    std_rad: Annotated[float, Above(0), _REFINED] | None = None
+    std_rad: Annotated[float, Above(0), _REFINED] | None
     """Error expected of a joint, radians per axis; null = the jitter, at least 0.02."""
-    std_m: Annotated[float, Above(0), _REFINED] | None = None
+    std_m: Annotated[float, Above(0), _REFINED] | None
     """Error expected of the root's place, metres per axis; null = its jitter, at least 0.01."""
-    events_of_held_out: bool = False
+    events_of_held_out: Annotated[bool, WITH_EVENTS, WITH_WINDOWS]
     """Let events around held-out frames correct the poses there; needs
     ``policy.held_out_events``. The pictures of those frames stay unseen and nothing else is learned
     there."""

@@ -1,4 +1,4 @@
-"""What every method hands over once it is trained: something that draws any instant."""
+"""Contract of a trained method: an object that draws any instant."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Reconstruction(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the method, as in tables."""
+        """Name of the method, as in tables."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Draw the instants ``times_us`` (camera clock) as ``camera`` sees them.
@@ -72,13 +72,13 @@ class SplatReconstruction(Protocol):
 
     @property
     def low_pass(self) -> float:
-        """What a pixel of its own pictures integrates over, px^2; viewers of others take 0.3."""
+        """Variance of the filter of a pixel in its pictures, px^2; viewers of others take 0.3."""
         ...
 
     def splats(
         self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
     ) -> list[Splats]:
-        """What `Reconstruction.render` draws, in world metres; the person first, then the scene.
+        """Gaussians that `Reconstruction.render` draws, world metres; the person first.
 
         Channels are R, G, B (sRGB) and the semantic attribute (1 = person). Colours that depend on
         the direction are those seen from ``camera``.

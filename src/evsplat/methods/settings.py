@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from evsplat.config import Above, AtLeast, Within
+from evsplat.config import Above, AtLeast, ReadIf, Within
 from evsplat.gaussians import DensifyLimits, Part
 
 NOMINAL_ITERATIONS = 15_000
@@ -34,17 +34,21 @@ def weight_at(weight: Weight, nominal: float) -> float:
     return value
 
 
+WITH_EVENTS = ReadIf("event_weight", "above 0", lambda weight: weight != 0.0)
+WITH_WINDOWS = ReadIf("event_term", "windows", lambda term: term == "windows")
+
+
 @dataclass(frozen=True)
 class Densify:
     """Growth and pruning of Gaussians, in nominal iterations; the other limits are the method's."""
 
-    start: Nominal = 1_000
+    start: Nominal
     """First nominal iteration."""
-    end: Nominal = 10_000
+    end: Nominal
     """Last nominal iteration."""
-    gradient: Positive = 2e-4
+    gradient: Positive
     """A Gaussian is cloned or split above this mean screen-space gradient (NDC units, as 3DGS)."""
-    max_human: Annotated[int, AtLeast(1)] = 10_000
+    max_human: Annotated[int, AtLeast(1)]
     """No clone or split of the person beyond this number of Gaussians."""
 
     def limits(self, *, cube_max_count: int | None = None) -> dict[Part, DensifyLimits]:

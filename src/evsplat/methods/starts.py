@@ -20,7 +20,6 @@ from evsplat.gaussians.initialise import (
     nearest_spacing,
     random_cube,
 )
-from evsplat.methods.settings import Positive
 
 MOST_SAMPLES = 20_000
 """Upper bound of the automatic number of samples of the person."""
@@ -38,10 +37,10 @@ _BACKDROP = ReadIf("scene.kind", "median_backdrop", lambda kind: kind == "median
 class HumanStart:
     """Number of the person's Gaussians at the start, samples of the body's surface (1.2)."""
 
-    count: Annotated[int, AtLeast(1)] | None = None
+    count: Annotated[int, AtLeast(1)] | None
     """Number of surface samples. 3DGS-Avatar takes 50,000; null = as many as ``spacing_px`` asks
     for, at most 20,000, since a person of 4,000 pixels needs no 50,000 Gaussians."""
-    spacing_px: Positive = 1.5
+    spacing_px: Annotated[float, Above(0), ReadIf("count", "null", lambda n: n is None)]
     """Mean distance of neighbouring samples on the screen when ``count`` is null."""
 
 
@@ -60,17 +59,17 @@ class Surface:
 class SceneStart:
     """Start of the scene's Gaussians (A21: unsaid in the paper)."""
 
-    kind: Literal["median_backdrop", "random_cube"] = "median_backdrop"
+    kind: Literal["median_backdrop", "random_cube"]
     """``random_cube``: as HUGS in the paper (2.9), needs far more steps. ``median_backdrop``: the
     temporal median of the training frames on a floor and a wall; static cameras only."""
-    cube_count: Annotated[int, AtLeast(4), _CUBE] = 100_000
+    cube_count: Annotated[int, AtLeast(4), _CUBE]
     """Points of the random cube."""
-    cube_half_side_m: Annotated[float, Above(0), _CUBE] | None = None
+    cube_half_side_m: Annotated[float, Above(0), _CUBE] | None
     """Half side of the cube; null = the larger of 2 m and 1.5 times the camera's distance."""
-    cube_max_count: Annotated[int, AtLeast(1), _CUBE] = 150_000
+    cube_max_count: Annotated[int, AtLeast(1), _CUBE]
     """No clone or split of the scene beyond this number of Gaussians; a median backdrop does not
     grow."""
-    backdrop_stride_px: Annotated[int, AtLeast(1), _BACKDROP] = 2
+    backdrop_stride_px: Annotated[int, AtLeast(1), _BACKDROP]
     """The sheet has one Gaussian per square of this side."""
 
     @property
@@ -83,7 +82,7 @@ class SceneStart:
 class FittedScene(SceneStart):
     """A start that is fitted to the median of the training frames."""
 
-    prefit_steps: Annotated[int, AtLeast(0), _BACKDROP] = 300
+    prefit_steps: Annotated[int, AtLeast(0), _BACKDROP]
     """Steps of fitting the sheet to the median before training proper."""
 
 

@@ -70,7 +70,7 @@ class Skinned(Protocol):
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians are."""
+        """Device of the Gaussians."""
 
     def at(
         self, times_us: Sequence[int], camera_center: Float[Tensor, "3"], *, hard_semantics: bool
@@ -96,7 +96,7 @@ class Skinned(Protocol):
 
 @torch.no_grad()
 def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
-    """What skinning can show of a model: its mean over ``views``, instants (us) and their cameras.
+    """Mean of a model over ``views``, instants (us) and their cameras, as skinning can show it.
 
     Centre, log-scales, rotation and colour are the means of what the model shows at those instants
     with the skinning undone, and the light where the model knows it. That drops less than switching
@@ -112,7 +112,7 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
         transforms = layers.transforms[0].double()
         offset = person.means[0].double() - transforms[:, :3, 3]
         centers = torch.linalg.solve(transforms[:, :3, :3], offset)
-        quaternions = normalize(person.quats[0].double(), dim=-1)
+        quaternions = normalize(person.quaternions[0].double(), dim=-1)
         first = quaternions if first is None else first
         # q and -q are one rotation: only those on one side have a mean.
         quaternions = quaternions * torch.where((quaternions * first).sum(-1) < 0, -1, 1)[:, None]

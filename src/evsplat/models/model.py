@@ -1,4 +1,4 @@
-"""What a model of person and scene is to the training loop and to whoever draws it."""
+"""Contract of a model of person and scene, and the base of those that follow a body track."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol

@@ -1,4 +1,4 @@
-"""What is learned of a motion's errors: a cubic B-spline in time per joint and for the root."""
+"""Learned errors of a motion: a cubic B-spline in time per joint and for the root."""
 
 import math
 from collections.abc import Sequence
@@ -137,7 +137,7 @@ class PoseSpline(nn.Module):
     def weights(
         self, times_us: Sequence[int] | Tensor, *, derivative: int = 0
     ) -> Float[Tensor, "T K"]:
-        """Of the control points at given times, or of the second derivative (1/s^2) there."""
+        """Weights of the control points at given times, or their second derivative (1/s^2)."""
         device = self.mean.device
         times = send(torch.as_tensor(times_us, dtype=torch.float64), device)
         place = (times.clamp(*self.span_us) - self.span_us[0]) / self.knot_us

@@ -1,4 +1,4 @@
-"""What an objective is: it names the times it needs, and compares what was rendered there."""
+"""The protocol of objectives: they name times, and compare what was rendered there."""
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class Step(Generic[ModelType]):
 
     @property
     def rgb(self) -> tuple[Float[Tensor, "H W 3"], ...]:
-        """The pictures, sRGB."""
+        """Rendered pictures, sRGB."""
         return self.drawing.rgb
 
     @property
@@ -99,7 +99,7 @@ class Objective(Protocol):
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """What a checkpoint must hold for a resume to repeat the same steps."""
+        """Values that a checkpoint must hold for a resume to repeat the same steps."""
         ...
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -108,7 +108,11 @@ class Objective(Protocol):
 
 
 class Stateless:
-    """Base of objectives that remember nothing between steps."""
+    """Base of objectives that remember nothing between steps; by default they ask for nothing."""
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """No renders of its own."""
+        return ()
 
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
         """Nothing recorded is needed."""
@@ -117,7 +121,7 @@ class Stateless:
         """Nothing refers to rows."""
 
     def state(self) -> dict[str, Tensor]:
-        """Nothing."""
+        """No values."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:

@@ -1,15 +1,21 @@
-"""Learned properties of the event camera: contrast thresholds and a clock that runs apart."""
+"""The event camera in training: its noise, learned contrast thresholds, a clock that runs apart."""
+
+import math
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from evsplat.calibration import noise_of
+from evsplat.events import EventStore
 
 _OFFSET_UNIT_US = 10_000.0
 """One unit of the offset's parameter, so that all parameters learn well at one rate."""
 
 
 class EventSensor(nn.Module):
-    """How much log-brightness changes per event, for either polarity, and how late events come.
+    """Change of log-brightness per event of either polarity, and the lag of the events' clock.
 
     Events alone would have thresholds shrink: the mean absolute difference to a change that is not
     yet reconstructed is smallest when events mean little. `apart` is what holds them.
@@ -36,11 +42,11 @@ class EventSensor(nn.Module):
 
     @property
     def offset_us(self) -> Float[Tensor, ""] | None:
-        """How much later events are stamped than the frames' clock says; None: not learned."""
+        """Lag of the events behind the frames' clock, microseconds; None: not learned."""
         return _OFFSET_UNIT_US * self.offset if self.learns_clock else None
 
     def get_extra_state(self) -> Tensor:
-        """Whether the clock is learned: a saved run says so itself."""
+        """True if the clock is learned: a saved run says so itself."""
         return torch.tensor(self.learns_clock)
 
     def set_extra_state(self, state: Tensor) -> None:
@@ -59,5 +65,36 @@ class EventSensor(nn.Module):
         return threshold[0] * on - threshold[1] * off
 
     def path(self, count: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
-        """How far log-brightness moved, up or down, when events do not say which way."""
+        """Size of the log-brightness change that counts of events without polarity report."""
         return self.logs.mean().exp() * count
+
+
+class EventNoise:
+    """Background activity, and the pixels that fire without cause; measured when first asked for.
+
+    With a background rate r an interval T holds r T events per pixel that nothing caused, give or
+    take the root: what is compared with its events weighs ``1 / (1 + 2 sqrt(r T))``, as a Laplace
+    likelihood does whose width is half a threshold and that noise.
+    """
+
+    def __init__(self, events: EventStore, *, aware: bool = True) -> None:
+        """Noise of a whole recording; without ``aware`` every event counts fully."""
+        self.events, self.aware = events, aware
+
+    @cached_property
+    def _measured(self) -> tuple[float, Float[Tensor, "H W"]]:
+        sound = torch.ones(self.events.height, self.events.width)
+        if not self.aware:
+            return 0.0, sound
+        noise = noise_of(self.events)
+        sound[noise.hot_pixels[:, 1], noise.hot_pixels[:, 0]] = 0.0
+        return noise.background_hz, sound
+
+    @property
+    def sound(self) -> Float[Tensor, "H W"]:
+        """0 at hot pixels, 1 elsewhere."""
+        return self._measured[1]
+
+    def weight(self, duration_us: int) -> float:
+        """Weight, in 0..1, of what is compared with the events of so many microseconds."""
+        return 1 / (1 + 2 * math.sqrt(self._measured[0] * duration_us * 1e-6))

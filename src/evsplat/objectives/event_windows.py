@@ -2,6 +2,7 @@
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
 from jaxtyping import Float
@@ -11,12 +12,13 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import send
 from evsplat.events import EventStream, begun_counts, polarity_counts
 from evsplat.objectives.base import Stateless, Step
-from evsplat.objectives.event_noise import EventNoise
-from evsplat.objectives.event_sensor import EventSensor
+from evsplat.objectives.event_sensor import EventNoise, EventSensor
 from evsplat.pictures import luminance
 
 _RATE_US = 1_000
-"""How far before and after an instant events are counted for their rate there."""
+"""Time before and after an instant in which events are counted for their rate there."""
+RENDERS = 3
+"""Rendered times around a held-out frame."""
 
 
 class EventWindows(Stateless):
@@ -26,8 +28,8 @@ class EventWindows(Stateless):
     times of other objectives one more is asked for, at random before or after the exposure, within
     ``reach`` intervals of the training frames, so that the gaps between exposures teach as well.
     All pixels count: where there is no event, nothing changed. Nothing is asked of times whose
-    events may not be read (`EventStore.open_around`): there the gap is on one side only, and what
-    is looked at around a window ends with it.
+    events may not be read (`EventStore.readable_around`): there the gap is on one side only, and
+    what is looked at around a window ends with it.
 
     Events that nothing caused are allowed for: differences weigh by the noise of their time
     (`EventNoise`), and hot pixels do not count.
@@ -69,7 +71,7 @@ class EventWindows(Stateless):
             return ()
         draw = torch.rand(2, generator=self.generator).tolist()
         start, end = frame.exposure_us
-        low, high = self.events.open_around(frame.mid_us)
+        low, high = self.events.readable_around(frame.mid_us)
         before = min(self.reach_us, start - max(low, self.range_us[0]))
         after = min(self.reach_us, min(high, self.range_us[1]) - end)
         if max(before, after) < 1:
@@ -89,18 +91,19 @@ class EventWindows(Stateless):
             wrong, [end - start for start, end in zip(times, times[1:], strict=False)]
         )
         if self.events.has_polarity:
+            # The whole span as well: small errors of one sign in each window add up in it.
             event = 0.5 * (event + self.mean(wrong.sum(0, keepdim=True), [times[-1] - times[0]]))
         return {"event": event, "contrast": self.sensor.apart()}
 
     def readable(self, step: Step) -> slice:
-        """Which of a step's times are between events that may be read, by the events' clock."""
-        low, high = self.events.open_around(step.frame.mid_us)
+        """The part of a step's times between which events may be read, by the events' clock."""
+        low, high = self.events.readable_around(step.frame.mid_us)
         late = [time + self._late_us for time in step.times_us]
         return slice(bisect_left(late, low), bisect_right(late, high))
 
     @property
     def _late_us(self) -> int:
-        """By how much events are stamped later than the frames' clock says, as learned so far."""
+        """Lag of the events behind the frames' clock, as learned so far."""
         offset = self.sensor.offset_us
         return 0 if offset is None else round(float(offset.detach()))
 
@@ -111,13 +114,15 @@ class EventWindows(Stateless):
         """
         offset = self.sensor.offset_us
         late = [time + self._late_us for time in step.times_us[kept]]
-        low, high = self.events.open_around(step.frame.mid_us)
+        low, high = self.events.readable_around(step.frame.mid_us)
+        # A sensor compares logarithms of light, before any transfer curve of a camera.
         brightness = torch.log(luminance(step.linear[kept]) + self.eps)
         reach = max(_RATE_US, self.ramp_us)
         stream = self.events.between(max(late[0] - reach, low), min(late[-1] + reach, high))
         windows = list(zip(late, late[1:], strict=False))
         counts = self._counts(stream, windows, brightness.device)
         changes = brightness[1:] - brightness[:-1]
+        # Without polarity a window's events tell how far brightness went, not which way.
         if not self.events.has_polarity:
             return changes.abs() - self.sensor.path(counts.sum(1))
         if self.ramp_us > 0:
@@ -150,6 +155,54 @@ class EventWindows(Stateless):
         size = self.events.height, self.events.width
         maps = [polarity_counts(stream.between(*ends), *size) for ends in windows]
         return send(torch.stack(maps), device)
+
+
+class HeldOutWindows(Stateless):
+    """Events around a held-out frame, counted from the nearest training exposure on.
+
+    Windows between neighbouring times say how the person moves; sums of them from a training
+    exposure on, where the picture tells the pose, say where the person is. Events without polarity
+    have no such sums. Only for a policy under which the events of held-out intervals are seen.
+    """
+
+    def __init__(self, windows: EventWindows, train_frames: Sequence[Frame]) -> None:
+        """``windows`` knows events and sensor."""
+        self.windows = windows
+        self.train_frames = sorted(train_frames, key=lambda frame: frame.mid_us)
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """Random times: one in a training exposure, `RENDERS` around the frame."""
+        draw = torch.rand(RENDERS + 2, generator=self.windows.generator).tolist()
+        anchors = self._anchors(frame)
+        start, end = anchors[int(draw[0] * len(anchors))].exposure_us
+        anchor = start + int(draw[1] * (end - start))
+        width = self.windows.interval_us / RENDERS
+        first = frame.mid_us - self.windows.interval_us // 2
+        around = (first + int((place + share) * width) for place, share in enumerate(draw[2:]))
+        low, high = self.windows.range_us
+        return sorted({anchor, *(min(max(time, low), high) for time in around)})
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """``event``: mean over windows, and over sums of them from the training exposure on."""
+        times = step.times_us
+        if len(times) < 2:
+            return {}
+        wrong = self.windows.differences(step, slice(None))
+        lasting = [end - start for start, end in zip(times, times[1:], strict=False)]
+        each = self.windows.mean(wrong, lasting)
+        if not self.windows.events.has_polarity:
+            return {"event": each}
+        middle = step.frame.mid_us
+        if abs(times[-1] - middle) > abs(times[0] - middle):
+            wrong, lasting = wrong.flip(0), lasting[::-1]
+        sums = self.windows.mean(wrong.cumsum(0), list(accumulate(lasting)))
+        return {"event": 0.5 * (each + sums)}
+
+    def _anchors(self, frame: Frame) -> list[Frame]:
+        """The nearest training frames, on either side."""
+        before = [other for other in self.train_frames if other.mid_us < frame.mid_us]
+        after = [other for other in self.train_frames if other.mid_us > frame.mid_us]
+        return [*before[-1:], *after[:1]]
 
 
 def _median_gap(times_us: Sequence[int]) -> int:

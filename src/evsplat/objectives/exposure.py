@@ -27,13 +27,13 @@ def motion_px(camera: Camera, track: BodyTrack, frame: Frame) -> float:
 
 
 def renders_for(motion: float, px_per_render: float, most: int) -> int:
-    """An odd number of renders, so that one lies in the middle of the exposure.
+    """An odd number of renders, at most ``most``, so that one lies in the middle of the exposure.
 
     At least 3, but where ``most`` is 1: then the sharp middle stands for the blurry frame.
     """
     if most < 3:
         return 1
-    wanted = max(3.0, min(motion / px_per_render, float(most)))
+    wanted = max(3.0, min(motion / px_per_render, float(most - 1 + most % 2)))
     return 2 * int((wanted - 1) / 2 + 0.5) + 1
 
 
@@ -60,6 +60,7 @@ class Exposure(Stateless):
         count = self.renders[frame.name]
         places = torch.arange(count) + torch.rand(count, generator=self.generator)
         drawn = [start + int(share * (end - start) / count) for share in places.tolist()]
+        # Other objectives and the non-rigid network look at the middle, which must be among them.
         drawn[count // 2] = frame.mid_us
         return sorted(set(drawn))
 
@@ -71,6 +72,7 @@ class Exposure(Stateless):
         """``l1`` and ``dssim`` of the drawn frame."""
         start, end = step.frame.exposure_us
         first, last = (bisect_left(step.times_us, time) for time in (start, end))
+        # Times of other objectives lie outside. A shutter adds light up before it is coded.
         mean = step.linear[first:last].mean(0)
         l1, similarity = l1_and_ssim(
             encode(mean.clamp_min(DARKEST_LINEAR)), step.observed(step.frame)

@@ -19,7 +19,7 @@ from evsplat.similarity.psnr_ssim import l1_and_ssim
 PATCHES, PATCH_PX = 4, 128
 """Number and side of the squares that the perceptual distance sees."""
 ON_PERSON = 0.9
-"""How often such a square is centred on a pixel of the person."""
+"""Probability of a square to be centred on a pixel of the person."""
 
 
 def mask_of(capture: TrainingCapture, frame: Frame) -> Float[Tensor, "H W"]:
@@ -139,17 +139,17 @@ class HumanPicture(Stateless):
         self, step: Step[HugsModel], index: int, colour: Float[Tensor, "3"]
     ) -> Float[Tensor, "H W 3"]:
         human = step.layers.human
-        person = replace(
+        human = replace(
             human,
             **{
                 name: getattr(human, name)[index : index + 1]
-                for name in ("means", "quats", "scales", "linear")
+                for name in ("means", "quaternions", "scales", "linear")
             },
             channels=human.channels[index : index + 1, :, :3],
             centers2d_offset=None,
         )
         camera = step.capture.camera(step.frame).to(colour.device)
-        return render(person, camera, background=colour).image[0]
+        return render(human, camera, background=colour).image[0]
 
 
 class SkinningTarget:
@@ -172,7 +172,7 @@ class SkinningTarget:
         """Nothing recorded is needed."""
 
     def loss(self, step: Step[HugsModel]) -> dict[str, Tensor]:
-        """``skinning``."""
+        """``skinning``, mean over Gaussians and joints."""
         assert isinstance(step.drawing, HugsDrawing)
         decoded = step.drawing.decoded
         if self.age == 0 or self.age >= self.refresh:

@@ -132,7 +132,7 @@ class Isometry:
         every = -(-len(posed.means) // MOST_TIMES)
         moved = (
             posed.means[::every],
-            posed.quats[::every],
+            posed.quaternions[::every],
             posed.scales[::every],
             step.layers.transforms[::every],
         )

@@ -1,6 +1,5 @@
 """Teaches the semantic attribute where the person is, without any mask (A8)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +24,7 @@ LEAST_SHARE = 1e-4
 def silhouette_bounds(
     silhouette: Bool[np.ndarray, "H W"], band_px: int
 ) -> tuple[Bool[Tensor, "H W"], Bool[Tensor, "H W"]]:
-    """Where a pixel surely is the person, and where it surely is the scene.
+    """Pixels that surely are the person, and pixels that surely are the scene.
 
     Inside the posed bare body it is the person; farther than ``band_px`` from it the scene; between
     lie clothes and hair, about which nothing is said.
@@ -95,7 +94,10 @@ class _NativeMembership(torch.autograd.Function):
 
 
 class RenderedSemantics(Stateless):
-    """Cross-entropy of the rendered attribute against the posed body's bounds (A2 iii, A8)."""
+    """Cross-entropy of the rendered attribute against the posed body's bounds (A2 iii, A8).
+
+    It looks at the mid-exposures that other objectives render.
+    """
 
     def __init__(
         self,
@@ -103,10 +105,6 @@ class RenderedSemantics(Stateless):
     ) -> None:
         """``bounds`` of the posed body, by mid-exposure (microseconds) of the training frames."""
         self.bounds = bounds
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """None of its own: it looks at the mid-exposures that others render."""
-        return ()
 
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
         """The bounds at the frame's mid-exposure."""

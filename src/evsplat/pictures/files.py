@@ -135,7 +135,7 @@ def save_png(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
 
 
 def _has_16_bits(image: Image.Image) -> bool:
-    """Whether the file holds 16 bits per channel, which Pillow would cut to 8."""
+    """True for 16 bits per channel, which Pillow would cut to 8."""
     return any(
         "16" in str(tile[3][0] if isinstance(tile[3], tuple) else tile[3])
         for tile in getattr(image, "tile", [])

@@ -1,10 +1,9 @@
 """Drawing posed Gaussians: one function, several backends that give the same numbers."""
 
 from evsplat.render.api import BackendName, choose_device, render
-from evsplat.render.backdrop import Backdrop
-from evsplat.render.in_view import rows_in_view
-from evsplat.render.pictures import split_channels
-from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats
+from evsplat.render.job import Backdrop
+from evsplat.render.native import rows_in_view
+from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats, split_channels
 
 __all__ = [
     "LOW_PASS",

@@ -10,14 +10,14 @@ from torch import Tensor
 from evsplat.cuda_support import needs, what_is_missing
 from evsplat.errors import BackendError, ConfigError
 from evsplat.render import cuda, native, reference
-from evsplat.render.backdrop import Backdrop
+from evsplat.render.job import Backdrop, RenderJob
 from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats
 
 logger = logging.getLogger(__name__)
 
 BackendName = Literal["auto", "native", "gsplat", "reference"]
 
-_BACKENDS = {"gsplat": cuda.render, "reference": reference.render}
+_BACKENDS = {"native": native.render, "gsplat": cuda.render, "reference": reference.render}
 _BACKEND_OF_DEVICE = {"cpu": "native", "cuda": "gsplat"}
 
 
@@ -74,9 +74,8 @@ def render(
                 f"No render backend for device {device}; move the tensors to the CPU or a CUDA "
                 "device, or ask for backend='reference', which is slow."
             )
-    if chosen == "native":
-        return native.render(splats, static, times, camera, background, near, low_pass, backdrop)
-    return _BACKENDS[chosen](splats, static, times, camera, background, near, low_pass)
+    job = RenderJob(splats, static, times, camera, background, near, low_pass, backdrop)
+    return _BACKENDS[chosen](job)
 
 
 def _check_splats(splats: Splats, prefix: str) -> int:
@@ -89,7 +88,7 @@ def _check_splats(splats: Splats, prefix: str) -> int:
     count = means.shape[1]
     inner: dict[str, tuple[int, ...]] = {
         "means": (count, 3),
-        "quats": (count, 4),
+        "quaternions": (count, 4),
         "scales": (count, 3),
         "opacities": (count,),
         "channels": (count, max(1, splats.channels.shape[-1])),

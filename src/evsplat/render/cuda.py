@@ -18,8 +18,9 @@ from torch import Tensor
 from evsplat.cuda_support import what_is_missing
 from evsplat.devices import send
 from evsplat.errors import BackendError
+from evsplat.render.job import RenderJob
 from evsplat.render.reference import MAX_PIXEL, rotation_matrices
-from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
+from evsplat.render.splats import RenderOutput, Splats
 
 logger = logging.getLogger(__name__)
 
@@ -28,27 +29,19 @@ _CHANNELS_AT_ONCE = 32
 """gsplat's kernels keep a pixel's channels in registers; beyond this they spill."""
 
 
-def render(
-    splats: Splats,
-    static: Splats | None,
-    times: int,
-    camera: PinholeCamera,
-    background: Tensor | None,
-    near: float,
-    low_pass: float,
-) -> RenderOutput:
-    """Draw with gsplat; fields have their leading axis of times.
+def render(job: RenderJob) -> RenderOutput:
+    """Draw with gsplat.
 
     A ``centers2d_offset`` moves what is drawn, but whether a Gaussian is on the screen is decided
     where its centre lies without it.
     """
-    means = splats.means
+    means = job.splats.means
     if means.dtype != torch.float32 or means.device.type != "cuda":
         raise BackendError(
             f"The gsplat render backend needs float32 tensors on a CUDA device, not {means.dtype} "
             f"on {means.device}."
         )
-    return draw(load(), splats, static, times, camera, background, near, low_pass)
+    return draw(load(), job)
 
 
 @functools.cache
@@ -70,32 +63,22 @@ def load() -> Any:
     return import_module("gsplat")
 
 
-def draw(
-    gsplat: Any,
-    splats: Splats,
-    static: Splats | None,
-    times: int,
-    camera: PinholeCamera,
-    background: Tensor | None,
-    near: float,
-    low_pass: float,
-) -> RenderOutput:
+def draw(gsplat: Any, job: RenderJob) -> RenderOutput:
     """Project each layer, bin all Gaussians of all times into tiles at once, and composite."""
-    width, height = camera.width, camera.height
-    moving = _project(gsplat, splats, camera, near, low_pass)
-    layers = (
-        [moving] if static is None else [moving, _project(gsplat, static, camera, near, low_pass)]
-    )
+    width, height, channels = job.camera.width, job.camera.height, job.splats.channels
+    layers = [
+        _project(gsplat, layer, job) for layer in (job.splats, job.static) if layer is not None
+    ]
     if sum(layer.radii.shape[1] for layer in layers) == 0:
-        image = splats.channels.new_zeros(times, height, width, splats.channels.shape[-1])
+        image = channels.new_zeros(job.times, height, width, channels.shape[-1])
         alpha = image[..., 0]
     else:
-        image, alpha = _composite(gsplat, _join(layers, times), width, height)
-    if background is not None:
-        image = image + (1 - alpha)[..., None] * background
+        image, alpha = _composite(gsplat, _join(layers, job.times), width, height)
+    if job.background is not None:
+        image = image + (1 - alpha)[..., None] * job.background
     drawn = [layer.radii.amax(-1) for layer in layers]
-    still = drawn[1] if len(drawn) > 1 else drawn[0].new_zeros(1, 0)
-    return RenderOutput(image, alpha, drawn[0].expand(times, -1), still)
+    static = drawn[1] if len(drawn) > 1 else drawn[0].new_zeros(1, 0)
+    return RenderOutput(image, alpha, drawn[0].expand(job.times, -1), static)
 
 
 @dataclass(frozen=True)
@@ -110,10 +93,9 @@ class _Projected:
     channels: Float[Tensor, "T N C"]
 
 
-def _project(
-    gsplat: Any, splats: Splats, camera: PinholeCamera, near: float, low_pass: float
-) -> _Projected:
+def _project(gsplat: Any, splats: Splats, job: RenderJob) -> _Projected:
     """A layer on the screen, once for all times where nothing of its geometry moves."""
+    camera = job.camera
     geometry = [
         getattr(splats, f.name)
         for f in fields(splats)
@@ -136,24 +118,24 @@ def _project(
         return torch.where(mask, value, 0.0).expand(times, *inner).contiguous()
 
     means, opacities = usable(splats.means), usable(splats.opacities)
-    quats, scales = usable(splats.quats), usable(splats.scales)
+    quaternions, scales = usable(splats.quaternions), usable(splats.scales)
     covariances = None
     if splats.linear is not None:
-        shape = usable(splats.linear) @ rotation_matrices(quats) * scales[..., None, :]
+        shape = usable(splats.linear) @ rotation_matrices(quaternions) * scales[..., None, :]
         covariances = _upper(shape @ shape.mT)
     view = send(camera.world_to_camera, device).to(means.dtype)
     K = send(camera.K.detach().float(), device)
     radii, centers, depths, conics, _ = gsplat.fully_fused_projection(
         means,
         covariances,
-        quats if covariances is None else None,
+        quaternions if covariances is None else None,
         scales if covariances is None else None,
         view.expand(times, 1, 4, 4),
         K.expand(times, 1, 3, 3),
         camera.width,
         camera.height,
-        eps2d=low_pass,
-        near_plane=near,
+        eps2d=job.low_pass,
+        near_plane=job.near,
         opacities=opacities.detach(),
     )
     radii, centers, depths, conics = (

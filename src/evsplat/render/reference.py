@@ -1,11 +1,13 @@
 """The rasteriser in plain torch, any dtype and device: slow, the oracle of the tests."""
 
 import math
+from dataclasses import fields
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.render.job import RenderJob
 from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats, join
 
 # The rules of gsplat 1.5.3 (cuda/csrc/ProjectionEWA3DGSFused.cu, RasterizeToPixels3DGSFwd.cu).
@@ -20,48 +22,32 @@ _TILE = 32
 _PAIRS_PER_CHUNK = 1 << 19
 
 
-def render(
-    splats: Splats,
-    static: Splats | None,
-    times: int,
-    camera: PinholeCamera,
-    background: Tensor | None,
-    near: float,
-    low_pass: float,
-) -> RenderOutput:
+def render(job: RenderJob) -> RenderOutput:
     """Draw tile by tile, all pairs of a tile's pixels and Gaussians at once."""
-    s = splats if static is None else join(splats, static, times)
-    fields = (
-        s.means, s.quats, s.scales, s.opacities, s.channels, s.linear, s.centers2d_offset
-    )  # fmt: skip
+    splats = job.splats if job.static is None else join(job.splats, job.static, job.times)
+    values = [getattr(splats, f.name) for f in fields(Splats)]
     drawn = [
-        _draw(
-            [None if f is None else f[t if len(f) > 1 else 0] for f in fields],
-            camera,
-            near,
-            low_pass,
-        )
-        for t in range(times)
+        _draw([None if v is None else v[t if len(v) > 1 else 0] for v in values], job)
+        for t in range(job.times)
     ]
     images, alphas, radii = zip(*drawn, strict=True)
     image, alpha, all_radii = torch.stack(images), torch.stack(alphas), torch.stack(radii)
-    if background is not None:
-        image = image + (1 - alpha)[..., None] * background
-    count = splats.means.shape[1]
+    if job.background is not None:
+        image = image + (1 - alpha)[..., None] * job.background
+    count = job.splats.means.shape[1]
     return RenderOutput(image, alpha, all_radii[:, :count], all_radii[:1, count:])
 
 
-def _draw(
-    fields: list[Tensor | None], camera: PinholeCamera, near: float, low_pass: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def _draw(values: list[Tensor | None], job: RenderJob) -> tuple[Tensor, Tensor, Tensor]:
     """Image, alpha and radii of one time, without background."""
-    means, quats, scales, opacities, channels, linear, offset = fields
-    assert means is not None and quats is not None and scales is not None
+    camera = job.camera
+    means, quaternions, scales, opacities, channels, linear, offset = values
+    assert means is not None and quaternions is not None and scales is not None
     assert opacities is not None and channels is not None
-    centers, covariance, depth = project(means, quats, scales, linear, camera, low_pass)
+    centers, covariance, depth = project(means, quaternions, scales, linear, camera, job.low_pass)
     if offset is not None:
         centers = centers + offset
-    reach, visible = _extents(centers, covariance, depth, opacities, camera, near)
+    reach, visible = _extents(centers, covariance, depth, opacities, camera, job.near)
 
     # Stable: equal depths keep the order of the Gaussians.
     order = torch.argsort(torch.where(visible, depth, math.inf).detach(), stable=True)
@@ -95,7 +81,7 @@ def _draw(
 
 def project(
     means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
+    quaternions: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
     linear: Float[Tensor, "N 3 3"] | None,
     camera: PinholeCamera,
@@ -121,14 +107,14 @@ def project(
     factor = jacobian.view(-1, 2, 3) @ view[:3, :3]
     if linear is not None:
         factor = factor @ linear
-    factor = factor @ rotation_matrices(quats) * scales[:, None, :]
+    factor = factor @ rotation_matrices(quaternions) * scales[:, None, :]
     blur = low_pass * torch.eye(2, dtype=means.dtype, device=means.device)
     return centers, factor @ factor.mT + blur, local[:, 2]
 
 
-def rotation_matrices(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
+def rotation_matrices(quaternions: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
     """Rotations of quaternions wxyz of any length but zero."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
     return torch.stack(
         [
             1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

@@ -1,18 +1,20 @@
-"""What goes into rendering and what comes out."""
+"""Inputs and outputs of rendering."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 LOW_PASS = 0.3
 """Low-pass filter of 3DGS and most viewers, px^2: see `render`."""
 
 
 class PinholeCamera(Protocol):
-    """What rendering reads of a camera (`evsplat.capture.Camera` has it)."""
+    """The part of a camera that rendering reads (`evsplat.capture.Camera` has it)."""
 
     @property
     def width(self) -> int:
@@ -37,14 +39,14 @@ class Splats:
 
     means: Float[Tensor, "T N 3"]
     """Centres in the world, metres."""
-    quats: Float[Tensor, "*T N 4"]
+    quaternions: Float[Tensor, "*T N 4"]
     """Rotations wxyz, of any length but zero."""
     scales: Float[Tensor, "*T N 3"]
     """Standard deviations along the rotated axes, metres."""
     opacities: Float[Tensor, "*T N"]
-    """In [0, 1]."""
+    """Opacities at the centres, in [0, 1]."""
     channels: Float[Tensor, "T N C"]
-    """What is composited, any number of channels."""
+    """Composited values, any number of channels."""
     linear: Float[Tensor, "T N 3 3"] | None = None
     """L in covariance = (L R S)(L R S)^T: a skinning matrix with its shear. None: identity."""
     centers2d_offset: Float[Tensor, "T N 2"] | None = None
@@ -80,7 +82,7 @@ def join(first: Splats, second: Splats, times: int) -> Splats:
         parts.append(
             (
                 splats.means,
-                splats.quats,
+                splats.quaternions,
                 splats.scales,
                 splats.opacities,
                 splats.channels,
@@ -103,3 +105,36 @@ class RenderOutput:
     """Radius on the screen in pixels, rounded up; 0 = not drawn."""
     static_radii: Int[Tensor, "1 S"]
     """The same of the static Gaussians."""
+
+
+def split_channels(
+    images: Float[Tensor, "T H W C"], sizes: Sequence[int]
+) -> tuple[tuple[Float[Tensor, "H W c"], ...], ...]:
+    """Pictures of all times per group of channels, as views.
+
+    Their gradients are put into one tensor, planar as the rasteriser's pictures are, in one pass.
+    """
+    parts = _SplitChannels.apply(images, tuple(sizes))
+    times = len(images)
+    return tuple(tuple(parts[k : k + times]) for k in range(0, len(parts), times))
+
+
+class _SplitChannels(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, images: Tensor, sizes: tuple[int, ...]) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        ctx.shape, ctx.sizes = images.shape, sizes
+        return tuple(part[t] for part in images.split(sizes, -1) for t in range(len(images)))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, None]:
+        given = next((part for part in upstream if part is not None), None)
+        if given is None:
+            return None, None
+        times, height, width, channels = ctx.shape
+        gradient = given.new_empty(times, channels, height, width).permute(0, 2, 3, 1)
+        parts = [part[t] for part in gradient.split(ctx.sizes, -1) for t in range(times)]
+        for part, value in zip(parts, upstream, strict=True):
+            part.zero_() if value is None else part.copy_(value)
+        return gradient, None

@@ -1,4 +1,4 @@
-"""What a restorer is, and which there are."""
+"""The protocol of restorers, and all of them by name."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
@@ -31,7 +31,7 @@ class Restorer(Protocol):
         ...
 
     def provenance(self) -> dict[str, Any]:
-        """How the pictures were made, as JSON values."""
+        """Origin of the pictures, as JSON values."""
         ...
 
 
@@ -44,7 +44,7 @@ RESTORERS: dict[str, Callable[..., Restorer]] = {
     E2Vid.name: E2Vid,
     PieNet.name: PieNet,
 }
-"""By name; called with the capture and the restorer's own options as keywords."""
+"""Restorers by name; called with the capture and the restorer's own options as keywords."""
 
 WEIGHT_FILES: dict[str, WeightFile] = {
     NafNet.name: NafNet.file,
@@ -53,4 +53,4 @@ WEIGHT_FILES: dict[str, WeightFile] = {
     D2Net.name: D2Net.file,
     E2Vid.name: FILE,
 }
-"""What users bring for the restorers whose weights come with no package."""
+"""Files that users bring for the restorers whose weights come with no package."""

@@ -151,7 +151,7 @@ class Reconstruction(nn.Module):
     def forward(
         self, frames: Float[Tensor, "1 9 H W"], events: Float[Tensor, "1 40 H W"]
     ) -> Float[Tensor, "1 3 H W"]:
-        """The middle frame."""
+        """The sharp middle frame."""
         fine = self.inBlock(frames)
         middle = self.encoder_first(fine)
         coarse = self.transform1(
@@ -192,7 +192,7 @@ class Residual(nn.Module):
         self.se = _attention(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape."""
+        """Features of the same shape."""
         y = self.conv2(F.relu(self.conv1(x)))
         return x + y * self.se(y.mean((-2, -1)))[..., None, None]
 
@@ -204,7 +204,7 @@ def _attention(channels: int) -> nn.Module:
 
 
 def _unused_memory(channels: int) -> nn.Module:
-    """What the checkpoint holds of the memory between frames."""
+    """Entries of the checkpoint for the memory between frames."""
     holder = nn.Module()
     for source in "xh":
         for gate in "fioj":

@@ -205,7 +205,7 @@ class Enlarging(Convolution):
         super().__init__(inputs, outputs, 5, normalised=normalised)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Twice the resolution."""
+        """Features at twice the resolution."""
         return super().forward(
             F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
         )
@@ -222,7 +222,7 @@ class Transposed(nn.Module):
         self.norm_layer = nn.BatchNorm2d(outputs) if normalised else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Twice the resolution."""
+        """Features at twice the resolution."""
         return F.relu(self.norm_layer(self.transposed_conv2d(x)))
 
 
@@ -236,7 +236,7 @@ class Recurrent(nn.Module):
         self.recurrent_block = nn.Sequential(OrderedDict(Gates=gates))
 
     def forward(self, x: Tensor, state: State | None) -> tuple[Tensor, State]:
-        """What it gives, and that again with the cells as its memory."""
+        """The output, and the output with the cells as the next memory."""
         x = self.conv(x)
         hidden, cell = state or (torch.zeros_like(x), torch.zeros_like(x))
         gates = self.recurrent_block(torch.cat((x, hidden), 1))
@@ -263,6 +263,6 @@ class Residual(nn.Module):
             self.add_module(f"bn{place}", norm)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape."""
+        """Features of the same shape."""
         y = F.relu(self.bn1(self.conv1(x)))
         return F.relu(self.bn2(self.conv2(y)) + x)

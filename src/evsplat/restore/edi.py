@@ -10,7 +10,7 @@ from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import deblur
 from evsplat.pictures import Transfer
-from evsplat.restore.needs import require_signed_events
+from evsplat.restore.network import require_signed_events
 
 
 class Edi:

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.events import EventStream
 from evsplat.events.maps import count_map
-from evsplat.restore.network import NetworkRestorer, as_input
+from evsplat.restore.network import NetworkRestorer, SupervisedAttention, as_input
 from evsplat.weights import WeightFile, fill, state_under
 
 CHANNELS = (64, 128, 256)
@@ -113,7 +113,7 @@ class TwoStages(nn.Module):
             ):
                 up.append(Up(coarse, fine))
                 skip.append(nn.Conv2d(fine, fine, 3, padding=1))
-        self.sam12 = SupervisedAttention(full)
+        self.sam12 = SupervisedAttention(full, 3, bias=True)
         self.cat12 = nn.Conv2d(2 * full, full, 1)
         self.last = nn.Conv2d(full, 3, 3, padding=1)
 
@@ -236,7 +236,7 @@ class EventAttention(nn.Module):
         self.ffn = nn.Sequential(OrderedDict(zip(("fc1", "act", "fc2"), layers, strict=True)))
 
     def forward(self, picture: Tensor, events: Tensor) -> Tensor:
-        """Same shape as both."""
+        """The picture's features, of the same shape as both."""
         x = picture + self.attn(self.norm1_image(picture), self.norm1_event(events))
         pixels = x.movedim(1, -1)
         return (pixels + self.ffn(self.norm2(pixels))).movedim(-1, 1)
@@ -253,7 +253,7 @@ class ChannelAttention(nn.Module):
         )
 
     def forward(self, picture: Tensor, events: Tensor) -> Tensor:
-        """What the events answer to the picture; same shape as both."""
+        """Attention of the picture to the events; same shape as both."""
         query, key, value = (
             part.unflatten(1, (len(self.temperature), -1)).flatten(3)
             for part in (self.q(picture), self.k(events), self.v(events))
@@ -272,24 +272,9 @@ class PixelNorm(nn.Module):
         self.body = nn.LayerNorm(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape."""
+        """Features of the same shape."""
         normal: Tensor = self.body(x.movedim(1, -1))
         return normal.movedim(-1, 1)
-
-
-class SupervisedAttention(nn.Module):
-    """What the first stage passes on, weighted by its own picture."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
-        self.conv2 = nn.Conv2d(channels, 3, 3, padding=1)
-        self.conv3 = nn.Conv2d(3, channels, 3, padding=1)
-
-    def forward(self, x: Tensor, picture: Tensor) -> Tensor:
-        """Features for the second stage."""
-        attention = torch.sigmoid(self.conv3(self.conv2(x) + picture))
-        return x + self.conv1(x) * attention
 
 
 def _levels(path: nn.ModuleList) -> Iterable[Level]:

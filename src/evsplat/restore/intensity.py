@@ -18,7 +18,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.events import EventStream
 from evsplat.events.maps import polarity_counts
 from evsplat.pictures.light import REC709
-from evsplat.restore.needs import require_signed_events
+from evsplat.restore.network import require_signed_events
 
 MATCHED_OVER = 0.02
 """Standard deviation, over the picture's shorter side, of the weights of brightness matching."""
@@ -70,7 +70,7 @@ class FromEvents:
         interval = times[1] - times[0] if len(times) > 1 else times[0]
         stretch, before = None, 0
         for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us):
-            if stretch != (stretch := capture.events.open_around(frame.mid_us)):
+            if stretch != (stretch := capture.events.readable_around(frame.mid_us)):
                 self._network.reset()
                 before = max(frame.mid_us - interval, stretch[0])
             camera = capture.camera(frame)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evsplat.capture import Frame, TrainingCapture
-from evsplat.restore.network import NetworkRestorer, as_input
+from evsplat.restore.network import NetworkRestorer, SupervisedAttention, as_input
 from evsplat.weights import WeightFile, fill, state_under
 
 LEVELS = (96, 144, 192)
@@ -67,8 +67,8 @@ class ThreeStages(nn.Module):
         self.stage2_encoder = Encoder(act, takes_earlier=True)
         self.stage2_decoder = Decoder(act)
         self.stage3_orsnet = FullResolution(act)
-        self.sam12 = SupervisedAttention(channels)
-        self.sam23 = SupervisedAttention(channels)
+        self.sam12 = SupervisedAttention(channels, 1, bias=False)
+        self.sam23 = SupervisedAttention(channels, 1, bias=False)
         self.concat12 = _conv(2 * channels, channels)
         self.concat23 = _conv(2 * channels, WIDE)
         self.tail = _conv(WIDE, 3)
@@ -91,7 +91,7 @@ class ThreeStages(nn.Module):
         return restored
 
     def _first(self, half: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """What the first stage finds in the two quarters of a half."""
+        """Features that the first stage finds in the two quarters of a half."""
         quarters = [
             self.stage1_encoder(self.shallow_feat1(quarter)) for quarter in half.chunk(2, -1)
         ]
@@ -110,7 +110,7 @@ class AttentionBlock(nn.Module):
         self.body = nn.Sequential(_conv(channels, channels), act, _conv(channels, channels))
 
     def forward(self, x: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 C H W"]:
-        """Same shape."""
+        """Features of the same shape."""
         return self.CA(self.body(x)) + x
 
 
@@ -125,25 +125,8 @@ class ChannelAttention(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 C H W"]:
-        """Same shape."""
+        """Features of the same shape."""
         return x * self.conv_du(x.mean((-2, -1), keepdim=True))
-
-
-class SupervisedAttention(nn.Module):
-    """What one stage passes on, weighted by its own picture."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv1 = _conv(channels, channels, 1)
-        self.conv2 = _conv(channels, 3, 1)
-        self.conv3 = _conv(3, channels, 1)
-
-    def forward(
-        self, x: Float[Tensor, "1 C H W"], picture: Float[Tensor, "1 3 H W"]
-    ) -> Float[Tensor, "1 C H W"]:
-        """Features for the next stage."""
-        attention = torch.sigmoid(self.conv3(self.conv2(x) + picture))
-        return x + self.conv1(x) * attention
 
 
 class Encoder(nn.Module):
@@ -234,7 +217,7 @@ class Original(nn.Module):
         self.body = nn.Sequential(*blocks, _conv(WIDE, WIDE))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape."""
+        """Features of the same shape."""
         return self.body(x) + x
 
 

@@ -110,7 +110,7 @@ class NafBlock(nn.Module):
         self.gamma = nn.Parameter(torch.zeros(1, channels, 1, 1))
 
     def forward(self, x: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 C H W"]:
-        """Same shape."""
+        """Features of the same shape."""
         y = _gate(self.conv2(self.conv1(self.norm1(x))))
         x = x + self.beta * self.conv3(y * self.sca(y))
         return x + self.gamma * self.conv5(_gate(self.conv4(self.norm2(x))))
@@ -125,7 +125,7 @@ class ChannelNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(channels))
 
     def forward(self, x: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 C H W"]:
-        """Same shape."""
+        """Features of the same shape."""
         normal = F.layer_norm(x.movedim(1, -1), self.weight.shape, self.weight, self.bias, 1e-6)
         return normal.movedim(-1, 1)
 

@@ -1,7 +1,7 @@
-"""What all restorers have in common that run a pretrained network on each frame."""
+"""Base of restorers that run a pretrained network on each frame, in tiles where it is large."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,14 +9,16 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import network_device
-from evsplat.errors import BackendError
-from evsplat.restore.needs import require_signed_events
-from evsplat.restore.tiles import OVERLAP_PX, SIDE_PX, in_tiles
+from evsplat.errors import BackendError, DataError
 from evsplat.weights import WeightFile, sha256_of
 
+SIDE_PX = 512
+"""Longest side of a tile; all the pictures that fit go through whole."""
+OVERLAP_PX = 64
 # what torch says on Linux and on Windows
 _CPU_SIGNS = ("can't allocate memory", "not enough memory")
 
@@ -51,7 +53,7 @@ class NetworkRestorer(ABC):
 
     @abstractmethod
     def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
-        """What the network takes for a frame."""
+        """Inputs of the network for a frame."""
 
     def restore(
         self, capture: TrainingCapture, frames: Sequence[Frame]
@@ -74,6 +76,25 @@ class NetworkRestorer(ABC):
         }
 
 
+class SupervisedAttention(nn.Module):
+    """Features that one stage passes on to the next, weighted by its own picture."""
+
+    def __init__(self, channels: int, size: int, *, bias: bool) -> None:
+        """``size`` of the convolutions, pixels."""
+        super().__init__()
+        self.conv1, self.conv2, self.conv3 = (
+            nn.Conv2d(inputs, outputs, size, padding=size // 2, bias=bias)
+            for inputs, outputs in ((channels, channels), (channels, 3), (3, channels))
+        )
+
+    def forward(
+        self, x: Float[Tensor, "1 C H W"], picture: Float[Tensor, "1 3 H W"]
+    ) -> Float[Tensor, "1 C H W"]:
+        """Features for the next stage."""
+        attention = torch.sigmoid(self.conv3(self.conv2(x) + picture))
+        return x + self.conv1(x) * attention
+
+
 def as_input(picture: Float[Tensor, "H W C"]) -> Float[Tensor, "1 C H W"]:
     """A picture in the order that networks take."""
     return picture.permute(2, 0, 1)[None]
@@ -93,3 +114,62 @@ def enough_memory(name: str, height: int, width: int, device: torch.device) -> I
             f"{device.type}; use {'--device cpu' if is_cuda else 'a machine with more memory'}, or "
             "a smaller capture."
         ) from error
+
+
+def require_signed_events(capture: TrainingCapture, restorer: str) -> None:
+    """Raises `DataError` where the capture has no events, or they have no polarity."""
+    if capture.events is None:
+        raise DataError(
+            f"{capture.path}: has no events, which {restorer} needs; record or simulate them first."
+        )
+    if not capture.events.has_polarity:
+        raise DataError(
+            f"{capture.events.path}: no event has a polarity (events/p is 0 throughout), which "
+            f"{restorer} needs; record or simulate them with it."
+        )
+
+
+def in_tiles(
+    network: Callable[..., Float[Tensor, "1 C h w"]],
+    inputs: Sequence[Float[Tensor, "1 _ H W"]],
+    *,
+    multiple: int,
+    side: int = SIDE_PX,
+    overlap: int = OVERLAP_PX,
+) -> Float[Tensor, "1 C H W"]:
+    """``network(*inputs)``, tile by tile where the pictures are larger than ``side``.
+
+    Each tile is padded to sides that are a multiple of ``multiple`` by repeating its border, and
+    neighbours are blended linearly over their overlap.
+    """
+    height, width = inputs[0].shape[-2:]
+    total: Tensor | None = None
+    share = torch.zeros(height, width, device=inputs[0].device)
+    for top in _starts(height, side, overlap):
+        for left in _starts(width, side, overlap):
+            place = (..., slice(top, top + side), slice(left, left + side))
+            parts = [part[place] for part in inputs]
+            h, w = parts[0].shape[-2:]
+            padding = (0, -w % multiple, 0, -h % multiple)
+            made = network(*(F.pad(part, padding, mode="replicate") for part in parts))[..., :h, :w]
+            weight = _ramp(h, overlap).to(made)[:, None] * _ramp(w, overlap).to(made)
+            if total is None:
+                total = made.new_zeros((*made.shape[:-2], height, width))
+            total[place] += weight * made
+            share[place] += weight
+    assert total is not None
+    return total / share
+
+
+def _starts(length: int, side: int, overlap: int) -> list[int]:
+    """Starts of tiles, evenly spread and overlapping by at least ``overlap``."""
+    if length <= side:
+        return [0]
+    count = -(-(length - overlap) // (side - overlap))
+    return [round(i * (length - side) / (count - 1)) for i in range(count)]
+
+
+def _ramp(length: int, overlap: int) -> Float[Tensor, "L"]:
+    """Grows from the border inwards over ``overlap`` pixels, and is 1 further in."""
+    at = torch.arange(1, length + 1)
+    return torch.minimum(at, at.flip(0)).clamp_max(overlap + 1) / (overlap + 1)

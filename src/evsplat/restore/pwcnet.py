@@ -49,7 +49,7 @@ class PwcNet(nn.Module):
     def forward(
         self, first: Float[Tensor, "1 3 H W"], second: Float[Tensor, "1 3 H W"]
     ) -> Float[Tensor, "1 2 H W"]:
-        """Where each pixel of ``first`` lies in ``second``: offset (x, y) in pixels."""
+        """Offset (x, y) in pixels to where each pixel of ``first`` lies in ``second``."""
         height, width = first.shape[-2:]
         size = (height + -height % _MULTIPLE, width + -width % _MULTIPLE)
         pyramids = [self._features(_resized(picture, size)) for picture in (first, second)]

@@ -1,4 +1,4 @@
-"""How alike two pictures are: PSNR, SSIM, LPIPS, ST-LPIPS; for training terms and evaluation."""
+"""Similarity of two pictures: PSNR, SSIM, LPIPS, ST-LPIPS; for training terms and evaluation."""
 
 from evsplat.similarity.lpips import load_lpips
 from evsplat.similarity.psnr_ssim import Ssim, psnr, ssim

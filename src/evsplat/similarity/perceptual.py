@@ -21,7 +21,7 @@ class Conv:
 
     key: str
     shape: tuple[int, int, int, int]
-    """Of the weight: channels out, channels in, height, width."""
+    """Shape of the weight: channels out, channels in, height, width."""
     stride: int = 1
     padding: int = 1
 
@@ -126,7 +126,7 @@ class PerceptualMetric:
     ) -> None:
         self.network = network
         self.sha256 = sha256
-        """Of the file that the network's weights came from."""
+        """Checksum of the file that the network's weights came from."""
         self.device = torch.device(device)
         self._parameters = {k: v.detach().to(self.device) for k, v in parameters.items()}
         self._heads = [head.detach().to(self.device) for head in heads]

@@ -71,7 +71,7 @@ GAUSSIAN_SSIM = Ssim()
 """Gaussian 11/1.5, range 1: scikit-image's gaussian_weights, sigma=1.5, no sample covariance."""
 
 SCIKIT_DEFAULT_SSIM = Ssim("uniform", 7, data_range=2.0, sample_covariance=True)
-"""What scikit-image up to 0.19 computes for float images where no data range is given."""
+"""scikit-image's up to 0.19 for float images where no data range is given."""
 
 ZERO_PADDED_SSIM = Ssim(padding="zero")
 """Gaussian 11/1.5, range 1, with zero padding: the SSIM of most 3DGS code."""

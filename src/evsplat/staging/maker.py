@@ -224,7 +224,7 @@ class _Film:
                     view = make_camera(eye, *settings.size)
                     seen, _ = self._draw_at(times.mid_us, view)
                     writer.add_novel_view(camera, name, times.mid_us, _coded(seen))
-            yield _joined(events)
+            yield EventStream.joined(events)
 
     def _draw(self, times_us: np.ndarray) -> Iterator[tuple[int, Float32[np.ndarray, "H W 3"]]]:
         """Time and linear picture of the recording camera, drawn in batches."""
@@ -276,7 +276,3 @@ def _frame_count(settings: StageSettings, motion: SkeletonMotion) -> int:
 def _coded(linear: np.ndarray) -> np.ndarray:
     """sRGB-coded (power 2.2), clipped to [0, 1]."""
     return encode(torch.from_numpy(linear).clamp(0, 1)).numpy()
-
-
-def _joined(parts: list[EventStream]) -> EventStream:
-    return EventStream(*(np.concatenate([getattr(p, k) for p in parts]) for k in "txyp"))

@@ -9,8 +9,8 @@ import numpy as np
 
 from evsplat.capture import BodyFile, CaptureWriter
 from evsplat.capture.body_file import RIG_ARRAYS, body_from_arrays, read_arrays
+from evsplat.capture.write import read_camera
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import read_json
 from evsplat.footage import Footage
 from evsplat.synthesis.source import RecordedEvents, set_body
 
@@ -18,6 +18,7 @@ logger = logging.getLogger(__name__)
 
 # Field of view across the longer side of a camera that nobody has described.
 _NOMINAL_FOV_DEG = 60.0
+_CAMERA_KEYS = ("width", "height", "K", "world_to_camera")
 
 
 class FootageSource:
@@ -37,7 +38,9 @@ class FootageSource:
             )
         self.footage: Footage = footage
         self._body = None if body is None else _read_body(body)
-        self._camera = None if camera is None else _read_camera(camera, footage)
+        self._camera = None
+        if camera is not None:
+            self._camera = read_camera(camera, footage.width, footage.height, _CAMERA_KEYS)
 
     def describe(self) -> dict[str, Any]:
         """See `Source`."""
@@ -105,36 +108,3 @@ def _read_body(path: Path) -> BodyFile:
     if count == 0:
         raise DataError(f"{path}: times_us is empty, expected at least one pose.")
     return body_from_arrays(path, arrays, "")
-
-
-def _read_camera(path: Path, footage: Footage) -> dict[str, Any]:
-    """K, world_to_camera and distortion for `CaptureWriter.add_camera`, which checks the values."""
-    entry = read_json(path)
-    keys = ("width", "height", "K", "world_to_camera")
-    missing = [key for key in keys if not isinstance(entry, dict) or key not in entry]
-    if missing:
-        raise DataError(
-            f"{path}: {', '.join(missing)} missing, expected one camera as in capture.json "
-            "(docs/capture-format.md)."
-        )
-    if (entry["width"], entry["height"]) != (footage.width, footage.height):
-        raise DataError(
-            f"{path}: describes {entry['width']}x{entry['height']} pixels, {footage.path} has "
-            f"{footage.width}x{footage.height}; give K for that size."
-        )
-    lens = entry.get("distortion") or {}
-    return {
-        "K": _matrix(path, entry, "K", 3),
-        "world_to_camera": _matrix(path, entry, "world_to_camera", 4),
-        "distortion": lens.get("coefficients"),
-    }
-
-
-def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarray:
-    try:
-        matrix = np.array(entry[key], dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (size, size):
-        raise DataError(f"{path}: {key} is no {size}x{size} matrix of numbers; correct it.")
-    return matrix

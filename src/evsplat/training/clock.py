@@ -1,4 +1,4 @@
-"""Where a training run stands in its schedule, by steps or by the time it was given."""
+"""Place of a training run in its schedule, by steps or by the time it was given."""
 
 from dataclasses import dataclass
 

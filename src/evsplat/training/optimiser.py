@@ -129,7 +129,7 @@ class Optimiser:
             )
 
     def learning_rates(self) -> dict[str, float]:
-        """Of the Gaussians' attributes, for the log."""
+        """Learning rates of the Gaussians' attributes, for the log."""
         several = len(self.rows) > 1
         return {
             f"{name}.{group['name']}" if several else group["name"]: group["lr"]

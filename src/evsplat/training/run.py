@@ -18,7 +18,7 @@ from evsplat.capture import Camera, Capture, Policy, TrainingCapture, load_captu
 from evsplat.capture.masked import MaskedCapture
 from evsplat.config import load_yaml
 from evsplat.devices import hardware
-from evsplat.errors import DataError
+from evsplat.errors import ConfigError, DataError
 from evsplat.files import read_json, write_json, write_text
 from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
@@ -34,7 +34,7 @@ PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Where the parts of a run lie."""
+    """Paths of the parts of a run."""
 
     path: Path
 
@@ -228,11 +228,18 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
         raise DataError(f"{folder.path}: not a run folder, config.yaml is missing.")
     values = load_yaml(folder.config)
     method = values.pop("method", DEFAULT_METHOD)
-    return method, method_config(method, values, where=str(folder.config)), read_json(folder.facts)
+    try:
+        config = method_config(method, values, where=str(folder.config))
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}\nIf another version of evsplat wrote this run (versions.json beside it names "
+            "it), open it with that one, or train again."
+        ) from None
+    return method, config, read_json(folder.facts)
 
 
 def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:
-    """What a method with this configuration is given of a capture."""
+    """The part of a capture that a method with this configuration is given."""
     return capture.for_training(config.policy, MASKERS["background"])
 
 

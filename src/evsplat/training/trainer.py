@@ -28,7 +28,7 @@ PARTS: tuple[Part, Part] = ("human", "scene")
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step measured. Reading a number waits for the device that computes it."""
+    """Measures of one step. Reading a number waits for the device that computes it."""
 
     losses: tuple[Float[Tensor, ""], ...]
     """What was minimised, and its terms, unweighted."""
@@ -51,17 +51,17 @@ class StepReport:
 
     @property
     def loss(self) -> float:
-        """What was minimised."""
+        """Value that was minimised."""
         return self._numbers[0]
 
     @property
     def psnr(self) -> float:
-        """Of the drawn frame's render against the recorded, blurry picture, dB."""
+        """PSNR of the drawn frame's render against the recorded, blurry picture, dB."""
         return self._numbers[1]
 
     @property
     def terms(self) -> dict[str, float]:
-        """Of the loss, unweighted."""
+        """Terms of the loss, unweighted."""
         return dict(zip(self.names, self._numbers[2:], strict=True))
 
 
@@ -188,7 +188,7 @@ class Trainer:
         return tensors, state
 
     def snapshot(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """What of `state` is needed to draw the model."""
+        """Part of `state` that is needed to draw the model."""
         tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
         return tensors, {"clock": asdict(self.clock), "human_count": self.counts()["human"]}
 

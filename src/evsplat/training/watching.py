@@ -1,4 +1,4 @@
-"""How a run that is being trained shows itself: snapshots of its model, while someone watches.
+"""Snapshots of a run that is being trained, written while someone watches.
 
 The only thing that trainer and watcher share is the run folder. While it trains there is a file
 ``.watch`` in it. A watcher changes that file's time every second or so; the trainer, seeing this,

@@ -10,11 +10,11 @@ import numpy as np
 import viser
 
 from evsplat.view.camera import Orbit
-from evsplat.view.desk import Desk
 from evsplat.view.painter import Painter
+from evsplat.view.request import ViewRequest
 from evsplat.view.resolution import Resolution
+from evsplat.view.scheduler import RenderScheduler
 from evsplat.view.timeline import Playback
-from evsplat.view.wish import Wish
 
 LONGEST_PX = 1600
 """Pictures are drawn no larger; the browser enlarges them to its window."""
@@ -41,19 +41,19 @@ class Snap:
 
 
 class Client:
-    """Holds what a browser wishes; its callbacks only write it down, the desk does the work."""
+    """Holds the request of a browser; callbacks only write it down, the scheduler does the work."""
 
     def __init__(
         self,
         handle: viser.ClientHandle,
         painter: Painter,
-        desk: Desk,
-        wish: Wish,
+        scheduler: RenderScheduler,
+        request: ViewRequest,
         playback: Playback,
     ) -> None:
-        self.handle, self.painter, self.desk = handle, painter, desk
+        self.handle, self.painter, self.scheduler = handle, painter, scheduler
         self._lock = threading.Lock()
-        self._wish = wish
+        self._request = request
         self._playback = playback
         self._snap: Snap | None = None
         self._resolution = Resolution()
@@ -64,23 +64,23 @@ class Client:
         handle.camera.on_update(self._camera_moved)
 
     def change(self, **fields: Any) -> None:
-        """Wish for other fields."""
+        """Ask for other fields."""
         with self._lock:
-            self._wish = replace(self._wish, **fields)
-        self.desk.wake()
+            self._request = replace(self._request, **fields)
+        self.scheduler.wake()
 
     def move(self, **fields: Any) -> None:
-        """Wish for a motion with other fields."""
+        """Ask for a motion with other fields."""
         with self._lock:
-            self._wish = replace(self._wish, motion=replace(self._wish.motion, **fields))
-        self.desk.wake()
+            self._request = replace(self._request, motion=replace(self._request.motion, **fields))
+        self.scheduler.wake()
 
     def play(self, change: Callable[[Playback, float], Playback]) -> Playback:
         """Change how time goes by."""
         with self._lock:
             self._playback = change(self._playback, time.monotonic())
             playback = self._playback
-        self.desk.wake()
+        self.scheduler.wake()
         return playback
 
     def look_through(self, camera: str, orbit: Orbit, look_at: np.ndarray) -> None:
@@ -88,33 +88,33 @@ class Client:
         ahead = look_at - np.asarray(orbit.position)
         with self._lock:
             self._snap = Snap(np.asarray(orbit.position), ahead / np.linalg.norm(ahead))
-            self._wish = replace(self._wish, recording=camera, orbit=orbit)
+            self._request = replace(self._request, recording=camera, orbit=orbit)
         with self.handle.atomic():
             self.handle.camera.position = orbit.position
             self.handle.camera.look_at = look_at
             self.handle.camera.fov = orbit.fov
-        self.desk.wake()
+        self.scheduler.wake()
 
     @property
-    def standing(self) -> Wish:
-        """The present wish, at the time where it stands."""
+    def standing(self) -> ViewRequest:
+        """The present request, at the time where it stands."""
         with self._lock:
             place = round(self._playback.at(time.monotonic()))
-            return replace(self._wish, time_us=place)
+            return replace(self._request, time_us=place)
 
-    def wish(self, now: float) -> Wish:
+    def request(self, now: float) -> ViewRequest:
         """The picture to show at a second of the wall clock."""
         with self._lock:
-            return replace(self._wish, time_us=round(self._playback.at(now)))
+            return replace(self._request, time_us=round(self._playback.at(now)))
 
-    def serve(self, wish: Any, *, draft: bool) -> None:
+    def render(self, request: Any, *, draft: bool) -> None:
         """Draw and send."""
-        shrink = min(1.0, LONGEST_PX / max(wish.width, wish.height))
-        size = max(16, round(shrink * wish.width)), max(16, round(shrink * wish.height))
+        shrink = min(1.0, LONGEST_PX / max(request.width, request.height))
+        size = max(16, round(shrink * request.width)), max(16, round(shrink * request.height))
         if draft:
             size = self._resolution.size(*size)
         started = time.perf_counter()
-        picture = self.painter.paint(wish, size, rough=draft)
+        picture = self.painter.paint(request, size, rough=draft)
         if self.gone:
             return
         self.handle.scene.set_background_image(
@@ -123,7 +123,7 @@ class Client:
         self.handle.flush()
         if draft:
             self._resolution.took(time.perf_counter() - started)
-        self.on_time(wish.time_us)
+        self.on_time(request.time_us)
 
     async def _camera_moved(self, camera: viser.CameraHandle) -> None:
         # A coroutine runs in the order of the messages; a function would in a pool of threads.
@@ -132,9 +132,9 @@ class Client:
         with self._lock:
             if self._snap is not None and self._snap.left(camera):
                 self._snap = None
-                self._wish = replace(self._wish, recording=None)
-            self._wish = replace(self._wish, orbit=orbit, width=width, height=height)
-        self.desk.wake()
+                self._request = replace(self._request, recording=None)
+            self._request = replace(self._request, orbit=orbit, width=width, height=height)
+        self.scheduler.wake()
 
 
 def orbit_of(camera: viser.CameraHandle) -> Orbit:

@@ -1,4 +1,4 @@
-"""From a wish to the picture that the browser shows."""
+"""From a request to the picture that the browser shows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from evsplat.events.maps import count_map
 from evsplat.film import camera_at
 from evsplat.view import pixels
 from evsplat.view.camera import Box, framed, orbit_camera, resized
+from evsplat.view.request import BLURRY, SHARP, ViewRequest
 from evsplat.view.subject import Subject
-from evsplat.view.wish import BLURRY, SHARP, Wish
 
 INSET_SHARE = 0.3
 """Height of the recorded picture in the corner, as a share of the viewport's."""
@@ -28,7 +28,7 @@ class Pane:
 
 
 class Painter:
-    """Draws wishes of one run, or of two runs of one capture."""
+    """Draws requests of one run, or of two runs of one capture."""
 
     def __init__(self, subject: Subject, others: Mapping[str, Subject]) -> None:
         """``others`` are what the run can be compared with, by name."""
@@ -41,87 +41,92 @@ class Painter:
         return all(s.knows_depth for s in (self.subject, *self.others.values()))
 
     def paint(
-        self, wish: Wish, size: tuple[int, int], *, rough: bool
+        self, request: ViewRequest, size: tuple[int, int], *, rough: bool
     ) -> UInt8[np.ndarray, "H W 3"]:
         """The picture with ``size`` (width, height) pixels, whatever the viewport has."""
         width, height = size
-        other = wish.compare if self._has_place(wish) else None
-        beside = wish.layout == "side by side" and other is not None
+        other = request.compare if self._has_place(request) else None
+        beside = request.layout == "side by side" and other is not None
         share = 0.5 if beside else 1.0
-        pane = self._pane(wish, round(share * wish.width), wish.height)
+        pane = self._pane(request, round(share * request.width), request.height)
         pane = _scaled(pane, round(share * width), height)
-        right = self._drawn(self.subject, pane, wish, rough)
+        right = self._drawn(self.subject, pane, request, rough)
         picture, labels = right, []
         if other is not None:
-            left = self._compared(other, wish, pane, right, rough)
+            left = self._compared(other, request, pane, right, rough)
             if beside:
                 picture = np.concatenate([left, right], 1)
                 picture[:, left.shape[1] - 1 : left.shape[1] + 1] = 1
                 labels = [(0.0, other), (0.5, self.subject.name)]
             else:
-                picture = pixels.divided(left, right, wish.divider)
-                labels = [(0.0, other), (wish.divider, self.subject.name)]
-        if pane.box is None and (wish.events_us is not None or wish.compare != other):
-            self._inset(picture, wish)
+                picture = pixels.divided(left, right, request.divider)
+                labels = [(0.0, other), (request.divider, self.subject.name)]
+        if pane.box is None and (request.events_us is not None or request.compare != other):
+            self._inset(picture, request)
         return pixels.with_labels(pixels.to_bytes(picture), labels)
 
-    def camera(self, wish: Wish) -> Camera:
-        """From where a wish is seen."""
-        return self._pane(wish, wish.width, wish.height).camera
+    def camera(self, request: ViewRequest) -> Camera:
+        """From where a request is seen."""
+        return self._pane(request, request.width, request.height).camera
 
     def frame(self, camera: str | None, time_us: int) -> Frame:
         """The recorded frame nearest in time, of a camera where it recorded any."""
         return nearest_frame(self.capture, camera, time_us)
 
-    def _pane(self, wish: Wish, width: int, height: int) -> Pane:
-        if wish.recording is None:
-            return Pane(orbit_camera(wish.orbit, width, height), None)
+    def _pane(self, request: ViewRequest, width: int, height: int) -> Pane:
+        if request.recording is None:
+            return Pane(orbit_camera(request.orbit, width, height), None)
         # Another motion has times of its own; the camera then stands where it stood first.
-        time_us = wish.time_us if wish.motion.name is None else self.capture.frames[0].mid_us
-        camera = camera_at(self.capture, wish.recording, time_us)
+        time_us = request.time_us if request.motion.name is None else self.capture.frames[0].mid_us
+        camera = camera_at(self.capture, request.recording, time_us)
         return Pane(*framed(camera, width, height))
 
     def _drawn(
-        self, subject: Subject, pane: Pane, wish: Wish, rough: bool
+        self, subject: Subject, pane: Pane, request: ViewRequest, rough: bool
     ) -> Float[np.ndarray, "H W 3"]:
         """A run's picture with everything laid over it."""
         picture = np.array(
-            subject.picture(pane.camera, wish.time_us, wish.motion, wish.look, rough=rough)
+            subject.picture(pane.camera, request.time_us, request.motion, request.look, rough=rough)
         )
         if pane.box is not None:
             pixels.dim_outside(picture, pane.box)
-            if wish.events_us is not None and wish.motion.is_recorded:
-                counts = self._events(wish)
+            if request.events_us is not None and request.motion.is_recorded:
+                counts = self._events(request)
                 if counts is not None:
                     pixels.events_on(picture, counts, pane.box)
         return picture
 
-    def _has_place(self, wish: Wish) -> bool:
+    def _has_place(self, request: ViewRequest) -> bool:
         """Whether what is compared is known for this view; recordings are for their camera."""
-        if wish.compare in self.others:
+        if request.compare in self.others:
             return True
-        frames = [f for f in self.capture.frames if f.camera == wish.recording]
-        return wish.compare is not None and bool(frames) and wish.motion.is_recorded
+        frames = [f for f in self.capture.frames if f.camera == request.recording]
+        return request.compare is not None and bool(frames) and request.motion.is_recorded
 
     def _compared(
-        self, other: str, wish: Wish, pane: Pane, drawn: Float[np.ndarray, "H W 3"], rough: bool
+        self,
+        other: str,
+        request: ViewRequest,
+        pane: Pane,
+        drawn: Float[np.ndarray, "H W 3"],
+        rough: bool,
     ) -> Float[np.ndarray, "H W 3"]:
-        """What stands beside the run's picture."""
+        """The picture beside the run's."""
         if other in self.others:
-            return self._drawn(self.others[other], pane, wish, rough)
-        recorded, picture = self._recorded(wish), np.zeros_like(drawn)
+            return self._drawn(self.others[other], pane, request, rough)
+        recorded, picture = self._recorded(request), np.zeros_like(drawn)
         assert pane.box is not None and recorded is not None
         pixels.paste(picture, recorded, pane.box)
         return picture
 
-    def _inset(self, picture: Float[np.ndarray, "H W 3"], wish: Wish) -> None:
+    def _inset(self, picture: Float[np.ndarray, "H W 3"], request: ViewRequest) -> None:
         """Put the recorded picture, with its events, into the lower left corner."""
-        recorded = self._recorded(wish)
+        recorded = self._recorded(request)
         if recorded is None:
             return
         recorded = recorded.copy()
-        if wish.events_us is not None:
-            counts = self._events(wish)
+        if request.events_us is not None:
+            counts = self._events(request)
             if counts is not None:
                 whole = Box(0, 0, recorded.shape[1], recorded.shape[0])
                 pixels.events_on(recorded, counts, whole)
@@ -134,20 +139,20 @@ class Painter:
         pixels.paste(picture, np.ones((2, 2, 3), np.float32), around)
         pixels.paste(picture, recorded, box)
 
-    def _recorded(self, wish: Wish) -> Float[np.ndarray, "h w 3"] | None:
-        if not wish.motion.is_recorded:
+    def _recorded(self, request: ViewRequest) -> Float[np.ndarray, "h w 3"] | None:
+        if not request.motion.is_recorded:
             return None
-        frame = self.frame(wish.recording, wish.time_us)
-        if wish.compare == SHARP and frame.sharp is not None:
+        frame = self.frame(request.recording, request.time_us)
+        if request.compare == SHARP and frame.sharp is not None:
             return self.capture.sharp(frame).numpy()
         return self.capture.image(frame).numpy()
 
-    def _events(self, wish: Wish) -> Float[np.ndarray, "h w"] | None:
+    def _events(self, request: ViewRequest) -> Float[np.ndarray, "h w"] | None:
         store = self.capture.events
-        if store is None or wish.events_us is None:
+        if store is None or request.events_us is None:
             return None
-        start = wish.time_us - wish.events_us // 2
-        stream = store.between(start, start + wish.events_us)
+        start = request.time_us - request.events_us // 2
+        stream = store.between(start, start + request.events_us)
         return count_map(stream, store.height, store.width).numpy()
 
 

@@ -13,9 +13,9 @@ from evsplat.view.camera import Orbit, forward, framed, vertical_fov
 from evsplat.view.client import Client
 from evsplat.view.painter import comparisons
 from evsplat.view.pose_panel import PosePanel
+from evsplat.view.request import ViewRequest
 from evsplat.view.save_panel import SavePanel
 from evsplat.view.timeline import Playback
-from evsplat.view.wish import Wish
 
 SPEEDS = {
     "as recorded": 1.0,
@@ -37,7 +37,7 @@ _SLIDER_S = 0.1
 class Panel:
     """Builds the controls of one browser and connects them with its client.
 
-    Callbacks are coroutines, which the event loop runs in order; each only writes a wish down.
+    Callbacks are coroutines, which the event loop runs in order; each only writes a request down.
     """
 
     def __init__(self, client: Client, pivot: np.ndarray) -> None:
@@ -60,9 +60,9 @@ class Panel:
             self._build_show()
         if client.painter.subject.is_posable:
             with self.gui.add_folder("Motion and pose"):
-                PosePanel(self)
+                PosePanel(client, self.show_motion)
         with self.gui.add_folder("Save"):
-            SavePanel(self)
+            SavePanel(client, self.instant_name)
         client.on_time = self._follow
 
     def _build_time(self) -> None:
@@ -147,13 +147,13 @@ class Panel:
 
     def look_through(self, camera: str) -> None:
         """Put the browser's camera where a recording camera is at this time."""
-        wish = self.client.standing
-        recording = camera_at(self.capture, camera, wish.time_us)
-        view, _ = framed(recording, wish.width, wish.height)
+        request = self.client.standing
+        recording = camera_at(self.capture, camera, request.time_us)
+        view, _ = framed(recording, request.width, request.height)
         centre, ahead = recording.center().double().numpy(), forward(recording)
         # The view turns around the place on the optical axis that is as far as the pivot.
         away = max(0.5, float((self.pivot - centre) @ ahead))
-        orbit = Orbit(wish.orbit.wxyz, tuple(centre.tolist()), vertical_fov(view))
+        orbit = Orbit(request.orbit.wxyz, tuple(centre.tolist()), vertical_fov(view))
         self.client.look_through(camera, orbit, centre + away * ahead)
 
     def show_motion(self, name: str | None) -> None:
@@ -225,8 +225,8 @@ class Panel:
             where = "between exposures"
         return f"Frame {frame.name} ({split}), {where} of {(end - start) / 1e3:.3g} ms"
 
-    def instant_name(self, wish: Wish) -> str:
+    def instant_name(self, request: ViewRequest) -> str:
         """What a file of this instant is called, without its ending."""
-        motion = "" if wish.motion.name is None else f"-{wish.motion.name}"
-        place_ms = wish.time_us / 1e3
+        motion = "" if request.motion.name is None else f"-{request.motion.name}"
+        place_ms = request.time_us / 1e3
         return f"{self.capture.name}{motion}-{place_ms:.1f}ms"

@@ -1,15 +1,13 @@
-"""The controls of what the person does: motions that ship, and sliders per group of joints."""
+"""Controls of the person's motion: motions that ship, and sliders per group of joints."""
 
 import functools
+from collections.abc import Callable
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import viser
 
 from evsplat.staging.assets import motions
-
-if TYPE_CHECKING:
-    from evsplat.view.panel import Panel
+from evsplat.view.client import Client
 
 _RECORDED = "as recorded"
 
@@ -17,10 +15,10 @@ _RECORDED = "as recorded"
 class PosePanel:
     """A choice of motions, and angles on top of the one that is chosen."""
 
-    def __init__(self, panel: "Panel") -> None:
-        """Build the controls in the folder that is open."""
-        self.panel, self.client = panel, panel.client
-        gui = panel.gui
+    def __init__(self, client: Client, show_motion: Callable[[str | None], None]) -> None:
+        """Build the controls in the folder that is open; ``show_motion`` runs between pictures."""
+        self.client = client
+        gui = client.handle.gui
         names = {_RECORDED: None, **{name.replace("_", " "): name for name in motions()}}
         motion = gui.add_dropdown("Motion", tuple(names))
         self.sliders = []
@@ -36,8 +34,8 @@ class PosePanel:
         reset.visible = bool(self.sliders)
 
         async def chosen(_: viser.GuiEvent) -> None:
-            job = functools.partial(panel.show_motion, names[motion.value])
-            self.client.desk.do(job)
+            job = functools.partial(show_motion, names[motion.value])
+            self.client.scheduler.do(job)
 
         async def straightened(_: viser.GuiEvent) -> None:
             for slider in self.sliders:

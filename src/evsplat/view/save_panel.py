@@ -1,18 +1,17 @@
-"""The controls that hand what is shown to the browser as a file."""
+"""Controls that hand what is shown to the browser as a file."""
 
 import io
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import viser
 from PIL import Image
 
 from evsplat.errors import DataError
 from evsplat.export.gaussians import FileKind, facts_of, file_rotation, write_file
-
-if TYPE_CHECKING:
-    from evsplat.view.panel import Panel
+from evsplat.view.client import Client
+from evsplat.view.request import ViewRequest
 
 _FORMATS: dict[str, tuple[FileKind, str]] = {
     "PLY": ("ply", ".ply"),
@@ -26,42 +25,42 @@ _FORMATS: dict[str, tuple[FileKind, str]] = {
 class SavePanel:
     """A picture of the view, and the Gaussians of its instant for other programs."""
 
-    def __init__(self, panel: "Panel") -> None:
-        """Build the controls in the folder that is open."""
-        self.panel, self.client = panel, panel.client
-        gui, desk = panel.gui, panel.client.desk
+    def __init__(self, client: Client, instant_name: Callable[[ViewRequest], str]) -> None:
+        """Build the controls in the folder that is open; files begin with ``instant_name``."""
+        self.client, self.instant_name = client, instant_name
+        gui, scheduler = client.handle.gui, client.scheduler
         picture = gui.add_button("Picture (PNG)", icon=viser.Icon.DOWNLOAD)
         known = self.client.painter.subject.has_splats
         self.format = gui.add_dropdown("Format", tuple(_FORMATS), visible=known)
         gaussians = gui.add_button("Gaussians", icon=viser.Icon.DOWNLOAD, visible=known)
 
         async def save_picture(_: viser.GuiEvent) -> None:
-            desk.do(self._send_picture)
+            scheduler.do(self._send_picture)
 
         async def save_gaussians(_: viser.GuiEvent) -> None:
-            desk.do(self._send_gaussians)
+            scheduler.do(self._send_gaussians)
 
         picture.on_click(save_picture)
         gaussians.on_click(save_gaussians)
 
     def _send_picture(self) -> None:
         """Draw the present view with all its pixels and hand it to the browser as a file."""
-        wish = self.client.standing
-        picture = self.client.painter.paint(wish, (wish.width, wish.height), rough=False)
+        request = self.client.standing
+        picture = self.client.painter.paint(request, (request.width, request.height), rough=False)
         data = io.BytesIO()
         Image.fromarray(picture).save(data, "PNG")
-        self._send(f"{self.panel.instant_name(wish)}.png", data.getvalue())
+        self._send(f"{self.instant_name(request)}.png", data.getvalue())
 
     def _send_gaussians(self) -> None:
         """The parts that are shown, as they are posed and as they are coloured from here."""
-        wish, painter = self.client.standing, self.client.painter
-        subject, parts = painter.subject, wish.look.parts
+        request, painter = self.client.standing, self.client.painter
+        subject, parts = painter.subject, request.look.parts
         kind, ending = _FORMATS[self.format.value]
-        cloud = subject.cloud(painter.camera(wish), wish.time_us, wish.motion, parts)
+        cloud = subject.cloud(painter.camera(request), request.time_us, request.motion, parts)
         which = {"all": "", "human": "-person", "scene": "-scene"}[parts]
-        name = f"{self.panel.instant_name(wish)}{which}{ending}"
-        motion = {"motion": wish.motion.name or "recorded", "angles_deg": wish.motion.angles}
-        facts = facts_of(subject.run) | {"time_us": wish.time_us, **motion}
+        name = f"{self.instant_name(request)}{which}{ending}"
+        motion = {"motion": request.motion.name or "recorded", "angles_deg": request.motion.angles}
+        facts = facts_of(subject.run) | {"time_us": request.time_us, **motion}
         rotation = file_rotation(subject.track(None), kind, None)
         with tempfile.TemporaryDirectory(prefix="evsplat-view-") as folder:
             path = Path(folder) / name

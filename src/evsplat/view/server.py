@@ -21,13 +21,13 @@ from evsplat.training.run import Run
 from evsplat.training.watching import is_training
 from evsplat.view.camera import forward, vertical_fov
 from evsplat.view.client import Client, orbit_of
-from evsplat.view.desk import Desk
 from evsplat.view.follow import Follower, load_newest, yield_to_training
 from evsplat.view.painter import Painter
 from evsplat.view.panel import SPEEDS, Panel
+from evsplat.view.request import ViewRequest
+from evsplat.view.scheduler import RenderScheduler
 from evsplat.view.subject import Subject
 from evsplat.view.timeline import Playback
-from evsplat.view.wish import Wish
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class Viewer:
         self.capture = main.capture
         self.painter = Painter(main, {other.name: other for other in others})
         self.pivot, up = _pivot_and_up(self.capture)
-        self.desk = Desk()
+        self.scheduler = RenderScheduler()
         self.port = _free_port(host, port)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server = _Server(host, self.port, label="evsplat", verbose=False)
@@ -62,9 +62,9 @@ class Viewer:
         self._clients: dict[int, Client] = {}
         self.server.on_client_connect(self._enter)
         self.server.on_client_disconnect(self._leave)
-        self.desk.start()
+        self.scheduler.start()
         self._followers = [
-            Follower(subject, self.desk.do, lambda: bool(self._clients), self._reloaded)
+            Follower(subject, self.scheduler.do, lambda: bool(self._clients), self._reloaded)
             for subject in self.subjects
             if is_training(subject.run.path)
         ]
@@ -73,13 +73,13 @@ class Viewer:
         """Stop serving."""
         for follower in self._followers:
             follower.stop()
-        self.desk.close()
+        self.scheduler.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     def _reloaded(self) -> None:
         self._told.content = _description(self.subjects)
-        self.desk.redraw()
+        self.scheduler.redraw()
 
     def _set_scene(self, up: np.ndarray) -> None:
         server, first = self.server, self.capture.frames[0]
@@ -104,24 +104,24 @@ class Viewer:
     async def _enter(self, handle: viser.ClientHandle) -> None:
         camera, frames = handle.camera, self.capture.frames
         times = [frame.mid_us for frame in frames if frame.camera == frames[0].camera]
-        wish = Wish(
+        request = ViewRequest(
             width=max(16, camera.image_width),
             height=max(16, camera.image_height),
             orbit=orbit_of(camera),
             time_us=min(times),
         )
         playback = Playback(min(times), max(times), min(times), speed=SPEEDS["1/5"])
-        client = Client(handle, self.painter, self.desk, wish, playback)
+        client = Client(handle, self.painter, self.scheduler, request, playback)
         panel = Panel(client, self.pivot)
         panel.look_through(frames[0].camera)
         self._clients[handle.client_id] = client
-        self.desk.enter(client)
+        self.scheduler.enter(client)
 
     async def _leave(self, handle: viser.ClientHandle) -> None:
         client = self._clients.pop(handle.client_id, None)
         if client is not None:
             client.gone = True
-            self.desk.leave(client)
+            self.scheduler.leave(client)
 
 
 def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> None:

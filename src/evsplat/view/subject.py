@@ -25,9 +25,9 @@ from evsplat.methods.reconstruction import (
 )
 from evsplat.render import Backdrop
 from evsplat.training.run import GaussianReconstruction, Run, reload_run
-from evsplat.view.memory import remembering, set_rough
+from evsplat.view.network_cache import set_rough, with_cached_networks
 from evsplat.view.posing import HeldPose, PoseSlider, pose_sliders, turned
-from evsplat.view.wish import Motion
+from evsplat.view.request import Motion
 
 _ROUGH_SHADOW_STEP_PX = 4
 
@@ -151,5 +151,5 @@ def _remembering(reconstruction: Reconstruction) -> Reconstruction:
     if not isinstance(reconstruction, GaussianReconstruction):
         return reconstruction
     assert isinstance(reconstruction.model, nn.Module)
-    model: Any = remembering(reconstruction.model)
+    model: Any = with_cached_networks(reconstruction.model)
     return replace(reconstruction, model=model, backdrop=Backdrop())

@@ -1,7 +1,6 @@
-"""Method `hugs` as a whole: its losses, the released code's slips, a run saved and read back."""
+"""Method `hugs` as a whole: its losses, its scene, a run saved and read back."""
 
 import json
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,8 +9,6 @@ from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import load_capture
 from evsplat.errors import DataError
 from evsplat.objectives.hugs import PATCH_PX, Perceptual, draw_squares
-from evsplat.models.hugs.model import HugsDrawing
-from evsplat.methods import TRAINABLE, method_config
 from evsplat.render import render
 from evsplat.similarity.psnr_ssim import ssim
 from evsplat.training import load_run, train
@@ -19,23 +16,15 @@ from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
-SMALL = {
-    "human": {"count": 80},
-    "triplane": {"resolution": 16, "channels": 8},
-    "fit": {"steps": 2, "batch": 32},
-    "scene": {"cube_count": 600},
-}
+from ...small_model import built, small
 
 
-def composed(path, **settings):
-    config = method_config("hugs", SMALL | settings, where="test")
-    return TRAINABLE["hugs"].build(
-        config, load_capture(path).for_training(config.policy), 0, fit=False
-    )
+def composed(path, *settings: str):
+    return built("hugs", path, *settings)
 
 
 def step_of(composition, capture, frame):
-    """What the losses see of one step, and the pieces that they are made from."""
+    """The step that the losses see, and their terms."""
     trainer = Trainer(composition, capture, Clock(10))
     seen = []
 
@@ -65,7 +54,7 @@ def test_terms_are_those_of_the_description(tiny_capture):
     generator.set_state(composed(capture.path).generator.get_state())
     background, colour = (torch.rand(3, generator=generator) for _ in range(2))
     assert not torch.equal(background, colour)
-    person = step.posed.moving()
+    person = step.layers.human
     alone = render(person, capture.camera(frame), background=torch.cat([colour, torch.zeros(1)]))
     alone = alone.image[0, ..., :3].detach().clamp(0, 1)
     expected = torch.where(mask, observed, colour)
@@ -80,50 +69,9 @@ def test_terms_are_those_of_the_description(tiny_capture):
     torch.testing.assert_close(terms["skinning"], (weights - target).square().mean())
 
 
-def test_mode_human_learns_the_person_alone_from_one_masked_picture(tiny_capture):
-    capture = load_capture(tiny_capture(frames=10))
-    composition = composed(capture.path, mode="human")
-    model, masked = composition.model, composition.capture
-    frame = masked.train_frames[3]
-    assert (len(model.scene), {*composition.densify}) == (0, {"human"})
-    inside = (capture.mask(frame) > 0.5)[..., None]
-    assert torch.equal(masked.image(frame), capture.image(frame) * inside)
-
-    step, terms = step_of(composition, masked, frame)
-    assert {*terms} == {"human_l1", "human_dssim", "skinning"}
-    generator = torch.Generator().manual_seed(0)
-    generator.set_state(composed(capture.path, mode="human").generator.get_state())
-    colour = torch.rand(3, generator=generator)
-    # The same Gaussians drawn over the colour itself.
-    behind = torch.cat([colour, torch.zeros(1)])
-    alone = render(step.posed.moving(), capture.camera(frame), background=behind)
-    alone = alone.image[0, ..., :3].detach().clamp(0, 1)
-    expected = torch.where(inside, capture.image(frame), colour)
-    l1 = (alone - expected).abs().sum() / inside.sum()
-    torch.testing.assert_close(terms["human_l1"], l1, rtol=1e-3, atol=1e-5)
-    dssim = (1 - ssim(alone, expected)) * inside.float().mean()
-    torch.testing.assert_close(terms["human_dssim"], dssim, rtol=1e-3, atol=1e-5)
-
-
-def test_a_run_of_the_person_alone_is_drawn_on_black_and_measured_as_such(tiny_capture, tmp_path):
-    path = tiny_capture(frames=10)
-    settings = ("mode=human", "human.count=80", "triplane.resolution=16", "fit.steps=5")
-    run = load_run(
-        train(path, method="hugs", out=tmp_path / "run", iterations=20, overrides=settings)
-    )
-    assert run.human_only and run.gaussians["scene"] == 0
-    frame = run.capture.test_frames[0]
-    whole, scene = (
-        run.reconstruction.render(run.capture.camera(frame), [frame.mid_us], parts=parts)
-        for parts in ("all", "scene")
-    )
-    assert float(whole.rgb.amax()) > 0 and float(scene.rgb.abs().amax()) == 0
-    torch.testing.assert_close(whole.alpha, whole.human)
-
-
 def test_every_set_of_parameters_learns(tiny_capture):
     capture = load_capture(tiny_capture(frames=10))
-    composition = composed(capture.path, scene=SMALL["scene"] | {"sh_degree": 1})
+    composition = composed(capture.path, "sh_degree=1")
     model = composition.model
     model.scene.directional.data += 0.01
     before = {n: p.detach().clone() for n, p in model.named_parameters()}
@@ -148,8 +96,7 @@ def test_squares_lie_in_the_picture_and_mostly_on_the_person():
     assert draw_squares(torch.zeros(40, 30, dtype=torch.bool), generator)[0][1] == slice(0, 30)
 
 
-@pytest.mark.parametrize("rescaled", [True, False])
-def test_released_code_gives_the_perceptual_distance_unscaled_pictures(rescaled):
+def test_the_perceptual_distance_sees_pictures_between_minus_one_and_one():
     seen = []
 
     def metric(image, reference):
@@ -158,49 +105,27 @@ def test_released_code_gives_the_perceptual_distance_unscaled_pictures(rescaled)
 
     pictures = torch.rand(2, 40, 40, 3).round()
     generator = torch.Generator().manual_seed(0)
-    Perceptual(metric, rescaled=rescaled)(*pictures, torch.ones(40, 40), generator)
-    assert (min(seen), max(seen)) == ((-1.0, 1.0) if rescaled else (0.0, 1.0))
+    Perceptual(metric)(*pictures, torch.ones(40, 40), generator)
+    assert (min(seen), max(seen)) == (-1.0, 1.0)
 
 
-@pytest.mark.parametrize("shifted", [True, False])
-def test_released_code_gives_the_scene_gradients_of_rows_shifted_by_the_person(shifted):
-    def layer(values):
-        offset = torch.zeros(1, len(values), 2, requires_grad=True)
-        offset.grad = torch.tensor(values)[None, :, None].expand(1, -1, 2)
-        return SimpleNamespace(centers2d_offset=offset)
-
-    posed = SimpleNamespace(human_opacities=torch.zeros(2), scene_opacities=torch.zeros(3))
-    drawing = HugsDrawing(
-        rgb=(), semantic=(), output=None, posed=posed, moving=layer([1.0, 2.0]),
-        static=layer([3.0, 4.0, 5.0]), decoded=None, shifted=shifted,
-    )  # fmt: skip
-    human, scene = drawing.center_gradients()
-    assert human[0, :, 0].tolist() == [1.0, 2.0]
-    assert scene[0, :, 0].tolist() == ([1.0, 2.0, 3.0] if shifted else [3.0, 4.0, 5.0])
-
-
-def test_release_compatible_repeats_the_other_slips(tiny_capture):
-    path = tiny_capture(frames=10)
-    repaired, released = composed(path), composed(path, release_compatible=True)
-    for composition, slip in ((repaired, False), (released, True)):
-        model, learning = composition.model, composition.learning
-        model.nominal.fill_(2_500)
-        assert model.active_degree == (0 if slip else 2)
-        learned = {id(p) for network in learning.networks for p in network.parameters}
-        assert id(model.turns) in learned
-        assert (id(model.shifts) in learned) == (not slip)
-        # A static camera is no distance away from itself: nothing moves, everything is split.
-        scene = composition.densify["scene"]
-        assert (learning.rows["scene"]["means"].rate.start == 0) == slip
-        assert (scene.split_above_m == 0) == slip
-        assert scene.opacity_reset == ((500,) if slip else ())
+def test_scene_harmonics_come_one_degree_at_a_time_and_poses_are_corrected(tiny_capture):
+    composition = composed(tiny_capture(frames=10))
+    model, learning = composition.model, composition.learning
+    for nominal, degree in ((0, 0), (999, 0), (1_000, 1), (2_500, 2), (9_000, 3)):
+        model.nominal.fill_(nominal)
+        assert model.active_degree == degree
+    learned = {id(p) for network in learning.networks for p in network.parameters}
+    assert {id(model.turns), id(model.shifts)} <= learned
+    # A static camera is no distance away from itself: lengths are those of the cube.
+    assert learning.rows["scene"]["means"].rate.start > 0
+    assert composition.densify["scene"].split_above_m > 0
 
 
 def test_a_backdrop_is_not_densified_and_hardly_moves(tiny_capture):
     path = tiny_capture(frames=10)
     cube, backdrop = (
-        composed(path, scene=SMALL["scene"] | {"kind": kind})
-        for kind in ("random_cube", "median_backdrop")
+        composed(path, f"scene.kind={kind}") for kind in ("random_cube", "median_backdrop")
     )
     assert {*cube.densify} == {"human", "scene"}
     assert {*backdrop.densify} == {"human"}
@@ -211,7 +136,7 @@ def test_a_backdrop_is_not_densified_and_hardly_moves(tiny_capture):
 def test_a_scene_colour_has_the_harmonics_that_are_asked_for(tiny_capture):
     path = tiny_capture()
     assert composed(path).model.scene.directional.shape[1] == 0  # one static camera
-    scene = composed(path, scene=SMALL["scene"] | {"sh_degree": 3}).model.scene
+    scene = composed(path, "sh_degree=3").model.scene
     center = torch.tensor([0.1, 0.2, -3.0])
     constant = scene.rgb(center, 3)
     torch.nn.init.normal_(scene.directional)
@@ -225,7 +150,7 @@ def test_points_that_no_camera_sees_are_left_out(tiny_capture):
     capture = load_capture(path)
     camera = capture.camera(capture.frames[0])
     pixels, depth = camera.project(scene.means.detach())
-    assert 0 < len(scene) < SMALL["scene"]["cube_count"]
+    assert 0 < len(scene) < 600
     assert (depth > 0).all()
     assert (pixels[:, 0].abs() < 1.2 * camera.width).all()
 
@@ -271,11 +196,8 @@ def test_a_resumed_run_goes_on_as_the_uninterrupted_one(tiny_capture):
 
 def test_a_run_is_drawn_after_loading_and_its_sets_densify(tiny_capture, tmp_path):
     path = tiny_capture(frames=10)
-    settings = ("human.count=80", "triplane.resolution=16", "triplane.channels=8", "fit.steps=5")
-    out = train(
-        path, method="hugs", out=tmp_path / "run", iterations=30,
-        overrides=(*settings, "scene.cube_count=600", "densify_human.gradient=1e-7"),
-    )  # fmt: skip
+    settings = small("hugs", "fit_steps=5", "densify.gradient=1e-7")
+    out = train(path, method="hugs", out=tmp_path / "run", iterations=30, overrides=settings)
     run = load_run(out)
     assert run.gaussians["human"] > 80
     tensors, _ = load_checkpoint(latest_checkpoint(out / "checkpoints"))

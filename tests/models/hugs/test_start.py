@@ -7,7 +7,7 @@ from evsplat.body import skin
 from evsplat.body.rotations import matrix_to_six, six_to_matrix
 from evsplat.capture import load_body_track, load_capture
 from evsplat.models.hugs.human import TriplaneHuman
-from evsplat.models.hugs.start import START_OPACITY, body_weights, facing, fit_to_body
+from evsplat.models.hugs.start import START_OPACITY, body_weights, fit_to_body
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -18,17 +18,6 @@ def test_six_numbers_make_a_rotation_and_hold_any(seed):
     torch.testing.assert_close(matrices @ matrices.mT, eye)
     torch.testing.assert_close(torch.linalg.det(matrices), torch.ones(20, dtype=torch.float64))
     torch.testing.assert_close(six_to_matrix(matrix_to_six(matrices)), matrices)
-
-
-def test_facing_turns_z_to_the_normal_by_the_shortest_way():
-    torch.manual_seed(0)
-    normals = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
-    normals = torch.cat([normals, torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])])
-    matrices = facing(normals)
-    torch.testing.assert_close(matrices[..., 2], normals)
-    torch.testing.assert_close(matrices @ matrices.mT, torch.eye(3).expand(52, 3, 3))
-    # The shortest turn's trace is 1 + 2 cos of the angle between z and the normal.
-    torch.testing.assert_close(matrices.diagonal(dim1=1, dim2=2).sum(-1), 1 + 2 * normals[:, 2])
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -5,9 +5,14 @@ import math
 import pytest
 import torch
 
-from evsplat.models.networks.colour import HumanColour, SceneColour, view_jitter
+from evsplat.models.networks.colour import (
+    HumanColour,
+    SceneColour,
+    beside_basis,
+    view_directions,
+    view_jitter,
+)
 from evsplat.models.networks.spherical_harmonics import sh_basis
-from evsplat.models.networks.colour import beside_basis, view_directions
 
 
 def unit(*shape, seed=0, dtype=torch.float32):
@@ -48,31 +53,18 @@ def test_human_colour_gradcheck():
     assert torch.autograd.gradcheck(lambda *a: network(*a[:4]), (*leaves, *network.parameters()))
 
 
-def test_scene_colour_without_view_dependence_ignores_the_direction():
+def test_scene_colour_sees_the_direction_unless_it_is_hidden():
     torch.manual_seed(2)
-    features = torch.randn(9, 32)
-    fixed, seeing = SceneColour(view_dependent=False), SceneColour()
+    network, features = SceneColour(), torch.randn(9, 32)
     one, other = unit(9, 3, seed=1), unit(9, 3, seed=2)
-    assert torch.equal(fixed(features, one), fixed(features, other))
-    assert (seeing(features, one) - seeing(features, other)).abs().max() > 1e-3
-    assert sum(p.numel() for p in seeing.parameters()) == 47 * 64 + 64 + 64 * 65 + 65 * 3
-
-
-def test_direction_dropout_acts_in_training_only_and_at_its_rate():
-    torch.manual_seed(3)
-    network = SceneColour(direction_dropout=0.3)
-    features, directions = torch.randn(1, 32).expand(4_000, -1), unit(1, 3).expand(4_000, -1)
-    network.eval()
-    still = network(features, directions)
-    assert (still == still[0]).all()
-    network.train()
-    dropped = (network(features, directions) - still[0]).abs().amax(-1) > 1e-6
-    assert abs(dropped.float().mean().item() - 0.3) < 0.03
-    blind = SceneColour(direction_dropout=1.0)
-    blind.load_state_dict(network.state_dict())
-    assert torch.allclose(network(features, directions)[dropped][0], blind(features, directions)[0])
-    with pytest.raises(ValueError, match="expected 0..1"):
-        SceneColour(direction_dropout=1.5)
+    assert (network(features, one) - network(features, other)).abs().max() > 1e-3
+    assert sum(p.numel() for p in network.parameters()) == 47 * 64 + 64 + 64 * 65 + 65 * 3
+    # A direction of zero says nothing: the colour is that of the features alone.
+    mlp = network.mlp
+    hidden = features @ mlp.point_weight[:, :32].T + mlp.first_bias
+    for w, b in zip(mlp.weights, mlp.biases, strict=True):
+        hidden = torch.nn.functional.leaky_relu(hidden, 0.01) @ w.T + b
+    assert torch.allclose(network(features, torch.zeros(9, 3)), hidden.sigmoid(), atol=1e-6)
 
 
 def test_scene_colour_gradcheck():

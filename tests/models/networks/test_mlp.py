@@ -144,7 +144,8 @@ def test_every_simd_level_agrees(level):
     if level not in native_levels():
         pytest.skip(f"this processor has no {level}")
     code = (
-        "import evsplat, torch; from evsplat.models.networks.mlp import PointMLP; torch.manual_seed(0);"
+        "import evsplat, torch; from evsplat.models.networks.mlp import PointMLP;"
+        "torch.manual_seed(0);"
         "n = PointMLP(9, 4, 5, width=23, depth=2, out=6); p = torch.randn(130, 9).requires_grad_();"
         "o = n(p, torch.randn(2, 4), torch.randn(2, 130, 5)); o.square().sum().backward();"
         "print(float(o.double().norm()), float(p.grad.double().norm()))"

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from evsplat.models.networks.one_blob import OneBlobEncoding
 from evsplat.models.networks.non_rigid import NonRigid, NonRigidNetwork
+from evsplat.models.networks.one_blob import OneBlobEncoding
 
 
 def test_start_changes_almost_nothing_unless_asked_for():

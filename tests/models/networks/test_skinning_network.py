@@ -7,8 +7,8 @@ import torch
 
 from evsplat.body import bounding_box, default_body
 from evsplat.body.canonical import SMPL_PARENTS
-from evsplat.models.networks.skinning_network import HierarchicalSoftmax, SkinningNetwork
 from evsplat.errors import DataError
+from evsplat.models.networks.skinning_network import HierarchicalSoftmax, SkinningNetwork
 
 
 def smpl_rule(x):

@@ -1,4 +1,4 @@
-"""Opening pose files: what is inside, without running any of it."""
+"""Opening pose files without running anything that is in them."""
 
 import io
 import re
@@ -31,7 +31,7 @@ class Document:
 
 @dataclass(frozen=True)
 class Request:
-    """What the caller wants from the files."""
+    """Wishes of the caller of `read_poses`."""
 
     path: Path
     person: str | int | None = None
@@ -73,7 +73,7 @@ def pose_paths(path: Path) -> list[Path]:
 
 
 def open_document(path: Path) -> Document:
-    """Read one file.
+    """The content of one file.
 
     Raises:
         DataError: missing, damaged, of an unknown kind, or holding pickled types other than arrays,

@@ -16,17 +16,17 @@ from evsplat.errors import DataError
 
 _KEYS = ("Rh", "Th", "poses", "shapes")
 _MODELS = {72: "smpl", 69: "smpl", 78: "smplh", 156: "smplh", 87: "smplx", 165: "smplx"}
-"""By numbers of ``poses``; 78 and 87 end in hand components that need the model."""
+"""Model by the size of ``poses``; 78 and 87 end in hand components that need the model."""
 
 
 def fits(content: Any) -> bool:
-    """Whether the content is that of EasyMocap or ZJU-MoCap."""
+    """True for people with root, poses and shapes as EasyMocap and ZJU-MoCap name them."""
     people = _people(content)
     return bool(people) and all(has(entry, *_KEYS) for entry in people)
 
 
 def read(documents: list[Document], request: Request) -> PoseSequence:
-    """In the world of the calibrated cameras."""
+    """Poses in the world of the calibrated cameras."""
     where = str(request.path)
     seen: dict[str, list[tuple[Document, dict]]] = {}
     for document in documents:

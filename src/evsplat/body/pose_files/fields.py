@@ -10,8 +10,17 @@ from evsplat.errors import DataError
 
 
 def has(content: Any, *keys: str) -> bool:
-    """Whether ``content`` is a mapping with all the keys."""
+    """True for a mapping with all the keys."""
     return isinstance(content, Mapping) and all(key in content for key in keys)
+
+
+def all_have(content: Any, *keys: str) -> bool:
+    """True for a dictionary of one or more entries that all have the keys."""
+    return (
+        isinstance(content, dict)
+        and bool(content)
+        and all(has(entry, *keys) for entry in content.values())
+    )
 
 
 def numbers(
@@ -46,7 +55,7 @@ def numbers(
 
 
 def whole_numbers(content: Any, key: str, count: int, where: str) -> np.ndarray:
-    """``count`` frame indices."""
+    """A field of ``count`` whole numbers, such as frame indices."""
     values = numbers(content, key, (count,), where, flat=True)
     if (values != np.rint(values)).any():
         raise DataError(f"{where}: {key} holds fractions, expected whole numbers.")
@@ -60,6 +69,11 @@ def axis_angles(matrices: np.ndarray, where: str) -> np.ndarray:
     if off > 1e-2 or (np.linalg.det(flat) < 0).any():
         raise DataError(f"{where}: holds matrices that are no rotations (off by {off:.2g}).")
     return Rotation.from_matrix(flat).as_rotvec().reshape(*matrices.shape[:-2], 3)
+
+
+def pinhole(focal_px: float, width: float, height: float) -> np.ndarray:
+    """Intrinsics (3, 3) with the principal point in the middle of the picture."""
+    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
 
 
 def choose_person(people: Mapping[str, int], person: str | int | None, where: str) -> str:

@@ -14,12 +14,12 @@ _CAMERA, _WORLD = "smpl_params_incam", "smpl_params_global"
 
 
 def fits(content: Any) -> bool:
-    """Whether the content is that of GVHMR."""
+    """True for GVHMR's ``hmr4d_results.pt``."""
     return has(content, _CAMERA, _WORLD)
 
 
 def read(documents: list[Document], request: Request) -> PoseSequence:
-    """In the camera, or (``world``) in the static world with y up and the camera in it."""
+    """Poses in the camera, or (``world``) in the static world with y up and the camera in it."""
     content, where = documents[0].content, str(documents[0].path)
     poses, transl, betas = _parameters(content, _CAMERA, where)
     count, cameras = len(poses), None
@@ -67,7 +67,7 @@ def _cameras(
     world_transl: np.ndarray,
     pelvis: np.ndarray,
 ) -> np.ndarray:
-    """World to camera (T, 4, 4): what takes the body of the one set to that of the other."""
+    """World to camera (T, 4, 4), which takes the body in the world to that in the camera."""
     root, world_root = (Rotation.from_rotvec(p[:, 0]) for p in (poses, world_poses))
     cameras = np.tile(np.eye(4), (len(poses), 1, 1))
     turn = (root * world_root.inv()).as_matrix()

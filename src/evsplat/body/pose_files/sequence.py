@@ -42,7 +42,7 @@ class PoseSequence:
     world_to_camera: Float[np.ndarray, "T 4 4"] | None = None
     """Per frame, where the file has cameras and the world is not the camera."""
     notes: tuple[str, ...] = ()
-    """What the file could not say, one sentence each."""
+    """Gaps of the file, one sentence each."""
 
     def times_us(self, fps: float | None = None, start_us: int = 0) -> Int[np.ndarray, "T"]:
         """Times of the poses at a constant frame rate; ``start_us`` is the time of frame 0."""

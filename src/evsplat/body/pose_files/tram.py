@@ -6,24 +6,18 @@ from typing import Any
 import numpy as np
 
 from evsplat.body.pose_files.documents import Document, Request, open_document
-from evsplat.body.pose_files.fields import (
-    axis_angles,
-    choose_person,
-    has,
-    numbers,
-    whole_numbers,
-)
+from evsplat.body.pose_files.fields import axis_angles, choose_person, has, numbers, whole_numbers
 from evsplat.body.pose_files.sequence import PoseSequence, make_sequence, moved
 from evsplat.errors import DataError
 
 
 def fits(content: Any) -> bool:
-    """Whether the content is that of TRAM."""
+    """True for a person's ``hps_track_<k>.npy``."""
     return has(content, "pred_rotmat", "pred_trans", "pred_shape", "frame")
 
 
 def read(documents: list[Document], request: Request) -> PoseSequence:
-    """In the camera, or (``world``) in the world of its SLAM with the moving camera in it."""
+    """Poses in the camera, or (``world``) in the world of its SLAM with the moving camera in it."""
     people = {str(document.number): np.size(document.content["frame"]) for document in documents}
     person = choose_person(people, request.person, str(request.path))
     document = next(document for document in documents if str(document.number) == person)

@@ -15,18 +15,18 @@ _HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class Format:
-    """How a format is recognised, and where its reader is."""
+    """Name, recognition and reader of a format."""
 
     name: str
     matches: Callable[[bytes], bool]
-    """Whether a file that begins with these bytes is of this format."""
+    """True for the first bytes of a file of this format."""
     reader: str
     """``module:class``, imported at first use."""
     is_stream: bool = True
     """Read from the first byte to the last, so that it may be gzipped."""
 
     def open(self, path: Path, options: ReadOptions, damage: Damage) -> Source:
-        """Read the header."""
+        """The recording, its header read."""
         module, name = self.reader.split(":")
         source: Source = getattr(import_module(f"{__name__}.{module}"), name)(path, options, damage)
         return source

@@ -12,12 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import (
-    ByteReader,
-    Damage,
-    RawEvents,
-    Source,
-)
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
 from evsplat.options import ReadOptions
 
 MAGIC = b"#!AER-DAT2.0"
@@ -30,7 +25,7 @@ _PAIR = np.dtype([("address", ">u4"), ("t", ">i4")])
 
 @dataclass(frozen=True)
 class _Chip:
-    """How an address says the pixel: columns count from the right, rows from the bottom."""
+    """Layout of an address: columns count from the right, rows from the bottom."""
 
     width: int
     height: int
@@ -58,7 +53,7 @@ _CHIPS = {
 
 
 class Aedat2(Source):
-    """An AEDAT2 file."""
+    """An AEDAT2 file; polarity events alone are read."""
 
     def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
         self._path = path
@@ -82,12 +77,10 @@ class Aedat2(Source):
 
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte at a time."""
-        chip, size = self._chip, _PAIR.itemsize
+        chip = self._chip
         with ByteReader(self._path) as reader:
             reader.skip_to(self._start)
-            while data := reader.read(_READ_EVENTS * size):
-                whole = len(data) // size * size
-                pairs = np.frombuffer(data[:whole] if whole < len(data) else data, _PAIR)
+            for pairs in reader.records(_PAIR, _READ_EVENTS, self._damage):
                 address = pairs["address"].astype(np.uint32)
                 keep = (address & chip.not_polarity) == 0
                 address = address[keep]
@@ -99,11 +92,6 @@ class Aedat2(Source):
                     chip.height - 1 - y,
                     (address & chip.polarity) == chip.brighter,
                 )
-                if whole < len(data):
-                    self._damage.found(
-                        f"ends in the middle of an event at byte {reader.offset}",
-                        repaired_by="keeps the events before the cut",
-                    )
 
     def _read_header(self) -> str:
         """The lines that begin with #, decoded; remembers where they end."""

@@ -21,7 +21,6 @@ from evsplat.events.formats.base import (
     RecordedFrame,
     Source,
 )
-from evsplat.events.formats.flatbuffer import FlatbufferError, Table
 from evsplat.options import ReadOptions
 
 MAGIC = b"#!AER-DAT4.0\r\n"
@@ -66,8 +65,8 @@ class Aedat4(Source):
         """Packets of the event stream."""
         for offset, data in self._packets(self._events, b"EVTS"):
             try:
-                elements = Table.root(data, 4).vector(0, _EVENT.itemsize)
-            except FlatbufferError as error:
+                elements = _Table.root(data, 4).vector(0, _EVENT.itemsize)
+            except _FlatbufferError as error:
                 self._broken(offset, str(error))
                 continue
             events = np.frombuffer(elements, dtype=_EVENT)
@@ -79,8 +78,8 @@ class Aedat4(Source):
             return
         for offset, data in self._packets(self._frames, b"FRME"):
             try:
-                frame = _frame(Table.root(data, 4))
-            except (FlatbufferError, ValueError) as error:
+                frame = _frame(_Table.root(data, 4))
+            except (_FlatbufferError, ValueError) as error:
                 self._broken(offset, str(error))
                 continue
             yield frame
@@ -95,10 +94,10 @@ class Aedat4(Source):
             self._first_packet = reader.offset
         try:
             if len(data) < size or not size:
-                raise FlatbufferError(f"{size} bytes announced, {len(data)} there")
-            table = Table.root(data)
+                raise _FlatbufferError(f"{size} bytes announced, {len(data)} there")
+            table = _Table.root(data)
             return table.integer(0, "i"), table.integer(1, "q", -1), bytes(table.vector(2, 1))
-        except FlatbufferError as error:
+        except _FlatbufferError as error:
             raise DataError(f"{self.path}: its AEDAT4 header is damaged ({error}).") from None
 
     def _streams(self, description: bytes) -> _Streams:
@@ -164,7 +163,7 @@ class Aedat4(Source):
         )
 
 
-def _frame(table: Table) -> RecordedFrame:
+def _frame(table: "_Table") -> RecordedFrame:
     start, end, timestamp = table.integer(3, "q"), table.integer(4, "q"), table.integer(0, "q")
     if not start and not end:
         # dv-processing writes the middle of the exposure and its length instead
@@ -227,3 +226,56 @@ def _lz4(payload: bytes) -> bytes:
     if not unpacker.eof:
         raise ValueError("it ends early or unpacks to more than a packet can hold")
     return data
+
+
+class _FlatbufferError(ValueError):
+    """An offset leads outside of the buffer."""
+
+
+class _Table:
+    """A table of a FlatBuffers buffer, fields numbered as in the schema, every offset checked.
+
+    Layout: https://flatbuffers.dev/internals/. The official package trusts its offsets, which a
+    damaged file cannot be read with.
+    """
+
+    def __init__(self, data: bytes, position: int) -> None:
+        self._data = data
+        self._position = position
+        self._vtable = position - self._unpack("<i", position)
+        self._vtable_size = self._unpack("<H", self._vtable)
+
+    @classmethod
+    def root(cls, data: bytes, start: int = 0) -> "_Table":
+        """The table that the buffer at ``start`` (after a size prefix) begins with."""
+        if start + 4 > len(data):
+            raise _FlatbufferError("the buffer ends early")
+        return cls(data, start + struct.unpack_from("<I", data, start)[0])
+
+    def integer(self, index: int, code: str, default: int = 0) -> int:
+        """A scalar field; ``code`` is that of `struct`, without byte order."""
+        at = self._field(index)
+        return default if at is None else self._unpack(f"<{code}", at)
+
+    def vector(self, index: int, item_bytes: int) -> memoryview:
+        """The bytes of a vector (or string, ``item_bytes=1``); empty where the field is absent."""
+        at = self._field(index)
+        if at is None:
+            return memoryview(b"")
+        start = at + self._unpack("<I", at)
+        size = self._unpack("<I", start) * item_bytes
+        if start + 4 + size > len(self._data):
+            raise _FlatbufferError(f"a vector of {size} bytes does not fit in the buffer")
+        return memoryview(self._data)[start + 4 : start + 4 + size]
+
+    def _field(self, index: int) -> int | None:
+        slot = 4 + 2 * index
+        if slot + 2 > self._vtable_size:
+            return None
+        offset = self._unpack("<H", self._vtable + slot)
+        return self._position + offset if offset else None
+
+    def _unpack(self, code: str, position: int) -> int:
+        if position < 0 or position + struct.calcsize(code) > len(self._data):
+            raise _FlatbufferError(f"an offset leads to byte {position} of {len(self._data)}")
+        return struct.unpack_from(code, self._data, position)[0]

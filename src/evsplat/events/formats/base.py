@@ -1,10 +1,12 @@
-"""What readers of recordings share: options, raw blocks, bytes with an offset, damage."""
+"""Parts that readers of recordings share: options, raw blocks, bytes with an offset, damage."""
 
 import gzip
 import os
+import re
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -13,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evsplat.errors import DataError
+from evsplat.safe_pickle import BROKEN
 
 BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
@@ -61,7 +64,7 @@ class Source(ABC):
 
 @dataclass
 class Damage:
-    """What is wrong with a recording: an error by default, a counted repair where asked for."""
+    """Faults of a recording: an error by default, a counted repair where asked for."""
 
     path: Path
     repair: bool
@@ -135,9 +138,30 @@ class ByteReader:
         self.offset += len(line)
         return line
 
+    def records(self, kind: np.dtype, most: int, damage: Damage) -> Iterator[np.ndarray]:
+        """Events of a fixed size to the end of the file, at most ``most`` at a time."""
+        while data := self.read(most * kind.itemsize):
+            whole = len(data) // kind.itemsize * kind.itemsize
+            yield np.frombuffer(data[:whole] if whole < len(data) else data, kind)
+            if whole < len(data):
+                damage.found(
+                    f"ends in the middle of an event at byte {self.offset}",
+                    repaired_by="keeps the events before the cut",
+                )
+
+
+@contextmanager
+def broken_as_data_error(path: Path, fault: str) -> Iterator[None]:
+    """Errors that damaged files cause in other libraries as a `DataError` that begins so."""
+    try:
+        yield
+    except BROKEN as error:
+        reason = re.sub(r"\s+", " ", str(error))[:200]
+        raise DataError(f"{path}: {fault} ({reason}).") from None
+
 
 def is_gzipped(path: Path) -> bool:
-    """Whether the file is a gzip file, whatever its name."""
+    """True for a gzip file, whatever its name."""
     with ByteReader(path) as reader:
         return reader.zipped
 

@@ -22,7 +22,7 @@ class _Block(NamedTuple):
     """Index of its first event in the file."""
     stream: EventStream
     rising: bool
-    """Whether its times are known to be in order, from the event before it on."""
+    """True where its times are known to be in order, from the event before it on."""
 
 
 def checked(
@@ -202,26 +202,16 @@ def _sorted(blocks: Iterable[_Block], damage: Damage) -> Iterator[EventStream]:
                 repaired_by="leaves out events too late to be sorted in",
                 count=len(block) - int(on_time.sum()),
             )
-            block = _pick(block, on_time)
-        merged = block if held is None else _join(held, block)
+            block = block.take(on_time)
+        merged = block if held is None else EventStream.joined([held, block])
         falls = int((np.diff(merged.t) < 0).sum())
         if falls:
             damage.found("events out of order", repaired_by=_SORTS, count=falls)
-            merged = _pick(merged, np.argsort(merged.t, kind="stable"))
+            merged = merged.take(np.argsort(merged.t, kind="stable"))
         ready = max(0, len(merged) - BLOCK_EVENTS)
         if ready:
             last_us = int(merged.t[ready - 1])
-            yield _pick(merged, slice(0, ready))
-        held = _pick(merged, slice(ready, None))
+            yield merged.take(slice(0, ready))
+        held = merged.take(slice(ready, None))
     if held is not None and len(held):
         yield held
-
-
-def _pick(stream: EventStream, which: np.ndarray | slice) -> EventStream:
-    return EventStream(stream.t[which], stream.x[which], stream.y[which], stream.p[which])
-
-
-def _join(a: EventStream, b: EventStream) -> EventStream:
-    return EventStream(
-        *(np.concatenate([getattr(a, n), getattr(b, n)]) for n in ("t", "x", "y", "p"))
-    )

@@ -7,12 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import (
-    ByteReader,
-    Damage,
-    RawEvents,
-    Source,
-)
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
 

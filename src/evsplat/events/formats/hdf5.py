@@ -18,9 +18,9 @@ from evsplat.events.formats.base import (
     Damage,
     RawEvents,
     Source,
+    broken_as_data_error,
 )
-from evsplat.events.formats.columns import match_names
-from evsplat.events.formats.table import NO_POLARITY, Table, table_order
+from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
 from evsplat.options import ReadOptions
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -34,7 +34,7 @@ _MAX_EVENTS_PER_BYTE = 4096
 
 @dataclass(frozen=True)
 class _Column:
-    """Where a component is: a dataset, and perhaps a field or a column of it."""
+    """Place of a component: a dataset, and perhaps a field or a column of it."""
 
     dataset: str
     field: str | None = None
@@ -88,7 +88,7 @@ class Hdf5(Source):
         return {key: column.read(file, part) for key, column in self._columns.items()}
 
     def _any_polarity(self, file: h5py.File) -> bool:
-        """Whether an event after the first slice has a polarity other than 0."""
+        """True where an event after the first slice has a polarity other than 0."""
         if "p" not in self._columns:
             return False
         starts = range(BLOCK_EVENTS, self._count, BLOCK_EVENTS)
@@ -193,19 +193,8 @@ def _size(file: h5py.File) -> tuple[int | None, int | None]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (
-        OSError,
-        KeyError,
-        ValueError,
-        TypeError,
-        RuntimeError,
-        AttributeError,
-        IndexError,
-        OverflowError,
-        MemoryError,
-    ) as error:
-        reason = re.sub(r"\s+", " ", str(error))[:200]
-        raise DataError(f"{path}: its HDF5 content cannot be read ({reason}).") from None
+    with (
+        broken_as_data_error(path, "its HDF5 content cannot be read"),
+        h5py.File(path, "r") as file,
+    ):
+        yield file

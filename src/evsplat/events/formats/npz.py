@@ -1,11 +1,7 @@
 """.npz and .npy files with one array per component, or one table of them; never unpickled."""
 
-import re
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -17,9 +13,9 @@ from evsplat.events.formats.base import (
     Damage,
     RawEvents,
     Source,
+    broken_as_data_error,
 )
-from evsplat.events.formats.columns import match_names
-from evsplat.events.formats.table import Table, table_order
+from evsplat.events.formats.table import Table, match_names, table_order
 from evsplat.options import ReadOptions
 
 _READ_BYTES = 1 << 22
@@ -84,7 +80,7 @@ def _components(
 
 
 def _load(path: Path) -> dict[str, np.ndarray]:
-    with _as_data_error(path):
+    with broken_as_data_error(path, "not a readable NumPy file"):
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 arrays = {}
@@ -118,26 +114,3 @@ def _read_array(file: IO[bytes], size: int) -> np.ndarray:
         raise ValueError(f"an array of {expected} bytes is announced, {len(data)} are there")
     array = np.frombuffer(data, dtype=dtype)
     return array.reshape(shape, order="F" if fortran else "C")
-
-
-@contextmanager
-def _as_data_error(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (
-        OSError,
-        EOFError,
-        ValueError,
-        TypeError,
-        SyntaxError,
-        KeyError,
-        NotImplementedError,
-        RuntimeError,
-        MemoryError,
-        OverflowError,
-        tokenize.TokenError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
-        reason = re.sub(r"\s+", " ", str(error))[:200]
-        raise DataError(f"{path}: not a readable NumPy file ({reason}).") from None

@@ -10,12 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import (
-    ByteReader,
-    Damage,
-    RawEvents,
-    Source,
-)
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
 
@@ -104,7 +99,7 @@ class Raw(Source):
             self.notes.append(f"{decoder.untimed:,} {note}")
 
     def _layout_of_evt21(self, details: str) -> str:
-        """Which half of a word holds the type: the header says, or else the words do."""
+        """The half of a word that holds the type, by the header or else by the words."""
         if "endianness=legacy" in details:
             return "evt21_swapped"
         if "endianness=little" in details:
@@ -124,7 +119,7 @@ class Raw(Source):
 
 
 def _plausibility(heads: np.ndarray, rests: np.ndarray) -> tuple[bool, int]:
-    """Whether all heads have a type, and how many are times, whose other half is empty.
+    """True where all heads have a type, and the count of times, whose other half is empty.
 
     Read the wrong way round, a time would be an event at (0, 0) with the highest of its 32 bits.
     """
@@ -154,12 +149,9 @@ class Dat(Source):
 
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte at a time."""
-        size = _DAT_EVENT.itemsize
         with ByteReader(self._path) as reader:
             reader.skip_to(self._start)
-            while data := reader.read(_DAT_READ_EVENTS * size):
-                whole = len(data) // size * size
-                events = np.frombuffer(data[:whole] if whole < len(data) else data, _DAT_EVENT)
+            for events in reader.records(_DAT_EVENT, _DAT_READ_EVENTS, self._damage):
                 pixel = events["pixel"]
                 yield RawEvents(
                     events["t"].astype(np.int64),
@@ -167,8 +159,3 @@ class Dat(Source):
                     (pixel >> 14 & 0x3FFF).astype(np.uint16),
                     pixel >> 28 & 1,
                 )
-                if whole < len(data):
-                    self._damage.found(
-                        f"ends in the middle of an event at byte {reader.offset}",
-                        repaired_by="keeps the events before the cut",
-                    )

@@ -15,12 +15,7 @@ from typing import Any
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import (
-    Damage,
-    RawEvents,
-    Source,
-    peek,
-)
+from evsplat.events.formats.base import Damage, RawEvents, Source, peek
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
 
@@ -102,10 +97,10 @@ class _Message:
     width: int
     height: int
     encoding: str
-    """Of a packet; empty for an array."""
+    """Encoding of a packet; empty for an array."""
     events: bytes
     kind: np.dtype
-    """Of an event of an array."""
+    """Layout of an event of an array."""
 
 
 def _array(message: _Message) -> RawEvents:

@@ -7,14 +7,14 @@ import numpy as np
 
 from evsplat import compiled
 from evsplat.errors import BackendError, DataError
-from evsplat.events.formats.base import (
-    ByteReader,
-    Damage,
-    RawEvents,
-    Source,
+from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
+from evsplat.events.formats.table import (
+    NO_POLARITY,
+    guess_time_unit,
+    match_names,
+    table_order,
+    to_polarity,
 )
-from evsplat.events.formats.columns import guess_time_unit, match_names
-from evsplat.events.formats.table import NO_POLARITY, table_order, to_polarity
 from evsplat.events.formats.text_layout import MAX_LINE_BYTES, inspect_text
 from evsplat.options import ReadOptions
 
@@ -108,7 +108,7 @@ class Text(Source):
         return ["" if name == _PASSED_OVER else name for name in given]
 
     def _find_unit(self, column: int) -> str:
-        """By how the times of the first lines are written."""
+        """The time unit, guessed from the times of the first lines."""
         times = self._file.sample[:, column]
         whole = not len(times) or self._file.whole_times[column]
         unit = guess_time_unit(times.astype(np.int64) if whole else times)
@@ -117,7 +117,7 @@ class Text(Source):
         return unit
 
     def _any_polarity(self) -> bool:
-        """Whether an event anywhere has a polarity other than 0; reads until the first."""
+        """True where an event has a polarity other than 0; reads until the first such."""
         return not len(self._file.sample) or any(p.any() for _, _, _, p in self._parsed())
 
     def _parsed(self) -> Iterator[np.ndarray]:

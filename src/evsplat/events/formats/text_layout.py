@@ -1,4 +1,4 @@
-"""What a text file of events looks like: its header, its delimiter, the names of its columns."""
+"""Layout of a text file of events: its header, its delimiter, the names of its columns."""
 
 import re
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ _DELIMITERS = (b",", b";")
 
 @dataclass(frozen=True)
 class TextFile:
-    """The shape of a text file."""
+    """Layout and first lines of a text file."""
 
     delimiter: str
-    """Between fields; empty: any white space."""
+    """Separator of fields; empty: any white space."""
     fields: int
-    """Per line."""
+    """Fields per line."""
     first_byte: int
-    """Where the first event begins."""
+    """Offset of the first event."""
     names: list[str]
-    """Of the columns; empty where the file does not say."""
+    """Names of the columns; empty where the file does not say."""
     width: int | None
     height: int | None
     sample: np.ndarray
@@ -38,7 +38,7 @@ class TextFile:
 
 
 def inspect_text(path: Path) -> TextFile:
-    """Pass over comments and header; the first line of numbers tells delimiter and fields.
+    """Pass over comments and header; the first line of numbers has the delimiter and the fields.
 
     A file with a header that names columns and no line after it is an empty recording.
     """
@@ -105,7 +105,7 @@ def _read_sample(lines: list[bytes], delimiter: bytes, count: int) -> tuple[np.n
 
 
 def _read_names(fields: list[str]) -> tuple[list[str], tuple[int | None, int | None]]:
-    """Names, and the sizes that ``x@320`` and ``y@240`` tell."""
+    """Names, and the size of the sensor that ``x@320`` and ``y@240`` give."""
     names: list[str] = []
     size: dict[str, int] = {}
     for field in fields:

@@ -1,4 +1,4 @@
-"""Where the light of a room comes from: lamps at learned places."""
+"""Lamps of a room, at learned places."""
 
 import torch
 from jaxtyping import Float
@@ -32,7 +32,7 @@ class Lamps(nn.Module):
         self.distances_log = nn.Parameter(torch.full((count,), START_DISTANCE_M).log())
 
     def distances(self) -> Float[Tensor, "L"]:
-        """From the middle of where the person goes, metres."""
+        """Distances from the middle of where the person goes, metres."""
         return self.distances_log.exp()
 
     def places(self) -> Float[Tensor, "L 3"]:

@@ -1,4 +1,4 @@
-"""How bright the person's surface is, by where it stands and how it is turned."""
+"""Brightness of the person's surface by its place and its normal."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -29,7 +29,7 @@ class Shading(nn.Module):
     radius_m: Tensor
 
     def __init__(self, center: Float[Tensor, "3"], radius_m: float, lamps: int = 0) -> None:
-        """Where the person goes: places are relative to ``center``, in units of ``radius_m``."""
+        """Places are relative to ``center``, in units of ``radius_m``: where the person goes."""
         super().__init__()
         self.register_buffer("center", center.clone())
         self.register_buffer("radius_m", torch.tensor(float(radius_m)))

@@ -136,7 +136,7 @@ class BodyShadow(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class _LampView:
-    """What a lamp sees, on the plane through the body's middle that faces it."""
+    """View of a lamp: the plane through the body's middle that faces it."""
 
     lamp: Float[Tensor, "3"]
     axis: Float[Tensor, "T 3"]

@@ -9,7 +9,7 @@ from evsplat.neighbours import nearest
 
 
 class NearestSurface:
-    """What Gaussians take from the nearest point of the canonical body's surface.
+    """Normals and bones of Gaussians by the nearest point of the canonical body's surface.
 
     Looked up again only after rows have changed: between two densifications a Gaussian moves by
     less than what turns the surface or changes the bones it hangs on.
@@ -53,7 +53,7 @@ class NearestSurface:
         self.index = self.index[:0]
 
     def state(self) -> dict[str, Tensor]:
-        """What a resume needs."""
+        """Tensors that a resume needs."""
         return {"index": self.index}
 
     def load_state(self, state: dict[str, Tensor]) -> None:

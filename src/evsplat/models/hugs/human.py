@@ -8,14 +8,18 @@ from torch import Tensor
 
 from evsplat.body.rotations import matrix_to_quaternion, six_to_matrix
 from evsplat.gaussians import OneClassRows, Shape
-from evsplat.models.hugs.decoders import AppearanceDecoder, GeometryDecoder, SkinningDecoder
-from evsplat.models.hugs.triplane import Triplane
+from evsplat.models.hugs.triplane import (
+    AppearanceDecoder,
+    GeometryDecoder,
+    SkinningDecoder,
+    Triplane,
+)
 from evsplat.models.networks.skinning_turns import SkinningTurns
 
 SH_CONSTANT = 0.28209479177387814
 """The constant spherical harmonic; colour is 0.5 more than its multiple, as 3DGS."""
 START_MULTIPLIER = 0.5
-"""Of every Gaussian's size."""
+"""Factor of every Gaussian's standard deviations at the start."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,7 @@ class Decoded:
     offsets: Float[Tensor, "N 3"]
     """From the learned centre, metres."""
     six: Float[Tensor, "N 6"]
-    """Rotation, see `six_to_matrix`."""
+    """Rotations as six numbers, see `six_to_matrix`."""
     scales: Float[Tensor, "N 3"]
     """Standard deviations before the multiplier, metres."""
     colours: Float[Tensor, "N 3"]
@@ -73,7 +77,7 @@ class TriplaneHuman(OneClassRows):
         self.skinning_turns = SkinningTurns(skinning_turns)
 
     def look_up(self, positions: Float[Tensor, "M 3"]) -> Decoded:
-        """What the decoders say of any canonical places."""
+        """Gaussians decoded at any canonical places."""
         features = self.triplane(positions)
         return self._decode(features, self.skinning(features))
 

@@ -62,7 +62,7 @@ class HugsModel(PosedModel):
 
     @property
     def sets(self) -> dict[str, OneClassRows]:
-        """Person and scene."""
+        """The two sets, by class."""
         return {"human": self.human, "scene": self.scene}
 
     @property

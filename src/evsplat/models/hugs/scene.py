@@ -43,7 +43,7 @@ class SphericalScene(OneClassRows):
         return colour.clamp_min(0)
 
     def opacities(self) -> Float[Tensor, " N"]:
-        """In (0, 1)."""
+        """Opacities in (0, 1)."""
         return self.opacity_logits.sigmoid()
 
     @torch.no_grad()

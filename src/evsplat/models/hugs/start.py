@@ -5,8 +5,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import SurfaceSamples
-from evsplat.body.rotations import matrix_to_six
+from evsplat.body.rotations import matrix_to_six, quaternion_to_matrix
 from evsplat.devices import send
+from evsplat.gaussians.initialise import facing
 from evsplat.models.hugs.human import TriplaneHuman
 from evsplat.neighbours import nearest
 
@@ -35,17 +36,6 @@ def body_weights(
     return ((shares / shares.sum(-1, keepdim=True))[..., None] * around).sum(1)
 
 
-def facing(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
-    """Rotations that take the z axis to unit ``normals`` by the shortest way."""
-    x, y, z = normals.unbind(-1)
-    # Where the normal is -z there are many shortest ways; half a turn about x is one.
-    scale = 1 / (1 + z).clamp_min(1e-6)
-    rows = (1 - x * x * scale, -x * y * scale, x) + (-x * y * scale, 1 - y * y * scale, y)
-    matrices = torch.stack((*rows, -x, -y, z), -1).unflatten(-1, (3, 3))
-    flip = torch.diag(normals.new_tensor([1.0, -1.0, -1.0]))
-    return torch.where((z < -1 + 1e-5)[:, None, None], flip, matrices)
-
-
 def fit_to_body(
     human: TriplaneHuman,
     surface: SurfaceSamples,
@@ -72,7 +62,7 @@ def fit_to_body(
         lr=DECODER_RATE,
         fused=True,
     )
-    targets = matrix_to_six(facing(surface.normals))
+    targets = matrix_to_six(quaternion_to_matrix(facing(surface.normals)))
     for step in range(steps):
         for group in adam.param_groups:
             group["lr"] = group["rate"] * max(1 - step / steps, 0.02)

@@ -1,11 +1,14 @@
-"""Features of space on three axis-aligned planes (reference 2.1)."""
+"""Features of space on three axis-aligned planes, and their decoders (reference 2.1)."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.utils.parametrizations import weight_norm
 
 _FIRST, _SECOND = [0, 0, 1], [1, 2, 2]
 """Axes of the planes xy, xz and yz."""
+TEMPERATURE = 0.1
+"""Temperature of the softmax over joints."""
 
 
 class Triplane(nn.Module):
@@ -57,3 +60,64 @@ class Triplane(nn.Module):
         u, v = part[:, _FIRST], part[:, _SECOND]
         shares = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], -1)
         return rows, shares
+
+
+def _trunk(inputs: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU())
+
+
+class AppearanceDecoder(nn.Module):
+    """Decoder of colour and opacity.
+
+    The released decoder gives 48 spherical harmonics of which it draws the first three; the others
+    take part in nothing and are left out.
+    """
+
+    def __init__(self, inputs: int, width: int = 64) -> None:
+        super().__init__()
+        self.trunk = _trunk(inputs, width)
+        self.colour, self.opacity = nn.Linear(width, 3), nn.Linear(width, 1)
+
+    def forward(
+        self, features: Float[Tensor, "N F"]
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
+        """Coefficients of the constant spherical harmonic, and opacities."""
+        hidden = self.trunk(features)
+        return self.colour(hidden), self.opacity(hidden)[:, 0].sigmoid()
+
+
+class GeometryDecoder(nn.Module):
+    """Decoder of offset, rotation and size."""
+
+    def __init__(self, inputs: int, width: int = 128) -> None:
+        super().__init__()
+        self.trunk = _trunk(inputs, width)
+        self.offset, self.rotation = nn.Linear(width, 3), nn.Linear(width, 6)
+        self.scale = nn.Linear(width, 3)
+
+    def forward(
+        self, features: Float[Tensor, "N F"]
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 6"], Float[Tensor, "N 3"]]:
+        """Offset in metres, rotation as six numbers, standard deviations before the multiplier.
+
+        Those pass a GELU and so may be a little below zero; a Gaussian is drawn the same.
+        """
+        hidden = self.trunk(features)
+        scales = nn.functional.gelu(self.scale(hidden))
+        return self.offset(hidden), self.rotation(hidden), scales
+
+
+class SkinningDecoder(nn.Module):
+    """Decoder of skinning weights over the joints of any body."""
+
+    def __init__(self, inputs: int, joints: int, width: int = 128) -> None:
+        super().__init__()
+        self.trunk = _trunk(inputs, width)
+        self.normed = weight_norm(nn.Linear(width, width))
+        self.joints = nn.Linear(width, joints)
+
+    def forward(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N J"]:
+        """Weights that sum to one."""
+        hidden = nn.functional.gelu(self.normed(self.trunk(features)))
+        scores = nn.functional.gelu(self.joints(hidden))
+        return torch.softmax(scores / TEMPERATURE, dim=-1)

@@ -47,7 +47,7 @@ class SkinningTurns:
         self.kept = self.kept[:0]
 
     def state(self) -> dict[str, Tensor]:
-        """What a resume needs."""
+        """Tensors that a resume needs."""
         return {"kept": self.kept, "turn": torch.tensor(self.turn)}
 
     def load_state(self, state: dict[str, Tensor]) -> None:

@@ -1,18 +1,18 @@
 """Networks that remember give the pictures of those that do not."""
 
-import dataclasses
-
 import pytest
 import torch
 
 from evsplat.capture import load_capture
-from evsplat.config import override
-from evsplat.methods import compose, method_config
-from evsplat.view.memory import NETWORKS, Remembering, Turns, remembering, set_rough
+from evsplat.view.network_cache import (
+    NETWORKS,
+    CachedNetwork,
+    Turns,
+    set_rough,
+    with_cached_networks,
+)
 
-from ..seen import seen
-
-SMALL = ("human.count=150", "deform.width=16", "deform.colour_width=16")
+from ..small_model import built
 
 
 class Counting(torch.nn.Module):
@@ -27,7 +27,7 @@ class Counting(torch.nn.Module):
 
 def test_the_same_question_is_asked_once():
     network = Counting()
-    memory = Remembering(network, Turns(4, (0, None)))
+    memory = CachedNetwork(network, Turns(4, (0, None)))
     x = torch.rand(4, 3)
     assert torch.equal(memory(x, 2.0), x * 2)
     assert torch.equal(memory(x.clone(), 2.0), x * 2)
@@ -40,7 +40,7 @@ def test_the_same_question_is_asked_once():
 @pytest.mark.parametrize("count", [8, 10])
 def test_rough_answers_are_renewed_in_turns_and_then_exact(count):
     network = Counting()
-    memory = Remembering(network, Turns(4, (0, None)))
+    memory = CachedNetwork(network, Turns(4, (0, None)))
     x, scale = torch.rand(count, 3), torch.tensor(2.0)
     first = memory(x, scale)
     kept = first.clone()
@@ -61,7 +61,7 @@ def test_rough_answers_are_renewed_in_turns_and_then_exact(count):
 
 
 def test_an_exact_answer_has_nothing_of_older_questions():
-    memory = Remembering(Counting(), Turns(4, (0, None)))
+    memory = CachedNetwork(Counting(), Turns(4, (0, None)))
     x, scale = torch.rand(8, 3), torch.tensor(2.0)
     memory(x, scale)
     memory.rough = True
@@ -77,8 +77,7 @@ def test_an_exact_answer_has_nothing_of_older_questions():
 @pytest.fixture
 def model(tiny_capture):
     capture = load_capture(tiny_capture())
-    values = override({}, (*SMALL, "deform.non_rigid_start=0"))
-    composition = compose(method_config("paper", values, where="test"), seen(capture), 0, fit=False)
+    composition = built("paper", capture, "networks.non_rigid_start=0")
     with torch.no_grad():
         for parameter in composition.model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
@@ -88,34 +87,34 @@ def model(tiny_capture):
 @torch.no_grad()
 def test_a_remembering_model_poses_and_colours_as_the_model_does(model):
     model, capture = model
-    assert set(NETWORKS) <= set(model._modules)
-    twin = remembering(model)
+    assert set(NETWORKS) <= {name for name, _ in model.named_modules()}
+    twin = with_cached_networks(model)
     cameras = list(capture.cameras.values())
     times = [frame.mid_us for frame in capture.frames[:3]]
     for time_us in (times[0], times[1], times[0]):
         for camera in (cameras[0], cameras[1], cameras[0]):
             seen = [m.at([time_us], camera.center()) for m in (model, twin)]
-            for part in ("moving", "static"):
-                expected, found = (getattr(posed, part)() for posed in seen)
+            for part in ("human", "scene"):
+                expected, found = (getattr(layers, part) for layers in seen)
                 assert torch.equal(found.means, expected.means)
                 assert torch.equal(found.channels, expected.channels)
-    assert not any(isinstance(module, Remembering) for module in model.modules())
+    assert not any(isinstance(module, CachedNetwork) for module in model.modules())
 
 
 @torch.no_grad()
 def test_a_model_in_its_first_steps_can_be_shown(model):
     model, capture = model
-    model.config = dataclasses.replace(model.config, non_rigid_start=1_000)
+    model.non_rigid_start = 1_000
     camera, time_us = next(iter(capture.cameras.values())), capture.frames[0].mid_us
-    found = remembering(model).at([time_us], camera.center())
+    found = with_cached_networks(model).at([time_us], camera.center())
     expected = model.at([time_us], camera.center())
-    assert torch.equal(found.moving().means, expected.moving().means)
+    assert torch.equal(found.human.means, expected.human.means)
 
 
 @torch.no_grad()
 def test_drafts_come_to_be_exact_and_are_near_it_before(model):
     model, capture = model
-    twin = remembering(model)
+    twin = with_cached_networks(model)
     cameras = list(capture.cameras.values())
     first = twin.at([capture.frames[0].mid_us], cameras[0].center())
     time_us, centre = capture.frames[3].mid_us, cameras[1].center()
@@ -126,18 +125,19 @@ def test_drafts_come_to_be_exact_and_are_near_it_before(model):
     away = (draft.human.means - expected.human.means).abs().max()
     assert float(away) < 0.25 * float((first.human.means - expected.human.means).abs().max())
     renewed = slice(0, None, NETWORKS["scene_colour"].every)
-    assert_close(draft.scene.rgb[renewed], expected.scene.rgb[renewed])
-    assert (draft.scene.rgb - expected.scene.rgb).abs().max() > 1e-3
+    found, wanted = draft.scene.channels[0], expected.scene.channels[0]
+    assert_close(found[renewed], wanted[renewed])
+    assert (found - wanted).abs().max() > 1e-3
     # Each network waits for those whose answers it is asked about.
     for _ in range(sum(turns.every for turns in NETWORKS.values())):
         draft = twin.at([time_us], centre)
-    for name in ("means", "quaternions", "scales", "rgb"):
+    for name in ("means", "quaternions", "scales", "channels"):
         assert_close(getattr(draft.human, name), getattr(expected.human, name))
-    assert_close(draft.scene.rgb, expected.scene.rgb)
+    assert_close(draft.scene.channels, expected.scene.channels)
     set_rough(twin, False)
     sharp = twin.at([time_us], centre)
-    for part in ("moving", "static"):
-        found, wanted = (vars(getattr(posed, part)()) for posed in (sharp, expected))
+    for part in ("human", "scene"):
+        found, wanted = (vars(getattr(layers, part)) for layers in (sharp, expected))
         assert all(v is None or torch.equal(found[name], v) for name, v in wanted.items())
 
 

@@ -1,4 +1,4 @@
-"""Networks that are not asked twice: what a viewer changes from picture to picture is little."""
+"""Cache of networks' answers: a viewer changes little from picture to picture."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from evsplat.models.networks.non_rigid import NonRigid
-from evsplat.render.backdrop import same_values
+from evsplat.render.job import same_values
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Turns:
 
 
 NETWORKS = {
-    "non_rigid": Turns(4, (0, None)),
+    "deformation.network": Turns(4, (0, None)),
     "skinning": Turns(16, (1,)),
     "human_colour": Turns(4, (0, 1, 1, None)),
     "scene_colour": Turns(8, (0, 0)),
@@ -45,7 +45,7 @@ _WITHOUT_POSE = {
 """Networks of HUGS, which see neither pose nor view: one answer serves all pictures."""
 
 
-class Remembering(nn.Module):
+class CachedNetwork(nn.Module):
     """A network with its last answer, given again to the same question.
 
     With ``rough`` set, another question about as many points renews the answer for the points of
@@ -101,32 +101,32 @@ class Remembering(nn.Module):
             self._answer = values
 
 
-def remembering(model: nn.Module) -> nn.Module:
+def with_cached_networks(model: nn.Module) -> nn.Module:
     """A shallow copy of a model, with the same parameters, whose networks remember.
 
     Parameters must not change while it is used; make another one when they have.
     """
     for path, turns in {**NETWORKS, **_WITHOUT_POSE}.items():
-        model = _with_memory(model, path, turns)
+        model = _with_cache(model, path, turns)
     return model
 
 
-def _with_memory(module: nn.Module, path: str, turns: Turns) -> nn.Module:
+def _with_cache(module: nn.Module, path: str, turns: Turns) -> nn.Module:
     """A shallow copy whose module at ``path`` remembers, where there is one."""
     name, _, rest = path.partition(".")
     network = module._modules.get(name)
     if network is None:
         return module
     twin = copy.copy(module)
-    inner = _with_memory(network, rest, turns) if rest else Remembering(network, turns)
+    inner = _with_cache(network, rest, turns) if rest else CachedNetwork(network, turns)
     twin._modules = {**module._modules, name: inner}
     return twin
 
 
 def set_rough(model: nn.Module, rough: bool) -> None:
     """Let the networks that remember answer in turns, or exactly."""
-    for network in model._modules.values():
-        if isinstance(network, Remembering):
+    for network in model.modules():
+        if isinstance(network, CachedNetwork) and network.turns.every > 1:
             network.rough = rough
 
 

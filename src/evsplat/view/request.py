@@ -1,4 +1,4 @@
-"""What a browser shows: a plain value, so that two wishes can be compared."""
+"""What a browser shows: a plain value, so that two requests can be compared."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -28,7 +28,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Wish:
+class ViewRequest:
     """One picture: from where, of when, and how."""
 
     width: int

@@ -1,12 +1,14 @@
-"""Prior that keeps learned pose residuals small and smooth where the recording says little."""
+"""Priors: skinning near the body model's weights, pose residuals small and smooth."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from evsplat.capture import Frame
+from evsplat.body import SurfaceSamples
+from evsplat.devices import send
 from evsplat.models.discs import DiscModel
+from evsplat.models.paper import PaperModel
 from evsplat.objectives.base import Stateless, Step
 
 
@@ -23,10 +25,6 @@ class PosePrior(Stateless):
         self.times_us = list(times_us)
         span = self.times_us[-1] - self.times_us[0]
         self.gap_s = 1e-6 * span / max(1, len(self.times_us) - 1)
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """No renders."""
-        return ()
 
     def loss(self, step: Step[DiscModel]) -> dict[str, Tensor]:
         """``pose_prior``, once residuals are learned."""
@@ -45,3 +43,24 @@ class PosePrior(Stateless):
         value = torch.einsum("tk,kjc->tjc", weights, points).square().mean((0, 2))
         bend = torch.einsum("tk,kjc->tjc", bends, points).square().mean((0, 2))
         return value + stiffness * self.gap_s * bend
+
+
+class SkinningPrior(Stateless):
+    """Mean over surface points of the squared weight error, summed over joints (1.6)."""
+
+    def __init__(self, surface: SurfaceSamples, points_per_step: int) -> None:
+        """``surface``: samples of the canonical body, drawn once; each step uses a few of them."""
+        self.surface, self.points_per_step = surface, points_per_step
+
+    def loss(self, step: Step[PaperModel]) -> dict[str, Tensor]:
+        """``skinning``: see `of`."""
+        return {"skinning": self.of(step.model, step.generator)}
+
+    def of(self, model: PaperModel, generator: torch.Generator) -> Tensor:
+        """The prior of a model, at random surface points."""
+        chosen = torch.randint(
+            len(self.surface.points), (self.points_per_step,), generator=generator
+        )
+        chosen = send(chosen, self.surface.points.device)
+        weights = model.skinning_weights(self.surface.points[chosen])
+        return (weights - self.surface.weights[chosen]).square().sum(-1).mean()

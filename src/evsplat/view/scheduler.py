@@ -1,4 +1,4 @@
-"""The drawing thread: one for all clients, so that they share the processor and the caches."""
+"""The drawing thread, one for all clients: they share the processor and the caches."""
 
 import logging
 import threading
@@ -15,34 +15,34 @@ LEAST_S = 1 / 30
 """Pictures of a client follow each other no faster."""
 
 
-class Customer(Protocol):
-    """A client as the desk sees it."""
+class RenderClient(Protocol):
+    """Contract of a client: what it asks for, and who draws it."""
 
-    def wish(self, now: float) -> Hashable | None:
+    def request(self, now: float) -> Hashable | None:
         """What shall be seen at wall-clock second ``now``; None: nothing yet."""
         ...
 
-    def serve(self, wish: Hashable, *, draft: bool) -> None:
-        """Draw ``wish`` and send it; ``draft`` while it changes."""
+    def render(self, request: Hashable, *, draft: bool) -> None:
+        """Draw ``request`` and send it; ``draft`` while it changes."""
         ...
 
 
 @dataclass(eq=False)
-class _Seat:
-    customer: Customer
+class _Slot:
+    client: RenderClient
     shown: Hashable | None = None
     sharp: bool = False
     changed: float = field(default=-1e9)
-    """When the last different wish was seen."""
+    """When the last different request was seen."""
     served: float = -1e9
 
 
-class Desk:
-    """Serves customers in turn, each with its newest wish; what it wished before is forgotten."""
+class RenderScheduler:
+    """Draws for clients in turn, each its newest request; older ones are forgotten."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._seats: dict[Customer, _Seat] = {}
+        self._slots: dict[RenderClient, _Slot] = {}
         self._changed = threading.Condition()
         self._awake = False
         self._closed = False
@@ -62,19 +62,19 @@ class Desk:
         if self._thread is not None:
             self._thread.join(timeout=10)
 
-    def enter(self, customer: Customer) -> None:
-        """Begin to serve a customer."""
+    def enter(self, client: RenderClient) -> None:
+        """Begin to draw for a client."""
         with self._changed:
-            self._seats[customer] = _Seat(customer)
+            self._slots[client] = _Slot(client)
         self.wake()
 
-    def leave(self, customer: Customer) -> None:
-        """Forget a customer."""
+    def leave(self, client: RenderClient) -> None:
+        """Forget a client."""
         with self._changed:
-            self._seats.pop(customer, None)
+            self._slots.pop(client, None)
 
     def wake(self) -> None:
-        """Tell that some wish may have changed; never waits for a picture."""
+        """Tell that some request may have changed; never waits for a picture."""
         with self._changed:
             self._awake = True
             self._changed.notify()
@@ -86,10 +86,10 @@ class Desk:
         self.wake()
 
     def redraw(self) -> None:
-        """Draw everything anew: what wishes mean has changed."""
+        """Draw everything anew: what requests mean has changed."""
         with self._changed:
-            for seat in self._seats.values():
-                seat.shown = None
+            for slot in self._slots.values():
+                slot.shown = None
         self.wake()
 
     def turn(self) -> float | None:
@@ -97,33 +97,33 @@ class Desk:
         with self._changed:
             jobs, self._jobs = self._jobs, []
             # Whoever waited longest comes first.
-            seats = sorted(self._seats.values(), key=lambda seat: seat.served)
+            slots = sorted(self._slots.values(), key=lambda slot: slot.served)
         for job in jobs:
             job()
         pause: float | None = 0.0 if jobs else None
-        for seat in seats:
-            wait = self._serve(seat)
+        for slot in slots:
+            wait = self._render(slot)
             if wait is not None:
                 pause = wait if pause is None else min(pause, wait)
         return pause
 
-    def _serve(self, seat: _Seat) -> float | None:
+    def _render(self, slot: _Slot) -> float | None:
         now = self._clock()
-        wish = seat.customer.wish(now)
-        if wish is None:
+        request = slot.client.request(now)
+        if request is None:
             return None
-        if wish != seat.shown:
-            if now - seat.served < LEAST_S:
-                return seat.served + LEAST_S - now
-            seat.changed, seat.shown, seat.sharp, seat.served = now, wish, False, now
-            seat.customer.serve(wish, draft=True)
+        if request != slot.shown:
+            if now - slot.served < LEAST_S:
+                return slot.served + LEAST_S - now
+            slot.changed, slot.shown, slot.sharp, slot.served = now, request, False, now
+            slot.client.render(request, draft=True)
             return 0.0
-        if seat.sharp:
+        if slot.sharp:
             return None
-        if now - seat.changed < SETTLED_S:
-            return seat.changed + SETTLED_S - now
-        seat.sharp, seat.served = True, now
-        seat.customer.serve(wish, draft=False)
+        if now - slot.changed < SETTLED_S:
+            return slot.changed + SETTLED_S - now
+        slot.sharp, slot.served = True, now
+        slot.client.render(request, draft=False)
         return 0.0
 
     def _run(self) -> None:

@@ -1,7 +1,9 @@
-"""A picture of the recording over time: exposures, key poses and event rate."""
+"""Pages with a time axis: a capture's exposures, key poses and event rate; one curve."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import numpy as np
+from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 from evsplat.capture.capture import Capture
@@ -11,6 +13,7 @@ from evsplat.inspection.drawing import (
     INK,
     OVERSAMPLING,
     PAPER,
+    TEST,
     font,
     header,
     line,
@@ -23,6 +26,8 @@ _WIDTH, _HEIGHT = 1400, 470
 _LEFT, _RIGHT = 96, 24
 _BARS, _POSES, _RATE = (84, 168), (190, 204), (238, 408)
 _RATE_BINS = 400
+_CURVE_WIDTH, _CURVE_HEIGHT = 1000, 360
+_CURVE_LEFT, _CURVE_RIGHT, _TOP, _BOTTOM = 70, 976, 76, 290
 
 
 def draw_timeline(capture: Capture) -> Image.Image:
@@ -49,7 +54,7 @@ def draw_timeline(capture: Capture) -> Image.Image:
 
 
 def _span_us(capture: Capture) -> tuple[int, int]:
-    """From the first to the last thing that was recorded."""
+    """Time from the first to the last exposure or event."""
     starts = [min(frame.exposure_us[0] for frame in capture.frames)]
     ends = [max(frame.exposure_us[1] for frame in capture.frames)]
     if capture.events is not None and len(capture.events):
@@ -127,3 +132,51 @@ def _draw_labels(
         )
     centre = (_LEFT + _WIDTH - _RIGHT) / 2
     draw.text((centre, _HEIGHT - 26), "seconds", fill=FAINT, font=font(14), anchor="mt")
+
+
+def draw_curve(
+    title: str,
+    subtitle: str,
+    x: Float[np.ndarray, "N"],
+    y: Float[np.ndarray, "N"],
+    *,
+    x_label: str,
+    x_unit: float = 1.0,
+    marks: Sequence[float] = (),
+) -> Image.Image:
+    """A curve over whole-number ``x``, with ticks at round multiples, shown divided by ``x_unit``.
+
+    ``marks`` are places on the x axis that get a vertical line. Values that are NaN are left out.
+    """
+    x, y = x[np.isfinite(y)], y[np.isfinite(y)]
+    start, end = float(x.min()), float(max(x.max(), x.min() + 1))
+    low, high = min(0.0, float(y.min())), max(float(y.max()), 1e-9)
+    page = Image.new("RGB", (_CURVE_WIDTH * OVERSAMPLING, _CURVE_HEIGHT * OVERSAMPLING), PAPER)
+    shapes = ImageDraw.Draw(page)
+
+    def place(at: float, value: float) -> tuple[float, float]:
+        return (
+            _CURVE_LEFT + (at - start) / (end - start) * (_CURVE_RIGHT - _CURVE_LEFT),
+            _BOTTOM - (value - low) / (high - low) * (_BOTTOM - _TOP),
+        )
+
+    ticks = round_ticks(round(start), round(end))
+    for tick in ticks:
+        line(shapes, [place(tick, low), place(tick, high)], (232, 235, 239), 1)
+    line(shapes, [place(start, 0), place(end, 0)], FAINT, 1)
+    for mark in marks:
+        line(shapes, [place(mark, low), place(mark, high)], TEST, 1.5)
+    line(shapes, [place(*point) for point in zip(x, y, strict=True)], CURVE, 1.5)
+    page = page.resize((_CURVE_WIDTH, _CURVE_HEIGHT), Image.Resampling.LANCZOS)
+    draw = ImageDraw.Draw(page)
+    header(draw, title, subtitle, _CURVE_WIDTH, set())
+    for value in (low, high):
+        beside = (_CURVE_LEFT - 6, place(start, value)[1])
+        text = f"-{short_number(-value)}" if value < 0 else short_number(value)
+        draw.text(beside, text, fill=FAINT, font=font(12), anchor="rm")
+    for tick in ticks:
+        below = (place(tick, low)[0], _BOTTOM + 8)
+        draw.text(below, f"{tick / x_unit:g}", fill=FAINT, font=font(13), anchor="mt")
+    centre = ((_CURVE_LEFT + _CURVE_RIGHT) / 2, _CURVE_HEIGHT - 26)
+    draw.text(centre, x_label, fill=INK, font=font(14), anchor="mt")
+    return page

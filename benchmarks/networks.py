@@ -1,6 +1,6 @@
-"""Time of the deformation and colour networks, forward and backward, beside their GEMM limit.
+"""Time of the networks for motion and colour, forward and backward, beside their GEMM limit.
 
-python benchmarks/deform.py [--points N] [--times T] [--repeats R]
+python benchmarks/networks.py [--points N] [--times T] [--repeats R]
 
 The limit is the time of the same multiply-adds in products of the widest layer's size, measured
 here with torch: the share says what a perfect implementation of the same arithmetic would save.
@@ -19,14 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from evsplat.body import default_body
-from evsplat.deform import (
-    HumanColour,
-    NonRigidNetwork,
-    PoseEncoder,
-    SceneColour,
-    SkinningNetwork,
-    normalise_joints,
-)
+from evsplat.models.networks.colour import HumanColour, SceneColour
+from evsplat.models.networks.non_rigid import NonRigidNetwork
+from evsplat.models.networks.pose_encoder import PoseEncoder, normalise_joints
+from evsplat.models.networks.skinning_network import SkinningNetwork
 
 
 def main() -> None:

@@ -1,12 +1,29 @@
-"""What static Gaussians look like to a camera that stands still, kept from render to render."""
+"""One render as backends take it, and the static layer kept from one to the next."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from evsplat.render.splats import PinholeCamera, Splats
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Checked arguments of `evsplat.render.render`; Gaussians have their leading axis of times."""
+
+    splats: Splats
+    static: Splats | None
+    times: int
+    """Number of pictures."""
+    camera: PinholeCamera
+    background: Tensor | None
+    near: float
+    """Least depth of what is drawn, metres."""
+    low_pass: float
+    """Added to the projected covariances, px^2."""
+    backdrop: "Backdrop | None" = None
 
 
 class Backdrop:
@@ -18,29 +35,22 @@ class Backdrop:
     """
 
     def __init__(self) -> None:
-        self.job: Any = None
+        self.kept: Any = None
         """The native render that kept the layer; None: it is to be drawn anew."""
         self._seen: list[Any] = []
         self._versions: list[int | None] = []
 
-    def show(
-        self,
-        moving: Splats,
-        static: Splats,
-        camera: PinholeCamera,
-        background: Tensor | None,
-        near: float,
-        low_pass: float,
-    ) -> None:
+    def show(self, job: RenderJob) -> None:
         """Forget what does not fit the render that comes next."""
+        camera = job.camera
         seen = [
-            *(camera.width, camera.height, near, low_pass, moving.means.shape[1]),
-            *(camera.K, camera.world_to_camera, background),
-            *(getattr(static, field.name) for field in fields(Splats)),
+            *(camera.width, camera.height, job.near, job.low_pass, job.splats.means.shape[1]),
+            *(camera.K, camera.world_to_camera, job.background),
+            *(getattr(job.static, field.name) for field in fields(Splats)),
         ]
-        if self.job is not None and all(map(_same, seen, self._seen, self._versions)):
+        if self.kept is not None and all(map(_same, seen, self._seen, self._versions)):
             return
-        self.job, self._seen = None, seen
+        self.kept, self._seen = None, seen
         self._versions = [value._version if isinstance(value, Tensor) else None for value in seen]
 
 
@@ -52,7 +62,7 @@ def _same(value: Any, old: Any, version: int | None) -> bool:
 
 
 def same_values(new: Tensor, old: Tensor) -> bool:
-    """Whether two tensors hold the same; they are not read where they are one in memory."""
+    """True for tensors that hold the same; they are not read where they are one in memory."""
     if new.shape != old.shape or new.dtype != old.dtype or new.device != old.device:
         return False
     if new.data_ptr() == old.data_ptr() and new.stride() == old.stride():

@@ -1,0 +1,256 @@
+"""The disc model put together: who carries a disc, what lights it, and where gradients reach."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline
+
+from evsplat.body import skin
+from evsplat.capture import load_capture
+from evsplat.models.pose_spline import PoseSpline
+from evsplat.training.clock import Clock
+from evsplat.training.trainer import Trainer
+
+from ...seen import seen
+from ...small_model import built
+from ..wild_poses import assert_posed, bend
+
+
+def model_of(path, *settings: str):
+    """Model, capture, the times of two frames and a camera centre."""
+    capture = load_capture(path)
+    model = built("evsplat", capture, "lamps=2", *settings).model
+    times = [frame.mid_us for frame in capture.train_frames[:2]]
+    return model, capture, times, capture.camera(capture.train_frames[0]).center()
+
+
+def activate(model) -> None:
+    """Past the start of every part, with deformations and light that can be seen."""
+    model.nominal.fill_(10_000.0)
+    with torch.no_grad():
+        model.deformation.network.mlp.weights[-1].normal_(std=0.05)
+        model.gaussians.colour_logits.normal_()
+        if model.shading is not None:
+            model.shading.coefficients.normal_(std=0.03)
+            model.shading.intensities.uniform_(0.2, 1.0)
+        if model.residual is not None:
+            model.residual.rotations.normal_(std=0.1)
+
+
+def fields(splats) -> dict[str, torch.Tensor]:
+    names = ("means", "quaternions", "scales", "channels", "linear")
+    return {name: value for name in names if (value := getattr(splats, name)) is not None}
+
+
+def nearest_weights(model) -> torch.Tensor:
+    """The body's weights at the point of its surface that is nearest to each of the person's."""
+    canonical = model.gaussians.means[model.gaussians.human].detach()
+    samples = model.surface.surface
+    return samples.weights[torch.cdist(canonical, samples.points).argmin(1)]
+
+
+def test_a_disc_is_fifteen_floats(tiny_capture):
+    gaussians = model_of(tiny_capture())[0].gaussians
+    rows = [getattr(gaussians, name)[0].numel() for name in gaussians.attributes]
+    assert sum(rows) == 15
+    assert {name for name, _ in gaussians.named_parameters()} == set(gaussians.attributes)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_own_colours_on_the_body_surface_need_no_network(tiny_capture, seed):
+    model, _, times, center = model_of(tiny_capture(), "shading=false")
+    torch.manual_seed(seed)
+    activate(model)
+    gaussians = model.gaussians
+    layers = model.at(times, center)
+    canonical = gaussians.means[gaussians.human].detach()
+    weights = nearest_weights(model)
+    rotations, bones = model.pose(times)
+    human = [
+        value[gaussians.human]
+        for value in (gaussians.means, gaussians.scales_log, gaussians.quaternions)
+    ]
+    deformed, scales, quaternions, feature = model.deformation(*human, rotations)
+    expected, _ = skin(deformed, weights, bones)
+    assert torch.allclose(layers.human.means, expected, atol=1e-5)
+    assert torch.allclose(layers.human.scales, scales) and feature.numel() == 0
+    assert torch.allclose(layers.human.quaternions, quaternions)
+    # Wherever the rows have been moved to, they are drawn with the weights they have.
+    assert torch.equal(model.skinning_weights(canonical + 0.3), weights)
+    colours = gaussians.colour_logits[gaussians.human].sigmoid()
+    assert torch.equal(layers.human.channels[..., :3], colours.expand(len(times), -1, -1))
+    colours = gaussians.colour_logits[gaussians.scene].sigmoid()
+    assert torch.equal(layers.scene.channels[0, :, :3], colours)
+    assert torch.equal(layers.scene.means[0], gaussians.means[gaussians.scene])
+    names = {name.partition(".")[0] for name, _ in model.named_parameters()}
+    assert names == {"gaussians", "deformation", "residual", "lamps", "shadow", "sensor"}
+
+
+def test_before_the_non_rigid_network_the_person_is_blend_skinned(tiny_capture):
+    model, _, times, center = model_of(tiny_capture())
+    layers = model.at(times, center)
+    canonical = model.gaussians.means[model.gaussians.human]
+    expected, transforms = skin(canonical[None], nearest_weights(model), model.pose(times)[1])
+    assert torch.allclose(layers.human.means, expected, atol=1e-6)
+    assert torch.allclose(layers.transforms, transforms, atol=1e-6)
+    assert torch.equal(layers.human.linear, layers.transforms[..., :3, :3])
+
+
+def test_times_do_not_see_each_other(tiny_capture):
+    model, _, times, center = model_of(tiny_capture())
+    activate(model)
+    together = model.at(times, center)
+    places = together.scene.means + 0.1
+    shadows = together.shadow(places).detach()
+    assert float(shadows.min()) < 0.99 and not torch.allclose(shadows[0], shadows[1], atol=1e-3)
+    for index, time in enumerate(times):
+        alone = model.at([time], center)
+        others = fields(alone.human)
+        for name, both in fields(together.human).items():
+            assert torch.allclose(both[index], others[name][0], atol=1e-5), name
+        assert torch.allclose(together.transforms[index], alone.transforms[0], atol=1e-5)
+        assert torch.allclose(shadows[index], alone.shadow(places)[0], atol=1e-5)
+
+
+def test_nothing_depends_on_the_camera(tiny_capture):
+    model, _, times, center = model_of(tiny_capture())
+    activate(model)
+    here, there = (model.at(times, place) for place in (center, center + torch.randn(3)))
+    for one, other in ((here.human, there.human), (here.scene, there.scene)):
+        others = fields(other)
+        for name, value in fields(one).items():
+            assert torch.equal(value, others[name]), name
+
+
+def test_every_parameter_gets_a_gradient(tiny_capture, monkeypatch):
+    """Of one training step with all that the method can learn; the prior keeps the residual."""
+    capture = load_capture(tiny_capture())
+    settings = ("pose.refine=always", "pose.smooth=always", "clock=always", "most_renders=3")
+    composition = built("evsplat", capture, "lamps=2", *settings, purpose="train")
+    trainer = Trainer(composition, seen(capture), Clock(100, fraction=0.5))
+    activate(trainer.model)
+    trainer.previous_nominal = trainer.clock.nominal  # no new rows in this step
+    monkeypatch.setattr(trainer.optimiser, "step", lambda *_: None)
+    assert trainer.step() is not None
+    learned = {name: p for name, p in trainer.model.named_parameters() if p.numel()}
+    assert {"sensor.logs", "sensor.offset", "shadow.own_widths_log"} <= set(learned)
+    silent = [name for name, p in learned.items() if p.grad is None or not p.grad.any()]
+    assert silent == []
+    rates = {id(p) for network in composition.learning.networks for p in network.parameters}
+    rows = {f"gaussians.{name}" for name in composition.learning.rows["gaussians"]}
+    assert {name for name, p in learned.items() if id(p) not in rates} == rows
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_the_body_hides_from_a_lamp_is_darker(tiny_capture, seed):
+    model, capture, _, _ = model_of(tiny_capture())
+    torch.manual_seed(seed)
+    frames = capture.train_frames[:3]
+    times, center = [frame.mid_us for frame in frames], torch.tensor([0.3, -2.0, 1.2])
+    with torch.no_grad():
+        dark = model.at(times, center).human.channels[..., :3]
+        model.shading.intensities.copy_(0.2 + torch.rand(2, 3))
+        lit = model.at(times, center)
+        lamps = model.lamps.places()
+        casters = model.shadow.place(model.pose(times)[1])
+        shares = model.shadow.lit(casters, lit.human.means, lamps)
+        light = model.surface_light()
+        expected = light.factors(lit.transforms, lit.human.means, shares)
+        assert torch.allclose(lit.human.channels[..., :3], dark * expected, atol=1e-5)
+        assert (expected < light.factors(lit.transforms, lit.human.means) - 0.01).any()
+        # A training step looks for shadows on the person at its middle alone.
+        expected = light.factors(lit.transforms, lit.human.means, shares[:, 1:2])
+        camera, generator = capture.camera(frames[1]), torch.Generator().manual_seed(0)
+        step = model.training_drawing(times, frames[1], camera, generator).layers
+    assert torch.allclose(step.human.channels[..., :3], dark * expected, atol=1e-5)
+
+
+def test_the_person_does_not_shade_itself_where_that_is_not_asked_for(tiny_capture):
+    model, _, times, center = model_of(tiny_capture(), "self_shadow=false")
+    assert model.shadow is not None and not model.shadow.on_body
+    activate(model)
+    model.nominal.fill_(0.0)
+    layers = model.at(times, center)
+    gaussians = model.gaussians
+    expected = model.surface_light().factors(layers.transforms, layers.human.means)
+    colours = gaussians.colour_logits[gaussians.human].sigmoid()
+    assert torch.allclose(layers.human.channels[..., :3], colours * expected, atol=1e-6)
+    assert layers.shadow is not None
+
+
+def test_without_lamps_there_is_no_shadow_and_light_is_the_polynomial(tiny_capture):
+    path = tiny_capture()
+    model, _, times, center = model_of(path, "lamps=0")
+    assert model.lamps is None and model.shadow is None
+    assert model.at(times, center).shadow is None
+    assert len(model.shading.intensities) == 0
+    bare = model_of(path, "lamps=0", "shading=false")[0]
+    assert bare.shading is None and bare.surface_light() is None
+
+
+@pytest.mark.parametrize("middle", range(3))
+def test_a_training_step_deforms_by_the_pose_at_the_middle_of_its_frame(tiny_capture, middle):
+    model, capture, _, center = model_of(tiny_capture(), "pose_noise=0")
+    activate(model)
+    with torch.no_grad():
+        model.deformation.network.mlp.weights[-1].mul_(30)
+    times = [frame.mid_us + 3_000 for frame in capture.train_frames[:3]]
+    frame, generator = capture.train_frames[middle], torch.Generator().manual_seed(0)
+    gaussians = model.gaussians
+    human = [
+        value[gaussians.human]
+        for value in (gaussians.means, gaussians.scales_log, gaussians.quaternions)
+    ]
+    with torch.no_grad():
+        step = model.training_drawing(times, frame, capture.camera(frame), generator).layers
+        deformed, scales, quaternions, _ = model.deformation(*human, model.pose([frame.mid_us])[0])
+        expected, _ = skin(deformed, nearest_weights(model), model.pose(times)[1])
+        each = model.at(times, center)
+    assert torch.allclose(step.human.means, expected, atol=1e-5)
+    assert torch.allclose(step.human.scales, scales.expand(3, -1, -1), atol=1e-6)
+    assert torch.allclose(step.human.quaternions, quaternions.expand(3, -1, -1), atol=1e-6)
+    # Evaluation asks at each time: another deformation, under the same bones.
+    assert not torch.allclose(each.human.means, expected, atol=1e-3)
+    assert torch.allclose(each.transforms, step.transforms, atol=1e-6)
+
+
+def test_half_of_the_training_steps_see_noise_on_the_pose(tiny_capture):
+    model, capture, times, _ = model_of(tiny_capture())
+    activate(model)
+    with torch.no_grad():
+        model.deformation.network.mlp.weights[-1].mul_(30)
+    frame, generator = capture.train_frames[0], torch.Generator().manual_seed(0)
+    camera = capture.camera(frame)
+    with torch.no_grad():
+        scales = torch.stack(
+            [
+                model.training_drawing(times, frame, camera, generator).layers.human.scales[0]
+                for _ in range(40)
+            ]
+        )
+    clean = model.at([frame.mid_us], camera.center()).human.scales[0].detach()
+    noisy = [not torch.allclose(one, clean, atol=1e-6) for one in scales]
+    assert 10 < sum(noisy) < 30
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pose_residuals_of_a_spline_turn_joints_about_their_own_axes(tiny_capture, seed):
+    model, capture, _, _ = model_of(tiny_capture())
+    rng, knot_us = np.random.default_rng(seed), [70_000.0, 40_000.0, 110_000.0][seed]
+    frames = [frame.mid_us for frame in capture.train_frames]
+    units = torch.tensor(rng.uniform(0.3, 0.9, len(model.track.body.parents)))
+    span = (frames[0], frames[-1])
+    spline = PoseSpline(span, knot_us, frames, joint_rad=units, root_m=0.2)
+    model.residual = spline
+    bend(model, frames, rng)
+    knots = 1e-6 * (frames[0] + knot_us * np.arange(-3, spline.count + 1))
+    times = rng.integers(frames[0], frames[-1] + 1, size=12).tolist()
+    found = []
+    for points, unit in (
+        (spline.rotations, units.double().numpy()[:, None]),
+        (spline.translations, spline.root_m),
+    ):
+        curve = BSpline(knots, points.detach().double().numpy(), 3)
+        mean = curve(1e-6 * np.array(frames)).mean(0)
+        found.append(unit * (curve(1e-6 * np.array(times)) - mean))
+    assert_posed(model, times, *found)
