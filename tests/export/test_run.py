@@ -115,7 +115,7 @@ def test_up_turns_the_world_and_says_how(run, up, axis):
         ("avatar", {"out": "a.ply"}, "ends in .html or is a folder"),
         ("avatar", {"motion": "swimming"}, "neither a file nor one of"),
         ("avatar", {"camera": "left"}, "only main, side"),
-        ("html", {"fps": 0.1}, "expected 1 to 120"),
+        ("html", {"fps": 0.1}, "--fps 0.1: expected a number within 1 and 120"),
     ],
 )
 def test_bad_options_are_one_sentence_and_write_nothing(run, kind, options, message):

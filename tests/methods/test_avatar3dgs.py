@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from evsplat.capture import load_capture
-from evsplat.cli.summary import summary_table
+from evsplat.cli.runs import summary_table
 from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation.run import evaluate_run
 from evsplat.methods import TRAINABLE

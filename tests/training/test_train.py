@@ -175,7 +175,7 @@ def test_wrong_calls_are_refused_before_anything_is_written(tiny_capture, tmp_pa
         ({"iterations": 0}, ConfigError, "--iterations 0"),
         ({"max_minutes": -1.0}, ConfigError, "--max-minutes -1"),
         ({"device": "cuda"}, BackendError, "--device cuda"),
-        ({"device": "gpu"}, ConfigError, "expected auto, cpu or cuda"),
+        ({"device": "gpu"}, ConfigError, "expected one of auto, cpu, cuda"),
         ({"overrides": ("event_wieght=1",)}, ConfigError, "Did you mean event_weight"),
         ({"resume": True}, DataError, "not a run folder"),
     ]

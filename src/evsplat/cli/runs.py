@@ -1,14 +1,13 @@
-"""Verbs that make runs, measure them and show them."""
+"""Verbs that make runs, measure them and show them; the table printed after an evaluation."""
 
 import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from evsplat.cli.summary import print_summary
 from evsplat.options import BenchOptions, ExportOptions, Film, TrainOptions
 from evsplat.options.declare import (
     FLAT,
@@ -21,8 +20,10 @@ from evsplat.options.declare import (
     Threads,
     option,
 )
-from evsplat.options.export import Kind
+from evsplat.options.runs import Kind
 from evsplat.shipped import demo_capture
+
+_REGIONS = ("full", "person_crop", "person_mask")
 
 
 def demo(
@@ -119,7 +120,7 @@ class Evaluate:
         from evsplat.evaluation.run import evaluate_run, write_report
 
         metrics = evaluate_run(self.run, lpips_weights=self.lpips_weights, device=self.device)
-        print_summary(metrics, run=self.run, report=write_report(self.run))
+        _print_summary(metrics, run=self.run, report=write_report(self.run))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,3 +222,46 @@ class Bench:
             command = shlex.join(["evsplat", *sys.argv[1:]])
             raise KeyboardInterrupt(f"{stop} Go on with: {command}") from None
         print(f"tables: {folder / 'tables.md'}\npage:   {folder / 'index.html'}")
+
+
+def _print_summary(metrics: dict[str, Any], *, run: Path, report: Path) -> None:
+    """Print the run's figures above the trivial rows, where the report is and how to view it."""
+    print(summary_table(metrics))
+    print(f"run:    {run}\nreport: {report}\nview:   {_command()} view {shlex.quote(str(run))}")
+
+
+def summary_table(metrics: dict[str, Any]) -> str:
+    """Format PSNR (dB) / SSIM of protocol 'standard' per region: the run and the trivial rows.
+
+    The last row is what the camera itself took at those times, which no method sees.
+    """
+    from evsplat.evaluation.tables import composited, terms
+
+    if metrics["frames"]["test"] == 0:
+        return f"No test figures. {terms(metrics)}"
+    rows = {
+        metrics["method"]: metrics["protocols"]["standard"],
+        **composited(metrics),
+        **metrics["trivial"],
+        "own blurry picture": metrics["blurry_input"],
+    }
+    width = max(map(len, rows))
+    head = "".join(f"{region.replace('_', ' '):>18}" for region in _REGIONS)
+    lines = [f"PSNR dB / SSIM on the test frames, protocol 'standard'\n{'':{width}}{head}"]
+    for name, regions in rows.items():
+        cells = "".join(f"{_cell(regions[region]):>18}" for region in _REGIONS)
+        lines.append(f"{name:{width}}{cells}")
+    return "\n".join([*lines, terms(metrics)])
+
+
+def _cell(values: dict[str, float | None] | None) -> str:
+    """Format one region; a figure that could not be measured is a dash."""
+    values = values or {}
+    psnr, ssim = values.get("psnr"), values.get("ssim")
+    return f"{'-' if psnr is None else f'{psnr:.2f}'} / {'-' if ssim is None else f'{ssim:.3f}'}"
+
+
+def _command() -> str:
+    """Command by which the user calls evsplat: as it was called, where that is a path to it."""
+    called = Path(sys.argv[0])
+    return str(called) if called.name == "evsplat" and not called.is_absolute() else "evsplat"

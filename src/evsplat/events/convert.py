@@ -45,7 +45,6 @@ def convert_recording(
     *,
     from_zero: bool = False,
     to: str | None = None,
-    format: str | None = None,
     **changes: Any,
 ) -> Conversion:
     """Read any recording and write it as another; memory does not grow with its length.
@@ -53,16 +52,15 @@ def convert_recording(
     Args:
         source: The recording to read.
         out: The file to write; the suffix chooses the format as in `write_events`.
-        options: As `open_recording` takes them, which also takes ``format``.
+        options: The caller's statements about the source.
         from_zero: Let the first event be at 0.
         to: Format to write, whatever the suffix.
-        format: Format of the source.
-        changes: Fields of `ReadOptions`.
+        changes: Fields of ``options``, such as ``repair``, or the source's ``format``.
     """
     source, out = Path(source), Path(out)
     if out.exists() and source.exists() and out.samefile(source):
         raise ConfigError(f"{out}: is the recording itself; write to another file.")
-    recording = open_recording(source, options, format=format, **changes)
+    recording = open_recording(source, options, **changes)
     times: list[int] = []
     pieces = _watched(recording, from_zero, times)
     count = write_events(out, pieces, format=to, width=recording.width, height=recording.height)

@@ -87,12 +87,12 @@ def open_recording(
     """Open an event recording of any format that evsplat reads (docs/event-formats.md).
 
     Args:
-        path: The recording; its format is told from its content, whatever its name.
-        options: What the file does not say, or says wrongly, and whether damage is repaired: what
-            was done is counted in ``notes``. Without ``repair`` each is a `DataError`.
+        path: The recording; its content names the format, not its suffix.
+        options: The caller's statements about it. With ``repair`` what was done is counted in
+            ``notes``; without it each damage is a `DataError`.
         format: One of `evsplat.events.formats.FORMATS`; the content must agree.
-        changes: Fields of `ReadOptions`. Of .npz and HDF5 ``columns`` is the key of each, such as
-            ``{"t": "stamps"}``.
+        changes: Fields of `ReadOptions`. For .npz and HDF5 ``columns`` says which key holds which,
+            such as ``{"t": "stamps"}``.
 
     Raises:
         DataError: The file is missing, of no known format, or its header is damaged.
@@ -116,11 +116,7 @@ def open_recording(
 
 
 def read_events(
-    path: Path | str,
-    options: ReadOptions | None = None,
-    *,
-    format: str | None = None,
-    **changes: Any,
+    path: Path | str, options: ReadOptions | None = None, **changes: Any
 ) -> EventStream:
     """All events of a recording in memory; options and errors are those of `open_recording`."""
-    return open_recording(path, options, format=format, **changes).read()
+    return open_recording(path, options, **changes).read()

@@ -15,7 +15,7 @@ from evsplat.export.cloud import SplatCloud, cloud_of, joined
 from evsplat.export.formats import write_gltf, write_ply, write_splat, write_spz
 from evsplat.film import camera_at
 from evsplat.methods.reconstruction import Parts, SplatReconstruction
-from evsplat.options.export import FileKind, UpAxis
+from evsplat.options.runs import FileKind, UpAxis
 from evsplat.training.run import Run
 
 _AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

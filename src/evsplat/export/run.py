@@ -21,7 +21,7 @@ from evsplat.export.gaussians import (
 )
 from evsplat.options import ExportOptions
 from evsplat.options.declare import given
-from evsplat.options.export import FileKind, Kind
+from evsplat.options.runs import FileKind, Kind
 from evsplat.training.run import Run, load_run
 
 logger = logging.getLogger(__name__)

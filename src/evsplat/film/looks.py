@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt16
 from evsplat.capture import Camera
 from evsplat.errors import ConfigError
 from evsplat.methods.reconstruction import Parts, Reconstruction, WithDepth
-from evsplat.options.film import Shown
+from evsplat.options.runs import Shown
 from evsplat.pictures import decode, encode, luminance
 from evsplat.pictures.colours import colours
 

@@ -4,13 +4,8 @@ A field's annotation gives type, range and placeholder, its docstring the help t
 loads torch, so that ``--help`` is quick.
 """
 
-from evsplat.options.bench import BenchOptions
-from evsplat.options.export import ExportOptions
-from evsplat.options.film import Film
-from evsplat.options.recording import ReadOptions
-from evsplat.options.stage import StageSettings
-from evsplat.options.synthesis import RECIPES, SynthesisSettings
-from evsplat.options.train import TrainOptions
+from evsplat.options.captures import RECIPES, ReadOptions, StageSettings, SynthesisSettings
+from evsplat.options.runs import BenchOptions, ExportOptions, Film, TrainOptions
 
 __all__ = [
     "RECIPES",

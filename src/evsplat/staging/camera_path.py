@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from evsplat.body import axis_angle_to_matrix
 from evsplat.camera import Camera
-from evsplat.options.stage import CameraMotion
+from evsplat.options.captures import CameraMotion
 
 TARGET = (0.0, 0.0, 0.98)
 """What every camera looks at: the middle of a standing person, metres."""

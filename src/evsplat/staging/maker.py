@@ -22,8 +22,8 @@ from evsplat.errors import ConfigError
 from evsplat.events import EventStream
 from evsplat.events.simulator import PRESETS, SensorSimulator
 from evsplat.options import StageSettings
+from evsplat.options.captures import PoseNoise
 from evsplat.options.declare import given
-from evsplat.options.stage import PoseNoise
 from evsplat.pictures import encode, luminance
 from evsplat.staging.assets import find_character, find_motion
 from evsplat.staging.camera_path import MAIN, NOVEL, CameraPath, make_camera

@@ -3,7 +3,7 @@
 from dataclasses import asdict
 
 from evsplat.capture import Policy
-from evsplat.cli.summary import summary_table
+from evsplat.cli.runs import summary_table
 
 
 def _regions(psnr):
