@@ -29,7 +29,7 @@ def make_step(seed: int, count: int = 60, turn: float = 0.7, stretch: float = 1.
     moved = gaussians.means.detach() @ matrix[:3, :3].T + matrix[:3, 3]
     human = SimpleNamespace(
         means=moved[None],
-        quats=gaussians.quaternions.detach()[None],
+        quaternions=gaussians.quaternions.detach()[None],
         scales=gaussians.scales_log.detach().exp()[None],
     )
     return SimpleNamespace(
@@ -67,7 +67,7 @@ def test_neighbours_are_searched_again_when_rows_changed_though_their_number_did
         for value in gaussians.parameters():
             value[:] = value[order]
     human = shuffled.layers.human
-    human.means, human.quats = human.means[:, order], human.quats[:, order]
+    human.means, human.quaternions = human.means[:, order], human.quaternions[:, order]
     human.scales = human.scales[:, order]
     stale = float(objective.loss(shuffled)["isometry_centers"])
     objective.rows_changed()
