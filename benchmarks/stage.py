@@ -19,7 +19,7 @@ import numpy as np
 
 from evsplat.body.motion import load_motion
 from evsplat.staging.assets import find_character, find_motion
-from evsplat.staging.camera_path import MAIN, CameraPath, make_camera
+from evsplat.staging.camera import MAIN, CameraPath, make_camera
 from evsplat.staging.character import load_character
 from evsplat.staging.motion import place_motion
 from evsplat.staging.renderer import StageRenderer

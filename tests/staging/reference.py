@@ -3,11 +3,10 @@
 import numpy as np
 
 from evsplat.capture import Camera
-from evsplat.staging import lighting as lights
+from evsplat.staging import room as lights
 from evsplat.staging.character import Character
-from evsplat.staging.lighting import Lighting
 from evsplat.staging.renderer import STILL_SAMPLES
-from evsplat.staging.room import Room
+from evsplat.staging.room import Lighting, Room
 
 
 def draw(

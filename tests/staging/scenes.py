@@ -6,8 +6,7 @@ import torch
 from evsplat.body import default_body
 from evsplat.capture import Camera
 from evsplat.staging.character import Character
-from evsplat.staging.lighting import Lighting
-from evsplat.staging.room import Room
+from evsplat.staging.room import Lighting, Room
 
 WHITE = np.full((1, 16, 16, 3), 255, np.uint8)
 LAMP = (0.0, 0.0, 2.6, 0.5, 0.5)

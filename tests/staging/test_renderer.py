@@ -3,8 +3,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.staging.lighting import Lighting
 from evsplat.staging.renderer import StageRenderer
+from evsplat.staging.room import Lighting
 
 from . import reference
 from .scenes import (

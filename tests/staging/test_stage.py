@@ -18,7 +18,7 @@ from evsplat.events.simulator import PRESETS
 from evsplat.pictures import luminance
 from evsplat.staging import StageSettings, characters, motions, stage
 from evsplat.staging.assets import find_character, find_motion
-from evsplat.staging.camera_path import CameraPath
+from evsplat.staging.camera import CameraPath, frame_times
 from evsplat.staging.character import load_character
 from evsplat.staging.cloth import Cloth
 from evsplat.staging.motion import (
@@ -28,7 +28,6 @@ from evsplat.staging.motion import (
 )
 from evsplat.staging.renderer import StageRenderer
 from evsplat.staging.room import load_room
-from evsplat.staging.timing import frame_times
 
 FAST = StageSettings(
     character="worker",

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from evsplat.synthesis.flow import FlowInterpolator
-from evsplat.synthesis.interpolate import Blend
 
 from .helpers import disc_over_texture, picture, psnr, shifted, texture
 
@@ -21,7 +20,7 @@ def test_a_moving_picture_is_moved_by_the_fraction(seed):
         truth = shifted(image, *(fraction * motion))
         inside = np.s_[10:-10, 10:-10]
         assert psnr(between[inside], truth[inside]) > 36
-        blended = next(Blend().between(before, after, [fraction]))
+        blended = (1 - fraction) * before.linear + fraction * after.linear
         assert psnr(between[inside], truth[inside]) > psnr(blended[inside], truth[inside]) + 8
 
 

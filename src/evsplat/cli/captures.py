@@ -103,7 +103,7 @@ class Synthesize:
     weights: Annotated[Path | None, option("FILE", default="in torch's hub")] = None
     """Super SloMo's checkpoint."""
     source_fps: Annotated[float | None, option("HZ", default="the video's")] = None
-    """Rate of shooting."""
+    """Rate at which footage was shot."""
     body: Annotated[Path | None, option("NPZ", default="none")] = None
     """Poses as in body.npz."""
     camera: Annotated[Path | None, option("JSON", default="a nominal one")] = None
@@ -200,7 +200,7 @@ class Masks:
     weights: Annotated[Path | None, option("FILE", default="EVSPLAT_RVM, or torch's cache")] = None
     """For rvm: the network's TorchScript file, which you bring."""
     use: Use = "training"
-    """What masks of training frames are made from; everything looks at held-out ones too."""
+    """Source of the masks of training frames; everything looks at held-out ones too."""
 
     def __call__(self) -> None:
         from evsplat.capture import Policy
@@ -253,7 +253,7 @@ class Restore:
     device: Device = "auto"
     """For networks: where they run."""
     use: Use = "training"
-    """What training frames are restored from; everything looks at held-out frames too."""
+    """Source of restored training frames; everything looks at held-out frames too."""
 
     def __call__(self) -> None:
         from evsplat.capture import Policy

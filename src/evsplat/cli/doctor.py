@@ -23,14 +23,14 @@ _MARKS = {"ok": "ok", "missing": "MISSING", "optional": "-"}
 
 @dataclass(frozen=True)
 class Check:
-    """What was found of one thing that evsplat can use."""
+    """Finding about one thing that evsplat can use."""
 
     name: str
     status: Literal["ok", "missing", "optional"]
     """missing: evsplat does not work without it; optional: it does, with less."""
     detail: str
     remedy: str = ""
-    """How to get it, where it is not there."""
+    """Way to get it, where it is not there."""
 
 
 def doctor(*, json: Flag = False) -> None:

@@ -60,7 +60,7 @@ class _ImportToBlur(_Import):
     interpolation: Annotated[
         Literal["super-slomo", "flow"] | None, option("KIND", default="the recipe's")
     ] = None
-    """How pictures between the frames are made for --blur."""
+    """Kind of pictures between the frames for --blur."""
     weights: Annotated[Path | None, option("FILE", default="in torch's hub folder")] = None
     """Checkpoint of Super SloMo for --blur."""
 

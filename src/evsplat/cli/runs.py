@@ -32,7 +32,7 @@ def demo(
     max_minutes: Annotated[
         float, option("M", "Minutes of training; evaluation and report come on top.")
     ] = 6.0,
-    device: Annotated[Device, option(help="Where to compute.")] = "auto",
+    device: Annotated[Device, option(help="Device that computes.")] = "auto",
     threads: Threads = None,
 ) -> None:
     """Train on the packaged capture, evaluate it and write a report.
@@ -114,7 +114,7 @@ class Evaluate:
     lpips_weights: Annotated[Path | None, option("FILE", default="torch hub cache")] = None
     """Backbone weights for LPIPS; without any it stays empty, with the reason."""
     device: Device = "auto"
-    """Where to draw and compare."""
+    """Device that draws and compares."""
 
     def __call__(self) -> None:
         from evsplat.evaluation.run import evaluate_run, write_report
@@ -150,7 +150,7 @@ class Render:
     out: Annotated[Path | None, option("PATH", default="in RUN/renders")] = None
     """NAME.mp4, .webp or .gif, or a new folder for PNG."""
     device: Device = "auto"
-    """Where to draw."""
+    """Device that draws."""
 
     def __call__(self) -> None:
         from evsplat.export import render_run
@@ -170,9 +170,9 @@ class View:
     """A second run of the same capture to compare with."""
     port: Port = 8080
     host: Annotated[str, option("ADDRESS", default="127.0.0.1, this machine alone")] = "127.0.0.1"
-    """Which network to listen at; 0.0.0.0 lets other machines in."""
+    """Network to listen at; 0.0.0.0 lets other machines in."""
     device: Device = "auto"
-    """Where to draw."""
+    """Device that draws."""
 
     def __call__(self) -> None:
         from evsplat.view import view_run

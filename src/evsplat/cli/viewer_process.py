@@ -37,7 +37,7 @@ class ViewerProcess:
             self._process.wait()
 
     def close(self) -> None:
-        """Stop showing."""
+        """End the viewer, where it runs."""
         if self._process is not None:
             self._process.terminate()
             self._process.wait()

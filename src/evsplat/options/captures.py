@@ -55,13 +55,13 @@ _NONE = Recipe("flow", duty=0.75)
 _PAPER = Recipe("super-slomo", duty=1.0, contrast=0.2)
 # The recorded events of MMHPSD carry no polarity, so they are simulated as well.
 RECIPES = {"zju-mocap-blur": _PAPER, "mmhpsd-blur": _PAPER}
-"""How the paper's data sets are made from ZJU-MoCap and MMHPSD, by name."""
+"""Recipes of the paper's data sets, made from ZJU-MoCap and MMHPSD, by name."""
 _EXPOSURES = ("exposure_us", "duty", "subframes")
 
 
 @dataclass(frozen=True)
 class SynthesisSettings:
-    """How blurry frames and events are made; at most one of the three exposures is given.
+    """Making of blurry frames and events; at most one of the three exposures is given.
 
     What a recipe says is filled in where nothing else is given.
     """
@@ -69,7 +69,7 @@ class SynthesisSettings:
     recipe: Annotated[
         Literal["zju-mocap-blur", "mmhpsd-blur"] | None, option("NAME", default="none")
     ] = None
-    """zju-mocap-blur or mmhpsd-blur."""
+    """Data set of the paper: zju-mocap-blur or mmhpsd-blur."""
     fps: Annotated[float | None, Above(0), option("HZ", default="the source's")] = None
     """Blurry frames per second."""
     exposure_us: Annotated[int | None, Above(1), option("US", default="by --duty")] = None
@@ -81,21 +81,21 @@ class SynthesisSettings:
     upsample: Annotated[int, AtLeast(1), option("N")] = 8
     """Sub-frames per source picture."""
     interpolation: Annotated[Interpolation | None, option("KIND", default="flow")] = None
-    """flow, super-slomo or none."""
+    """Pictures in between: flow, super-slomo or none."""
     transfer: Annotated[Transfer, option("CURVE")] = "power"
     """Values to light: power (2.2), srgb or linear."""
     sensor: Annotated[Sensor, option("PRESET")] = "clean"
     """Event camera, as of 'evsplat simulate'."""
     contrast: Annotated[float | None, AtLeast(0.01), option("C", default="the sensor's")] = None
-    """Event threshold."""
+    """Contrast threshold of events."""
     seed: Annotated[int, option("N")] = 0
     """Seed of all noise."""
     read_noise: Annotated[float, Within(0, 1), option("SIGMA")] = 0.0
     """Noise of frames, in linear light."""
     events: Annotated[Literal["simulate", "source", "none"], option("WHICH")] = "simulate"
-    """simulate, source or none."""
+    """Events: simulate, source or none."""
     split: Annotated[Literal["modulo", "source"], option("HOW")] = "modulo"
-    """modulo or source."""
+    """Split of the frames: modulo or source."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -133,19 +133,19 @@ class StageSettings:
     frames: Annotated[
         int | None, Within(1, 100_000), option("N", default="the motion's, to 100")
     ] = None
-    """How many frames."""
+    """Number of frames."""
     fps: Annotated[float, Within(0.1, 1000), option("HZ")] = 25.0
     """Frames per second."""
     exposure_ms: Annotated[float, Within(0.05, 10_000), option("MS")] = 30.0
     """Exposure of each frame."""
     start_s: Annotated[float, Within(0, 1e6), option("S", name="start")] = 0.0
-    """Where in the motion to begin."""
+    """Time in the motion to begin at."""
     yaw_deg: Annotated[float, Within(-360, 360), option("DEG", name="yaw")] = 0.0
     """Turn of the person about the vertical."""
     in_place: Flag = False
     """Leave out travel across the floor."""
     camera: Annotated[CameraMotion, option("HOW")] = "static"
-    """static, orbit (an arc round the person) or handheld."""
+    """Tripod (static), arc round the person (orbit) or handheld."""
     orbit_deg: Annotated[float, Within(-360, 360), option("DEG", name="orbit")] = 30.0
     """Arc of an orbiting camera over the whole capture."""
     shadows: Annotated[Flag, option(default="", name="shadow")] = True

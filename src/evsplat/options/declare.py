@@ -1,4 +1,4 @@
-"""How options are declared, made of what a caller gives, and checked."""
+"""Declaration of options, their making of what a caller gives, and their check."""
 
 import math
 from collections.abc import Mapping
@@ -64,7 +64,7 @@ Use = Literal["training", "everything"]
 Parts = Literal["all", "human", "scene"]
 Sensor = Literal["clean", "davis346", "dvxplorer", "evk4"]
 Transfer = Literal["power", "srgb", "linear"]
-"""The same as `evsplat.pictures.Transfer`, which loads torch."""
+"""Copy of `evsplat.pictures.Transfer`, whose module loads torch."""
 
 
 def given(kind: type[Options], options: Options | None, changes: Mapping[str, Any]) -> Options:

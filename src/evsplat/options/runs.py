@@ -21,13 +21,13 @@ from evsplat.options.declare import (
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How a method is trained on a capture, and where the run goes."""
+    """Training of a method on a capture, and the place of the run."""
 
     method: Annotated[str | None, option("NAME", default="that of --config, or evsplat")] = None
     """Name of the method."""
     out: NewRun = None
     device: Device = "auto"
-    """Where to compute; auto takes what the installed rasterisers can use."""
+    """Device; auto takes what the installed rasterisers can use."""
     iterations: Annotated[int | None, AtLeast(1), option("N", default="the method's")] = None
     """Training steps; every schedule is scaled to it."""
     max_minutes: Annotated[float | None, Above(0), option("M", default="no limit")] = None
@@ -69,7 +69,7 @@ Shown = Literal["rgb", "semantic", "depth", "events"]
 
 @dataclass(frozen=True)
 class Film:
-    """What `render_run` draws."""
+    """Film of a run, as `render_run` draws it."""
 
     what: Literal["sequence", "test"] = "sequence"
     """The whole recording, or the held-out frames at mid-exposure."""
@@ -144,7 +144,7 @@ Kind = Literal["ply", "spz", "splat", "gltf", "html", "avatar"]
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What of a run a file for other programs holds."""
+    """Part of a run that a file for other programs holds."""
 
     out: Annotated[Path | None, option("PATH", default="in RUN/exports")] = None
     """The file to write; avatar: a page NAME.html, or a new folder."""
@@ -171,7 +171,7 @@ class ExportOptions:
     fps: Annotated[float, Within(1, 120), option("HZ")] = 24.0
     """Pictures per second of html."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device that computes."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -185,7 +185,7 @@ class ExportOptions:
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What of a suite is run, and where; what is given replaces what the suite says."""
+    """Part of a suite that is run, and where; what is given replaces what the suite says."""
 
     out: Annotated[Path | None, option("FOLDER", default="bench/SUITE")] = None
     """Results folder: tables.md, tables.tex, index.html, one JSON per cell."""
@@ -196,7 +196,7 @@ class BenchOptions:
     max_minutes: Annotated[float | None, Above(0), option("M", default="the suite's")] = None
     """Minutes of training of every cell; schedules are shortened to fit."""
     seeds: Annotated[tuple[int, ...], option("[S ...]", default="the suite's")] = ()
-    """Seeds."""
+    """Seeds in place of the suite's."""
     only: Annotated[tuple[str, ...], option("[ROW ...]", default="all rows")] = ()
     """Rows of the suite to run."""
     jobs: Annotated[int | None, AtLeast(1), option("N", default="one per core or GPU")] = None
@@ -210,7 +210,7 @@ class BenchOptions:
     gpus_per_cell: Annotated[float | None, AtLeast(0), option("G", default="0 on Ray")] = None
     """GPUs of a cell, on Ray."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device that computes."""
     retry: Flag = False
     """Run cells again that failed."""
 

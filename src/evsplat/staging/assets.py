@@ -1,9 +1,13 @@
-"""What ships for synthetic captures, and the user's own files in its place."""
+"""Characters and motions that ship, and the user's own files in their place."""
 
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import UInt8
+
 from evsplat.errors import DataError
+from evsplat.pictures.files import opened_picture
 
 
 def characters() -> tuple[str, ...]:
@@ -42,3 +46,9 @@ def _find(kind: str, name: str, known: tuple[str, ...], shipped: Path) -> Path:
     raise DataError(
         f"{kind} {name!r}: neither a file nor one of {', '.join(known)}; correct the name or path."
     )
+
+
+def read_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
+    """A picture with its transparency (opaque where it has none)."""
+    with opened_picture(path) as image:
+        return np.array(image.convert("RGBA"))

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from evsplat.body import Body, default_body, make_body
 from evsplat.capture.body_file import read_arrays
 from evsplat.errors import DataError
-from evsplat.staging.textures import read_rgba
+from evsplat.staging.assets import read_rgba
 
 _ARRAYS = {
     "vertices": ("V", 3),
@@ -38,7 +38,7 @@ class Character:
     cutout: Bool[np.ndarray, "F"]
     """Triangles in which the atlas's transparency cuts holes (hair)."""
     cloth: Float32[np.ndarray, "V"]
-    """How loosely each vertex hangs, 0 to 1 (`evsplat.staging.cloth`)."""
+    """Looseness of each vertex, 0 to 1 (`evsplat.staging.cloth`)."""
     atlas: UInt8[np.ndarray, "H W 4"]
     """sRGB-coded colour and transparency."""
     body: Body

@@ -26,7 +26,14 @@ from evsplat.options.captures import PoseNoise
 from evsplat.options.declare import given
 from evsplat.pictures import encode, luminance
 from evsplat.staging.assets import find_character, find_motion
-from evsplat.staging.camera_path import MAIN, NOVEL, CameraPath, make_camera
+from evsplat.staging.camera import (
+    MAIN,
+    NOVEL,
+    CameraPath,
+    FrameTimes,
+    frame_times,
+    make_camera,
+)
 from evsplat.staging.character import Character, load_character
 from evsplat.staging.cloth import Cloth
 from evsplat.staging.motion import (
@@ -38,7 +45,6 @@ from evsplat.staging.motion import (
 )
 from evsplat.staging.renderer import StageRenderer
 from evsplat.staging.room import load_room
-from evsplat.staging.timing import FrameTimes, frame_times
 
 POSE_ERRORS: dict[PoseNoise, float] = {
     "none": 0.0,
@@ -133,7 +139,7 @@ class _Film:
         return np.array([times.mid_us for times in self.times])
 
     def describe(self, writer: CaptureWriter) -> None:
-        """Cameras and provenance."""
+        """Write the cameras and the provenance."""
         settings, moving = self.settings, self.settings.camera != "static"
         poses = self.path.at(self.mids_us)
         size = settings.size

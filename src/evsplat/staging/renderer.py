@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 
 from evsplat import compiled
 from evsplat.body import Body
@@ -10,13 +10,13 @@ from evsplat.body.skeleton import find_skeleton
 from evsplat.camera import Camera
 from evsplat.errors import BackendError
 from evsplat.staging.character import Character
-from evsplat.staging.lighting import Lighting
-from evsplat.staging.room import Room
-from evsplat.staging.textures import pyramid
+from evsplat.staging.room import Lighting, Room
 
 STILL_SAMPLES = 4
 """Samples of the room per pixel and axis where the camera stands still: drawn once, kept."""
 MOVING_SAMPLES = 2
+_GAMMA = 2.2
+"""Textures are coded with this power, as the pictures of the capture are."""
 _ROOM_LEVELS = 5
 # Tiles of an atlas lie side by side: coarser levels would blend one garment into the next.
 _ATLAS_LEVELS = 3
@@ -57,7 +57,7 @@ class StageRenderer:
             tint=_floats(room.tint),
             direct=_floats(room.direct),
             ambient=_floats(room.ambient),
-            room_texture=pyramid(room.textures, _ROOM_LEVELS),
+            room_texture=_pyramid(room.textures, _ROOM_LEVELS),
             faces=np.ascontiguousarray(character.faces, np.int32),
             person_uv=_floats(character.uv),
             cutout=np.ascontiguousarray(character.cutout, np.uint8),
@@ -65,7 +65,7 @@ class StageRenderer:
             weights=weights,
             contact=self.contact_joints,
             rest_joints=character.body.rest_joints.numpy(),
-            atlas=pyramid(character.atlas[None, ..., :3], _ATLAS_LEVELS),
+            atlas=_pyramid(character.atlas[None, ..., :3], _ATLAS_LEVELS),
             alpha=np.ascontiguousarray(character.atlas[..., 3]),
             light=self.lighting.to_native(),
         )
@@ -119,3 +119,16 @@ def _sparse(weights: Float32[np.ndarray, "V J"]) -> tuple[np.ndarray, np.ndarray
     count = int((weights > 0).sum(1).max())
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :count].astype(np.int32)
     return np.ascontiguousarray(bones), _floats(np.take_along_axis(weights, bones, axis=1))
+
+
+def _pyramid(
+    textures: UInt8[np.ndarray, "L H W 3"], levels: int
+) -> list[Float32[np.ndarray, "L h w 3"]]:
+    """Linear light of the textures and of their halves, at most ``levels`` while sides are even."""
+    pixels = ((np.arange(256) / 255) ** _GAMMA).astype(np.float32)[textures]
+    result = [np.ascontiguousarray(pixels)]
+    while len(result) < levels and not any(side % 2 for side in pixels.shape[1:3]):
+        count, height, width, _ = pixels.shape
+        pixels = pixels.reshape(count, height // 2, 2, width // 2, 2, 3).mean((2, 4))
+        result.append(np.ascontiguousarray(pixels, dtype=np.float32))
+    return result

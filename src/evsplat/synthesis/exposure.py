@@ -1,4 +1,4 @@
-"""Which sub-frames each exposure sees, and their mean in linear light as they come by."""
+"""Exposures over sub-frames, and the mean of each in linear light as they come by."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -100,7 +100,7 @@ def _spaced(
     period_us: float,
     gap_us: float,
 ) -> Int64[np.ndarray, "M"]:
-    """Of the allowed pictures those nearest to even times from the first of them on."""
+    """Indices of allowed pictures nearest to even times from the first of them on."""
     times = times_us[allowed]
     wanted = np.arange(times[0], times[-1] + gap_us / 2, period_us)
     after = np.searchsorted(times, wanted).clip(0, len(times) - 1)

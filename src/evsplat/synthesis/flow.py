@@ -35,13 +35,13 @@ _NOTHING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Where each pixel of a picture goes until the other picture, and how much it counts."""
+    """Way of each pixel of a picture to the other picture, and its weight."""
 
     flow: Float[np.ndarray, "H W 2"]
     """Pixels, x and y."""
     weight: Float[np.ndarray, "H W"]
     background: Float[np.ndarray, "2"]
-    """Median motion."""
+    """Median motion, pixels, x and y."""
 
 
 class FlowInterpolator:

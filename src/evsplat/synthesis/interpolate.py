@@ -1,4 +1,4 @@
-"""Pictures between two pictures: what the kinds of up-sampling share, and plain blending."""
+"""Pictures between two pictures: the protocol of up-sampling."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ class Picture:
     """A sharp picture in both of its forms, grey (C = 1) or RGB (C = 3)."""
 
     coded: Float[np.ndarray, "H W C"]
-    """As stored, float32 in [0, 1]."""
+    """Values as stored, float32 in [0, 1]."""
     linear: Float[np.ndarray, "H W C"]
     """Linear light, float32 in [0, 1]."""
 
@@ -26,14 +26,3 @@ class Interpolator(Protocol):
     ) -> Iterator[Float[np.ndarray, "H W C"]]:
         """Linear light at each fraction, 0 at ``before`` and 1 at ``after``, exclusive."""
         ...
-
-
-class Blend:
-    """Fades from one picture to the next: nothing moves. The yardstick for the other kinds."""
-
-    def between(
-        self, before: Picture, after: Picture, fractions: Sequence[float]
-    ) -> Iterator[Float[np.ndarray, "H W C"]]:
-        """See `Interpolator`."""
-        for fraction in fractions:
-            yield (1 - fraction) * before.linear + fraction * after.linear

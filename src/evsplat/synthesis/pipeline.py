@@ -20,11 +20,9 @@ from evsplat.footage import TimedPicture, open_footage
 from evsplat.options import SynthesisSettings
 from evsplat.options.declare import given
 from evsplat.pictures.light import Transfer, decode, encode
-from evsplat.synthesis.capture_source import CaptureSource
 from evsplat.synthesis.exposure import Exposure, ExposureMean, Plan, plan_exposures
-from evsplat.synthesis.footage_source import FootageSource
 from evsplat.synthesis.interpolate import Interpolator, Picture
-from evsplat.synthesis.source import RecordedEvents, Source
+from evsplat.synthesis.sources import CaptureSource, FootageSource, RecordedEvents, Source
 
 
 def synthesize(

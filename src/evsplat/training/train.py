@@ -58,14 +58,14 @@ class Stopped(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class _Start:
-    """What a training begins with."""
+    """Beginning of a training: its run folder and all that follows from it."""
 
     folder: RunFolder
     method: str
     settings: MethodConfig
     seed: int
     checkpoint: Path | None
-    """Of a training that goes on."""
+    """Last checkpoint of a training that goes on."""
 
 
 def train(

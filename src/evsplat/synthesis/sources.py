@@ -1,0 +1,284 @@
+"""Sharp pictures and what they bring along into the new capture: footage, or a sharp capture."""
+
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NoReturn, Protocol
+
+import numpy as np
+from jaxtyping import Int64
+
+from evsplat.capture import BodyFile, Capture, CaptureWriter, Frame, load_capture
+from evsplat.capture.body_file import RIG_ARRAYS, body_from_arrays, read_arrays
+from evsplat.capture.write import read_camera
+from evsplat.errors import ConfigError, DataError
+from evsplat.events import EventStore, EventStream
+from evsplat.footage import Footage, TimedPicture
+from evsplat.pictures.files import read_image
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedEvents:
+    """Events that a source has of its own."""
+
+    pieces: Iterator[EventStream]
+    contrast_threshold: tuple[float, float] | None
+    simulated: bool
+
+
+class Source(Protocol):
+    """Sharp pictures with what belongs to them."""
+
+    footage: Footage
+    camera: str
+    """Name of the camera that took them."""
+
+    def describe(self) -> dict[str, Any]:
+        """Facts about the source for the provenance."""
+        ...
+
+    def declare(self, writer: CaptureWriter) -> None:
+        """Add the cameras."""
+        ...
+
+    def extras(self, index: int) -> dict[str, Any]:
+        """Options of `CaptureWriter.add_frame` that go with the source picture of that index."""
+        ...
+
+    def split(self, index: int) -> Literal["train", "test"]:
+        """The source's own split; `ConfigError` where it has none."""
+        ...
+
+    def events(self) -> RecordedEvents:
+        """The source's own events; `ConfigError` where it has none."""
+        ...
+
+    def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
+        """Add the body and the rest; ``frames`` are names and mid-exposures of those made."""
+        ...
+
+
+def set_body(
+    writer: CaptureWriter,
+    body: BodyFile,
+    dense: BodyFile | None,
+    middles_us: Int64[np.ndarray, "M"],
+) -> None:
+    """Key poses are those at mid-exposures; all there are, or the denser truth, go beside them."""
+    nearest = np.abs(body.times_us[None] - middles_us[:, None]).argmin(axis=1)
+    keys = np.unique(nearest)
+    truth = dense or body
+    writer.set_body(
+        body.model,
+        body.times_us[keys],
+        body.poses[keys],
+        body.transl[keys],
+        rig=body.rig,
+        betas=body.betas,
+        gender=body.gender,
+        dense=(truth.times_us, truth.poses, truth.transl),
+    )
+
+
+_PIECE_US = 100_000
+
+
+class CaptureSource:
+    """Camera, poses, masks, other views and first points go on to the new capture (`Source`).
+
+    The sharp pictures are the frames' ``sharp`` where all have one, else their ``image``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._capture = load_capture(path)
+        self.footage: Footage = _CaptureFootage(self._capture)
+        self.camera = self._capture.frames[0].camera
+
+    def describe(self) -> dict[str, Any]:
+        """See `Source`."""
+        return {"capture": self._capture.name, "provenance": self._capture.provenance}
+
+    def declare(self, writer: CaptureWriter) -> None:
+        """See `Source`; lenses stay, pictures are handled as they were recorded."""
+        for name, camera in self._capture.cameras.items():
+            lens = self._capture.metadata.distortions.get(name)
+            writer.add_camera(
+                name,
+                camera.width,
+                camera.height,
+                camera.K,
+                camera.world_to_camera,
+                distortion=None if lens is None else lens.coefficients,
+            )
+
+    def extras(self, index: int) -> dict[str, Any]:
+        """See `Source`."""
+        frame = self._capture.frames[index]
+        return {"mask": frame.mask, "world_to_camera": frame.world_to_camera}
+
+    def split(self, index: int) -> Literal["train", "test"]:
+        """See `Source`."""
+        return self._capture.frames[index].split
+
+    def events(self) -> RecordedEvents:
+        """See `Source`; with the lens as it is."""
+        entry = self._capture.metadata.events
+        if entry is None:
+            raise ConfigError(
+                f"{self._capture.path}: has no events to keep; leave --events out to simulate them."
+            )
+        store = EventStore(entry.file, entry.width, entry.height, entry.clock_offset_us)
+        return RecordedEvents(_pieces(store), entry.contrast_threshold, entry.simulated)
+
+    def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
+        """See `Source`."""
+        capture = self._capture
+        middles = np.array(list(frames.values()))
+        set_body(writer, capture.body_file, capture.dense_body_file, middles)
+        for view in capture.novel_views:
+            if view.frame in frames:
+                writer.add_novel_view(view.camera, view.frame, view.time_us, view.image)
+        points = capture.initial_points()
+        if points is not None:
+            writer.set_points(*points)
+
+
+class _CaptureFootage:
+    """The sharp pictures of a capture as they are stored (`Footage`)."""
+
+    def __init__(self, capture: Capture) -> None:
+        self.path = capture.path
+        self._frames = capture.frames
+        cameras = sorted({frame.camera for frame in capture.frames})
+        if len(cameras) > 1:
+            raise DataError(
+                f"{capture.path}: frames of {len(cameras)} cameras ({', '.join(cameras)}), "
+                "expected one; keep the frames of one in capture.json."
+            )
+        camera = capture.cameras[cameras[0]]
+        self.width, self.height = camera.width, camera.height
+        self.times_us = np.array([frame.mid_us for frame in capture.frames], dtype=np.int64)
+        self._files = _sharp_files(capture)
+
+    def __iter__(self) -> Iterator[TimedPicture]:
+        """See `Footage`."""
+        for frame, file in zip(self._frames, self._files, strict=True):
+            yield TimedPicture(frame.name, frame.mid_us, read_image(file))
+
+
+def _sharp_files(capture: Capture) -> list[Path]:
+    without = [frame for frame in capture.frames if frame.sharp is None]
+    if 0 < len(without) < len(capture.frames):
+        raise DataError(
+            f"{capture.path / 'capture.json'}: {len(without)} of {len(capture.frames)} frames have "
+            f"no sharp picture (first: {without[0].name!r}), expected one for all or for none."
+        )
+    return [_file(frame) for frame in capture.frames]
+
+
+def _file(frame: Frame) -> Path:
+    return frame.image if frame.sharp is None else frame.sharp
+
+
+def _pieces(store: EventStore) -> Iterator[EventStream]:
+    start, end = store.time_range_us
+    for first in range(start, end, _PIECE_US):
+        yield store.between(first, min(end, first + _PIECE_US))
+    store.close()
+
+
+# Field of view across the longer side of a camera that nobody has described.
+_NOMINAL_FOV_DEG = 60.0
+_CAMERA_KEYS = ("width", "height", "K", "world_to_camera")
+
+
+class FootageSource:
+    """Footage with a camera and body poses, if the user has them (`Source`).
+
+    ``body`` is an npz like body.npz of a capture, on the footage's clock; ``camera`` a JSON file
+    with one camera as in capture.json.
+    """
+
+    camera = "main"
+
+    def __init__(self, footage: Footage, body: Path | None, camera: Path | None) -> None:
+        if body is not None and camera is None:
+            raise ConfigError(
+                f"{body}: poses mean nothing without the camera that saw them; give its "
+                "description with --camera."
+            )
+        self.footage: Footage = footage
+        self._body = None if body is None else _read_body(body)
+        self._camera = None
+        if camera is not None:
+            self._camera = read_camera(camera, footage.width, footage.height, _CAMERA_KEYS)
+
+    def describe(self) -> dict[str, Any]:
+        """See `Source`."""
+        return {"footage": self.footage.path.name, "camera_known": self._camera is not None}
+
+    def declare(self, writer: CaptureWriter) -> None:
+        """See `Source`."""
+        width, height = self.footage.width, self.footage.height
+        if self._camera is not None:
+            writer.add_camera(self.camera, width, height, **self._camera)
+            return
+        logger.warning(
+            "No camera is given: one with %g degrees of view is written. Correct it in "
+            "capture.json before you fit poses.",
+            _NOMINAL_FOV_DEG,
+        )
+        focal = max(width, height) / 2 / np.tan(np.radians(_NOMINAL_FOV_DEG) / 2)
+        K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+        writer.add_camera(self.camera, width, height, K)
+
+    def extras(self, index: int) -> dict[str, Any]:
+        """See `Source`."""
+        return {}
+
+    def split(self, index: int) -> Literal["train", "test"]:
+        """See `Source`."""
+        self._has_no("split")
+
+    def events(self) -> RecordedEvents:
+        """See `Source`."""
+        self._has_no("events")
+
+    def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
+        """See `Source`."""
+        if self._body is None:
+            logger.warning("No body poses are given; 'evsplat train' will need them.")
+            writer.leave_out_body()
+            return
+        set_body(writer, self._body, None, np.array(list(frames.values())))
+
+    def _has_no(self, what: str) -> NoReturn:
+        raise ConfigError(
+            f"--{what} source: {self.footage.path} is no capture and has no {what} of its own."
+        )
+
+
+def _read_body(path: Path) -> BodyFile:
+    arrays = read_arrays(path)
+    needed: tuple[str, ...] = ("model", "times_us", "poses", "transl")
+    if "model" in arrays and str(arrays["model"]) == "rig":
+        needed += RIG_ARRAYS
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        raise DataError(
+            f"{path}: {', '.join(missing)} missing, expected the arrays of body.npz "
+            "(docs/capture-format.md); add them."
+        )
+    count = len(np.atleast_1d(arrays["times_us"]))
+    for name in ("poses", "transl"):
+        if arrays[name].ndim < 2 or len(arrays[name]) != count:
+            raise DataError(
+                f"{path}: {name} has shape {arrays[name].shape}, expected one row for each of the "
+                f"{count} times_us."
+            )
+    if count == 0:
+        raise DataError(f"{path}: times_us is empty, expected at least one pose.")
+    return body_from_arrays(path, arrays, "")
