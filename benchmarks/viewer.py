@@ -99,19 +99,19 @@ async def pictures(port: int, seconds: float, change, viewer: Viewer) -> list[tu
 
 def turn_camera(client, elapsed: float) -> None:
     """Another viewpoint."""
-    orbit = client.standing.orbit
-    x = 0.3 * np.sin(elapsed)
-    client.change(recording=None, orbit=replace(orbit, position=(float(x), *orbit.position[1:])))
+    camera = client.current.browser_camera
+    position = (0.3 * float(np.sin(elapsed)), *camera.position[1:])
+    client.change(recording_camera=None, browser_camera=replace(camera, position=position))
 
 
 def move_in_time(client, elapsed: float) -> None:
     """Another recorded pose."""
-    client.play(lambda p, now: p.moved(p.start_us + 1e6 * (elapsed % 2), now))
+    client.change_playback(lambda p, now: p.moved(p.start_us + 1e6 * (elapsed % 2), now))
 
 
 def bend_arm(client, elapsed: float) -> None:
     """Another pose by hand."""
-    count = len(client.painter.subject.sliders)
+    count = len(client.compositor.viewed.sliders)
     angles = [0.0] * count
     angles[-1] = 40 * float(np.sin(3 * elapsed)) + 41
     client.change(motion=Motion(None, tuple(angles)))

@@ -8,28 +8,28 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.capture import Camera
-from evsplat.view.camera import Orbit, forward, framed, orbit_camera, resized, vertical_fov
+from evsplat.view.camera import BrowserCamera, forward, letterboxed, resized, vertical_fov
 
 
-def _random_orbit(rng):
+def _random_view(rng):
     x, y, z, w = Rotation.random(rng=rng).as_quat()
-    return Orbit((w, x, y, z), tuple(rng.normal(size=3)), rng.uniform(0.3, 1.5))
+    return BrowserCamera((w, x, y, z), tuple(rng.normal(size=3)), rng.uniform(0.3, 1.5))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_browser_camera_projects_as_its_angles_say(seed):
     """A point at angles (a, b) right of and below the optical axis, by trigonometry alone."""
     rng = np.random.default_rng(seed)
-    orbit = _random_orbit(rng)
+    view = _random_view(rng)
     width, height = int(rng.integers(50, 900)), int(rng.integers(50, 900))
-    camera = orbit_camera(orbit, width, height)
-    w, x, y, z = orbit.wxyz
+    camera = view.sized(width, height)
+    w, x, y, z = view.wxyz
     right, down, ahead = Rotation.from_quat([x, y, z, w]).as_matrix().T
     a, b, depth = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(0.5, 9)
     direction = ahead + math.tan(a) * right + math.tan(b) * down
-    point = np.asarray(orbit.position) + depth * direction
+    point = np.asarray(view.position) + depth * direction
     pixel, z = camera.project(torch.from_numpy(point).float())
-    half = math.tan(orbit.fov / 2)
+    half = math.tan(view.fov / 2)
     expected = [
         width / 2 + height / 2 * math.tan(a) / half,
         height / 2 * (1 + math.tan(b) / half),
@@ -37,23 +37,23 @@ def test_browser_camera_projects_as_its_angles_say(seed):
     assert pixel.numpy() == pytest.approx(expected, abs=1e-2)
     assert float(z) == pytest.approx(depth, rel=1e-4)
     assert forward(camera) == pytest.approx(ahead, abs=1e-6)
-    assert camera.center().numpy() == pytest.approx(orbit.position, abs=1e-5)
-    assert vertical_fov(camera) == pytest.approx(orbit.fov)
+    assert camera.center().numpy() == pytest.approx(view.position, abs=1e-5)
+    assert vertical_fov(camera) == pytest.approx(view.fov)
 
 
 def test_the_upper_border_of_the_picture_is_half_the_field_of_view_up():
-    camera = orbit_camera(Orbit((1, 0, 0, 0), (0, 0, 0), math.pi / 2), 640, 480)
+    camera = BrowserCamera((1, 0, 0, 0), (0, 0, 0), math.pi / 2).sized(640, 480)
     pixel, _ = camera.project(torch.tensor([0.0, -1.0, 1.0]))
     assert pixel.tolist() == pytest.approx([320, 0])
 
 
 @pytest.mark.parametrize("size", [(300, 800), (800, 300), (501, 377), (64, 48)])
-def test_a_framed_camera_shows_its_whole_picture_centred(size):
+def test_a_letterboxed_camera_shows_its_whole_picture_centred(size):
     K = torch.tensor([[310.0, 0, 120.0], [0, 290.0, 101.0], [0, 0, 1]])
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.2, -0.1, 0.4])
     camera = Camera(256, 192, K, pose)
-    view, box = framed(camera, *size)
+    view, box = letterboxed(camera, *size)
     assert (view.width, view.height) == size
     assert box.width / box.height == pytest.approx(256 / 192)
     assert (box.left + box.width / 2, box.top + box.height / 2) == (size[0] / 2, size[1] / 2)
@@ -67,7 +67,7 @@ def test_a_framed_camera_shows_its_whole_picture_centred(size):
 
 
 def test_resizing_keeps_what_is_seen_where():
-    camera = orbit_camera(Orbit((1, 0, 0, 0), (0, 0, 0), 1.0), 640, 480)
+    camera = BrowserCamera((1, 0, 0, 0), (0, 0, 0), 1.0).sized(640, 480)
     small = resized(camera, 160, 90)
     point = torch.tensor([0.3, -0.2, 2.0])
     pixel, _ = camera.project(point)

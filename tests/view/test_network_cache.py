@@ -1,4 +1,4 @@
-"""Networks that remember give the pictures of those that do not."""
+"""Cached networks give the pictures of those that are not."""
 
 import pytest
 import torch
@@ -7,8 +7,8 @@ from evsplat.capture import load_capture
 from evsplat.view.network_cache import (
     NETWORKS,
     CachedNetwork,
-    Turns,
-    set_rough,
+    Interleave,
+    set_draft,
     with_cached_networks,
 )
 
@@ -25,53 +25,53 @@ class Counting(torch.nn.Module):
         return x * scale
 
 
-def test_the_same_question_is_asked_once():
+def test_the_same_inputs_are_computed_once():
     network = Counting()
-    memory = CachedNetwork(network, Turns(4, (0, None)))
+    cached = CachedNetwork(network, Interleave(4, (0, None)))
     x = torch.rand(4, 3)
-    assert torch.equal(memory(x, 2.0), x * 2)
-    assert torch.equal(memory(x.clone(), 2.0), x * 2)
+    assert torch.equal(cached(x, 2.0), x * 2)
+    assert torch.equal(cached(x.clone(), 2.0), x * 2)
     assert network.calls == 1
-    assert torch.equal(memory(x, 3.0), x * 3)
-    assert torch.equal(memory(x + 1, 3.0), (x + 1) * 3)
+    assert torch.equal(cached(x, 3.0), x * 3)
+    assert torch.equal(cached(x + 1, 3.0), (x + 1) * 3)
     assert network.calls == 3
 
 
 @pytest.mark.parametrize("count", [8, 10])
-def test_rough_answers_are_renewed_in_turns_and_then_exact(count):
+def test_draft_outputs_are_renewed_in_phases_and_then_exact(count):
     network = Counting()
-    memory = CachedNetwork(network, Turns(4, (0, None)))
+    cached = CachedNetwork(network, Interleave(4, (0, None)))
     x, scale = torch.rand(count, 3), torch.tensor(2.0)
-    first = memory(x, scale)
+    first = cached(x, scale)
     kept = first.clone()
-    memory.rough = True
-    for turn in range(4):
-        answer = memory(x + 1, scale)
-        renewed = torch.arange(count) % 4 <= turn
-        assert torch.equal(answer, torch.where(renewed[:, None], (x + 1) * 2, x * 2))
-    # What was handed out before is not changed by what is learned later.
+    cached.draft = True
+    for phase in range(4):
+        output = cached(x + 1, scale)
+        renewed = torch.arange(count) % 4 <= phase
+        assert torch.equal(output, torch.where(renewed[:, None], (x + 1) * 2, x * 2))
+    # An output handed out before is not changed by later updates.
     assert torch.equal(first, kept)
     assert network.calls == 5
-    assert torch.equal(memory(x + 1, scale), (x + 1) * 2)
+    assert torch.equal(cached(x + 1, scale), (x + 1) * 2)
     assert network.calls == 5
-    # Answers in parts are rounded otherwise: what is no draft is asked in one go.
-    memory.rough = False
-    assert torch.equal(memory(x + 1, scale), (x + 1) * 2)
+    # Parts are rounded otherwise: final outputs are computed in one go.
+    cached.draft = False
+    assert torch.equal(cached(x + 1, scale), (x + 1) * 2)
     assert network.calls == 6
 
 
-def test_an_exact_answer_has_nothing_of_older_questions():
-    memory = CachedNetwork(Counting(), Turns(4, (0, None)))
+def test_an_exact_output_has_nothing_of_older_inputs():
+    cached = CachedNetwork(Counting(), Interleave(4, (0, None)))
     x, scale = torch.rand(8, 3), torch.tensor(2.0)
-    memory(x, scale)
-    memory.rough = True
-    memory(x + 1, scale)
-    memory(x + 2, scale)
-    memory.rough = False
-    assert torch.equal(memory(x + 2, scale), (x + 2) * 2)
-    memory.rough = True
-    # Another number of points cannot be asked about in part.
-    assert torch.equal(memory(x[:3] + 1, scale), (x[:3] + 1) * 2)
+    cached(x, scale)
+    cached.draft = True
+    cached(x + 1, scale)
+    cached(x + 2, scale)
+    cached.draft = False
+    assert torch.equal(cached(x + 2, scale), (x + 2) * 2)
+    cached.draft = True
+    # Another number of points cannot be computed in part.
+    assert torch.equal(cached(x[:3] + 1, scale), (x[:3] + 1) * 2)
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def model(tiny_capture):
 
 
 @torch.no_grad()
-def test_a_remembering_model_poses_and_colours_as_the_model_does(model):
+def test_a_model_with_cached_networks_poses_and_colours_as_the_model_does(model):
     model, capture = model
     assert set(NETWORKS) <= {name for name, _ in model.named_modules()}
     twin = with_cached_networks(model)
@@ -119,7 +119,7 @@ def test_drafts_come_to_be_exact_and_are_near_it_before(model):
     first = twin.at([capture.frames[0].mid_us], cameras[0].center())
     time_us, centre = capture.frames[3].mid_us, cameras[1].center()
     expected = model.at([time_us], centre)
-    set_rough(twin, True)
+    set_draft(twin, True)
     draft = twin.at([time_us], centre)
     # The person has moved in the first draft already.
     away = (draft.human.means - expected.human.means).abs().max()
@@ -128,13 +128,13 @@ def test_drafts_come_to_be_exact_and_are_near_it_before(model):
     found, wanted = draft.scene.channels[0], expected.scene.channels[0]
     assert_close(found[renewed], wanted[renewed])
     assert (found - wanted).abs().max() > 1e-3
-    # Each network waits for those whose answers it is asked about.
-    for _ in range(sum(turns.every for turns in NETWORKS.values())):
+    # Each network waits for those whose outputs are its inputs.
+    for _ in range(sum(interleave.every for interleave in NETWORKS.values())):
         draft = twin.at([time_us], centre)
     for name in ("means", "quaternions", "scales", "channels"):
         assert_close(getattr(draft.human, name), getattr(expected.human, name))
     assert_close(draft.scene.channels, expected.scene.channels)
-    set_rough(twin, False)
+    set_draft(twin, False)
     sharp = twin.at([time_us], centre)
     for part in ("human", "scene"):
         found, wanted = (vars(getattr(layers, part)) for layers in (sharp, expected))

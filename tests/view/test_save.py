@@ -19,7 +19,7 @@ from evsplat.capture import load_capture  # noqa: E402
 from evsplat.training.run import GaussianReconstruction, Run  # noqa: E402
 from evsplat.view.request import Motion  # noqa: E402
 from evsplat.view.server import Viewer  # noqa: E402
-from evsplat.view.subject import Subject  # noqa: E402
+from evsplat.view.viewed_run import ViewedRun  # noqa: E402
 
 from ..export.clouds import read_ply, read_spz  # noqa: E402
 from ..small_model import built, small_config  # noqa: E402
@@ -145,7 +145,7 @@ def test_gaussians_come_in_every_format_and_as_the_parts_that_are_shown(run, tmp
     # The window shows the first frame; the file holds that instant.
     first = min(run.capture.frames, key=lambda frame: frame.mid_us)
     assert whole.name == f"{run.capture.name}-{first.mid_us / 1e3:.1f}ms.ply"
-    expected = Subject(run, "it").cloud(run.capture.camera(first), first.mid_us, Motion(), "all")
+    expected = ViewedRun(run, "it").cloud(run.capture.camera(first), first.mid_us, Motion(), "all")
     found = np.stack([columns[axis] for axis in "xyz"], 1)
     np.testing.assert_allclose(found, expected.means, atol=1e-6)
     np.testing.assert_array_equal(columns["semantic"], [1] * people + [0] * scene)

@@ -1,4 +1,4 @@
-"""The drawing thread: the newest request is served, nobody is forgotten or waits for a picture."""
+"""The render thread draws the newest requests in turn; drafts have the size that time allows."""
 
 import itertools
 import threading
@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from evsplat.view.scheduler import LEAST_S, RenderScheduler
+from evsplat.view.scheduler import MIN_INTERVAL_S, MIN_SCALE, DraftResolution, RenderScheduler
 
 
 class Clock:
@@ -17,16 +17,16 @@ class Clock:
         return self.now
 
 
-class RenderClient:
-    def __init__(self, name="", served=None):
+class Client:
+    def __init__(self, name="", drawn=None):
         self.name, self.wanted = name, None
-        self.served = [] if served is None else served
+        self.drawn = [] if drawn is None else drawn
 
     def request(self, now):
         return self.wanted(now) if callable(self.wanted) else self.wanted
 
     def render(self, request, *, draft):
-        self.served.append((self.name, request, draft))
+        self.drawn.append((self.name, request, draft))
 
 
 @pytest.fixture
@@ -35,85 +35,85 @@ def scheduler():
 
 
 def _run(scheduler, seconds):
-    """Serve for some seconds of a clock that goes by only while the scheduler sleeps."""
+    """Draw for some seconds of a clock that goes by only while the scheduler sleeps."""
     end = scheduler._clock.now + seconds
     while True:
-        pause = scheduler.turn()
+        pause = scheduler.step()
         if pause is None or scheduler._clock.now + pause > end:
             return
         scheduler._clock.now += max(pause, 1e-6)
 
 
 def test_a_view_that_settles_is_drawn_roughly_then_sharply_and_then_rests(scheduler):
-    client = RenderClient()
-    scheduler.enter(client)
-    assert scheduler.turn() is None
+    client = Client()
+    scheduler.add(client)
+    assert scheduler.step() is None
     client.wanted = "view"
     _run(scheduler, 10)
-    assert client.served == [("", "view", True), ("", "view", False)]
+    assert client.drawn == [("", "view", True), ("", "view", False)]
 
 
-def test_only_the_newest_wish_is_drawn(scheduler):
-    client = RenderClient()
-    scheduler.enter(client)
+def test_only_the_newest_request_is_drawn(scheduler):
+    client = Client()
+    scheduler.add(client)
     for request in range(50):
         client.wanted = request
-    scheduler.turn()
-    assert client.served == [("", 49, True)]
+    scheduler.step()
+    assert client.drawn == [("", 49, True)]
 
 
 def test_while_a_view_moves_it_is_never_drawn_sharply(scheduler):
-    client = RenderClient()
+    client = Client()
     views = itertools.count()
     client.wanted = lambda now: next(views)
-    scheduler.enter(client)
+    scheduler.add(client)
     _run(scheduler, 3)
-    assert len(client.served) > 20
-    assert all(draft for _, _, draft in client.served)
+    assert len(client.drawn) > 20
+    assert all(draft for _, _, draft in client.drawn)
 
 
 def test_pictures_of_one_client_come_no_faster_than_a_screen_shows_them(scheduler):
-    client = RenderClient()
+    client = Client()
     client.wanted = lambda now: now
-    scheduler.enter(client)
+    scheduler.add(client)
     _run(scheduler, 2)
-    assert len(client.served) <= 2 / LEAST_S + 1
+    assert len(client.drawn) <= 2 / MIN_INTERVAL_S + 1
 
 
 def test_clients_take_turns(scheduler):
-    served = []
-    first, second = RenderClient("a", served), RenderClient("b", served)
+    drawn = []
+    first, second = Client("a", drawn), Client("b", drawn)
     for client in (first, second):
         client.wanted = lambda now: now
-        scheduler.enter(client)
+        scheduler.add(client)
     _run(scheduler, 1)
-    names = [name for name, _, _ in served]
+    names = [name for name, _, _ in drawn]
     assert abs(names.count("a") - names.count("b")) <= 1
 
 
-def test_a_client_that_left_is_not_served(scheduler):
-    client = RenderClient()
+def test_a_client_that_left_is_not_drawn(scheduler):
+    client = Client()
     client.wanted = "view"
-    scheduler.enter(client)
-    scheduler.leave(client)
+    scheduler.add(client)
+    scheduler.remove(client)
     _run(scheduler, 1)
-    assert client.served == []
+    assert client.drawn == []
 
 
 def test_new_parameters_are_drawn_anew(scheduler):
-    client = RenderClient()
+    client = Client()
     client.wanted = "view"
-    scheduler.enter(client)
+    scheduler.add(client)
     _run(scheduler, 1)
     scheduler.redraw()
     _run(scheduler, 1)
-    assert [draft for _, _, draft in client.served] == [True, False, True, False]
+    assert [draft for _, _, draft in client.drawn] == [True, False, True, False]
 
 
 def test_asking_never_waits_for_a_picture_and_a_bad_picture_ends_nothing(caplog):
     drawing, go_on = threading.Event(), threading.Event()
 
-    class Slow(RenderClient):
+    class SlowClient(Client):
         def render(self, request, *, draft):
             super().render(request, draft=draft)
             drawing.set()
@@ -121,20 +121,52 @@ def test_asking_never_waits_for_a_picture_and_a_bad_picture_ends_nothing(caplog)
             if request == "bad":
                 raise ValueError("no such picture")
 
-    scheduler, client = RenderScheduler(), Slow()
+    scheduler, client = RenderScheduler(), SlowClient()
     client.wanted = "bad"
     scheduler.start()
-    scheduler.enter(client)
+    scheduler.add(client)
     assert drawing.wait(10)
     started = time.perf_counter()
     client.wanted = "good"
-    scheduler.wake()
-    scheduler.enter(RenderClient())
+    scheduler.notify()
+    scheduler.add(Client())
     assert time.perf_counter() - started < 0.5
     go_on.set()
     deadline = time.monotonic() + 10
-    while ("", "good", False) not in client.served and time.monotonic() < deadline:
+    while ("", "good", False) not in client.drawn and time.monotonic() < deadline:
         time.sleep(0.01)
     scheduler.close()
-    assert ("", "good", False) in client.served
+    assert ("", "good", False) in client.drawn
     assert "could not be drawn" in caplog.text
+
+
+@pytest.mark.parametrize("nanoseconds_per_pixel", [20, 100, 300])
+def test_drafts_come_to_take_the_target(nanoseconds_per_pixel):
+    resolution = DraftResolution(target_s=0.04)
+    for _ in range(40):
+        width, height = resolution.size(1024, 1024)
+        seconds = width * height * nanoseconds_per_pixel * 1e-9
+        resolution.record(seconds)
+    # Sizes go in steps of a quarter of an octave of the side, half an octave of the pixels.
+    assert resolution.scale == 1 or 0.04 / 1.8 < seconds < 0.04 * 1.8
+
+
+def test_drafts_never_become_useless():
+    resolution = DraftResolution()
+    for _ in range(40):
+        resolution.record(100.0)
+    assert resolution.scale == MIN_SCALE
+    assert resolution.size(100, 50) == (30, 16)
+    for _ in range(40):
+        resolution.record(1e-6)
+    assert resolution.size(100, 50) == (100, 50)
+
+
+def test_a_slow_picture_now_and_then_does_not_change_the_size():
+    resolution = DraftResolution(target_s=0.04)
+    sizes = set()
+    for picture in range(60):
+        sizes.add(resolution.size(512, 512))
+        # A scene that has to be drawn anew takes three times as long.
+        resolution.record(0.036 * resolution.scale**2 * (2 if picture % 20 == 0 else 1))
+    assert len(sizes) <= 2

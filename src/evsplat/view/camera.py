@@ -7,20 +7,31 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.capture import Camera
+from evsplat.camera import Camera
 
 Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Orbit:
-    """Where the browser's camera stands; OpenCV axes, metres."""
+class BrowserCamera:
+    """Pose and field of view of the browser's camera; OpenCV axes, metres."""
 
     wxyz: tuple[float, float, float, float]
     """Rotation from the camera to the world, a unit quaternion."""
     position: Vector
     fov: float
     """Vertical field of view, radians."""
+
+    def sized(self, width: int, height: int) -> Camera:
+        """The camera with so many square pixels and the principal point in the middle."""
+        focal = height / (2 * math.tan(self.fov / 2))
+        w, *xyz = self.wxyz
+        to_world = Rotation.from_quat([*xyz, w]).as_matrix()
+        world_to_camera = np.eye(4)
+        world_to_camera[:3, :3] = to_world.T
+        world_to_camera[:3, 3] = -to_world.T @ np.asarray(self.position)
+        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return Camera(width, height, K, torch.from_numpy(world_to_camera).float())
 
 
 @dataclass(frozen=True)
@@ -33,22 +44,10 @@ class Box:
     height: float
 
 
-def orbit_camera(orbit: Orbit, width: int, height: int) -> Camera:
-    """What the browser's camera sees: square pixels, principal point in the middle."""
-    focal = height / (2 * math.tan(orbit.fov / 2))
-    w, *xyz = orbit.wxyz
-    to_world = Rotation.from_quat([*xyz, w]).as_matrix()
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = to_world.T
-    world_to_camera[:3, 3] = -to_world.T @ np.asarray(orbit.position)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(width, height, K, torch.from_numpy(world_to_camera).float())
+def letterboxed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
+    """A recording camera seen through a viewport: its whole picture, centred, and its box.
 
-
-def framed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
-    """A recording camera seen through a viewport: its whole picture, centred, and where it lies.
-
-    What the viewport shows around the picture is drawn as well.
+    The bars that the viewport shows around the picture are drawn as well.
     """
     scale = min(width / camera.width, height / camera.height)
     box = Box(

@@ -1,4 +1,4 @@
-"""One browser: its controls, and what it sees by them."""
+"""One browser: the picture that it asks for, its playback, and drawing and sending pictures."""
 
 import threading
 import time
@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 import viser
 
-from evsplat.view.camera import Orbit
-from evsplat.view.painter import Painter
-from evsplat.view.request import ViewRequest
-from evsplat.view.resolution import Resolution
-from evsplat.view.scheduler import RenderScheduler
-from evsplat.view.timeline import Playback
+from evsplat.view.camera import BrowserCamera
+from evsplat.view.compositor import Compositor
+from evsplat.view.request import Playback, ViewRequest
+from evsplat.view.scheduler import DraftResolution, RenderScheduler
 
 LONGEST_PX = 1600
 """Pictures are drawn no larger; the browser enlarges them to its window."""
-_DRAFT_QUALITY, _SHARP_QUALITY = 75, 93
-_STANDS_STILL = 2e-3
+_DRAFT_QUALITY, _FINAL_QUALITY = 75, 93
+_SAME_PLACE = 2e-3
+"""Distance in metres and in direction below which two cameras stand at the same place."""
 
 
 @dataclass
@@ -29,78 +28,76 @@ class Snap:
     position: np.ndarray
     forward: np.ndarray
     arrived: bool = False
-    """Whether the browser said that it stands there; what it said before is old."""
+    """The browser has said that it stands there; what it said before is old."""
 
     def left(self, camera: viser.CameraHandle) -> bool:
-        """Whether the user has moved the browser's camera since."""
+        """True once the user has moved the browser's camera away."""
         ahead = camera.look_at - camera.position
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
         away = np.abs(camera.position - self.position).max() + np.abs(ahead - self.forward).max()
-        self.arrived = self.arrived or away < _STANDS_STILL
-        return self.arrived and away >= _STANDS_STILL
+        self.arrived = self.arrived or away < _SAME_PLACE
+        return self.arrived and away >= _SAME_PLACE
 
 
 class Client:
-    """Holds the request of a browser; callbacks only write it down, the scheduler does the work."""
+    """State of a browser; its callbacks only write it down, the scheduler has it drawn."""
 
     def __init__(
         self,
         handle: viser.ClientHandle,
-        painter: Painter,
+        compositor: Compositor,
         scheduler: RenderScheduler,
         request: ViewRequest,
         playback: Playback,
     ) -> None:
-        self.handle, self.painter, self.scheduler = handle, painter, scheduler
+        self.handle, self.compositor, self.scheduler = handle, compositor, scheduler
         self._lock = threading.Lock()
         self._request = request
         self._playback = playback
         self._snap: Snap | None = None
-        self._resolution = Resolution()
-        self.gone = False
-        """Whether the browser has left, perhaps while its picture was drawn."""
-        self.on_time: Callable[[int], None] = lambda time_us: None
-        """Called by the drawing thread with the time that is shown."""
+        self._resolution = DraftResolution()
+        self.disconnected = False
+        """The browser has left, perhaps while its picture was drawn."""
+        self.on_drawn: Callable[[int], None] = lambda time_us: None
+        """Called by the render thread with the time that is shown."""
         handle.camera.on_update(self._camera_moved)
 
     def change(self, **fields: Any) -> None:
-        """Ask for other fields."""
+        """Ask for a picture with other fields."""
         with self._lock:
             self._request = replace(self._request, **fields)
-        self.scheduler.wake()
+        self.scheduler.notify()
 
-    def move(self, **fields: Any) -> None:
+    def change_motion(self, **fields: Any) -> None:
         """Ask for a motion with other fields."""
         with self._lock:
-            self._request = replace(self._request, motion=replace(self._request.motion, **fields))
-        self.scheduler.wake()
+            motion = replace(self._request.motion, **fields)
+            self._request = replace(self._request, motion=motion)
+        self.scheduler.notify()
 
-    def play(self, change: Callable[[Playback, float], Playback]) -> Playback:
-        """Change how time goes by."""
+    def change_playback(self, change: Callable[[Playback, float], Playback]) -> Playback:
+        """Change the playback, given the wall-clock second."""
         with self._lock:
-            self._playback = change(self._playback, time.monotonic())
-            playback = self._playback
-        self.scheduler.wake()
+            self._playback = playback = change(self._playback, time.monotonic())
+        self.scheduler.notify()
         return playback
 
-    def look_through(self, camera: str, orbit: Orbit, look_at: np.ndarray) -> None:
+    def look_through(self, camera: str, view: BrowserCamera, look_at: np.ndarray) -> None:
         """Go to where a recording camera is; turning the view leaves it again."""
-        ahead = look_at - np.asarray(orbit.position)
+        ahead = look_at - np.asarray(view.position)
         with self._lock:
-            self._snap = Snap(np.asarray(orbit.position), ahead / np.linalg.norm(ahead))
-            self._request = replace(self._request, recording=camera, orbit=orbit)
+            self._snap = Snap(np.asarray(view.position), ahead / np.linalg.norm(ahead))
+            self._request = replace(self._request, recording_camera=camera, browser_camera=view)
         with self.handle.atomic():
-            self.handle.camera.position = orbit.position
+            self.handle.camera.position = view.position
             self.handle.camera.look_at = look_at
-            self.handle.camera.fov = orbit.fov
-        self.scheduler.wake()
+            self.handle.camera.fov = view.fov
+        self.scheduler.notify()
 
     @property
-    def standing(self) -> ViewRequest:
+    def current(self) -> ViewRequest:
         """The present request, at the time where it stands."""
-        with self._lock:
-            place = round(self._playback.at(time.monotonic()))
-            return replace(self._request, time_us=place)
+        return self.request(time.monotonic())
 
     def request(self, now: float) -> ViewRequest:
         """The picture to show at a second of the wall clock."""
@@ -108,39 +105,39 @@ class Client:
             return replace(self._request, time_us=round(self._playback.at(now)))
 
     def render(self, request: Any, *, draft: bool) -> None:
-        """Draw and send."""
+        """Draw a request and send its picture."""
         shrink = min(1.0, LONGEST_PX / max(request.width, request.height))
         size = max(16, round(shrink * request.width)), max(16, round(shrink * request.height))
         if draft:
             size = self._resolution.size(*size)
         started = time.perf_counter()
-        picture = self.painter.paint(request, size, rough=draft)
-        if self.gone:
+        picture = self.compositor.compose(request, size, draft=draft)
+        if self.disconnected:
             return
         self.handle.scene.set_background_image(
-            picture, format="jpeg", jpeg_quality=_DRAFT_QUALITY if draft else _SHARP_QUALITY
+            picture, format="jpeg", jpeg_quality=_DRAFT_QUALITY if draft else _FINAL_QUALITY
         )
         self.handle.flush()
         if draft:
-            self._resolution.took(time.perf_counter() - started)
-        self.on_time(request.time_us)
+            self._resolution.record(time.perf_counter() - started)
+        self.on_drawn(request.time_us)
 
     async def _camera_moved(self, camera: viser.CameraHandle) -> None:
         # A coroutine runs in the order of the messages; a function would in a pool of threads.
-        orbit = orbit_of(camera)
-        width, height = max(16, camera.image_width), max(16, camera.image_height)
+        fields = view_of(camera)
         with self._lock:
             if self._snap is not None and self._snap.left(camera):
                 self._snap = None
-                self._request = replace(self._request, recording=None)
-            self._request = replace(self._request, orbit=orbit, width=width, height=height)
-        self.scheduler.wake()
+                self._request = replace(self._request, recording_camera=None)
+            self._request = replace(self._request, **fields)
+        self.scheduler.notify()
 
 
-def orbit_of(camera: viser.CameraHandle) -> Orbit:
-    """Where a browser's camera stands."""
-    return Orbit(
-        tuple(camera.wxyz.tolist()),
-        tuple(camera.position.tolist()),
-        float(camera.fov),
-    )
+def view_of(camera: viser.CameraHandle) -> dict[str, Any]:
+    """Camera and viewport of a browser, as fields of a `ViewRequest`."""
+    position = tuple(camera.position.tolist())
+    return {
+        "browser_camera": BrowserCamera(tuple(camera.wxyz.tolist()), position, float(camera.fov)),
+        "width": max(16, camera.image_width),
+        "height": max(16, camera.image_height),
+    }

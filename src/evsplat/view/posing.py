@@ -73,10 +73,10 @@ def turned(
 
 
 class HeldPose(BodyTrack):
-    """A track that stands in whatever pose was put in last."""
+    """A track that stands in the pose that was set last."""
 
     def __init__(self, track: BodyTrack) -> None:
-        """Of the body of ``track``; begins in its first pose."""
+        """Take the body of ``track``, in its first pose."""
         joints = len(track.body.parents)
         super().__init__(track.body, np.zeros(1), np.zeros((1, joints, 3)), np.zeros((1, 3)))
         # Copies of this track share the dictionary and so the pose.

@@ -1,8 +1,7 @@
-"""Controls that hand what is shown to the browser as a file."""
+"""The controls that hand what is shown to the browser as a file."""
 
 import io
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import viser
@@ -19,62 +18,67 @@ _FORMATS: dict[str, tuple[FileKind, str]] = {
     "SPLAT": ("splat", ".splat"),
     "glTF": ("gltf", ".glb"),
 }
-"""Kind and ending of a file by what the browser shows."""
+"""Kind and ending of a file by the format's label."""
 
 
 class SavePanel:
     """A picture of the view, and the Gaussians of its instant for other programs."""
 
-    def __init__(self, client: Client, instant_name: Callable[[ViewRequest], str]) -> None:
-        """Build the controls in the folder that is open; files begin with ``instant_name``."""
-        self.client, self.instant_name = client, instant_name
-        gui, scheduler = client.handle.gui, client.scheduler
+    def __init__(self, client: Client) -> None:
+        """Build the controls in the folder that is open."""
+        self.client, gui = client, client.handle.gui
         picture = gui.add_button("Picture (PNG)", icon=viser.Icon.DOWNLOAD)
-        known = self.client.painter.subject.has_splats
+        known = client.compositor.viewed.has_splats
         self.format = gui.add_dropdown("Format", tuple(_FORMATS), visible=known)
         gaussians = gui.add_button("Gaussians", icon=viser.Icon.DOWNLOAD, visible=known)
 
         async def save_picture(_: viser.GuiEvent) -> None:
-            scheduler.do(self._send_picture)
+            client.scheduler.submit(self._send_picture)
 
         async def save_gaussians(_: viser.GuiEvent) -> None:
-            scheduler.do(self._send_gaussians)
+            client.scheduler.submit(self._send_gaussians)
 
         picture.on_click(save_picture)
         gaussians.on_click(save_gaussians)
 
     def _send_picture(self) -> None:
         """Draw the present view with all its pixels and hand it to the browser as a file."""
-        request = self.client.standing
-        picture = self.client.painter.paint(request, (request.width, request.height), rough=False)
+        request = self.client.current
+        size = request.width, request.height
+        picture = self.client.compositor.compose(request, size, draft=False)
         data = io.BytesIO()
         Image.fromarray(picture).save(data, "PNG")
-        self._send(f"{self.instant_name(request)}.png", data.getvalue())
+        self._send(f"{self._stem(request)}.png", data.getvalue())
 
     def _send_gaussians(self) -> None:
-        """The parts that are shown, as they are posed and as they are coloured from here."""
-        request, painter = self.client.standing, self.client.painter
-        subject, parts = painter.subject, request.look.parts
+        """Send the parts that are shown, as they are posed and as they are coloured from here."""
+        request, compositor = self.client.current, self.client.compositor
+        viewed, motion, parts = compositor.viewed, request.motion, request.look.parts
         kind, ending = _FORMATS[self.format.value]
-        cloud = subject.cloud(painter.camera(request), request.time_us, request.motion, parts)
+        cloud = viewed.cloud(compositor.camera(request), request.time_us, motion, parts)
         which = {"all": "", "human": "-person", "scene": "-scene"}[parts]
-        name = f"{self.instant_name(request)}{which}{ending}"
-        motion = {"motion": request.motion.name or "recorded", "angles_deg": request.motion.angles}
-        facts = facts_of(subject.run) | {"time_us": request.time_us, **motion}
-        rotation = file_rotation(subject.track(None), kind, None)
+        name = f"{self._stem(request)}{which}{ending}"
+        posed = {"motion": motion.name or "recorded", "angles_deg": motion.angles}
+        facts = facts_of(viewed.run) | {"time_us": request.time_us, **posed}
+        rotation = file_rotation(viewed.track(None), kind, None)
         with tempfile.TemporaryDirectory(prefix="evsplat-view-") as folder:
             path = Path(folder) / name
             try:
                 write_file(path, kind, cloud, rotation, facts)
             except DataError:
-                self._tell("Nothing to save", f"There is no Gaussian of the {which[1:]}.")
+                self._notify("Nothing to save", f"There is no Gaussian of the {which[1:]}.")
                 return
             data = path.read_bytes()
         self._send(name, data)
-        self._tell(name, f"{len(cloud):,} Gaussians, {len(data) / 1e6:.1f} MB.")
+        self._notify(name, f"{len(cloud):,} Gaussians, {len(data) / 1e6:.1f} MB.")
+
+    def _stem(self, request: ViewRequest) -> str:
+        """File name of a request's instant, without ending."""
+        motion = "" if request.motion.name is None else f"-{request.motion.name}"
+        return f"{self.client.compositor.capture.name}{motion}-{request.time_us / 1e3:.1f}ms"
 
     def _send(self, name: str, data: bytes) -> None:
         self.client.handle.send_file_download(name, data, save_immediately=True)
 
-    def _tell(self, title: str, body: str) -> None:
+    def _notify(self, title: str, body: str) -> None:
         self.client.handle.add_notification(title, body, auto_close_seconds=6)

@@ -1,25 +1,30 @@
-"""The drawing thread, one for all clients: they share the processor and the caches."""
+"""The render thread of all browsers, which share the processor and the caches, and draft sizes."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 logger = logging.getLogger(__name__)
 
 SETTLED_S = 0.15
-"""A view that stood still for so long is drawn again, sharp."""
-LEAST_S = 1 / 30
+"""A view that stood still for so long is drawn again in full quality."""
+MIN_INTERVAL_S = 1 / 30
 """Pictures of a client follow each other no faster."""
+MIN_SCALE = 0.3
+_SCALE_STEP = 2**-0.25
+"""Ratio of neighbouring draft scales."""
+_SCALE_STEPS = math.ceil(math.log(MIN_SCALE) / math.log(_SCALE_STEP))
 
 
 class RenderClient(Protocol):
-    """Contract of a client: what it asks for, and who draws it."""
+    """A browser as the scheduler sees it."""
 
     def request(self, now: float) -> Hashable | None:
-        """What shall be seen at wall-clock second ``now``; None: nothing yet."""
+        """The picture to show at wall-clock second ``now``; None: nothing yet."""
         ...
 
     def render(self, request: Hashable, *, draft: bool) -> None:
@@ -28,117 +33,157 @@ class RenderClient(Protocol):
 
 
 @dataclass(eq=False)
-class _Slot:
+class _ClientState:
     client: RenderClient
     shown: Hashable | None = None
-    sharp: bool = False
-    changed: float = field(default=-1e9)
-    """When the last different request was seen."""
-    served: float = -1e9
+    """The request drawn last."""
+    is_final: bool = False
+    """Drawn in full quality, not as a draft."""
+    changed_s: float = -1e9
+    """Clock when the last different request was seen."""
+    drawn_s: float = -1e9
 
 
 class RenderScheduler:
-    """Draws for clients in turn, each its newest request; older ones are forgotten."""
+    """Draws for clients in turn, each its newest request; requests that are overtaken are dropped.
+
+    A request that changes is drawn as a draft, one that has settled in full quality.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._slots: dict[RenderClient, _Slot] = {}
-        self._changed = threading.Condition()
-        self._awake = False
+        self._states: dict[RenderClient, _ClientState] = {}
+        self._condition = threading.Condition()
+        self._notified = False
         self._closed = False
         self._jobs: list[Callable[[], None]] = []
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin to serve."""
+        """Start the render thread."""
         self._thread = threading.Thread(target=self._run, name="evsplat-view", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop after the picture in hand."""
-        with self._changed:
+        """Stop after the picture that is being drawn."""
+        with self._condition:
             self._closed = True
-            self._changed.notify()
+            self._condition.notify()
         if self._thread is not None:
             self._thread.join(timeout=10)
 
-    def enter(self, client: RenderClient) -> None:
-        """Begin to draw for a client."""
-        with self._changed:
-            self._slots[client] = _Slot(client)
-        self.wake()
+    def add(self, client: RenderClient) -> None:
+        """Draw for a client from now on."""
+        with self._condition:
+            self._states[client] = _ClientState(client)
+        self.notify()
 
-    def leave(self, client: RenderClient) -> None:
-        """Forget a client."""
-        with self._changed:
-            self._slots.pop(client, None)
+    def remove(self, client: RenderClient) -> None:
+        """Draw for a client no more."""
+        with self._condition:
+            self._states.pop(client, None)
 
-    def wake(self) -> None:
-        """Tell that some request may have changed; never waits for a picture."""
-        with self._changed:
-            self._awake = True
-            self._changed.notify()
+    def notify(self) -> None:
+        """Say that some request may have changed; never waits for a picture."""
+        with self._condition:
+            self._notified = True
+            self._condition.notify()
 
-    def do(self, job: Callable[[], None]) -> None:
-        """Have something done between pictures, in the drawing thread."""
-        with self._changed:
+    def submit(self, job: Callable[[], None]) -> None:
+        """Have ``job`` called between pictures, in the render thread."""
+        with self._condition:
             self._jobs.append(job)
-        self.wake()
+        self.notify()
 
     def redraw(self) -> None:
-        """Draw everything anew: what requests mean has changed."""
-        with self._changed:
-            for slot in self._slots.values():
-                slot.shown = None
-        self.wake()
+        """Draw everything anew: equal requests mean other pictures now."""
+        with self._condition:
+            for state in self._states.values():
+                state.shown = None
+        self.notify()
 
-    def turn(self) -> float | None:
-        """Serve whoever needs it, once; seconds until there may be more to do, None: unknown."""
-        with self._changed:
+    def step(self) -> float | None:
+        """Draw for every client that needs it, once; seconds to the next step, None: unknown."""
+        with self._condition:
             jobs, self._jobs = self._jobs, []
-            # Whoever waited longest comes first.
-            slots = sorted(self._slots.values(), key=lambda slot: slot.served)
+            # The client that waited longest comes first.
+            states = sorted(self._states.values(), key=lambda state: state.drawn_s)
         for job in jobs:
             job()
         pause: float | None = 0.0 if jobs else None
-        for slot in slots:
-            wait = self._render(slot)
+        for state in states:
+            wait = self._draw(state)
             if wait is not None:
                 pause = wait if pause is None else min(pause, wait)
         return pause
 
-    def _render(self, slot: _Slot) -> float | None:
+    def _draw(self, state: _ClientState) -> float | None:
         now = self._clock()
-        request = slot.client.request(now)
+        request = state.client.request(now)
         if request is None:
             return None
-        if request != slot.shown:
-            if now - slot.served < LEAST_S:
-                return slot.served + LEAST_S - now
-            slot.changed, slot.shown, slot.sharp, slot.served = now, request, False, now
-            slot.client.render(request, draft=True)
+        if request != state.shown:
+            if now - state.drawn_s < MIN_INTERVAL_S:
+                return state.drawn_s + MIN_INTERVAL_S - now
+            state.changed_s = state.drawn_s = now
+            state.shown, state.is_final = request, False
+            state.client.render(request, draft=True)
             return 0.0
-        if slot.sharp:
+        if state.is_final:
             return None
-        if now - slot.changed < SETTLED_S:
-            return slot.changed + SETTLED_S - now
-        slot.sharp, slot.served = True, now
-        slot.client.render(request, draft=False)
+        if now - state.changed_s < SETTLED_S:
+            return state.changed_s + SETTLED_S - now
+        state.is_final, state.drawn_s = True, now
+        state.client.render(request, draft=False)
         return 0.0
 
     def _run(self) -> None:
         while True:
-            with self._changed:
+            with self._condition:
                 if self._closed:
                     return
-                self._awake = False
+                self._notified = False
             try:
-                pause = self.turn()
+                pause = self.step()
             except Exception:  # one bad picture must not end the view of everybody
                 logger.exception("A picture could not be drawn.")
                 pause = 1.0
             if pause == 0.0:
                 continue
-            with self._changed:
-                if not self._awake and not self._closed:
-                    self._changed.wait(pause)
+            with self._condition:
+                if not self._notified and not self._closed:
+                    self._condition.wait(pause)
+
+
+class DraftResolution:
+    """Finds the size of drafts that take no longer than ``target_s`` to draw.
+
+    Sizes are few and are left only for good reason: a picture of another size shares nothing with
+    the one before.
+    """
+
+    def __init__(self, target_s: float = 0.045) -> None:
+        self.target_s = target_s
+        # In steps below the viewport's size: what is drawn, and what would meet the target.
+        self._level = self._wanted = 0.0
+
+    @property
+    def scale(self) -> float:
+        """Side of the picture drawn, as a share of the viewport's; at most 1."""
+        return max(MIN_SCALE, _SCALE_STEP**self._level)
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Pixels to draw for a viewport."""
+        return max(16, round(self.scale * width)), max(16, round(self.scale * height))
+
+    def record(self, seconds: float) -> None:
+        """Learn from a picture that took ``seconds`` at the present scale.
+
+        A third of the way to what would have met the target, so that one slow picture does not make
+        the next ones coarse.
+        """
+        steps = math.log(max(seconds, 1e-4) / self.target_s) / (-2 * math.log(_SCALE_STEP))
+        self._wanted += (self._level + steps - self._wanted) / 3
+        self._wanted = min(max(self._wanted, 0.0), float(_SCALE_STEPS))
+        if abs(self._wanted - self._level) > 0.75:
+            self._level = float(round(self._wanted))

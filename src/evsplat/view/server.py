@@ -20,19 +20,17 @@ from evsplat.film import camera_at
 from evsplat.training.run import Run
 from evsplat.training.watching import is_training
 from evsplat.view.camera import forward, vertical_fov
-from evsplat.view.client import Client, orbit_of
-from evsplat.view.follow import Follower, load_newest, yield_to_training
-from evsplat.view.painter import Painter
+from evsplat.view.client import Client, view_of
+from evsplat.view.compositor import Compositor
 from evsplat.view.panel import SPEEDS, Panel
-from evsplat.view.request import ViewRequest
+from evsplat.view.request import Playback, ViewRequest
 from evsplat.view.scheduler import RenderScheduler
-from evsplat.view.subject import Subject
-from evsplat.view.timeline import Playback
+from evsplat.view.viewed_run import RunFollower, ViewedRun, load_newest, yield_to_training
 
 logger = logging.getLogger(__name__)
 
 _PORTS_TRIED = 20
-_EVERYWHERE = ("", "0.0.0.0", "::")
+_ALL_INTERFACES = ("", "0.0.0.0", "::")
 _DEFAULT_DISTANCE_M = 3.0
 
 
@@ -47,30 +45,31 @@ class Viewer:
     """Serves one run, or two to compare, until it is closed."""
 
     def __init__(self, runs: list[Run], *, host: str, port: int) -> None:
-        self.subjects = [Subject(run, name) for run, name in zip(runs, _names(runs), strict=True)]
-        main, *others = self.subjects
+        self.viewed = [ViewedRun(run, name) for run, name in zip(runs, _names(runs), strict=True)]
+        main, *others = self.viewed
         self.capture = main.capture
-        self.painter = Painter(main, {other.name: other for other in others})
+        self.compositor = Compositor(main, {other.name: other for other in others})
         self.pivot, up = _pivot_and_up(self.capture)
         self.scheduler = RenderScheduler()
         self.port = _free_port(host, port)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server = _Server(host, self.port, label="evsplat", verbose=False)
         self.port = self.server.get_port()
-        self.address = f"http://{'localhost' if host in _EVERYWHERE else host}:{self.port}"
+        self.address = f"http://{'localhost' if host in _ALL_INTERFACES else host}:{self.port}"
         self._set_scene(up)
         self._clients: dict[int, Client] = {}
-        self.server.on_client_connect(self._enter)
-        self.server.on_client_disconnect(self._leave)
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._disconnected)
         self.scheduler.start()
+        submit = self.scheduler.submit
         self._followers = [
-            Follower(subject, self.scheduler.do, lambda: bool(self._clients), self._reloaded)
-            for subject in self.subjects
-            if is_training(subject.run.path)
+            RunFollower(viewed, submit, lambda: bool(self._clients), self._reloaded)
+            for viewed in self.viewed
+            if is_training(viewed.run.path)
         ]
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop following, drawing and serving."""
         for follower in self._followers:
             follower.stop()
         self.scheduler.close()
@@ -78,7 +77,7 @@ class Viewer:
             self.server.stop()
 
     def _reloaded(self) -> None:
-        self._told.content = _description(self.subjects)
+        self._summary.content = _summary(self.viewed)
         self.scheduler.redraw()
 
     def _set_scene(self, up: np.ndarray) -> None:
@@ -99,29 +98,23 @@ class Viewer:
             brand_color=(38, 124, 160),
         )
         server.gui.main_panel.dock_right()
-        self._told = server.gui.add_markdown(_description(self.subjects))
+        self._summary = server.gui.add_markdown(_summary(self.viewed))
 
-    async def _enter(self, handle: viser.ClientHandle) -> None:
-        camera, frames = handle.camera, self.capture.frames
+    async def _connected(self, handle: viser.ClientHandle) -> None:
+        frames = self.capture.frames
         times = [frame.mid_us for frame in frames if frame.camera == frames[0].camera]
-        request = ViewRequest(
-            width=max(16, camera.image_width),
-            height=max(16, camera.image_height),
-            orbit=orbit_of(camera),
-            time_us=min(times),
-        )
+        request = ViewRequest(**view_of(handle.camera), time_us=min(times))
         playback = Playback(min(times), max(times), min(times), speed=SPEEDS["1/5"])
-        client = Client(handle, self.painter, self.scheduler, request, playback)
-        panel = Panel(client, self.pivot)
-        panel.look_through(frames[0].camera)
+        client = Client(handle, self.compositor, self.scheduler, request, playback)
+        Panel(client, self.pivot).look_through(frames[0].camera)
         self._clients[handle.client_id] = client
-        self.scheduler.enter(client)
+        self.scheduler.add(client)
 
-    async def _leave(self, handle: viser.ClientHandle) -> None:
+    async def _disconnected(self, handle: viser.ClientHandle) -> None:
         client = self._clients.pop(handle.client_id, None)
         if client is not None:
-            client.gone = True
-            self.scheduler.leave(client)
+            client.disconnected = True
+            self.scheduler.remove(client)
 
 
 def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> None:
@@ -156,7 +149,7 @@ def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> Non
 
 
 def _names(runs: list[Run]) -> list[str]:
-    """What runs are called: by their method, or by their folder where that is not enough."""
+    """Names of runs: their methods, or their folders where that is not enough."""
     names = [run.method for run in runs]
     if len(set(names)) < len(runs):
         names = [run.path.resolve().name for run in runs]
@@ -165,20 +158,21 @@ def _names(runs: list[Run]) -> list[str]:
     return names
 
 
-def _description(subjects: list[Subject]) -> str:
-    lines = [f"**{subjects[0].capture.name}**"]
-    for subject in subjects:
-        run = subject.run
+def _summary(viewed_runs: list[ViewedRun]) -> str:
+    """Markdown with the capture's name, steps and counts of the runs."""
+    lines = [f"**{viewed_runs[0].capture.name}**"]
+    for viewed in viewed_runs:
+        run = viewed.run
         people, scene = run.gaussians["human"], run.gaussians["scene"]
         lines.append(
-            f"{subject.name}: step {run.iteration:,}, {people:,} Gaussians of the person, "
+            f"{viewed.name}: step {run.iteration:,}, {people:,} Gaussians of the person, "
             f"{scene:,} of the scene"
         )
     return "  \n".join(lines)
 
 
 def _pivot_and_up(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
-    """Around what the view turns, and which way is up in the world."""
+    """Point about which the view turns, and the up direction, both in the world."""
     frames = capture.train_frames or capture.frames
     if capture.has_body:
         track = load_body_track(capture)

@@ -12,7 +12,7 @@ from evsplat.film.looks import Look
 from evsplat.training.run import GaussianReconstruction, Run
 from evsplat.view.posing import HeldPose, PoseSlider, turned
 from evsplat.view.request import Motion
-from evsplat.view.subject import Subject
+from evsplat.view.viewed_run import ViewedRun
 
 from ..small_model import built, small_config
 
@@ -53,25 +53,25 @@ def _views(run):
 
 
 def test_a_still_picture_is_that_of_the_run_bit_for_bit(run):
-    subject, look, motion = Subject(run, "it"), Look(), Motion()
+    viewed, look, motion = ViewedRun(run, "it"), Look(), Motion()
     for camera, time_us in _views(run):
         for _ in range(3):
-            subject.picture(camera, time_us + 500, motion, look, rough=True)
-        found = subject.picture(camera, time_us, motion, look, rough=False)
+            viewed.picture(camera, time_us + 500, motion, look, draft=True)
+        found = viewed.picture(camera, time_us, motion, look, draft=False)
         expected = run.reconstruction.render(camera, [time_us]).rgb[0].numpy()
         assert np.array_equal(found, expected)
 
 
 def test_drafts_of_a_view_that_stands_still_become_its_picture(run):
-    subject, look, motion = Subject(run, "it"), Look(), Motion()
+    viewed, look, motion = ViewedRun(run, "it"), Look(), Motion()
     (camera, first), (_, second), *_ = _views(run)
     # Shadows stay a little softer.
     drafted = replace(run.reconstruction, shadow_step_px=4)
     expected = drafted.render(camera, [second]).rgb[0].numpy()
-    subject.picture(camera, first, motion, look, rough=False)
+    viewed.picture(camera, first, motion, look, draft=False)
     errors = []
     for _ in range(40):
-        draft = subject.picture(camera, second, motion, look, rough=True)
+        draft = viewed.picture(camera, second, motion, look, draft=True)
         errors.append(np.abs(draft - expected).mean())
     start = run.reconstruction.render(camera, [first]).rgb[0].numpy()
     assert errors[0] < 0.5 * np.abs(start - expected).mean()
@@ -79,37 +79,37 @@ def test_drafts_of_a_view_that_stands_still_become_its_picture(run):
 
 
 @pytest.mark.parametrize("run", ["hugs"], indirect=True)
-def test_what_neither_pose_nor_view_changes_is_asked_once(run):
-    asked = []
+def test_what_neither_pose_nor_view_changes_is_computed_once(run):
+    computed = []
     for name in ("triplane", "skinning", "geometry", "appearance"):
         network = getattr(run.reconstruction.model.human, name)
-        network.register_forward_hook(lambda *_, name=name: asked.append(name))
-    subject = Subject(run, "it")
+        network.register_forward_hook(lambda *_, name=name: computed.append(name))
+    viewed = ViewedRun(run, "it")
     for camera, time_us in _views(run):
-        subject.picture(camera, time_us, Motion(), Look(), rough=False)
-    assert sorted(asked) == ["appearance", "geometry", "skinning", "triplane"]
+        viewed.picture(camera, time_us, Motion(), Look(), draft=False)
+    assert sorted(computed) == ["appearance", "geometry", "skinning", "triplane"]
 
 
 def test_gaussians_of_an_instant_are_those_that_are_drawn(run):
-    subject = Subject(run, "it")
+    viewed = ViewedRun(run, "it")
     # The body of the small capture has no limbs that are recognised.
     slider = PoseSlider("arm", "bend", (2,), np.array([0.0, 0.0, 1.0]), False, 60)
-    subject.__dict__["sliders"] = (slider,)
+    viewed.__dict__["sliders"] = (slider,)
     (camera, time_us), *_ = _views(run)
     angles = (30.0,)
-    subject.picture(camera, time_us, Motion(None, angles), Look(), rough=True)
-    cloud = subject.cloud(camera, time_us, Motion(None, angles), "human")
+    viewed.picture(camera, time_us, Motion(None, angles), Look(), draft=True)
+    cloud = viewed.cloud(camera, time_us, Motion(None, angles), "human")
     track = run.reconstruction.track
     rotations, transl = track.at([time_us])
     pose = HeldPose(track)
-    pose.hold(turned(subject.sliders, angles, rotations[0])[None], transl)
+    pose.hold(turned(viewed.sliders, angles, rotations[0])[None], transl)
     model = run.reconstruction.following(pose).model
     with torch.no_grad():
         expected = model.at([time_us], camera.center(), hard_semantics=True).human
     np.testing.assert_allclose(cloud.means, expected.means[0].numpy(), atol=1e-6)
-    at_rest = subject.cloud(camera, time_us, Motion(), "human")
+    at_rest = viewed.cloud(camera, time_us, Motion(), "human")
     assert np.abs(at_rest.means - cloud.means).max() > 0.02
     np.testing.assert_allclose(cloud.rgb, expected.channels[0, :, :3].numpy(), atol=1e-6)
-    everything = subject.cloud(camera, time_us, Motion(), "all")
+    everything = viewed.cloud(camera, time_us, Motion(), "all")
     assert len(everything) == run.gaussians["human"] + run.gaussians["scene"]
     assert everything.semantic.sum() == run.gaussians["human"]

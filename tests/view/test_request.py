@@ -1,9 +1,9 @@
-"""Time that stands, moves at a speed and loops."""
+"""Playback: time that stands, moves at a speed and loops."""
 
 import numpy as np
 import pytest
 
-from evsplat.view.timeline import Playback
+from evsplat.view.request import Playback
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -31,7 +31,7 @@ def test_a_change_of_speed_does_not_jump():
     assert paused.at(99) == pytest.approx(350_000)
 
 
-def test_another_loop_keeps_the_place_if_it_can():
+def test_another_loop_keeps_the_time_if_it_can():
     playback = Playback(0, 1e6, 400_000).playing(True, 0)
     assert playback.within(300_000, 500_000, 0.05).at(0.05) == pytest.approx(450_000)
     assert playback.within(600_000, 700_000, 0.05).at(0.05) == pytest.approx(600_000)

@@ -1,0 +1,238 @@
+"""A run as the viewer draws it: cached networks, rough drafts, poses by hand, newer checkpoints."""
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from evsplat.body import BodyTrack
+from evsplat.camera import Camera
+from evsplat.errors import DataError
+from evsplat.export.cloud import SplatCloud
+from evsplat.export.gaussians import Instant, cloud_at
+from evsplat.film import load_motion_of
+from evsplat.film.looks import Look, depth_colours
+from evsplat.methods.reconstruction import (
+    Parts,
+    Posable,
+    Reconstruction,
+    SplatReconstruction,
+    WithDepth,
+)
+from evsplat.render import Backdrop
+from evsplat.training.run import GaussianReconstruction, Run, load_run, reload_run
+from evsplat.training.watching import is_training, newest_state, watch
+from evsplat.view.network_cache import set_draft, with_cached_networks
+from evsplat.view.posing import HeldPose, PoseSlider, pose_sliders, turned
+from evsplat.view.request import Motion
+
+_DRAFT_SHADOW_STEP_PX = 4
+_POLL_S = 1.0
+"""A run that is being trained is looked at for newer states this often."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Posed:
+    reconstruction: Reconstruction
+    pose: HeldPose
+
+
+class ViewedRun:
+    """Draws one run; for the render thread alone but for what is fixed."""
+
+    def __init__(self, run: Run, name: str) -> None:
+        self.run = run
+        self.name = name
+        self.capture = run.capture
+        self._motions: dict[str, BodyTrack] = {}
+        self._clear_caches()
+
+    def reload(self, state: Path) -> None:
+        """Take the parameters of another checkpoint or snapshot of the run."""
+        self.run = reload_run(self.run, state)
+        self._clear_caches()
+
+    def _clear_caches(self) -> None:
+        """Begin caches anew: the parameters have changed."""
+        self._recorded = _cached(self.run.reconstruction)
+        self._posed: _Posed | None = None
+
+    @property
+    def is_posable(self) -> bool:
+        """True where the person can be made to move otherwise than it was recorded."""
+        return isinstance(self.run.reconstruction, Posable)
+
+    @property
+    def has_depth(self) -> bool:
+        """True where depth can be shown."""
+        return isinstance(self.run.reconstruction, WithDepth)
+
+    @property
+    def has_splats(self) -> bool:
+        """True where its Gaussians can be had as a file."""
+        return isinstance(self.run.reconstruction, SplatReconstruction)
+
+    @cached_property
+    def sliders(self) -> tuple[PoseSlider, ...]:
+        """Angles by which the person can be posed."""
+        made = self.run.reconstruction
+        return pose_sliders(made.track.body) if isinstance(made, Posable) else ()
+
+    def track(self, motion: str | None) -> BodyTrack:
+        """A motion on the person's body, placed where the recording was."""
+        made = self.run.reconstruction
+        assert isinstance(made, Posable)
+        if motion is None:
+            return made.track
+        if motion not in self._motions:
+            self._motions[motion] = load_motion_of(motion, made.track)
+        return self._motions[motion]
+
+    def picture(
+        self, camera: Camera, time_us: int, motion: Motion, look: Look, *, draft: bool
+    ) -> Float[np.ndarray, "H W 3"]:
+        """One instant, sRGB in [0, 1].
+
+        A ``draft`` evaluates networks for a part of the Gaussians only and has softer shadows.
+        """
+        drawn = self._moving(time_us, motion, draft=draft)
+        if draft and isinstance(drawn, GaussianReconstruction):
+            drawn = replace(drawn, shadow_step_px=_DRAFT_SHADOW_STEP_PX)
+        with torch.no_grad():
+            if look.shown == "rgb":
+                return drawn.render(camera, [time_us], parts=look.parts).rgb[0].numpy()
+            exposure = look.expose(drawn, camera, [time_us])[0]
+        if look.shown == "depth":
+            exposure = depth_colours(exposure, self._nearest_m)
+        return exposure.astype(np.float32) / 255
+
+    def cloud(self, camera: Camera, time_us: int, motion: Motion, parts: Parts) -> SplatCloud:
+        """The Gaussians of one instant in the world, coloured as ``camera`` sees them."""
+        drawn = self._moving(time_us, motion, draft=False)
+        assert isinstance(drawn, SplatReconstruction)
+        return cloud_at(drawn, Instant(time_us, camera, "the viewer's", ""), parts)
+
+    @cached_property
+    def _nearest_m(self) -> float:
+        """Depth that is shown brightest, the same in all pictures: the person's at its nearest."""
+        frame = self.capture.frames[0]
+        camera = self.capture.camera(frame)
+        made = self.run.reconstruction
+        assert isinstance(made, WithDepth)
+        depth = made.depth(camera, [frame.mid_us])
+        seen = depth[depth > 0]
+        return 0.8 * float(seen.quantile(0.02)) if len(seen) else 1.0
+
+    def _moving(self, time_us: int, motion: Motion, *, draft: bool) -> Reconstruction:
+        """The reconstruction that shows a motion at a time, as a draft or exactly."""
+        drawn, made = self._recorded, self.run.reconstruction
+        if not motion.is_recorded and isinstance(made, Posable):
+            if self._posed is None:
+                pose = HeldPose(made.track)
+                self._posed = _Posed(_cached(made.following(pose)), pose)
+            rotations, transl = self.track(motion.name).at([time_us])
+            if any(motion.angles):
+                rotations = turned(self.sliders, motion.angles, rotations[0])[None]
+            self._posed.pose.hold(rotations, transl)
+            drawn = self._posed.reconstruction
+        if isinstance(drawn, GaussianReconstruction):
+            assert isinstance(drawn.model, nn.Module)
+            set_draft(drawn.model, draft)
+        return drawn
+
+
+def _cached(reconstruction: Reconstruction) -> Reconstruction:
+    if not isinstance(reconstruction, GaussianReconstruction):
+        return reconstruction
+    assert isinstance(reconstruction.model, nn.Module)
+    model: Any = with_cached_networks(reconstruction.model)
+    return replace(reconstruction, model=model, backdrop=Backdrop())
+
+
+def load_newest(path: Path, device: str) -> Run:
+    """The run at its newest checkpoint or snapshot; waits for the first one of a training."""
+    while newest_state(path) is None and is_training(path):
+        watch(path)
+        threading.Event().wait(_POLL_S)
+    return load_run(path, device=device, state=newest_state(path))
+
+
+class RunFollower:
+    """Looks for newer states of a run that is being trained, in a thread of its own."""
+
+    def __init__(
+        self,
+        viewed: ViewedRun,
+        submit: Callable[[Callable[[], None]], None],
+        is_watched: Callable[[], bool],
+        changed: Callable[[], None],
+    ) -> None:
+        """``submit`` has a job done by the render thread; ``is_watched`` while a browser is there.
+
+        ``changed`` is called by the render thread when the run has new parameters.
+        """
+        self._viewed, self._submit = viewed, submit
+        self._is_watched, self._changed = is_watched, changed
+        self._stop = threading.Event()
+        self._loaded = self._newest()
+        threading.Thread(target=self._run, name="evsplat-follow", daemon=True).start()
+
+    def stop(self) -> None:
+        """Look for newer states no more."""
+        self._stop.set()
+
+    def _run(self) -> None:
+        path, training = self._viewed.run.path, True
+        while training and not self._stop.wait(_POLL_S):
+            # One more look after the end, for the last checkpoint.
+            training = is_training(path)
+            if self._is_watched():
+                watch(path)
+            newest = self._newest()
+            if newest is not None and newest != self._loaded:
+                self._loaded = newest
+                self._submit(self._reload)
+
+    def _newest(self) -> tuple[Path, int] | None:
+        """The newest state and when it was written."""
+        with contextlib.suppress(OSError):  # replaced just now
+            state = newest_state(self._viewed.run.path)
+            return None if state is None else (state, state.stat().st_mtime_ns)
+        return None
+
+    def _reload(self) -> None:
+        assert self._loaded is not None
+        try:
+            self._viewed.reload(self._loaded[0])
+        except (DataError, OSError):
+            return  # replaced or removed before it was read; there will be another one
+        self._changed()
+
+
+def yield_to_training() -> None:
+    """Let this process have only what processors have left, from now on.
+
+    Reading the run is better done before: it takes seconds once, and without end on what is left.
+    """
+    if not hasattr(os, "SCHED_IDLE"):
+        os.nice(19)
+        return
+    for thread in threading.enumerate():
+        _set_idle(thread.native_id or 0)
+    with contextlib.suppress(OSError):  # the pools of threads that Python does not know
+        for entry in Path("/proc/self/task").iterdir():
+            _set_idle(int(entry.name))
+
+
+def _set_idle(thread: int) -> None:
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
