@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from evsplat.capture import Camera, Frame
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import render_run, rendering
-from evsplat.film import camera_at, rendered_instants
+from evsplat.film import Film, FilmPlan, camera_at
+from evsplat.film.frame_cache import FilmFrame
 from evsplat.methods.reconstruction import Rendering
 
 WIDTH, HEIGHT = 20, 14
@@ -87,29 +88,30 @@ def run(tmp_path, monkeypatch):
     return path
 
 
+def planned(recording: _Recording, **options) -> list[FilmFrame]:
+    return FilmPlan.of(Film(**options), recording, _Clock()).frames
+
+
 @pytest.mark.parametrize("rate_hz", [12.5, 30.0, 240.0, 1000.0])
 def test_sequence_spans_first_to_last_mid_exposure_at_the_rate(rate_hz):
-    instants = rendered_instants(_Recording(), "sequence", rate_hz=rate_hz)
-    times = np.array([instant.time_us for instant in instants])
+    frames = planned(_Recording(), fps=rate_hz)
+    times = np.array([frame.time_us for frame in frames])
     assert times[0] == MIDS_US[0]
     assert MIDS_US[-1] - 1e6 / rate_hz < times[-1] <= MIDS_US[-1]
     np.testing.assert_allclose(np.diff(times), 1e6 / rate_hz, atol=1)
-    for instant in instants:
-        distances = [abs(mid - instant.time_us) for mid in MIDS_US]
-        assert distances[instant.frame.index] == min(distances)
-    assert len({instant.name for instant in instants}) == len(instants)
+    assert len({frame.name for frame in frames}) == len(frames)
 
 
 def test_test_frames_are_drawn_at_mid_exposure_under_their_names():
-    instants = rendered_instants(_Recording(), "test")
-    assert [(i.name, i.time_us) for i in instants] == [("f2", MIDS_US[2])]
+    frames = planned(_Recording(), what="test")
+    assert [(frame.name, frame.time_us) for frame in frames] == [("f2", MIDS_US[2])]
 
 
 def test_no_test_frame_is_told():
     recording = _Recording()
     recording.frames = tuple(f for f in recording.frames if f.split == "train")
     with pytest.raises(DataError, match="split 'test'"):
-        rendered_instants(recording, "test")
+        planned(recording, what="test")
 
 
 def test_moving_camera_passes_through_its_poses_and_turns_evenly_between():
@@ -128,16 +130,17 @@ def test_moving_camera_passes_through_its_poses_and_turns_evenly_between():
 def test_video_shows_the_asked_times_in_slow_motion_beside_the_blurry_frame(run):
     path = render_run(run, fps=25, slow=4, beside=True)
     assert path == run / "renders" / "sequence-beside.mp4"
-    expected = rendered_instants(_Recording(), "sequence", rate_hz=100)
+    expected = planned(_Recording(), fps=100)
     with av.open(str(path)) as container:
         assert container.streams.video[0].average_rate == 25
         pictures = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
     assert len(pictures) == len(expected) == 25
-    for picture, instant in zip(pictures, expected, strict=True):
+    for picture, frame in zip(pictures, expected, strict=True):
         assert picture.shape == (HEIGHT, 2 * WIDTH)
         # Grey is luma: limited range is undone, and the codec may be off by two levels.
-        assert abs(picture[:, 2:18].mean() - 10 * instant.frame.index) < 2.5
-        assert abs(picture[:, 22:38].mean() - min(instant.time_us / 1000, 255)) < 2.5
+        distances = [abs(mid - frame.time_us) for mid in MIDS_US]
+        assert abs(picture[:, 2:18].mean() - 10 * np.argmin(distances)) < 2.5
+        assert abs(picture[:, 22:38].mean() - min(frame.time_us / 1000, 255)) < 2.5
 
 
 def test_pictures_are_exact_and_a_second_call_replaces_them(run):

@@ -12,8 +12,8 @@ from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import open_recording
 from evsplat.export import render_run, rendering
-from evsplat.film import Film, kept, scene
-from evsplat.film.looks import Look
+from evsplat.film import Film, FilmPlan, Look, plan
+from evsplat.film.frame_cache import FilmFrame, FrameCache
 from evsplat.methods.reconstruction import Rendering
 from evsplat.pictures.video import write_animation
 
@@ -194,6 +194,15 @@ def test_a_folder_in_the_way_of_kept_pictures_is_left_alone(lamp, tmp_path):
     assert (mine / "notes.txt").read_text() == "keep"
 
 
+@pytest.mark.parametrize("text", ["{", "[" * 100_000], ids=["broken", "deep"])
+def test_a_broken_plan_of_kept_pictures_is_named(lamp, tmp_path, text):
+    folder = tmp_path / "film.mp4.partial"
+    folder.mkdir()
+    (folder / "plan.json").write_text(text)
+    with pytest.raises(DataError, match=r"plan\.json: not valid JSON"):
+        render_run(lamp.run, out=tmp_path / "film.mp4")
+
+
 @pytest.mark.parametrize("ending", [".gif", ".webp"])
 @pytest.mark.parametrize("fps", [12.0, 30.0])
 def test_animations_last_as_long_as_they_should(tmp_path, ending, fps):
@@ -229,17 +238,17 @@ def test_the_camera_turns_about_the_vertical_of_the_recording_whatever_the_motio
     lying = BodyTrack(recorded.body, np.array([0, 400_000]), poses, np.zeros((2, 3)))
     up = up_axis(recorded)
     assert float(up @ up_axis(lying)) == 0
-    monkeypatch.setattr(scene, "load_motion_of", lambda *_, **__: lying)
+    monkeypatch.setattr(plan, "load_motion_of", lambda *_, **__: lying)
     film = Film(path=path, motion="somersault")
-    shots = scene.Scene.of(film, capture, _Dancer(recorded)).shots
-    heights = torch.stack([shot.camera.center() for shot in shots]).double() @ up.double()
-    assert len(shots) > 5 and float(heights.max() - heights.min()) < 1e-4
+    frames = FilmPlan.of(film, capture, _Dancer(recorded)).frames
+    heights = torch.stack([frame.camera.center() for frame in frames]).double() @ up.double()
+    assert len(frames) > 5 and float(heights.max() - heights.min()) < 1e-4
 
 
 @pytest.mark.parametrize("name", ["../a", "/tmp/evsplat-a", "a/b"])
 def test_pictures_are_kept_in_their_folder_only(lamp, tmp_path, name):
-    pictures = kept.KeptPictures(tmp_path / "kept", "plan")
-    shot = kept.Shot(name, 0, 0, lamp.capture.cameras["main"])
+    cache = FrameCache(tmp_path / "kept", "digest")
+    frame = FilmFrame(name, 0, 0, lamp.capture.cameras["main"])
     with pytest.raises(DataError, match="is no name for a picture"):
-        pictures.fill(lamp.lamp, Look(), [shot])
+        cache.fill(lamp.lamp, Look(), [frame])
     assert lamp.lamp.drawn == []

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from evsplat.capture import load_capture
-from evsplat.film.looks import Look
+from evsplat.film import Look
 from evsplat.training.run import GaussianReconstruction, Run
 from evsplat.view.posing import HeldPose, PoseSlider, turned
 from evsplat.view.request import Motion

@@ -1,4 +1,4 @@
-"""Drawing a trained run: its test frames, or a film of the recording or of another motion."""
+"""Drawing a trained run: test frames, or a film of the recording or of another motion."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,21 +10,31 @@ from PIL import Image
 from tqdm import tqdm
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.events import PRESETS
-from evsplat.film.events import copy_events, event_picture, event_pictures, simulate_film
-from evsplat.film.kept import KeptPictures, Shot, plan_of
-from evsplat.film.looks import Look, depth_colours
-from evsplat.film.scene import Scene, recorded_by
+from evsplat.events import (
+    PRESETS,
+    EventStore,
+    SensorSettings,
+    count_map,
+    simulate_events,
+    write_events,
+)
+from evsplat.film.frame_cache import FilmFrame, FrameCache, film_digest
+from evsplat.film.looks import Look, depth_colours, linear_luma
+from evsplat.film.plan import FilmPlan, recorded_by
 from evsplat.methods.trivial import nearest_in_time
 from evsplat.options import Film
 from evsplat.options.declare import given
-from evsplat.pictures import to_bytes
+from evsplat.pictures import signed_map, to_bytes
 from evsplat.pictures.video import write_animation, write_pictures, write_video
 from evsplat.training.run import load_run
 
 _NEAREST = 0.6
 """Depth that gets the lightest colour, as a share of the distance to the person."""
 _VIDEO, _ANIMATION = (".mp4",), (".gif", ".webp")
+_FULL_SCALE = 3.0
+"""Events of a pixel in one picture that get the strongest colour."""
+_PIECE_US = 100_000
+"""Events are copied in pieces of this length."""
 
 Picture = UInt8[np.ndarray, "H W C"]
 
@@ -40,7 +50,7 @@ def render_run(
 ) -> Path:
     """Draw a run's reconstruction and return the file or folder that was written.
 
-    What is drawn is a `Film`, whose fields can be given as ``changes``. An ``out`` that ends in
+    The `Film` to draw can be given by its fields, as ``changes``. An ``out`` that ends in
     .mp4, .webp or .gif becomes a video or animation, any other a folder of PNG files; without it
     ``run/renders/`` receives it. ``events_out`` takes the simulated events of ``show="events"``,
     in any format that `evsplat.events.write_events` knows.
@@ -56,15 +66,14 @@ def render_run(
     if film.camera is not None and film.camera not in loaded.capture.cameras:
         known = ", ".join(loaded.capture.cameras)
         raise ConfigError(f"--camera {film.camera}: the capture has no such camera, only {known}.")
-    scene = Scene.of(film, loaded.capture, loaded.reconstruction)
+    plan = FilmPlan.of(film, loaded.capture, loaded.reconstruction)
     look = Look(film.show, film.parts, film.transparent)
-    plan = plan_of(
-        scene.shots, look, film, loaded.method, loaded.iteration, loaded.train_seconds, *scene.poses
-    )
-    kept = KeptPictures(out.with_name(out.name + ".partial"), plan)
-    kept.fill(scene.reconstruction, look, scene.shots)
-    _write(film, scene, kept, out, events_out, replace=ours)
-    kept.remove()
+    trained = loaded.method, loaded.iteration, loaded.train_seconds
+    digest = film_digest(plan.frames, look, film, *trained, *plan.poses)
+    cache = FrameCache(out.with_name(out.name + ".partial"), digest)
+    cache.fill(plan.reconstruction, look, plan.frames)
+    _write(film, plan, cache, out, events_out, replace=ours)
+    cache.remove()
     return out
 
 
@@ -88,60 +97,88 @@ def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours:
 
 def _write(
     film: Film,
-    scene: Scene,
-    kept: KeptPictures,
+    plan: FilmPlan,
+    cache: FrameCache,
     out: Path,
     events_out: Path | str | None,
     *,
     replace: bool,
 ) -> None:
-    """Make the result of the kept pictures."""
+    """Make the result of the cached frames."""
     suffix = out.suffix.lower()
     folder = suffix not in (*_VIDEO, *_ANIMATION)
-    shots = scene.shots
-    names = [shot.name for shot in shots]
+    frames = plan.frames
+    names = [frame.name for frame in frames]
     if film.show == "events":
         settings = PRESETS[film.sensor]
-        store = simulate_film(kept, shots, settings)
+        store = _simulate(cache, frames, settings)
         if events_out is not None:
-            copy_events(store, events_out, shots, settings)
-        shots = shots[: -1 : scene.step]
-        names = [f"{index:05d}" for index in range(len(shots))]
-        pictures: Iterator[Picture] = event_pictures(store, scene.edges_us())
+            _copy_events(store, events_out, frames, settings)
+        frames = frames[: -1 : plan.oversampling]
+        names = [f"{index:05d}" for index in range(len(frames))]
+        pictures: Iterator[Picture] = _event_pictures(store, plan)
     elif film.show == "depth" and not folder:
-        nearest = _NEAREST * scene.person_m()
-        pictures = (depth_colours(kept.read(shot), nearest) for shot in shots)
+        nearest = _NEAREST * plan.person_distance_m()
+        pictures = (depth_colours(cache.read(frame), nearest) for frame in frames)
     else:
-        pictures = (kept.read(shot) for shot in shots)
+        pictures = (cache.read(frame) for frame in frames)
     if film.beside:
-        pictures = _beside(film, scene, shots, pictures)
-    told = tqdm(
-        pictures, total=len(shots), unit="picture", desc="write", dynamic_ncols=True, leave=False
+        pictures = _beside(film, plan, frames, pictures)
+    counted = tqdm(
+        pictures, total=len(frames), unit="picture", desc="write", dynamic_ncols=True, leave=False
     )
     if folder:
-        named = zip(names, told, strict=True)
-        write_pictures(out, named, replace=replace)
+        write_pictures(out, zip(names, counted, strict=True), replace=replace)
     elif suffix in _VIDEO:
-        write_video(out, told, fps=film.fps)
+        write_video(out, counted, fps=film.fps)
     else:
-        write_animation(out, told, fps=film.fps)
+        write_animation(out, counted, fps=film.fps)
+
+
+def _simulate(
+    cache: FrameCache, frames: Sequence[FilmFrame], settings: SensorSettings
+) -> EventStore:
+    """Show the cached light to a sensor and put its events into a store beside it."""
+    path, camera = cache.path / "events.h5", frames[0].camera
+    light = ((frame.clock_us, linear_luma(cache.read(frame))) for frame in frames)
+    events = simulate_events(light, settings, 0)
+    write_events(path, events, width=camera.width, height=camera.height)
+    return EventStore(path, camera.width, camera.height)
+
+
+def _copy_events(
+    store: EventStore, out: Path | str, frames: Sequence[FilmFrame], settings: SensorSettings
+) -> None:
+    """Write the events to a file of any format that `write_events` knows."""
+    start, end = frames[0].clock_us, frames[-1].clock_us + 1
+    pieces = (store.between(at, min(at + _PIECE_US, end)) for at in range(start, end, _PIECE_US))
+    sensor = {f"sensor_{name}": value for name, value in settings.to_dict().items()}
+    attributes = {"simulated": True, "source": "evsplat render", **sensor}
+    write_events(out, pieces, width=store.width, height=store.height, attributes=attributes)
+
+
+def _event_pictures(store: EventStore, plan: FilmPlan) -> Iterator[Picture]:
+    """One picture per window of the plan: red brighter, blue darker, white neither."""
+    edges = plan.edges_us()
+    for window in zip(edges[:-1], edges[1:], strict=True):
+        counts = count_map(store.between(*window), store.height, store.width)
+        yield signed_map(counts, _FULL_SCALE)
 
 
 def _beside(
-    film: Film, scene: Scene, shots: Sequence[Shot], pictures: Iterator[Picture]
+    film: Film, plan: FilmPlan, frames: Sequence[FilmFrame], pictures: Iterator[Picture]
 ) -> Iterator[Picture]:
     """The recorded frame or recorded events at the left of each picture."""
-    capture = scene.capture
-    frames = recorded_by(capture, film.camera)
-    windows = zip(scene.edges_us()[:-1], scene.edges_us()[1:], strict=True)
-    for shot, picture in zip(shots, pictures, strict=True):
-        if film.show == "events":
-            assert capture.events is not None
-            recorded = capture.events.between(*next(windows))
-            left = event_picture(recorded, capture.events.height, capture.events.width)
-        else:
-            left = to_bytes(capture.image(nearest_in_time(frames, shot.time_us)))
-        yield _side_by_side(left, picture)
+    capture = plan.capture
+    if film.show == "events":
+        assert capture.events is not None
+        recorded: Iterator[Picture] = _event_pictures(capture.events, plan)
+    else:
+        frames_recorded = recorded_by(capture, film.camera)
+        nearest = (nearest_in_time(frames_recorded, frame.time_us) for frame in frames)
+        recorded = (to_bytes(capture.image(frame)) for frame in nearest)
+    for left, right in zip(recorded, pictures, strict=True):
+        yield _side_by_side(left, right)
 
 
 def _side_by_side(left: Picture, right: Picture) -> Picture:

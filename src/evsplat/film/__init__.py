@@ -1,4 +1,4 @@
-"""How a reconstruction is filmed: where the camera goes, what the person does, what is shown."""
+"""Films of a reconstruction: camera paths, motions, and the values that pixels show."""
 
 from evsplat.film.camera_path import (
     PATHS,
@@ -11,7 +11,7 @@ from evsplat.film.camera_path import (
 )
 from evsplat.film.looks import SHOWN, Look
 from evsplat.film.motion import load_motion_of, place_motion
-from evsplat.film.scene import Scene, rendered_instants
+from evsplat.film.plan import FilmPlan
 from evsplat.options import Film
 
 __all__ = [
@@ -19,14 +19,13 @@ __all__ = [
     "SHOWN",
     "CameraPath",
     "Film",
+    "FilmPlan",
     "Look",
-    "Scene",
     "camera_at",
     "load_motion_of",
     "orbit",
     "place_motion",
     "read_camera_path",
-    "rendered_instants",
     "swing",
     "through",
 ]

@@ -1,4 +1,4 @@
-"""Where the camera goes: as recorded, around the person, from camera to camera, or as a file says.
+"""Camera paths: as recorded, around the person, from camera to camera, or as a file says.
 
 The file is JSON:
 
@@ -74,7 +74,7 @@ def swing(
     up: Float[Tensor, "3"],
     degrees: float = _SWING_DEG,
 ) -> CameraPath:
-    """To either side of ``start`` around ``middle`` and back: what one camera's recording bears."""
+    """Swing both ways from ``start`` around ``middle``: as far as one camera's recording bears."""
     angle = math.radians(degrees)
     return lambda share: _turned(start, middle, up, angle * math.sin(2 * math.pi * share))
 

@@ -1,4 +1,4 @@
-"""What a pixel shows: colour, the person cut out, depth, which part it belongs to, light."""
+"""Looks of a film: the values that its pixels show."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt16
 
-from evsplat.capture import Camera
+from evsplat.camera import Camera
 from evsplat.errors import ConfigError
 from evsplat.methods.reconstruction import Parts, Reconstruction, WithDepth
 from evsplat.options.runs import Shown
@@ -18,7 +18,7 @@ from evsplat.pictures.colours import colours
 SHOWN: tuple[Shown, ...] = get_args(Shown)
 
 Exposure = np.ndarray
-"""A picture as it is kept: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""
+"""A picture as it is cached: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""
 
 _PERSON, _SCENE = (1.0, 0.46, 0.16), (0.16, 0.50, 0.72)
 # Near to far, from light to dark.
@@ -27,7 +27,7 @@ _NEAR_TO_FAR = ((255, 247, 200), (250, 190, 90), (214, 90, 90), (120, 40, 120), 
 
 @dataclass(frozen=True)
 class Look:
-    """What of the reconstruction is shown, and of which parts."""
+    """Shown values of a reconstruction and of which parts of it."""
 
     shown: Shown = "rgb"
     parts: Parts = "all"
@@ -41,7 +41,7 @@ class Look:
     def expose(
         self, reconstruction: Reconstruction, camera: Camera, times_us: Sequence[int]
     ) -> list[Exposure]:
-        """Pictures as they are kept: colours in 8 bit; depth in millimetres and light in 16 bit.
+        """Pictures as they are cached: colours in 8 bit; depth in millimetres and light in 16 bit.
 
         Light (for events) is linear luminance, coded by the exponent 1/2.2.
         """

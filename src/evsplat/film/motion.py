@@ -1,4 +1,4 @@
-"""What the person does: any motion or pose file, or one that ships, on the body of a recording."""
+"""Motions of the person: any motion or pose file, or one that ships, on a recording's body."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -101,7 +101,7 @@ def _up_of(sequence: PoseSequence) -> Float[np.ndarray, "3"] | None:
 
 
 def _facing(track: BodyTrack) -> Float[np.ndarray, "3"]:
-    """From the right hip to the left one at the start, in the world."""
+    """Vector from the right hip to the left one at the start, in the world."""
     body = track.body
     limbs = find_skeleton(body.parents.tolist(), body.joint_names, "the run's body").limbs
     joints = _joints(body, track, int(track.times_us[0]))

@@ -19,8 +19,8 @@ from evsplat.camera import Camera
 from evsplat.errors import DataError
 from evsplat.export.cloud import SplatCloud
 from evsplat.export.gaussians import Instant, cloud_at
-from evsplat.film import load_motion_of
-from evsplat.film.looks import Look, depth_colours
+from evsplat.film import Look, load_motion_of
+from evsplat.film.looks import depth_colours
 from evsplat.methods.reconstruction import (
     Parts,
     Posable,

@@ -1,9 +1,8 @@
-"""A film put together for one run: who moves how, and where the camera is at each exposure."""
+"""The frames of a film of one run: the motion, and time and camera of each frame."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -19,74 +18,35 @@ from evsplat.film.camera_path import (
     read_camera_path,
     swing,
 )
-from evsplat.film.kept import Shot
+from evsplat.film.frame_cache import FilmFrame
 from evsplat.film.motion import load_motion_of
 from evsplat.methods.reconstruction import Posable, Reconstruction
-from evsplat.methods.trivial import nearest_in_time
 from evsplat.options import Film
 
 _HELD_SECONDS = 4.0
 
 
-@dataclass(frozen=True)
-class Instant:
-    """One picture to draw."""
-
-    name: str
-    """File name without ending, where pictures are written one by one."""
-    time_us: int
-    frame: Frame
-    """The recorded frame nearest in time: the picture for ``beside``."""
-
-
-def rendered_instants(
-    capture: Capture,
-    what: Literal["sequence", "test"],
-    *,
-    rate_hz: float = 30.0,
-    camera: str | None = None,
-) -> list[Instant]:
-    """Say which instants of the recording are drawn.
-
-    ``test``: mid-exposure of each held-out frame. ``sequence``: from the first to the last
-    mid-exposure (poses are known between them), ``rate_hz`` instants per second of the recording.
-    Frames are those of ``camera`` where it recorded any, else those of the first camera.
-    """
-    frames = recorded_by(capture, camera)
-    if what == "test":
-        frames = [frame for frame in frames if frame.split == "test"]
-        if not frames:
-            raise DataError(f"{capture.path}: no frame has split 'test'; render the sequence.")
-        return [Instant(frame.name, frame.mid_us, frame) for frame in frames]
-    mids = np.array([frame.mid_us for frame in frames])
-    times = [int(mids[0]) + at for at in _even_steps(int(mids[-1] - mids[0]), rate_hz)]
-    return [
-        Instant(f"{index:05d}", time, nearest_in_time(frames, time))
-        for index, time in enumerate(times)
-    ]
-
-
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """A film put together for one run."""
+class FilmPlan:
+    """The frames of a film of one run."""
 
     capture: Capture
     reconstruction: Reconstruction
-    shots: list[Shot]
-    """What is exposed; for events more than what is seen."""
-    step: int
-    """Exposures per picture."""
-    person_m: Callable[[], float]
-    """Distance of the person from the first camera."""
+    frames: list[FilmFrame]
+    """Frames to draw; for events more than are shown."""
+    oversampling: int
+    """Frames drawn per picture shown."""
+    person_distance_m: Callable[[], float]
+    """Distance of the person from the first camera, metres."""
     poses: tuple[object, ...]
-    """What a motion is told apart by."""
+    """Times and poses of a motion, for the film's digest; empty for the recorded one."""
 
     @classmethod
-    def of(cls, film: Film, capture: Capture, reconstruction: Reconstruction) -> "Scene":
-        """Find out who moves how and where the camera is at every exposure.
+    def of(cls, film: Film, capture: Capture, reconstruction: Reconstruction) -> "FilmPlan":
+        """Choose the motion, and time and camera of every frame.
 
         Raises:
-            ConfigError: what the capture or the method cannot give.
+            ConfigError: the capture or the method cannot give what is asked for.
         """
         poses: tuple[object, ...] = ()
         recorded = reconstruction.track if isinstance(reconstruction, Posable) else None
@@ -105,12 +65,12 @@ class Scene:
                 *(value.numpy() for value in track.at(track.times_us.tolist())),
             )
         person = reconstruction.track if isinstance(reconstruction, Posable) else None
-        step = 1
+        oversampling = 1
         if film.show == "events":
             if film.beside and capture.events is None:
                 raise DataError(f"{capture.path}: has no events to put --beside the rendered ones.")
-            step = max(1, int(np.ceil(film.event_hz / (film.fps * film.slow))))
-        names, times, clock = _times(film, capture, person, step)
+            oversampling = max(1, int(np.ceil(film.event_hz / (film.fps * film.slow))))
+        names, times, clock = _times(film, capture, person, oversampling)
         recording = recorded_by(capture, film.camera)[0].camera
         view = film.camera or recording
 
@@ -130,31 +90,33 @@ class Scene:
             cameras = [camera_at(capture, view, time) for time in times]
         else:
             cameras = [start] * len(times)
-        shots = [Shot(*fields) for fields in zip(names, times, clock, cameras, strict=True)]
+        frames = [FilmFrame(*fields) for fields in zip(names, times, clock, cameras, strict=True)]
         return cls(
             capture,
             reconstruction,
-            shots,
-            step,
+            frames,
+            oversampling,
             lambda: float((middle() - cameras[0].center().cpu()).norm()),
             poses,
         )
 
     def edges_us(self) -> list[int]:
-        """Where the windows of event pictures begin and end, on the film's clock."""
-        return [shot.clock_us for shot in self.shots[:: self.step]]
+        """Edges of the windows of event pictures, on the film's clock."""
+        return [frame.clock_us for frame in self.frames[:: self.oversampling]]
 
 
 def _times(
-    film: Film, capture: Capture, track: BodyTrack | None, step: int
+    film: Film, capture: Capture, track: BodyTrack | None, oversampling: int
 ) -> tuple[list[str], list[int], list[int]]:
-    """Name, time of the person and time on the film's clock of every exposure."""
+    """Name, time of the person and time on the film's clock of every frame."""
     times: list[int]
     clock: list[int]
     if film.what == "test":
-        instants = rendered_instants(capture, "test", camera=film.camera)
-        times = [instant.time_us for instant in instants]
-        return [instant.name for instant in instants], times, times
+        held_out = [f for f in recorded_by(capture, film.camera) if f.split == "test"]
+        if not held_out:
+            raise DataError(f"{capture.path}: no frame has split 'test'; render the sequence.")
+        times = [frame.mid_us for frame in held_out]
+        return [frame.name for frame in held_out], times, times
     if film.motion is not None:
         assert track is not None
         first, last = 0, int(track.times_us[-1])
@@ -169,16 +131,17 @@ def _times(
                 "person's pose is known."
             )
         length = round((film.seconds or _HELD_SECONDS) * 1e6)
-        clock = _even_steps(length, film.fps * step)
+        clock = _even_steps(length, film.fps * oversampling)
         times = [held] * len(clock)
     else:
         length = last - first
         if film.seconds is not None:
             length = min(length, round(film.seconds * 1e6))
-        times = clock = [first + at for at in _even_steps(length, film.fps * film.slow * step)]
+        rate_hz = film.fps * film.slow * oversampling
+        times = clock = [first + at for at in _even_steps(length, rate_hz)]
     if film.show == "events":
         # Whole windows only.
-        whole = (len(clock) - 1) // step * step + 1
+        whole = (len(clock) - 1) // oversampling * oversampling + 1
         if whole < 2:
             raise ConfigError("--show events: the film is shorter than one picture; lengthen it.")
         times, clock = times[:whole], clock[:whole]
@@ -207,7 +170,7 @@ def _camera_path(
 
 
 def _middle(track: BodyTrack, times_us: Sequence[int]) -> torch.Tensor:
-    """Middle of the way of the body's root."""
+    """Middle of the box around the root joint's path, metres in the world."""
     root = track.at(times_us)[1] + track.body.rest_joints[0]
     return (root.amax(0) + root.amin(0)) / 2
 
@@ -219,7 +182,7 @@ def _even_steps(length_us: int, rate_hz: float) -> list[int]:
 
 
 def recorded_by(capture: Capture, camera: str | None) -> list[Frame]:
-    """Return the frames of one camera in the order of time."""
+    """The frames of a camera, or of the first one where it recorded none, in the order of time."""
     recording = {frame.camera for frame in capture.frames}
     name = camera if camera in recording else capture.frames[0].camera
     return sorted((f for f in capture.frames if f.camera == name), key=lambda f: f.mid_us)

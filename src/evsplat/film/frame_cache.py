@@ -1,0 +1,125 @@
+"""Frames cached on disk while a film is made: one that was stopped goes on where it was."""
+
+import hashlib
+import logging
+import shutil
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from evsplat.camera import Camera
+from evsplat.errors import DataError
+from evsplat.files import atomic_path, read_json, write_json
+from evsplat.film.looks import Exposure, Look
+from evsplat.methods.reconstruction import Reconstruction
+from evsplat.names import checked_name
+
+logger = logging.getLogger(__name__)
+
+_TIMES_AT_ONCE = 8
+_PLAN = "plan.json"
+
+
+@dataclass(frozen=True, eq=False)
+class FilmFrame:
+    """One picture of a film to draw."""
+
+    name: str
+    """File name without ending."""
+    time_us: int
+    """The person's time: the camera's clock, or the time since a motion's start."""
+    clock_us: int
+    """The film's time: since its start, or the camera's clock; it goes on where the person is
+    held."""
+    camera: Camera
+
+
+class FrameCache:
+    """A folder of drawn frames beside the film that is being made.
+
+    It belongs to one digest: frames of another one (other options, a run that was trained further)
+    are thrown away, which is logged.
+    """
+
+    def __init__(self, path: Path, digest: str) -> None:
+        self.path = path
+        plan = path / _PLAN
+        if path.exists() and not plan.is_file():
+            raise DataError(f"{path}: is in the way of pictures to be kept; move it elsewhere.")
+        if plan.is_file() and read_json(plan) != {"plan": digest}:
+            logger.info("%s: kept pictures belong to other options; starting over.", path)
+            shutil.rmtree(path)
+        path.mkdir(parents=True, exist_ok=True)
+        write_json(plan, {"plan": digest})
+
+    def __len__(self) -> int:
+        """Number of frames drawn so far."""
+        return sum(1 for _ in self.path.glob("*.png"))
+
+    def file(self, frame: FilmFrame) -> Path:
+        """Path of a frame's picture, drawn or not."""
+        return self.path / f"{checked_name(frame.name, 'a picture')}.png"
+
+    def read(self, frame: FilmFrame) -> Exposure:
+        """The picture of a frame that was drawn."""
+        with Image.open(self.file(frame)) as image:
+            return np.asarray(image)
+
+    def remove(self) -> None:
+        """Delete the folder with all frames."""
+        shutil.rmtree(self.path)
+
+    @torch.no_grad()
+    def fill(self, reconstruction: Reconstruction, look: Look, frames: Sequence[FilmFrame]) -> None:
+        """Draw what is missing, several times at once where the camera stands still."""
+        missing = [frame for frame in frames if not self.file(frame).is_file()]
+        try:
+            with tqdm(
+                total=len(frames),
+                initial=len(frames) - len(missing),
+                unit="picture",
+                desc="render",
+                dynamic_ncols=True,
+            ) as progress:
+                for batch in _of_one_camera(missing):
+                    times = [frame.time_us for frame in batch]
+                    exposures = look.expose(reconstruction, batch[0].camera, times)
+                    for frame, exposure in zip(batch, exposures, strict=True):
+                        with atomic_path(self.file(frame)) as temporary:
+                            Image.fromarray(exposure).save(temporary, compress_level=1)
+                        progress.update()
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"Stopped; {len(self)} of {len(frames)} pictures are kept in {self.path}. "
+                "The same command goes on from there."
+            ) from None
+
+
+def film_digest(frames: Iterable[FilmFrame], *rest: object) -> str:
+    """A digest of a film's frames and options: equal exactly where all pictures are."""
+    digest = hashlib.sha256()
+    for frame in frames:
+        digest.update(f"{frame.name} {frame.time_us} {frame.clock_us}".encode())
+        camera = frame.camera
+        digest.update(f"{camera.width} {camera.height}".encode())
+        digest.update(camera.K.cpu().numpy().tobytes())
+        digest.update(camera.world_to_camera.cpu().numpy().tobytes())
+    for value in rest:
+        digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return digest.hexdigest()
+
+
+def _of_one_camera(frames: Sequence[FilmFrame]) -> Iterable[list[FilmFrame]]:
+    batch: list[FilmFrame] = []
+    for frame in frames:
+        if batch and (frame.camera is not batch[0].camera or len(batch) == _TIMES_AT_ONCE):
+            yield batch
+            batch = []
+        batch.append(frame)
+    if batch:
+        yield batch
