@@ -11,12 +11,12 @@ import torch
 
 from evsplat.body import BodyTrack, SurfaceSamples
 from evsplat.capture import TrainingCapture
-from evsplat.config import Above, AtLeast, ReadIf, Within
+from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.gaussians import GaussianSet
 from evsplat.methods.base import Purpose
 from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
 from evsplat.methods.prefit import fit_skinning
-from evsplat.methods.settings import Nominal, NotNegative, Share, Weight
+from evsplat.methods.settings import Nominal, NotNegative, Weight
 from evsplat.models.paper import PaperModel, Released, Semantics
 from evsplat.objectives import Isometry, Objective, Photometric, SkinningPrior
 from evsplat.objectives.perceptual import PerceptualChoice, choose_perceptual
@@ -114,11 +114,11 @@ class AvatarRates:
     """Latents of frames."""
     pose: Annotated[float, AtLeast(0), _POSES] = 1e-4
     """Pose residuals, radians and metres."""
-    final: Annotated[float, Above(0), Within(0, 1)] = 0.1
+    final: Annotated[float, Above(0), AtMost(1)] = 0.1
     """Factor that rates of centres and networks reach at the end, exponentially."""
-    gaussians_final: Annotated[float, Above(0), Within(0, 1)] = 0.1
+    gaussians_final: Annotated[float, Above(0), AtMost(1)] = 0.1
     """The same for the Gaussians' other attributes; 3DGS-Avatar keeps their rates, 1."""
-    constant: Annotated[Share, Within(0, 0.99)] = 0.3
+    constant: Annotated[float, Within(0, 0.99)] = 0.3
     """Share of the training before the decay begins; 3DGS-Avatar: none, over 15,000 steps."""
 
 

@@ -14,7 +14,7 @@ import torch
 from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate
 from evsplat.capture import Policy, TrainingCapture, estimate_sensor
-from evsplat.config import Above, AtLeast, ReadIf, Within
+from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
 from evsplat.methods.base import (
@@ -100,7 +100,7 @@ class DiscRates:
     """Places of the lamps and their shadows."""
     sensor: Annotated[float, AtLeast(0), WITH_EVENTS, WITH_WINDOWS] = 1e-3
     """Logarithms of the contrast thresholds, and the events' clock."""
-    final: Annotated[float, Above(0), Within(0, 1)] = 0.1
+    final: Annotated[float, Above(0), AtMost(1)] = 0.1
     """Factor that every rate reaches at the end, exponentially from 0.3 of the training on."""
 
 
@@ -143,7 +143,7 @@ class EvsplatConfig:
     ``shading``, light the person; 0 = none."""
     self_shadow: Annotated[bool, _LAMPS, _SHADING] = True
     """Parts of the person that are nearer to a lamp shade others."""
-    low_pass: Annotated[float, Above(0), Within(0, LOW_PASS)] = 0.1
+    low_pass: Annotated[float, Above(0), AtMost(LOW_PASS)] = 0.1
     """Variance of the filter of a pixel, px^2; 3DGS and viewers of others take 0.3, the most."""
 
     px_per_render: Annotated[float, Above(0), _SEVERAL] = 3.0
