@@ -26,8 +26,8 @@ from PIL import Image
 
 import evsplat as ev
 from evsplat.capture import Camera
+from evsplat.export.avatar.avatar import avatar_of
 from evsplat.export.avatar.export import at_rest
-from evsplat.export.avatar.figure import figure_of
 from evsplat.export.cloud import cloud_of
 from evsplat.export.gaussians import file_rotation
 from evsplat.render import render
@@ -88,8 +88,8 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
     )  # fmt: skip
     seen = photograph(arguments, site, shots, out)
 
-    figure = figure_of(at_rest(run, None))
-    skinned = figure.gaussians.posed(source.pose([frame.mid_us])[1])
+    avatar = avatar_of(at_rest(run, None))
+    skinned = avatar.gaussians.posed(source.pose([frame.mid_us])[1])
     (alone,) = source.splats(camera, [frame.mid_us], parts="scene")
     avatar = render(skinned, camera, static=alone, low_pass=source.low_pass).image[0, ..., :3]
     save(out / "ours.png", ours)

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import DataError
 from evsplat.export import export_run
-from evsplat.export.avatar.figure import clip_of, figure_of, recorded_clip
-from evsplat.export.avatar.loss import measure_loss
+from evsplat.export.avatar.avatar import avatar_of, clip_of, recorded_clip
+from evsplat.export.avatar.export import measure_loss
 from evsplat.export.avatar.package import avatar_document
 from evsplat.export.cloud import cloud_of
 from evsplat.methods.reconstruction import Bakeable
@@ -132,22 +132,22 @@ def test_four_bones_in_255ths_are_the_heaviest_and_sum_to_one(reconstruction, se
     weights = rng.random((300, 9)) ** 4
     weights /= weights.sum(1, keepdims=True)
     gaussians = _skinned(track, 300, seed)
-    figure = figure_of(replace(gaussians, weights=torch.from_numpy(np.float32(weights))))
-    assert (figure.weights.astype(int).sum(1) == 255).all()
+    avatar = avatar_of(replace(gaussians, weights=torch.from_numpy(np.float32(weights))))
+    assert (avatar.weights.astype(int).sum(1) == 255).all()
     want = np.sort(weights, axis=1)[:, -4:]
-    got = np.sort(np.take_along_axis(weights, figure.bones.astype(int), axis=1), axis=1)
+    got = np.sort(np.take_along_axis(weights, avatar.bones.astype(int), axis=1), axis=1)
     np.testing.assert_allclose(got, want, rtol=1e-6)
-    exact = weights[np.arange(300)[:, None], figure.bones] / want.sum(1, keepdims=True)
-    assert np.abs(figure.weights / 255 - exact).max() < 1 / 255
+    exact = weights[np.arange(300)[:, None], avatar.bones] / want.sum(1, keepdims=True)
+    assert np.abs(avatar.weights / 255 - exact).max() < 1 / 255
     dense = np.zeros((300, 9))
-    np.put_along_axis(dense, figure.bones.astype(int), figure.weights / 255, axis=1)
-    np.testing.assert_allclose(figure.gaussians.weights, dense, atol=1e-7)
+    np.put_along_axis(dense, avatar.bones.astype(int), avatar.weights / 255, axis=1)
+    np.testing.assert_allclose(avatar.gaussians.weights, dense, atol=1e-7)
 
 
 def test_a_body_of_too_many_joints_is_told(reconstruction):
     gaussians = _skinned(load_body_track(reconstruction[0]), 5, 0)
     with pytest.raises(DataError, match="300 joints"):
-        figure_of(replace(gaussians, weights=torch.full((5, 300), 1 / 300)))
+        avatar_of(replace(gaussians, weights=torch.full((5, 300), 1 / 300)))
 
 
 def test_the_recorded_clip_is_the_motion_that_the_method_has(reconstruction):
@@ -192,10 +192,10 @@ def test_the_document_says_how_the_skeleton_moves(reconstruction):
 
 
 def _document(capture, source) -> dict:
-    figure = figure_of(_skinned(source.track, 20, 3))
+    avatar = avatar_of(_skinned(source.track, 20, 3))
     clips = [clip_of("again", source.track)]
     camera = capture.camera(capture.frames[0])
-    return avatar_document(figure, clips, track=source.track, camera=camera, facts={"a": 1})
+    return avatar_document(avatar, clips, track=source.track, camera=camera, facts={"a": 1})
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's script")
@@ -242,13 +242,13 @@ def test_the_page_moves_the_skeleton_as_the_document_says(reconstruction, tmp_pa
 
 def test_loss_is_that_of_the_avatar_and_nothing_else(reconstruction):
     capture, source = reconstruction
-    figure = figure_of(source.at_rest(_views(capture)))
-    loss = measure_loss(source, figure, capture)
+    avatar = avatar_of(source.at_rest(_views(capture)))
+    loss = measure_loss(source, avatar, capture)
     assert loss.frames == len([f for f in capture.frames if f.split == "test"])
     assert loss.model_to_truth is not None and loss.avatar_to_truth is not None
     assert f"{loss.avatar_to_model.person:.2f} dB" in loss.sentence()
     # Colours far off must show, on the person more than on the frame.
-    wrong = replace(figure, gaussians=replace(figure.gaussians, rgb=1 - figure.gaussians.rgb))
+    wrong = replace(avatar, gaussians=replace(avatar.gaussians, rgb=1 - avatar.gaussians.rgb))
     worse = measure_loss(source, wrong, capture)
     assert worse.avatar_to_model.person < loss.avatar_to_model.person - 3
     assert worse.avatar_to_model.person < worse.avatar_to_model.full

@@ -1,4 +1,4 @@
-"""What leaves a run: pictures, videos, and its Gaussians as files for other programs."""
+"""Files made of a run: pictures, videos, and its Gaussians for other programs."""
 
 from evsplat.export.rendering import render_run
 from evsplat.export.run import export_run

@@ -16,7 +16,7 @@ from evsplat.errors import DataError
 from evsplat.render import Splats
 
 CHANNELS = 4
-"""Of exported splats: R, G, B, semantic attribute."""
+"""Channels of exported splats: R, G, B, semantic attribute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class SplatCloud:
     scales: Float32[np.ndarray, "N 3"]
     """Standard deviations along the rotated axes, metres, above 0."""
     opacities: Float32[np.ndarray, " N"]
-    """In [0, 1]."""
+    """Opacity of the Gaussian's centre, in [0, 1]."""
     rgb: Float32[np.ndarray, "N 3"]
     """sRGB; mostly in [0, 1], not clamped."""
     semantic: Float32[np.ndarray, " N"]

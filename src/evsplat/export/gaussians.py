@@ -14,6 +14,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.export.cloud import SplatCloud, cloud_of, joined
 from evsplat.export.formats import write_gltf, write_ply, write_splat, write_spz
 from evsplat.film import camera_at
+from evsplat.film.camera_path import check_camera
 from evsplat.methods.reconstruction import Parts, SplatReconstruction
 from evsplat.options.runs import FileKind, UpAxis
 from evsplat.training.run import Run
@@ -25,13 +26,13 @@ ALWAYS_Y_UP = {"spz": "right, up, back (RUB)", "gltf": "+Y up"}
 
 @dataclass(frozen=True)
 class Instant:
-    """When, and from where the colours are seen."""
+    """A time, and the camera that sees the colours."""
 
     time_us: int
     camera: Camera
     camera_name: str
     label: str
-    """For file names."""
+    """The instant's part of file names."""
 
 
 def instant_of(
@@ -63,9 +64,7 @@ def instant_of(
             )
         chosen = min(frames, key=lambda f: abs(f.mid_us - time_us))
     name = camera or chosen.camera
-    if name not in capture.cameras:
-        known = ", ".join(capture.cameras)
-        raise ConfigError(f"--camera {name}: the capture has no such camera, only {known}.")
+    check_camera(capture, name)
     label = f"frame-{frame}" if frame is not None else f"{(time_us - first) / 1e6:.3f}s"
     return Instant(time_us, camera_at(capture, name, time_us), name, label)
 
@@ -87,7 +86,7 @@ def cloud_at(source: SplatReconstruction, instant: Instant, parts: Parts) -> Spl
 
 
 def facts_of(run: Run) -> dict[str, Any]:
-    """Where Gaussians come from, for formats that have room to say so."""
+    """Capture, method and step of the Gaussians, for formats that have room for them."""
     return {"capture": run.capture.name, "method": run.method, "iteration": run.iteration}
 
 

@@ -18,6 +18,7 @@ from evsplat.events import (
     simulate_events,
     write_events,
 )
+from evsplat.film.camera_path import check_camera
 from evsplat.film.frame_cache import FilmFrame, FrameCache, film_digest
 from evsplat.film.looks import Look, depth_colours, linear_luma
 from evsplat.film.plan import FilmPlan, recorded_by
@@ -63,9 +64,8 @@ def render_run(
     ours = out.parent == Path(run) / "renders"
     _check_output(film, out, events_out, ours=ours)
     loaded = load_run(Path(run), device=device)
-    if film.camera is not None and film.camera not in loaded.capture.cameras:
-        known = ", ".join(loaded.capture.cameras)
-        raise ConfigError(f"--camera {film.camera}: the capture has no such camera, only {known}.")
+    if film.camera is not None:
+        check_camera(loaded.capture, film.camera)
     plan = FilmPlan.of(film, loaded.capture, loaded.reconstruction)
     look = Look(film.show, film.parts, film.transparent)
     trained = loaded.method, loaded.iteration, loaded.train_seconds

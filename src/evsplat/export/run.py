@@ -34,7 +34,7 @@ _SUFFIXES: dict[Kind, tuple[str, ...]] = {
     "html": (".html",),
     "avatar": ("", ".html"),
 }
-"""What ``out`` may end in; the first is the default. No suffix: a folder."""
+"""Endings that ``out`` may have; the first is the default. No ending: a folder."""
 
 
 def export_run(

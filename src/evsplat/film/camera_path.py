@@ -38,6 +38,13 @@ PATHS = ("orbit", "swing", "interpolate")
 _SWING_DEG = 25.0
 
 
+def check_camera(capture: Capture, name: str) -> None:
+    """Raise a `ConfigError` where the capture has no camera of this name."""
+    if name not in capture.cameras:
+        known = ", ".join(capture.cameras)
+        raise ConfigError(f"--camera {name}: the capture has no such camera, only {known}.")
+
+
 def camera_at(capture: Capture, name: str, time_us: int) -> Camera:
     """Return a camera of the capture at any time.
 

@@ -1,17 +1,26 @@
-"""``export avatar``: from a run to a page that plays its person."""
+"""``export avatar``: from a run to a page that plays its person, and what that loses."""
 
 import logging
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from evsplat.errors import ConfigError, DataError
-from evsplat.export.avatar.figure import Clip, clip_of, figure_of, recorded_clip
-from evsplat.export.avatar.loss import measure_loss
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from evsplat.camera import Camera
+from evsplat.capture import Capture
+from evsplat.errors import DataError
+from evsplat.export.avatar.avatar import Avatar, Clip, avatar_of, clip_of, recorded_clip
 from evsplat.export.avatar.package import write_avatar
 from evsplat.export.gaussians import cloud_at, facts_of, instant_of
 from evsplat.film import camera_at, load_motion_of
+from evsplat.film.camera_path import check_camera
 from evsplat.methods.reconstruction import Bakeable, Parts
 from evsplat.models.at_rest import SkinnedGaussians
+from evsplat.render import Splats, render
+from evsplat.similarity import psnr
 from evsplat.training.run import Run
 
 logger = logging.getLogger(__name__)
@@ -20,9 +29,8 @@ logger = logging.getLogger(__name__)
 def at_rest(run: Run, camera: str | None) -> SkinnedGaussians:
     """The person's mean over the training frames; colours as ``camera`` (or theirs) sees them."""
     capture = run.capture
-    if camera is not None and camera not in capture.cameras:
-        known = ", ".join(capture.cameras)
-        raise ConfigError(f"--camera {camera}: the capture has no such camera, only {known}.")
+    if camera is not None:
+        check_camera(capture, camera)
     views = [
         (frame.mid_us, camera_at(capture, camera or frame.camera, frame.mid_us))
         for frame in capture.train_frames
@@ -50,22 +58,118 @@ def export_avatar(
     if motion is not None:
         clips.append(clip_of(Path(motion).stem, load_motion_of(motion, track)))
     gaussians = at_rest(run, camera)
-    figure = figure_of(gaussians)
+    avatar = avatar_of(gaussians)
     mids = [frame.mid_us for frame in capture.frames]
     clips.insert(0, recorded_clip(source, gaussians, (min(mids), max(mids))))
-    loss = measure_loss(source, figure, capture)
+    loss = measure_loss(source, avatar, capture)
     instant = instant_of(capture, time_s=None, frame=None, camera=camera)
     scene = cloud_at(source, instant, "scene") if parts == "all" else None
     facts = {**facts_of(run), "note": loss.sentence(), "loss_db": asdict(loss)}
     facts["low_pass_px2"] = source.low_pass
     page = write_avatar(
-        path, figure, clips, track=track, camera=instant.camera, scene=scene, facts=facts
+        path, avatar, clips, track=track, camera=instant.camera, scene=scene, facts=facts
     )
     logger.info("%s", loss.sentence())
     logger.info(
         "%d Gaussians, %d joints, %s; metres, axes of the capture.",
-        len(figure.bones),
+        len(avatar.bones),
         len(gaussians.body.parents),
         " and ".join(f"motion {clip.name}" for clip in clips),
     )
     return page
+
+
+@dataclass(frozen=True)
+class Psnr:
+    """PSNR, mean over frames, dB."""
+
+    person: float
+    """PSNR on the person's pixels."""
+    full: float
+    """PSNR on the full frame."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Model and avatar on the test frames, in the same scene, drawn by the same rasteriser."""
+
+    frames: int
+    keeps_light: bool
+    """True where the avatar has the light, which a method may know."""
+    avatar_to_model: Psnr
+    model_to_truth: Psnr | None
+    """None where the capture has no sharp truth."""
+    avatar_to_truth: Psnr | None
+
+    def sentence(self) -> str:
+        """The loss in words, with its figures."""
+        dropped = "non-rigid motion, colour" + ("" if self.keeps_light else ", light")
+        sentence = (
+            f"Dropped: what poses do beyond skinning ({dropped}). On the "
+            f"person's pixels of {self.frames} test frames the avatar is "
+            f"{self.avatar_to_model.person:.2f} dB PSNR from the model"
+        )
+        if self.model_to_truth is None or self.avatar_to_truth is None:
+            return sentence + "."
+        before, after = self.model_to_truth.person, self.avatar_to_truth.person
+        return (
+            f"{sentence}; against the sharp truth {before:.2f} dB becomes {after:.2f} dB "
+            f"({after - before:+.2f})."
+        )
+
+
+@torch.no_grad()
+def measure_loss(source: Bakeable, avatar: Avatar, capture: Capture) -> Loss:
+    """Draw model and avatar on the test frames, or on all frames where none is held out."""
+    frames = [f for f in capture.frames if f.split == "test"] or list(capture.frames)
+    rows: dict[str, list[Psnr]] = {"avatar": [], "model_truth": [], "avatar_truth": []}
+    for frame in tqdm(frames, unit="frame", desc="avatar against model", dynamic_ncols=True):
+        camera = capture.camera(frame)
+        person, scene = source.splats(camera, [frame.mid_us])
+        skinned = avatar.gaussians.posed(source.pose([frame.mid_us])[1])
+        model, model_share = _draw(person, scene, camera, source.low_pass)
+        baked, avatar_share = _draw(skinned, scene, camera, source.low_pass)
+        mask = capture.mask(frame)
+        pixels = torch.maximum(model_share, avatar_share) > 0.5 if mask is None else mask > 0.5
+        if not bool(pixels.any()):
+            continue
+
+        def of(image: Tensor, reference: Tensor, pixels: Tensor = pixels) -> Psnr:
+            return Psnr(float(psnr(image, reference, mask=pixels)), float(psnr(image, reference)))
+
+        rows["avatar"].append(of(baked, model))
+        if frame.sharp is not None:
+            truth = capture.sharp(frame)
+            rows["model_truth"].append(of(model, truth))
+            rows["avatar_truth"].append(of(baked, truth))
+    between = _mean(rows["avatar"])
+    if between is None:
+        raise DataError(f"{capture.path}: the person is in none of the test frames.")
+    return Loss(
+        len(rows["avatar"]),
+        avatar.gaussians.light is not None,
+        between,
+        _mean(rows["model_truth"]),
+        _mean(rows["avatar_truth"]),
+    )
+
+
+def _draw(
+    person: Splats, scene: Splats, camera: Camera, low_pass: float
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+    """Picture and the person's share of it."""
+    layers = [_on_cpu(layer) for layer in (person, scene)]
+    image = render(layers[0], camera, static=layers[1], low_pass=low_pass).image[0].clamp(0, 1)
+    return image[..., :3], image[..., 3]
+
+
+def _on_cpu(splats: Splats) -> Splats:
+    given = {name: value for name, value in vars(splats).items() if value is not None}
+    return Splats(**{name: value.cpu() for name, value in given.items()})
+
+
+def _mean(values: list[Psnr]) -> Psnr | None:
+    if not values:
+        return None
+    count = len(values)
+    return Psnr(sum(v.person for v in values) / count, sum(v.full for v in values) / count)

@@ -14,7 +14,7 @@ import torch
 from evsplat.body import BodyTrack, up_axis
 from evsplat.capture import Camera
 from evsplat.errors import DataError
-from evsplat.export.avatar.figure import Clip, Figure
+from evsplat.export.avatar.avatar import Avatar, Clip
 from evsplat.export.cloud import SplatCloud, cloud_of
 from evsplat.export.formats import write_ply
 from evsplat.files import new_folder, write_json, write_text
@@ -34,7 +34,7 @@ scene.ply      what stands around, in the axes of the capture (where it was aske
 
 def write_avatar(
     path: Path | str,
-    figure: Figure,
+    avatar: Avatar,
     clips: Sequence[Clip],
     *,
     track: BodyTrack,
@@ -48,8 +48,8 @@ def write_avatar(
     ``facts`` are shown (``note``) and kept. Returns the page.
     """
     path = Path(path)
-    document = avatar_document(figure, clips, track=track, camera=camera, facts=facts)
-    cloud = rest_cloud(figure)
+    document = avatar_document(avatar, clips, track=track, camera=camera, facts=facts)
+    cloud = rest_cloud(avatar)
     page = _page(document, cloud, scene)
     if path.suffix.lower() in (".html", ".htm"):
         write_text(path, page)
@@ -65,22 +65,22 @@ def write_avatar(
     return path / "index.html"
 
 
-def rest_cloud(figure: Figure) -> SplatCloud:
+def rest_cloud(avatar: Avatar) -> SplatCloud:
     """The person in the canonical pose."""
-    return cloud_of(figure.gaussians.at_rest())
+    return cloud_of(avatar.gaussians.at_rest())
 
 
 def avatar_document(
-    figure: Figure,
+    avatar: Avatar,
     clips: Sequence[Clip],
     *,
     track: BodyTrack,
     camera: Camera,
     facts: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What avatar.json holds; arrays are base64 of little-endian numbers, rows after rows."""
-    body = figure.gaussians.body
-    light = figure.gaussians.light
+    """Content of avatar.json; arrays are base64 of little-endian numbers, rows after rows."""
+    body = avatar.gaussians.body
+    light = avatar.gaussians.light
     inverse = torch.linalg.inv(body.canonical_bone_transforms().double())
     return {
         "format": FORMAT,
@@ -101,9 +101,9 @@ def avatar_document(
             "rest_from_canonical": [row.tolist() for row in inverse.float()],
         },
         "skin": {
-            "count": len(figure.bones),
-            "bones": _base64(figure.bones, "u1"),
-            "weights": _base64(figure.weights, "u1"),
+            "count": len(avatar.bones),
+            "bones": _base64(avatar.bones, "u1"),
+            "weights": _base64(avatar.weights, "u1"),
         },
         "light": None if light is None else _light(light),
         "clips": [
@@ -125,7 +125,6 @@ def _page(document: Mapping[str, Any], person: SplatCloud, scene: SplatCloud | N
     if len(person) != document["skin"]["count"]:
         raise DataError("Some Gaussians of the person are not finite; train the run longer.")
     page = _asset("page.html")
-    # A closing tag inside a script would end it.
     parts = {
         "STYLE": _asset("player.css"),
         # A closing tag inside a script would end it.

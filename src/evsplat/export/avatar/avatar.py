@@ -1,4 +1,4 @@
-"""What an avatar is made of: Gaussians with four bones each, and motions of the skeleton."""
+"""The avatar: Gaussians with four bones each, and motion clips of the skeleton."""
 
 from dataclasses import dataclass, replace
 
@@ -19,15 +19,15 @@ KEYS_PER_SECOND = 60.0
 
 
 @dataclass(frozen=True, eq=False)
-class Figure:
+class Avatar:
     """A person whose every Gaussian follows at most four bones, as graphics cards like it."""
 
     gaussians: SkinnedGaussians
-    """With the weights below, divided by 255."""
+    """Gaussians at rest; their weights are those below, divided by 255."""
     bones: UInt8[np.ndarray, "H 4"]
     """Joint numbers, heaviest first."""
     weights: UInt8[np.ndarray, "H 4"]
-    """They sum to 255."""
+    """Skinning weights; they sum to 255."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +39,10 @@ class Clip:
     rotations: Float32[np.ndarray, "T J 4"]
     """Against the parent, (w, x, y, z); the root's in the world."""
     transl: Float32[np.ndarray, "T 3"]
-    """Of the root joint from its rest place, metres."""
+    """Root joint's shift from its rest place, metres."""
 
 
-def figure_of(gaussians: SkinnedGaussians) -> Figure:
+def avatar_of(gaussians: SkinnedGaussians) -> Avatar:
     """Keep the four heaviest bones of each Gaussian, in 255ths; the rest is shared among them."""
     joints = gaussians.weights.shape[1]
     if joints > _MOST_JOINTS:
@@ -56,7 +56,7 @@ def figure_of(gaussians: SkinnedGaussians) -> Figure:
     weights = whole + (rank < missing)
     dense = torch.zeros_like(gaussians.weights).scatter_(1, bones, (weights / 255).float())
     padding = (0, BONES_EACH - bones.shape[1])
-    return Figure(
+    return Avatar(
         gaussians=replace(gaussians, weights=dense),
         bones=torch.nn.functional.pad(bones, padding).to(torch.uint8).numpy(),
         weights=torch.nn.functional.pad(weights, padding).to(torch.uint8).numpy(),
