@@ -14,11 +14,11 @@ from evsplat.evaluation.protocols import (
     PROTOCOLS,
     PSNR_CEILING_DB,
     STANDARD,
-    Absent,
+    MetricMeans,
     Truth,
+    all_absent,
 )
-from evsplat.evaluation.regions import Box, mask_box
-from evsplat.evaluation.tally import Tally, all_absent
+from evsplat.evaluation.regions import Absent, Box, mask_box
 
 NO_NETWORKS = dict.fromkeys(METRICS[2:], Absent("no weights"))
 
@@ -140,13 +140,13 @@ def test_boxes_stay_inside_the_picture():
 
 
 def test_means_skip_gaps_and_say_how_many():
-    tally = Tally()
+    frames = MetricMeans()
     truth, render, mask, box = scene()
     first = measure(STANDARD, truth, render, mask, box)
     second = measure(STANDARD, truth, 0.5 * (truth + render), mask, box)
     for measured in (first, second, all_absent("no truth")):
-        tally.add(measured)
-    means, reasons = tally.means()
+        frames.add(measured)
+    means, reasons = frames.means()
     expected = (first["full"]["psnr"] + second["full"]["psnr"]) / 2
     assert means["full"]["psnr"] == pytest.approx(expected)
     assert reasons["full.psnr"] == "missing in 1 of 3: no truth"

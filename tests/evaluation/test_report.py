@@ -14,7 +14,7 @@ from PIL import Image
 
 from evsplat.capture import Policy, load_capture
 from evsplat.config import to_dict
-from evsplat.errors import DataError
+from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation import evaluate, run
 from evsplat.evaluation.protocols import METRICS
 from evsplat.evaluation.report.charts import Series, line_chart
@@ -183,6 +183,32 @@ def test_report_needs_an_evaluation(tiny_capture, tmp_path, monkeypatch):
     evaluated(capture.path, tmp_path)
     path = run.write_report(tmp_path)
     assert path == tmp_path / "report.html" and path.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    "content", [b"{", b"[" * 100_000, b"[1]", b"\xff"], ids=["open", "deep", "list", "no text"]
+)
+@pytest.mark.parametrize("name", ["metrics.json", "versions.json"])
+def test_a_broken_file_of_the_run_is_one_sentence(tiny_capture, tmp_path, name, content):
+    source = evaluated(tiny_capture(), tmp_path)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(DataError, match=rf"{name}: "):
+        Source.read(tmp_path, source.capture, source.reconstruction)
+
+
+def test_lines_of_the_log_that_are_broken_or_deep_are_left_out(tiny_capture, tmp_path):
+    source = evaluated(tiny_capture(), tmp_path)
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write("\n" + "[" * 100_000 + "\n[1]\n")
+    read = Source.read(tmp_path, source.capture, source.reconstruction)
+    assert read.log == source.log and len(read.log) == 8
+    (tmp_path / "log.jsonl").write_bytes(b"\xff")
+    with pytest.raises(DataError, match="log.jsonl: not a text"):
+        Source.read(tmp_path, source.capture, source.reconstruction)
+    (tmp_path / "log.jsonl").unlink()
+    (tmp_path / "config.yaml").write_text("a: [")
+    with pytest.raises(ConfigError, match="config.yaml: not valid YAML"):
+        Source.read(tmp_path, source.capture, source.reconstruction)
 
 
 def points(svg: str) -> list[list[tuple[float, float]]]:

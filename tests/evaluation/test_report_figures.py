@@ -9,7 +9,7 @@ from evsplat.capture import Policy
 from evsplat.capture.policy import policy_of
 from evsplat.config import to_dict
 from evsplat.evaluation.protocols import METRICS, REGIONS
-from evsplat.evaluation.report import shots
+from evsplat.evaluation.report import frames
 from evsplat.evaluation.report.figures import distance, figures, references
 from evsplat.evaluation.report.page import _summary
 
@@ -171,7 +171,7 @@ def test_what_training_saw_is_told_beside_the_figures_and_the_test_frames(
     metrics = MIXED | {"policy": to_dict(policy)}
     ((_, intro),) = Text(figures(SimpleNamespace(metrics=metrics))).of("intro")
     assert policy.sentence in intro
-    told = shots._shown_to_training(policy_of(metrics))
+    told = frames._held_out_terms(policy_of(metrics))
     assert "neither picture nor mask" in told
     assert ("and no event of the intervals" in told) == (not held_out_events)
     assert ("but the events of the intervals" in told) == held_out_events
@@ -182,7 +182,7 @@ def test_what_training_saw_is_told_beside_the_figures_and_the_test_frames(
 def test_a_run_that_does_not_tell_what_training_saw_is_said_not_to():
     ((_, intro),) = Text(figures(SimpleNamespace(metrics=MIXED))).of("intro")
     assert "The run does not tell what training saw." in intro
-    told = shots._shown_to_training(policy_of(MIXED))
+    told = frames._held_out_terms(policy_of(MIXED))
     assert "does not tell what training saw" in told
     for claim in ("picture", "mask", "event", "pose"):
         assert claim not in told
@@ -193,7 +193,7 @@ def test_where_everything_trained_words_stand_in_place_of_figures(left):
     values = (row(38.5, 33.2, 24.0),) * 4 if left else (UNKNOWN,) * 4
     metrics = made_up(*values, policy=Policy(use="everything"), test=left)
     assert headline(metrics) == f"ours: {EVERYTHING}"
-    for section in (figures, shots.test_frames):
+    for section in (figures, frames.test_frames):
         page = section(SimpleNamespace(metrics=metrics))
         assert EVERYTHING[1:] in Text(page).read
         assert "dB" not in page and "card" not in page and "<table" not in page
@@ -202,7 +202,7 @@ def test_where_everything_trained_words_stand_in_place_of_figures(left):
 def test_a_capture_without_test_frames_is_not_said_to_lack_truth():
     metrics = made_up(*(UNKNOWN,) * 4, policy=Policy(), test=0)
     assert headline(metrics) == "ours: no frame has split “test”, so there are no test figures."
-    for section in (figures, shots.test_frames):
+    for section in (figures, frames.test_frames):
         page = section(SimpleNamespace(metrics=metrics))
         assert "No frame has split “test”" in page
         assert "card" not in page and "<table" not in page and "Held" not in page

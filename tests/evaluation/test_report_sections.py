@@ -9,8 +9,7 @@ from evsplat.capture import load_body_track, load_capture
 from evsplat.config import to_dict
 from evsplat.devices import hardware
 from evsplat.evaluation.report.configuration import _changed, configuration, made_with
-from evsplat.evaluation.report.frames import _speeds
-from evsplat.evaluation.report.shots import _worth_showing
+from evsplat.evaluation.report.frames import _chosen_entries, _speeds
 from evsplat.methods import TRAINABLE, method_config
 
 
@@ -77,7 +76,7 @@ def test_a_long_recording_shows_the_hardest_frame_and_an_even_choice_of_others(c
         }
         for i, value in enumerate(values)
     ]
-    shown = [entry["frame"] for entry in _worth_showing(entries, 30)]
+    shown = [entry["frame"] for entry in _chosen_entries(entries, 30)]
     assert shown[0] == int(values.argmin())
     assert len(set(shown)) == len(shown) <= max(30, 3)
     assert len(shown) >= min(count, 29)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib import resources
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,10 +14,8 @@ from evsplat.benching.tables import BenchTable
 from evsplat.benching.writers import LEGEND, html
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.errors import DataError
-from evsplat.evaluation.people import People
-from evsplat.evaluation.regions import CROP_MARGIN, Box
-from evsplat.evaluation.report.embed import Embedder
-from evsplat.evaluation.report.html import folded, section, spread
+from evsplat.evaluation.regions import Box, PersonRegions
+from evsplat.evaluation.report.html import Embedder, document, folded, section, spread
 from evsplat.pictures import to_bytes
 
 _PIXELS = 60_000_000
@@ -65,7 +62,6 @@ class _Row:
 def page(records: Records, tables: Sequence[BenchTable], folder: BenchFolder) -> str:
     """The page as HTML; all that comes from the user's files is escaped."""
     suite = records.plan.suite
-    style = (resources.files("evsplat") / "data" / "report.css").read_text(encoding="utf-8")
     title = suite.title or suite.name
     figures = "".join(
         section(escape(table.title), escape(table.note), html(table)) for table in tables
@@ -80,17 +76,14 @@ def page(records: Records, tables: Sequence[BenchTable], folder: BenchFolder) ->
         _capture(records, name, capture, folder, budget) for name, capture in captures.items()
     )
     done = sum(record["status"] == "done" for record in records.by_cell.values())
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{style}{_STYLE}</style></head><body>"
+    body = (
         '<input type="checkbox" id="person" checked aria-label="person only">'
         f'<header><p class="kicker">evsplat · bench · {escape(suite.name)}</p>'
         f'<h1>{escape(title)}</h1><p class="lead">{done} of {len(records.plan.cells)} cells. '
         f"{escape(LEGEND.format(second='underlined'))}</p></header>"
-        f"<main>{figures}{pictures}</main></body></html>\n"
+        f"<main>{figures}{pictures}</main>"
     )
+    return document(title, body, style=_STYLE)
 
 
 def _capture(
@@ -107,7 +100,7 @@ def _capture(
     of_frame = camera.width * camera.height * (len(rows) + 2)
     frames = spread(capture.test_frames, max(2, budget // of_frame))
     shown = spread(frames, _OPEN)
-    people = People(capture)
+    people = PersonRegions(capture)
     # Pictures of many methods: light compression is seen by nobody at this size.
     embed = Embedder(lossless=False)
     draw = {frame.name: _frame(capture, people, frame, rows, folder, embed) for frame in frames}
@@ -126,19 +119,14 @@ def _capture(
 
 def _frame(
     capture: Capture,
-    people: People,
+    people: PersonRegions,
     frame: Frame,
     rows: Sequence[_Row],
     folder: BenchFolder,
     embed: Embedder,
 ) -> str:
-    _, box = people.in_mask(frame)
-    camera = capture.camera(frame)
-    if isinstance(box, Box):
-        box = box.enlarged(CROP_MARGIN, camera.height, camera.width)
-        style = _window(box, camera.height, camera.width)
-    else:
-        style = ""
+    box, camera = people.crop(frame), capture.camera(frame)
+    style = "" if box is None else _window(box, camera.height, camera.width)
     tiles = [_tile(embed.image(to_bytes(capture.image(frame)), "blurry input"), style, "recorded")]
     if frame.sharp is not None:
         truth = embed.image(to_bytes(capture.sharp(frame)), "sharp truth")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from html import escape
 
 from evsplat.benching.tables import BenchTable, Heading, Shown
-from evsplat.evaluation.tables import latex_text
+from evsplat.evaluation.tables import latex_text, markdown_table
 
 _ARROWS = {True: "↑", False: "↓", None: ""}
 LEGEND = "Best of a column bold, second best {second}. ± is the standard deviation over seeds."
@@ -18,11 +18,11 @@ def markdown(title: str, tables: Sequence[BenchTable]) -> str:
         head = [
             f"{h.group} {h.title} {_ARROWS[h.higher_is_better]}".strip() for h in table.headings
         ]
-        lines.append("| " + " | ".join(["", *map(_markdown_text, head)]) + " |")
-        lines.append("|" + "|".join(["---", *["---:"] * len(head)]) + "|")
-        for name, cells in table.rows:
-            shown = [_marked(cell, ("{}", "**{}**", "*{}*")) for cell in cells]
-            lines.append("| " + " | ".join([_markdown_text(name), *shown]) + " |")
+        rows = [
+            (_markdown_text(name), [_marked(cell, ("{}", "**{}**", "*{}*")) for cell in cells])
+            for name, cells in table.rows
+        ]
+        lines += markdown_table("", [_markdown_text(text) for text in head], rows)
         lines += ["", *(f"- {_markdown_text(note)}" for note in table.footnotes)]
         lines += [""] if table.footnotes else []
     return "\n".join(lines).rstrip() + "\n"

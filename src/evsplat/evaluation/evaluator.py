@@ -14,18 +14,19 @@ from tqdm import tqdm
 from evsplat.capture import Capture, Frame, NovelView, Policy, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.evaluation.event_maps import evaluate_event_maps
-from evsplat.evaluation.people import People
 from evsplat.evaluation.protocols import (
     METRICS,
     PROTOCOLS,
     STANDARD,
-    Absent,
     Measured,
+    MetricMeans,
     Networks,
     Protocol,
     Truth,
+    all_absent,
+    without_reasons,
 )
-from evsplat.evaluation.tally import Tally, all_absent, without_reasons
+from evsplat.evaluation.regions import Absent, PersonRegions
 from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
@@ -76,7 +77,7 @@ def evaluate(
     out_dir = Path(out_dir)
     networks, weights = _load_networks(lpips_weights, device)
     protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
-    people = People(capture)
+    people = PersonRegions(capture)
     test = _TestFrames(
         capture,
         reconstruction,
@@ -120,7 +121,7 @@ class _TestFrames:
         reconstruction: Reconstruction,
         protocols: Sequence[Protocol],
         networks: Networks,
-        people: People,
+        people: PersonRegions,
         out_dir: Path,
         *,
         alone: bool = False,
@@ -146,23 +147,25 @@ class _TestFrames:
                 BLURRY_INPUT: capture.image,
             }
         rows = ("method", *self._others)
-        self._tallies = {(row, p.name): Tally() for row in rows for p in protocols}
-        self._against_blurry = Tally()
+        self._means = {(row, p.name): MetricMeans() for row in rows for p in protocols}
+        self._against_blurry = MetricMeans()
         self._per_frame: list[dict[str, Any]] = []
 
     def measure(self, frame: Frame) -> None:
         """Measure one test frame and write its pictures."""
         ours = self._method(frame)
-        mask, person = self._people.in_mask(frame)
+        mask, person = self._people.in_frame(frame)
         truth = None if frame.sharp is None else self._capture.sharp(frame)
         # Standard comes first in self._protocols; the report shows it for every frame and row.
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
         for protocol in self._protocols:
-            judge = None if truth is None else Truth(protocol, truth, mask, person, self._networks)
+            reference = (
+                None if truth is None else Truth(protocol, truth, mask, person, self._networks)
+            )
             for row, picture in pictures.items():
-                measured[row][protocol.name] = _compare(judge, picture)
-                self._tallies[row, protocol.name].add(measured[row][protocol.name])
+                measured[row][protocol.name] = _compare(reference, picture)
+                self._means[row, protocol.name].add(measured[row][protocol.name])
         entry = {
             "frame": frame.name,
             "time_us": frame.mid_us,
@@ -184,13 +187,13 @@ class _TestFrames:
         """Means of everything; "trivial" and "blurry_input" are of the protocol standard."""
         reasons: dict[str, str] = {}
 
-        def means(tally: Tally, path: str) -> dict[str, Any]:
-            values, why = tally.means()
+        def means(frames: MetricMeans, path: str) -> dict[str, Any]:
+            values, why = frames.means()
             reasons.update({f"{path}.{key}": reason for key, reason in why.items()})
             return values
 
         def row(name: str, protocol: Protocol, path: str) -> dict[str, Any]:
-            return means(self._tallies[name, protocol.name], path)
+            return means(self._means[name, protocol.name], path)
 
         compat = [protocol for protocol in self._protocols if protocol is not STANDARD]
         rows = {"protocols": "method"}
@@ -233,22 +236,22 @@ class _TestFrames:
         return {kind: f"pictures/{stem}_{kind}.png" for kind in pictures}
 
 
-def _compare(judge: Truth | None, picture: Tensor | Absent) -> Measured:
-    if judge is None:
+def _compare(reference: Truth | None, picture: Tensor | Absent) -> Measured:
+    if reference is None:
         return all_absent("the frame has no sharp ground truth")
-    return all_absent(picture.reason) if isinstance(picture, Absent) else judge.measure(picture)
+    return all_absent(picture.reason) if isinstance(picture, Absent) else reference.measure(picture)
 
 
 def _novel_views(
     capture: Capture,
     reconstruction: Reconstruction,
     networks: Networks,
-    people: People,
+    people: PersonRegions,
     out_dir: Path,
     reasons: dict[str, str],
 ) -> dict[str, Any]:
     """Standard figures of cameras that took no part in the training; empty where there are none."""
-    tallies: dict[str, Tally] = {}
+    means_by_camera: dict[str, MetricMeans] = {}
     per_view: dict[str, list[dict[str, Any]]] = {}
     for view in tqdm(
         capture.novel_views, desc="novel views", unit="picture", leave=False, disable=None
@@ -260,7 +263,7 @@ def _novel_views(
             person = people.in_view(capture.cameras[view.camera], view.time_us)
             truth = Truth(STANDARD, capture.novel_image(view), None, person, networks)
             measured = truth.measure(ours)
-        tallies.setdefault(view.camera, Tally(("full", "person_crop"))).add(measured)
+        means_by_camera.setdefault(view.camera, MetricMeans(("full", "person_crop"))).add(measured)
         entry = {
             "index": view.index,
             "frame": view.frame,
@@ -275,8 +278,8 @@ def _novel_views(
             entry["pictures"] = {"render": path}
         per_view.setdefault(view.camera, []).append(entry)
     result = {}
-    for name, tally in tallies.items():
-        means, why = tally.means()
+    for name, camera_means in means_by_camera.items():
+        means, why = camera_means.means()
         reasons.update({f"novel_views.{name}.{key}": reason for key, reason in why.items()})
         result[name] = {**means, "per_view": per_view[name]}
     if not result:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.evaluation.protocols import Absent
+from evsplat.evaluation.regions import Absent
 from evsplat.events import count_map
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.names import file_stem
@@ -52,7 +52,7 @@ def evaluate_event_maps(
     Events between training frames are input of the training, those around test frames only where
     the policy shows them; the rendered maps show whether the reconstruction explains them.
     """
-    absent = _cannot(capture)
+    absent = _missing_input(capture)
     if absent is not None:
         return absent
     pairs: list[dict[str, Any]] = []
@@ -81,7 +81,8 @@ def evaluate_event_maps(
     }
 
 
-def _cannot(capture: Capture) -> Absent | None:
+def _missing_input(capture: Capture) -> Absent | None:
+    """The reason why the capture has no event maps to compare, if there is one."""
     if capture.events is None:
         return Absent("the capture has no events")
     if not capture.events.has_polarity:

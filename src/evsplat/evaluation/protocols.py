@@ -1,15 +1,18 @@
-"""Named sets of choices: the same picture gets other figures under each, so each has a name."""
+"""Protocols: named sets of choices by which pictures are measured, and means over frames.
+
+The same picture gets other figures under each protocol.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from evsplat.evaluation.regions import CROP_MARGIN, Box
+from evsplat.evaluation.regions import CROP_MARGIN, Absent, Box
 from evsplat.similarity.perceptual import Features, PerceptualMetric
 from evsplat.similarity.psnr_ssim import (
     GAUSSIAN_SSIM,
@@ -28,23 +31,16 @@ PSNR_CEILING_DB = 100.0
 """Equal pictures have an infinite PSNR, which no mean survives and JSON cannot hold."""
 
 
-@dataclass(frozen=True)
-class Absent:
-    """A figure that was not measured, and why."""
-
-    reason: str
-
-
 Value = float | Absent
 Measured = dict[str, dict[str, Value]]
 """Region -> metric -> value, every region and metric present."""
 Networks = Mapping[str, PerceptualMetric | Absent]
-"""Of ``lpips_alex``, ``lpips_vgg`` and ``st_lpips``."""
+"""The network distances ``lpips_alex``, ``lpips_vgg`` and ``st_lpips``."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How a rendered picture is compared with the true one."""
+    """A way of comparing a rendered picture with the true one."""
 
     name: str
     summary: str
@@ -57,9 +53,9 @@ class Protocol:
     perceptual: tuple[str, ...]
     """The network distances that belong to the protocol."""
     perceptual_range: tuple[float, float]
-    """What [0, 1] is mapped to before the networks see it."""
+    """Range that [0, 1] is mapped to before the networks see it."""
     perceptual_clip: bool
-    """Whether the rendered picture is clipped at 1 (but not at 0) before the networks see it."""
+    """Clip the rendered picture at 1 (but not at 0) before the networks see it."""
     crop: Literal["enlarged", "tight"]
     """Person crop: box enlarged by 10 % per side, or the box without its last row and column."""
     mask: Literal["pixels", "blackened"]
@@ -138,11 +134,11 @@ class Truth:
         image = self._prepared(image)
         result: Measured = {}
         for region in REGIONS:
-            view = self._views[region]
+            part = self._regions[region]
             result[region] = (
-                dict.fromkeys(METRICS, view)
-                if isinstance(view, Absent)
-                else view.measure(view.cut(image))
+                dict.fromkeys(METRICS, part)
+                if isinstance(part, Absent)
+                else part.measure(part.cut(image))
             )
         return result
 
@@ -152,12 +148,12 @@ class Truth:
         return eight_bit(image) if self.protocol.eight_bit else image
 
     @cached_property
-    def _views(self) -> dict[str, "_View | Absent"]:
+    def _regions(self) -> dict[str, "_Region | Absent"]:
         truth = self._prepared(self.image)
-        full = _View(self.protocol, truth, self.networks)
+        full = _Region(self.protocol, truth, self.networks)
         return {"full": full, "person_crop": self._crop(truth), "person_mask": self._masked(truth)}
 
-    def _crop(self, truth: Float[Tensor, "H W 3"]) -> "_View | Absent":
+    def _crop(self, truth: Float[Tensor, "H W 3"]) -> "_Region | Absent":
         if isinstance(self.person, Absent):
             return self.person
         if self.protocol.crop == "enlarged":
@@ -166,21 +162,21 @@ class Truth:
             box = self.person.without_last()
         if box.bottom <= box.top or box.right <= box.left:
             return Absent("the person's box is empty")
-        return _View(self.protocol, box.crop(truth), self.networks, box=box)
+        return _Region(self.protocol, box.crop(truth), self.networks, box=box)
 
-    def _masked(self, truth: Float[Tensor, "H W 3"]) -> "_View | Absent":
+    def _masked(self, truth: Float[Tensor, "H W 3"]) -> "_Region | Absent":
         if self.mask is None:
             return Absent("the capture has no person mask for this picture")
         if not bool(self.mask.any()):
             return Absent("the person mask is empty")
         if self.protocol.mask == "pixels":
-            return _View(self.protocol, truth, self.networks, pixels=self.mask)
+            return _Region(self.protocol, truth, self.networks, pixels=self.mask)
         black = truth * self.mask[..., None]
-        return _View(self.protocol, black, self.networks, blacken=self.mask)
+        return _Region(self.protocol, black, self.networks, blacken=self.mask)
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _Region:
     """One region of the true picture, ready to be compared."""
 
     protocol: Protocol
@@ -188,7 +184,7 @@ class _View:
     networks: Networks
     box: Box | None = None
     pixels: Bool[Tensor, "h w"] | None = None
-    """Where only single pixels count: PSNR alone is defined."""
+    """Single pixels that count alone, for which PSNR alone is defined."""
     blacken: Bool[Tensor, "h w"] | None = None
 
     def cut(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
@@ -252,3 +248,51 @@ class _View:
 def eight_bit(image: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """The values that an 8-bit file of ``image`` holds, in [0, 1]."""
     return (image.clamp(0, 1) * 255).round() / 255
+
+
+class MetricMeans:
+    """Means over frames of what was measured in each, with the reason wherever there is none."""
+
+    def __init__(self, regions: tuple[str, ...] = REGIONS) -> None:
+        self._values: dict[tuple[str, str], list[Value]] = {
+            (region, metric): [] for region in regions for metric in METRICS
+        }
+
+    def add(self, measured: Measured) -> None:
+        """Add one frame's figures; regions that were not asked for are ignored."""
+        for (region, metric), values in self._values.items():
+            values.append(measured[region][metric])
+
+    def means(self) -> tuple[dict[str, dict[str, float | None]], dict[str, str]]:
+        """Mean per region and metric over the frames that have it, and "region.metric" -> reason.
+
+        A figure that some frames lack keeps a reason that says how many.
+        """
+        means: dict[str, dict[str, float | None]] = {}
+        reasons: dict[str, str] = {}
+        for (region, metric), values in self._values.items():
+            numbers = [value for value in values if not isinstance(value, Absent)]
+            gaps = [value.reason for value in values if isinstance(value, Absent)]
+            means.setdefault(region, {})[metric] = sum(numbers) / len(numbers) if numbers else None
+            if gaps and numbers:
+                reasons[f"{region}.{metric}"] = (
+                    f"missing in {len(gaps)} of {len(values)}: {gaps[0]}"
+                )
+            elif not numbers:
+                reasons[f"{region}.{metric}"] = gaps[0] if gaps else "no picture to measure"
+        return means, reasons
+
+
+def without_reasons(measured: Measured) -> dict[str, Any]:
+    """The figures of one frame for JSON: None where one was not measured."""
+    return {
+        region: {
+            metric: None if isinstance(value, Absent) else value for metric, value in values.items()
+        }
+        for region, values in measured.items()
+    }
+
+
+def all_absent(reason: str) -> Measured:
+    """Every figure missing for one reason."""
+    return {region: dict.fromkeys(METRICS, Absent(reason)) for region in REGIONS}

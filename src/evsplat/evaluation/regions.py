@@ -1,4 +1,4 @@
-"""The parts of a picture that are measured by themselves: the person's box, the person's pixels."""
+"""Parts of a picture that are measured by themselves: the person's box, the person's pixels."""
 
 from dataclasses import dataclass
 from typing import TypeVar
@@ -11,10 +11,18 @@ from torch import Tensor
 from evsplat.body import BodyTrack, skin
 from evsplat.body import body_box as projected_box
 from evsplat.camera import Camera
+from evsplat.capture import Capture, Frame, load_body_track
 
 CROP_MARGIN = 0.1
 
 Picture = TypeVar("Picture", Tensor, np.ndarray)
+
+
+@dataclass(frozen=True)
+class Absent:
+    """A figure or a region that cannot be had, and why."""
+
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -72,3 +80,33 @@ def body_box(track: BodyTrack, camera: Camera, time_us: int) -> Box | None:
         return None
     left, top, right, bottom = corners
     return Box(top, bottom, left, right)
+
+
+class PersonRegions:
+    """The person in pictures of a capture: by masks, or by the posed body where there is none."""
+
+    def __init__(self, capture: Capture) -> None:
+        self._capture = capture
+        self._track: BodyTrack | None = None
+
+    def in_frame(self, frame: Frame) -> tuple[Bool[Tensor, "H W"] | None, Box | Absent]:
+        """The person's pixels, if the frame has a mask, and the tight box."""
+        mask = self._capture.mask(frame)
+        if mask is None:
+            return None, self.in_view(self._capture.camera(frame), frame.mid_us)
+        pixels = mask > 0.5
+        return pixels, mask_box(pixels) or Absent("the person mask is empty")
+
+    def in_view(self, camera: Camera, time_us: int) -> Box | Absent:
+        """The tight box of the posed body."""
+        if self._track is None:
+            self._track = load_body_track(self._capture)
+        return body_box(self._track, camera, time_us) or Absent("the body is out of view")
+
+    def crop(self, frame: Frame) -> Box | None:
+        """The box that ``person_crop`` measures under protocol standard; None where nobody is."""
+        _, box = self.in_frame(frame)
+        if isinstance(box, Absent):
+            return None
+        camera = self._capture.camera(frame)
+        return box.enlarged(CROP_MARGIN, camera.height, camera.width)

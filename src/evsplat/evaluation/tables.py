@@ -1,6 +1,6 @@
 """The figures as Markdown and LaTeX tables, one per protocol, trivial rows included."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ class Column:
 
     @property
     def arrow(self) -> str:
-        """Where better is."""
+        """The direction of better values."""
         return "↑" if self.higher_is_better else "↓"
 
     @property
@@ -60,8 +60,14 @@ class Table:
     """Row key (the method's name, trivial rows, blurry_input) -> region -> metric -> value."""
     method: str
 
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Titles of the regions over neighbouring columns, and how many each spans."""
+        spans = {r: sum(column.region == r for column in self.columns) for r in REGION_TITLES}
+        return [(REGION_TITLES[region], span) for region, span in spans.items() if span]
+
     def value(self, row: str, column: Column) -> float | None:
-        """One cell."""
+        """Value of one cell; None where nothing was measured."""
         return self.rows[row][column.region][column.metric]
 
     def text(self, row: str, column: Column) -> str:
@@ -70,7 +76,7 @@ class Table:
         return "–" if value is None else f"{value:.{column.decimals}f}"
 
     def is_best(self, row: str, column: Column) -> bool:
-        """Whether the row wins the column as it is printed; the blurry input does not compete."""
+        """True for the best row of a column as it is printed; the blurry input does not compete."""
         if row == "blurry_input" or self.value(row, column) is None:
             return False
         shown = [
@@ -81,8 +87,17 @@ class Table:
         best = max(shown) if column.higher_is_better else min(shown)
         return float(self.text(row, column)) == best
 
+    def cells(self, row: str, best: str) -> list[str]:
+        """Texts of a row; ``best`` is the form of the best of a column."""
+        return [
+            best.format(self.text(row, column))
+            if self.is_best(row, column)
+            else self.text(row, column)
+            for column in self.columns
+        ]
+
     def title(self, row: str) -> str:
-        """What a reader sees instead of the row's key."""
+        """Title of a row for readers."""
         return ROW_TITLES.get(row, row)
 
 
@@ -114,7 +129,7 @@ def composited(metrics: dict[str, Any]) -> dict[str, Any]:
 
 
 def terms(metrics: dict[str, Any]) -> str:
-    """What training saw, in a sentence."""
+    """Terms of the run: one sentence on what training saw."""
     policy = policy_of(metrics)
     return "The run does not tell what training saw." if policy is None else policy.sentence
 
@@ -138,16 +153,11 @@ def markdown(metrics: dict[str, Any]) -> str:
     lines += [f"{means}{terms(metrics)}", ""]
     for table in tables_of(metrics) if count else ():
         lines += [f"## Protocol `{table.protocol}`", "", f"{table.note}.", ""]
-        head = [_heading(column) for column in table.columns]
-        lines.append("| " + " | ".join(["", *head]) + " |")
-        lines.append("|" + "|".join(["---", *["---:"] * len(head)]) + "|")
-        for row in table.rows:
-            cells = [
-                f"**{table.text(row, c)}**" if table.is_best(row, c) else table.text(row, c)
-                for c in table.columns
-            ]
-            lines.append("| " + " | ".join([table.title(row), *cells]) + " |")
-        lines.append("")
+        head = [
+            f"{REGION_TITLES[c.region]} {METRIC_TITLES[c.metric]} {c.arrow}" for c in table.columns
+        ]
+        rows = [(table.title(row), table.cells(row, "**{}**")) for row in table.rows]
+        lines += [*markdown_table("", head, rows), ""]
     lines += _novel_markdown(metrics)
     lines += [f"- {reason}" for reason in missing_networks(metrics)]
     return "\n".join(lines).rstrip() + "\n"
@@ -156,32 +166,24 @@ def markdown(metrics: dict[str, Any]) -> str:
 def _novel_markdown(metrics: dict[str, Any]) -> list[str]:
     if not metrics["novel_views"]:
         return []
-    lines = ["## Novel views, protocol `standard`", ""]
-    lines += ["| camera | full PSNR | full SSIM | person crop PSNR | person crop SSIM |"]
-    lines += ["|---|---:|---:|---:|---:|"]
+    head = ("full PSNR", "full SSIM", "person crop PSNR", "person crop SSIM")
+    rows = []
     for camera, regions in metrics["novel_views"].items():
         cells = [
             "–" if (value := regions[region][metric]) is None else f"{value:.{digits}f}"
             for region in ("full", "person_crop")
             for metric, digits in (("psnr", 2), ("ssim", 4))
         ]
-        lines.append("| " + " | ".join([camera, *cells]) + " |")
-    return [*lines, ""]
+        rows.append((camera, cells))
+    title = "## Novel views, protocol `standard`"
+    return [title, "", *markdown_table("camera", head, rows), ""]
 
 
 def latex(metrics: dict[str, Any]) -> str:
     """All tables as LaTeX (booktabs)."""
     lines = [f"% {terms(metrics)}"]
     for table in tables_of(metrics) if metrics["frames"]["test"] else ():
-        spans = {
-            region: sum(column.region == region for column in table.columns)
-            for region in REGION_TITLES
-        }
-        groups = [
-            rf"\multicolumn{{{span}}}{{c}}{{{REGION_TITLES[region]}}}"
-            for region, span in spans.items()
-            if span
-        ]
+        groups = [rf"\multicolumn{{{span}}}{{c}}{{{title}}}" for title, span in table.groups]
         names = [
             METRIC_TITLES[c.metric] + (r"$\uparrow$" if c.higher_is_better else r"$\downarrow$")
             for c in table.columns
@@ -195,18 +197,18 @@ def latex(metrics: dict[str, Any]) -> str:
             r"\midrule",
         ]
         for row in table.rows:
-            cells = [
-                rf"\textbf{{{table.text(row, c)}}}" if table.is_best(row, c) else table.text(row, c)
-                for c in table.columns
-            ]
-            cells = [cell.replace("–", "--") for cell in cells]
+            cells = [cell.replace("–", "--") for cell in table.cells(row, r"\textbf{{{}}}")]
             lines.append(" & ".join([latex_text(table.title(row)), *cells]) + r" \\")
         lines += [r"\bottomrule", r"\end{tabular}", ""]
     return "\n".join(lines)
 
 
-def _heading(column: Column) -> str:
-    return f"{REGION_TITLES[column.region]} {METRIC_TITLES[column.metric]} {column.arrow}"
+def markdown_table(
+    corner: str, head: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]
+) -> list[str]:
+    """Lines of a Markdown table; each row has a title and its cells."""
+    lines = ["| " + " | ".join([title, *cells]) + " |" for title, cells in ((corner, head), *rows)]
+    return [lines[0], "|" + "|".join(["---", *["---:"] * len(head)]) + "|", *lines[1:]]
 
 
 _LATEX_SPECIAL = {

@@ -11,12 +11,12 @@ _WIDTH, _HEIGHT = 380, 240
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 12, 10, 36
 _MOST_POINTS = 240
 SERIES_COLOURS = 8
-"""How many line colours the style sheet has."""
+"""Line colours of the style sheet."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """One line."""
+    """One line of a chart."""
 
     name: str
     x: Sequence[float]

@@ -29,7 +29,7 @@ class Clip:
 
     mp4: bytes
     slower: float
-    """Times slower than life."""
+    """Playing time over recorded time."""
     first_us: int
     last_us: int
     pictures: int

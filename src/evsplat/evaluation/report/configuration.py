@@ -12,7 +12,7 @@ _HARDWARE = ("device", "gpu", "cpu", "cpu_cores", "threads", "memory_gb", "machi
 
 
 def configuration(source: Source) -> str:
-    """What differs from the method's defaults, and behind a click every setting of the run."""
+    """The settings that differ from the method's defaults, and behind a click all of the run."""
     if not source.config:
         return ""
     loose = {key: value for key, value in source.config.items() if not isinstance(value, dict)}
@@ -20,24 +20,24 @@ def configuration(source: Source) -> str:
     everything = "".join(_block(str(name), v) for name, v in [("run", loose), *groups.items()])
     changed = _changed(source.config)
     if changed is None:
-        told = '<p class="note">The defaults of this method are not known here.</p>'
+        shown = '<p class="note">The defaults of this method are not known here.</p>'
     elif changed:
         rows = "".join(
             f'<tr><th scope="row">{escape(key)}</th><td>{escape(_plain(value))}</td>'
             f"<td>{escape(_plain(default))}</td></tr>"
             for key, value, default in changed
         )
-        told = (
+        shown = (
             '<div class="scroll plain"><table><thead><tr><th scope="col" class="corner">setting'
             '</th><th scope="col">this run</th><th scope="col">default</th></tr></thead>'
             f"<tbody>{rows}</tbody></table></div>"
         )
     else:
-        told = '<p class="note">Every setting is the method’s default.</p>'
+        shown = '<p class="note">Every setting is the method’s default.</p>'
     return section(
         "Configuration",
         "What differs from the defaults of the method.",
-        told + folded("All settings", f'<div class="config">{everything}</div>'),
+        shown + folded("All settings", f'<div class="config">{everything}</div>'),
     )
 
 

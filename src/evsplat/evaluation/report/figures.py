@@ -48,7 +48,7 @@ def figures(source: Source) -> str:
 
 
 def no_test_figures(metrics: dict[str, Any]) -> str | None:
-    """Why there is no frame to test with, as HTML that continues a sentence; None where one is."""
+    """The reason for no test figures, as HTML that continues a sentence; None where there are."""
     policy = policy_of(metrics)
     if policy is not None and policy.use == "everything":
         return (
@@ -74,7 +74,7 @@ def references(metrics: dict[str, Any], region: str) -> dict[str, float]:
 
 
 def distance(ours: float, theirs: float, decimals: int) -> str:
-    """How far a PSNR lies above or below another, in words that a name of the other follows."""
+    """The difference of two PSNRs, in words that a name of the second one follows."""
     apart = f"{abs(ours - theirs):.{decimals}f}"
     if float(apart) == 0:
         return "level with"
@@ -104,9 +104,7 @@ def _table(table: Table) -> str:
     if not table.columns:
         return ""
     groups = "".join(
-        f'<th colspan="{span}" scope="colgroup">{title}</th>'
-        for region, title in REGION_TITLES.items()
-        if (span := sum(column.region == region for column in table.columns))
+        f'<th colspan="{span}" scope="colgroup">{title}</th>' for title, span in table.groups
     )
     names = "".join(
         f'<th scope="col">{METRIC_TITLES[c.metric]}&thinsp;{c.arrow}</th>' for c in table.columns

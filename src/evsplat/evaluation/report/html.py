@@ -1,12 +1,35 @@
-"""Small pieces that the sections of the report share."""
+"""HTML pieces of pages that are one file each: the document, sections, embedded pictures."""
 
+import base64
+import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
+from importlib import resources
 from typing import TypeVar
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
 
 from evsplat.evaluation.tables import REGION_TITLES
 
 Item = TypeVar("Item")
+
+_LOSSLESS_PIXELS = 6_000_000
+"""Up to this many pixels in all, pictures are embedded without loss; beyond, at quality 92."""
+
+
+def document(title: str, body: str, *, style: str = "") -> str:
+    """The whole page with the style sheet of reports and ``style`` after it; ``body`` is HTML."""
+    shared = (resources.files("evsplat") / "data" / "report.css").read_text(encoding="utf-8")
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{escape(title)}</title><style>{shared}{style}</style></head><body>{body}"
+        "</body></html>\n"
+    )
 
 
 def section(title: str, intro: str, body: str) -> str:
@@ -20,9 +43,9 @@ def folded(title: str, body: str) -> str:
     return f"<details><summary>{escape(title)}</summary>{body}</details>" if body else ""
 
 
-def more(shown: int, there: int, what: str) -> str:
-    """What is behind a click: all of the rest, or so many of it."""
-    return f"{shown} more {what}" if shown == there else f"{shown} of {there} more {what}"
+def more(shown: int, rest: int, items: str) -> str:
+    """Title of folded items: all of the rest, or so many of it."""
+    return f"{shown} more {items}" if shown == rest else f"{shown} of {rest} more {items}"
 
 
 def compare(left: str, right: str, caption: str) -> str:
@@ -42,16 +65,16 @@ def figure(image: str, caption: str = "") -> str:
     return f"<figure>{image}{text}</figure>"
 
 
-def legend(gradient: str, low: str, high: str, what: str) -> str:
+def legend(gradient: str, low: str, high: str, title: str) -> str:
     """A colour scale with text at both ends."""
     return (
-        f'<p class="scale"><span>{escape(what)}:</span><span>{escape(low)}</span>'
+        f'<p class="scale"><span>{escape(title)}:</span><span>{escape(low)}</span>'
         f'<i style="background:{gradient}"></i><span>{escape(high)}</span></p>'
     )
 
 
 def spread(items: Sequence[Item], count: int) -> list[Item]:
-    """At most ``count`` items, evenly spread, the first and the last among them."""
+    """Evenly spread items, ``count`` at most, the first and the last among them."""
     if len(items) <= count:
         return list(items)
     return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
@@ -65,3 +88,33 @@ def frame_figures(figures: Mapping[str, Mapping[str, float | None]]) -> str:
         if region in figures and (value := figures[region]["psnr"]) is not None
     ]
     return " · " + " · ".join(parts) if parts else ""
+
+
+@dataclass(frozen=True)
+class Embedder:
+    """Turns pictures into image elements."""
+
+    lossless: bool
+
+    @classmethod
+    def for_pixels(cls, count: int) -> "Embedder":
+        """Without loss where ``count`` pixels in all leave the page small enough."""
+        return cls(lossless=count <= _LOSSLESS_PIXELS)
+
+    def image(self, picture: UInt8[np.ndarray, "H W 3"], alt: str) -> str:
+        """An image element with the picture inside."""
+        buffer = io.BytesIO()
+        if self.lossless:
+            Image.fromarray(picture).save(buffer, "WEBP", lossless=True, quality=60, method=4)
+        else:
+            Image.fromarray(picture).save(buffer, "WEBP", quality=92, method=4)
+        height, width = picture.shape[:2]
+        return (
+            f'<img src="{data_uri(buffer.getvalue(), "image/webp")}" width="{width}" '
+            f'height="{height}" alt="{escape(alt)}" decoding="async">'
+        )
+
+
+def data_uri(content: bytes, media_type: str) -> str:
+    """``content`` as a data URI."""
+    return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"

@@ -2,16 +2,17 @@
 
 from collections.abc import Sequence
 from html import escape
-from importlib import resources
 from typing import Any
 
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
 from evsplat.evaluation.report.configuration import configuration, duration, made_with
-from evsplat.evaluation.report.embed import Embedder, data_uri
 from evsplat.evaluation.report.figures import distance, figures, no_test_figures, references
-from evsplat.evaluation.report.frames import frame_by_frame
+from evsplat.evaluation.report.frames import frame_by_frame, test_frames
 from evsplat.evaluation.report.html import (
+    Embedder,
+    data_uri,
+    document,
     figure,
     folded,
     frame_figures,
@@ -20,7 +21,6 @@ from evsplat.evaluation.report.html import (
     section,
     spread,
 )
-from evsplat.evaluation.report.shots import test_frames
 from evsplat.evaluation.report.source import Source
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import css_gradient
@@ -40,7 +40,7 @@ _REFERENCES = {
     "trivial": ("the best picture that needs no method", "the best without a method"),
     "camera": ("the camera’s own blurry picture", "the camera’s own"),
 }
-"""What the headline holds figures against: in full, and after that in short."""
+"""References that the headline holds figures against: in full, and after that in short."""
 
 
 def page(source: Source) -> str:
@@ -57,14 +57,8 @@ def page(source: Source) -> str:
         made_with(source),
     ]
     title = f"{source.metrics['capture']} · {source.metrics['method']}"
-    style = (resources.files("evsplat") / "data" / "report.css").read_text(encoding="utf-8")
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{style}</style></head><body>"
-        f"{_header(source)}<main>{''.join(sections)}</main>{_footer(source)}</body></html>\n"
-    )
+    body = f"{_header(source)}<main>{''.join(sections)}</main>{_footer(source)}"
+    return document(title, body)
 
 
 def _header(source: Source) -> str:
@@ -93,7 +87,7 @@ def _header(source: Source) -> str:
 
 
 def _summary(metrics: dict[str, Any]) -> str:
-    """How good, and how much better or worse than doing nothing: whole frame and person apart."""
+    """The headline: PSNR by region, and how far above or below doing nothing it is."""
     method = f"<b>{escape(metrics['method'])}</b>"
     why = no_test_figures(metrics)
     if why is not None:

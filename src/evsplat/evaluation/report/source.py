@@ -1,20 +1,19 @@
-"""What the report is made of: the run's files and its capture."""
+"""The evaluated run that a report is made of: its files and its capture."""
 
-import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import UInt8
 from PIL import Image
 
-from evsplat.capture import Capture
+from evsplat.capture import Capture, Frame
+from evsplat.config import load_yaml
 from evsplat.errors import DataError
-from evsplat.evaluation.people import People
-from evsplat.evaluation.regions import CROP_MARGIN, Box
-from evsplat.files import read_json
+from evsplat.evaluation.regions import Box, PersonRegions
+from evsplat.files import parse_json, read_json, read_text
 from evsplat.methods.reconstruction import Reconstruction
 
 
@@ -39,15 +38,15 @@ class Source:
             raise DataError(
                 f"{metrics_file}: file not found; run `evsplat evaluate {folder}` first."
             )
-        versions = folder / "versions.json"
+        config, versions = folder / "config.yaml", folder / "versions.json"
         return cls(
             folder,
             capture,
             reconstruction,
-            read_json(metrics_file),
+            _read_object(metrics_file),
             _read_log(folder / "log.jsonl"),
-            _read_config(folder / "config.yaml"),
-            read_json(versions) if versions.is_file() else {},
+            load_yaml(config) if config.is_file() else {},
+            _read_object(versions) if versions.is_file() else {},
         )
 
     def picture(self, path: str) -> UInt8[np.ndarray, "H W 3"]:
@@ -60,36 +59,24 @@ class Source:
                 f"{self.folder / path}: not readable ({error}); evaluate the run again."
             ) from error
 
-    def person(self, frame_name: str) -> Box | None:
-        """The box of the person in a test frame, enlarged as person_crop is."""
-        frame = self.capture.frame(frame_name)
-        _, box = People(self.capture).in_mask(frame)
-        if not isinstance(box, Box):
-            return None
-        camera = self.capture.camera(frame)
-        return box.enlarged(CROP_MARGIN, camera.height, camera.width)
+    def crop(self, frame: Frame) -> Box | None:
+        """The box of the person in a frame, enlarged as ``person_crop`` is."""
+        return PersonRegions(self.capture).crop(frame)
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    values = read_json(path)
+    if not isinstance(values, dict):
+        raise DataError(f"{path}: holds a {type(values).__name__}, expected an object of JSON.")
+    return values
 
 
 def _read_log(path: Path) -> list[dict[str, Any]]:
     """The lines that are whole: a run that was killed may end in the middle of one."""
     if not path.is_file():
         return []
-    lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            entry = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        if isinstance(entry, dict):
-            lines.append(entry)
-    return lines
-
-
-def _read_config(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise DataError(f"{path}: not valid YAML ({error}).") from None
-    return config if isinstance(config, dict) else {}
+    entries = []
+    for line in read_text(path).splitlines():
+        with suppress(ValueError):
+            entries.append(parse_json(line))
+    return [entry for entry in entries if isinstance(entry, dict)]
