@@ -41,7 +41,7 @@ DONE, FAILED = "done", "failed"
 
 @dataclass(frozen=True)
 class CaptureSource:
-    """Where a capture comes from."""
+    """A capture of a bench: its folder, or the settings to stage it with."""
 
     name: str
     path: Path
@@ -53,7 +53,7 @@ class CaptureSource:
 
 @dataclass(frozen=True)
 class Cell:
-    """What is asked for; nothing else decides the figures but the machine."""
+    """One request: nothing else decides its figures but the machine."""
 
     capture: CaptureSource
     row: str
@@ -64,7 +64,7 @@ class Cell:
     iterations: int | None
     max_minutes: float | None
     backdrop: bool = False
-    """Whether it is measured before the median background."""
+    """Measure it before the median background."""
 
     @property
     def id(self) -> str:
@@ -73,19 +73,19 @@ class Cell:
 
     @property
     def trains(self) -> bool:
-        """Whether the method is one that is trained."""
+        """True for methods that are trained."""
         return self.method not in UNTRAINED
 
     @property
     def policy(self) -> Policy:
-        """What the method may see of what is held out."""
+        """The policy: the held-out data that the method may see."""
         if not self.trains:
             return Policy()
         values = override({}, self.settings)
         return method_config(self.method, values, where=f"row {self.row}").policy
 
     def request(self) -> dict[str, Any]:
-        """What decides the figures, as JSON; a cell with another request is another cell."""
+        """All that decides the figures, as JSON; a cell with another request is another cell."""
         try:
             policy = to_dict(self.policy)
         except ConfigError:
@@ -218,7 +218,7 @@ def _restored(bench: BenchFolder, recorded: Capture, cell: Cell) -> Path:
 
 
 def _restored_by(policy: Policy) -> dict[str, Any]:
-    """Of a policy, what restorers see and is not the default."""
+    """Fields of a policy that restorers read and that are not the default."""
     strict = Policy()
     names = ("held_out_events", "thresholds")
     values = {name: getattr(policy, name) for name in names}
@@ -226,6 +226,6 @@ def _restored_by(policy: Policy) -> dict[str, Any]:
 
 
 def _peak_memory_mb() -> float:
-    """Of this process so far."""
+    """Peak memory of this process so far, MB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)

@@ -21,7 +21,7 @@ class Figure:
     spread: float | None
     """Standard deviation over seeds of the mean over captures; None with one seed."""
     captures: int
-    """How many captures it is over."""
+    """Captures that it is a mean over."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Records:
 
     plan: Plan
     by_cell: dict[tuple[str, str, int], Record]
-    """Of (capture, row, seed); cells without a record are not in it."""
+    """Records by (capture, row, seed); cells without one are not in it."""
 
     @classmethod
     def read(cls, plan: Plan, folder: BenchFolder) -> "Records":
@@ -77,8 +77,8 @@ class Records:
             spread = math.sqrt(squares / (len(per_seed) - 1))
         return Figure(mean, spread, len(by_capture))
 
-    def why_not(self, capture: str, row: str) -> str:
-        """Why a place in the table is empty."""
+    def reason_for_gap(self, capture: str, row: str) -> str:
+        """The reason why a place in the table is empty."""
         for (one, other, _), record in self.by_cell.items():
             if (one, other) == (capture, row) and record["status"] != DONE:
                 return f"failed: {record['reason']}"
@@ -100,13 +100,13 @@ def metric(protocol: str, region: str, name: str) -> Callable[[Record], float | 
 
 
 def train_minutes(record: Record) -> float | None:
-    """Minutes of training."""
+    """Minutes of training; None for rows that do not train."""
     seconds = record["train_seconds"]
     return None if seconds is None else seconds / 60
 
 
 def steps(record: Record) -> float | None:
-    """Training steps."""
+    """Training steps; None for rows that do not train."""
     return record["iteration"]
 
 

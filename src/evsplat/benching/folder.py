@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BenchFolder:
-    """Where the parts of a bench lie; ``id`` is a cell's ``capture/row/seed0``."""
+    """Paths of the parts of a bench; ``id`` is a cell's ``capture/row/seed0``."""
 
     path: Path
 
@@ -25,7 +25,7 @@ class BenchFolder:
         return self.path / "captures"
 
     def record_of(self, id: str) -> Path:  # noqa: A002 - the cell's own word
-        """What came of a cell, JSON; there when the cell is over."""
+        """Outcome of a cell, JSON; there when the cell is over."""
         return self.path / "cells" / f"{id}.json"
 
     def run_of(self, id: str) -> Path:  # noqa: A002
@@ -33,7 +33,7 @@ class BenchFolder:
         return self.path / "runs" / id
 
     def log_of(self, id: str) -> Path:  # noqa: A002
-        """What the cell's process printed."""
+        """Output of a cell's process."""
         return self.path / "logs" / f"{id}.log"
 
     def lock_of(self, name: str) -> Path:

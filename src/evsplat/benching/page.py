@@ -4,22 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-import numpy as np
-from jaxtyping import UInt8
-from PIL import Image
-
 from evsplat.benching.figures import Record, Records
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.tables import BenchTable
 from evsplat.benching.writers import LEGEND, html
 from evsplat.capture import Capture, Frame, load_capture
-from evsplat.errors import DataError
 from evsplat.evaluation.regions import Box, PersonRegions
-from evsplat.evaluation.report.html import Embedder, document, folded, section, spread
+from evsplat.evaluation.report.html import Embedder, document, folded, read_picture, section, spread
 from evsplat.pictures import to_bytes
 
 _PIXELS = 60_000_000
-"""Of all pictures of the page together; beyond, captures show fewer frames, evenly spread."""
+"""Pixels of all pictures of the page; beyond, captures show fewer frames, evenly spread."""
 _OPEN = 3
 """Frames of a capture that show at once; the others are folded."""
 
@@ -55,8 +50,8 @@ class _Row:
     title: str
     record: Record | None
     run: str
-    why: str
-    """Why there is no record of a result."""
+    reason: str
+    """The reason for no result."""
 
 
 def page(records: Records, tables: Sequence[BenchTable], folder: BenchFolder) -> str:
@@ -95,7 +90,7 @@ def _capture(
         found = records.of(name, row.name)
         record = found[0] if found else None
         run = "" if record is None else f"{name}/{row.name}/seed{record['cell']['seed']}"
-        rows.append(_Row(row.shown, record, run, records.why_not(name, row.name)))
+        rows.append(_Row(row.label, record, run, records.reason_for_gap(name, row.name)))
     camera = next(iter(capture.cameras.values()))
     of_frame = camera.width * camera.height * (len(rows) + 2)
     frames = spread(capture.test_frames, max(2, budget // of_frame))
@@ -135,13 +130,15 @@ def _frame(
         entry = None if row.record is None else _entry(row.record, frame.name)
         if entry is None:
             tiles.append(
-                f'<figure><div class="tile gap">{escape(row.why)}</div>'
+                f'<figure><div class="tile gap">{escape(row.reason)}</div>'
                 f"<figcaption><b>{escape(row.title)}</b></figcaption></figure>"
             )
             continue
         figures = entry["protocols"]["standard"]
         psnr = figures["person_crop"]["psnr"] or figures["full"]["psnr"]
-        picture = _read(folder, row.run, entry["pictures"]["render"])
+        file = folder.run_of(row.run) / entry["pictures"]["render"]
+        remedy = f"remove {folder.record_of(row.run)} to measure it again"
+        picture = read_picture(file, remedy)
         note = "" if psnr is None else f"{psnr:.2f}\u00a0dB"
         tiles.append(_tile(embed.image(picture, row.title), style, row.title, note))
     return (
@@ -168,14 +165,3 @@ def _window(box: Box, height: int, width: int) -> str:
 
 def _entry(record: Record, frame: str) -> Record | None:
     return next((entry for entry in record["per_frame"] if entry["frame"] == frame), None)
-
-
-def _read(folder: BenchFolder, run: str, path: str) -> UInt8[np.ndarray, "H W 3"]:
-    file = folder.run_of(run) / path
-    try:
-        with Image.open(file) as image:
-            return np.asarray(image.convert("RGB"))
-    except OSError as error:
-        raise DataError(
-            f"{file}: not readable ({error}); remove {folder.record_of(run)} to measure it again."
-        ) from None

@@ -1,4 +1,4 @@
-"""What a suite asks for on this machine: captures found, cells in the order they are run."""
+"""The plan of a suite on this machine: captures found, cells in the order they are run."""
 
 import hashlib
 import json
@@ -19,13 +19,13 @@ from evsplat.shipped import demo_capture
 
 @dataclass(frozen=True)
 class Plan:
-    """A suite and what of it can run."""
+    """A suite with the captures and cells of it that can run."""
 
     suite: Suite
     sources: dict[str, CaptureSource]
     """Captures that are there or can be made, by name."""
     missing: dict[str, str]
-    """Captures that are not, and what to do, by name."""
+    """Captures that are missing, and what to do, by name."""
     cells: tuple[Cell, ...]
     """Untrained rows first, since they take seconds and find what is wrong with a capture."""
 
@@ -72,7 +72,7 @@ def make_plan(
     return Plan(suite, sources, missing, tuple(_cells(suite, sources.values())))
 
 
-def left_to_do(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]:
+def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]:
     """Cells without a record; ``retry`` forgets the records of failures.
 
     Raises:
@@ -85,7 +85,7 @@ def left_to_do(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]:
             todo.append(cell)
             continue
         record = read_json(path)
-        _refuse_another(path, record["cell"], cell.request(), folder)
+        _check_same_request(path, record["cell"], cell.request(), folder)
         if retry and record["status"] == FAILED:
             path.unlink()
             todo.append(cell)
@@ -141,7 +141,7 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
-def _refuse_another(
+def _check_same_request(
     path: Path, there: dict[str, Any], asked: dict[str, Any], folder: BenchFolder
 ) -> None:
     for key, value in asked.items():

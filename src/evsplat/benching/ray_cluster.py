@@ -12,7 +12,7 @@ from evsplat.benching.folder import BenchFolder
 from evsplat.errors import BackendError, DataError
 
 RETRIES = 3
-"""How often a cell is started again whose worker or machine died; from its checkpoint."""
+"""Restarts of a cell whose worker or machine died, from its checkpoint."""
 _STOP_SECONDS = 120.0
 _ANSWER_SECONDS = 10.0
 
@@ -24,9 +24,9 @@ class RayCluster:
     folder: Path
     """Absolute, on a file system that every machine of the cluster sees there."""
     address: str
-    """Of the cluster; ``local`` starts one on this machine."""
+    """Address of the cluster; ``local`` starts one on this machine."""
     cpus: int
-    """Of each cell, also its threads."""
+    """Processor cores of each cell, also its threads."""
     gpus: float
     device: str
 
@@ -67,7 +67,7 @@ class RayCluster:
             )
             return
         try:
-            _knock(self.address)
+            _check_listening(self.address)
             ray.init(address=self.address, log_to_driver=False, logging_level="error")
         except (OSError, ValueError) as error:
             raise BackendError(
@@ -76,7 +76,7 @@ class RayCluster:
             ) from None
 
 
-def _knock(address: str) -> None:
+def _check_listening(address: str) -> None:
     """Fail at once where nobody listens at HOST:PORT; Ray itself would try for minutes."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if colon and port.isdigit():
@@ -84,7 +84,7 @@ def _knock(address: str) -> None:
 
 
 def _cell_on_node(folder: Path, cell: Cell, threads: int, device: str) -> None:
-    """What a Ray worker does."""
+    """Run a cell in a Ray worker."""
     bench = BenchFolder(folder)
     if not bench.lock_of("bench").exists():
         raise DataError(

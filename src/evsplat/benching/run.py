@@ -3,29 +3,38 @@
 import os
 import shutil
 import signal
+import sys
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from tqdm import tqdm
 
 from evsplat.benching.cell import FAILED, Cell
+from evsplat.benching.figures import Records
 from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.benching.local import LocalPool
-from evsplat.benching.output import write_output
-from evsplat.benching.plan import Plan, left_to_do, make_plan
-from evsplat.benching.progress import Progress
+from evsplat.benching.page import page
+from evsplat.benching.plan import Plan, make_plan, pending_cells
 from evsplat.benching.suite import read_suite
+from evsplat.benching.tables import make_tables
+from evsplat.benching.writers import latex, markdown
 from evsplat.errors import ConfigError
-from evsplat.files import read_json, write_json
+from evsplat.files import read_json, write_json, write_text
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.render import choose_device
 
+_REFRESH_S = 1.0
+_REASON_LENGTH = 200
+
 
 class Executor(Protocol):
-    """Where cells run."""
+    """Processes that cells run in: of this machine or of a cluster."""
 
     def run(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, str | None]]:
         """Each cell as it ends, with the reason where its process ended without a record.
@@ -65,7 +74,7 @@ def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any
         # What a killed bench left half made.
         for half in folder.captures.glob(".*"):
             shutil.rmtree(half, ignore_errors=True)
-        todo = left_to_do(plan, folder, retry=options.retry)
+        todo = pending_cells(plan, folder, retry=options.retry)
         executor = _executor(folder, len(todo), options)
         try:
             _run(plan, todo, folder, executor)
@@ -91,7 +100,7 @@ def _run(plan: Plan, todo: Sequence[Cell], folder: BenchFolder, executor: Execut
 
 
 def _executor(folder: BenchFolder, cells: int, options: BenchOptions) -> Executor:
-    """Where to run ``cells`` cells."""
+    """The executor of ``cells`` cells that the options ask for."""
     cpus, path = options.cpus_per_cell, folder.path.resolve()
     if options.ray is not None:
         from evsplat.benching.ray_cluster import RayCluster
@@ -131,3 +140,86 @@ def _stopped_by_signals() -> Iterator[None]:
     finally:
         for number, handler in zip(numbers, previous, strict=True):
             signal.signal(number, handler)
+
+
+class Progress:
+    """A line on stderr for every cell that ends, and one that says how far the bench is."""
+
+    def __init__(self, plan: Plan, todo: Sequence[Cell], folder: BenchFolder) -> None:
+        self._titles = {row.name: row.label for row in plan.suite.rows}
+        self._total, self._ended, self._failed = len(todo), 0, 0
+        self._trained, self._to_train = 0, sum(cell.trains for cell in todo)
+        self._started = time.monotonic()
+        suite, done = plan.suite, len(plan.cells) - len(todo)
+        _print(
+            f"suite {suite.name}: {_count(len(plan.sources), 'capture')} x "
+            f"{_count(len(suite.rows), 'row')} x {_count(len(suite.seeds), 'seed')}; "
+            f"{_count(len(todo), 'cell')} to do, {done} done before; logs in {folder.path / 'logs'}"
+        )
+        for sentence in plan.missing.values():
+            _print(sentence)
+        self._bar = tqdm(
+            total=len(todo),
+            bar_format="{n_fmt}/{total_fmt} cells |{bar:24}| {elapsed}{postfix}",
+            disable=not sys.stderr.isatty(),
+            dynamic_ncols=True,
+        )
+        self._over = threading.Event()
+        self._beat = threading.Thread(target=self._refresh, daemon=True)
+        self._beat.start()
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._beat.join()
+        self._bar.close()
+
+    def ended(self, cell: Cell, record: dict[str, Any]) -> None:
+        """Print the outcome of a cell."""
+        self._ended += 1
+        if record["status"] == FAILED:
+            self._failed += 1
+            self._to_train -= cell.trains  # it took no time that tells of the others'
+            outcome = f"failed: {record['reason'][:_REASON_LENGTH]}"
+        else:
+            self._trained += cell.trains
+            figures = record["protocols"]["standard"]
+            psnr = [figures[region]["psnr"] for region in ("full", "person_crop", "person_mask")]
+            shown = " / ".join("–" if value is None else f"{value:.2f}" for value in psnr)
+            outcome = f"{shown} dB (full / crop / mask), {record['seconds'] / 60:.1f} min"
+        place = f"{cell.capture.name} · {self._titles[cell.row]} · seed {cell.seed}"
+        _print(f"[{self._ended}/{self._total}{self._left()}] {place}: {outcome}")
+        self._bar.set_postfix_str(f"{self._failed} failed{self._left()}", refresh=False)
+        self._bar.update()
+
+    def _left(self) -> str:
+        """Expected time to the end, by the cells that train; empty before the first of them."""
+        if not self._trained:
+            return ""
+        elapsed = time.monotonic() - self._started
+        minutes = elapsed / self._trained * (self._to_train - self._trained) / 60
+        return f", {minutes:.0f} min left"
+
+    def _refresh(self) -> None:
+        while not self._over.wait(_REFRESH_S):
+            self._bar.refresh()
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("s" if number != 1 else "")
+
+
+def _print(text: str) -> None:
+    tqdm.write(text, file=sys.stderr)
+
+
+def write_output(plan: Plan, folder: BenchFolder) -> None:
+    """Write tables.md, tables.tex and index.html of what has been recorded so far."""
+    records = Records.read(plan, folder)
+    tables = make_tables(records)
+    title = plan.suite.title or plan.suite.name
+    write_text(folder.path / "tables.md", markdown(title, tables))
+    write_text(folder.path / "tables.tex", latex(tables))
+    write_text(folder.path / "index.html", page(records, tables, folder))

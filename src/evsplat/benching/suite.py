@@ -18,7 +18,7 @@ class SuiteCapture:
     """A capture of a suite: one on the disk, the packaged one, or one that is staged."""
 
     name: str
-    """Of the capture in tables and of its folders."""
+    """The capture's name in tables and folders."""
     path: str | None = None
     """Capture folder, relative to the working directory; ``demo`` is the one that ships."""
     stage: StageSettings | None = None
@@ -32,7 +32,7 @@ class Published:
     """Figures of a publication for a row: means over `PublishedTable.captures`."""
 
     psnr: float
-    """dB."""
+    """PSNR, dB."""
     ssim: float
     lpips: float
 
@@ -42,11 +42,11 @@ class SuiteRow:
     """One line of the table."""
 
     name: str
-    """In file names and for ``--only``."""
+    """The row's name in files and for ``--only``."""
     method: str
     """A method that is trained, or ``median_background`` or ``nearest_frame``."""
     title: str | None = None
-    """In tables; the name where it is not given."""
+    """The row's title in tables; the name where it is not given."""
     restore: str | None = None
     """Restoration of the training frames before (`evsplat restore --with`)."""
     backdrop: bool = False
@@ -57,14 +57,14 @@ class SuiteRow:
     published: Published | None = None
 
     @property
-    def shown(self) -> str:
-        """What a reader sees."""
+    def label(self) -> str:
+        """Title of the row, or its name."""
         return self.title or self.name
 
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """Where the published figures come from."""
+    """The table of a publication that published figures come from."""
 
     title: str
     captures: tuple[str, ...]
@@ -73,7 +73,7 @@ class PublishedTable:
 
 @dataclass(frozen=True)
 class Suite:
-    """What is compared with what."""
+    """Captures x rows x seeds that are compared."""
 
     name: str
     rows: tuple[SuiteRow, ...]

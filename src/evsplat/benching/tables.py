@@ -25,7 +25,7 @@ _PUBLISHED = "published"
 
 
 @dataclass(frozen=True)
-class Shown:
+class TableCell:
     """A cell as it is printed."""
 
     text: str
@@ -35,7 +35,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Heading:
-    """A column."""
+    """Head of a column."""
 
     group: str
     title: str
@@ -52,7 +52,7 @@ class BenchTable:
     title: str
     note: str
     headings: tuple[Heading, ...]
-    rows: tuple[tuple[str, tuple[Shown, ...]], ...]
+    rows: tuple[tuple[str, tuple[TableCell, ...]], ...]
     footnotes: tuple[str, ...] = field(default=())
 
     @property
@@ -90,7 +90,9 @@ def _published(records: Records, published: PublishedTable, shared: list[str]) -
     """Figures of the publication beside ours of the same captures, full frame first."""
     protocol = "avatar-compat"
     columns = [
-        _Column(Heading(_PUBLISHED, title, decimals, higher), partial(_stated, key, published))
+        _Column(
+            Heading(_PUBLISHED, title, decimals, higher), partial(_published_mean, key, published)
+        )
         for key, title, decimals, higher in (
             ("psnr", "PSNR", 2, True),
             ("ssim", "SSIM", 4, True),
@@ -110,7 +112,7 @@ def _published(records: Records, published: PublishedTable, shared: list[str]) -
     return replace(table, footnotes=tuple(notes))
 
 
-def _stated(key: str, published: PublishedTable, row: SuiteRow) -> Figure | None:
+def _published_mean(key: str, published: PublishedTable, row: SuiteRow) -> Figure | None:
     if row.published is None:
         return None
     return Figure(getattr(row.published, key), None, len(published.captures))
@@ -188,7 +190,7 @@ def _table(
     """Read, rank and format; a row that lacks some of ``captures`` does not compete."""
     rows = records.plan.suite.rows
     complete = {row.name: sum(bool(records.of(c, row.name)) for c in captures) for row in rows}
-    shown: dict[str, list[Shown]] = {row.name: [] for row in rows}
+    shown: dict[str, list[TableCell]] = {row.name: [] for row in rows}
     for column in columns:
         figures = {row.name: column.read(row) for row in rows}
         competing = {
@@ -199,10 +201,10 @@ def _table(
         }
         for key, figure in figures.items():
             rank = _rank(competing, key, column.heading.higher_is_better)
-            shown[key].append(Shown(_text(figure, column.heading.decimals), rank))
+            shown[key].append(TableCell(_text(figure, column.heading.decimals), rank))
     titled = []
     for row in rows:
-        title_of_row = "; ".join([row.shown, *_own_terms(records, row, captures)])
+        title_of_row = "; ".join([row.label, *_own_terms(records, row, captures)])
         if 0 < complete[row.name] < len(captures):
             title_of_row += f" ({complete[row.name]} of {len(captures)} captures)"
         elif not complete[row.name]:
@@ -215,7 +217,7 @@ def _table(
 
 
 def _terms(records: Records, captures: Sequence[str]) -> str:
-    """What every row was given where its title says nothing else, how long, and on how much."""
+    """Terms of every row whose title says nothing else: policy, training steps, test frames."""
     rows = records.plan.suite.rows
     found = [record for c in captures for row in rows for record in records.of(c, row.name)]
     made = sorted({record["iteration"] for record in found if record["iteration"] is not None})
@@ -234,7 +236,7 @@ def _terms(records: Records, captures: Sequence[str]) -> str:
 
 
 def _own_terms(records: Records, row: SuiteRow, captures: Sequence[str]) -> list[str]:
-    """What a row was given that others were not, or was not given."""
+    """Departures of a row's policy from the strict terms."""
     policies = [policy_of(r) for c in captures for r in records.of(c, row.name)]
     return list(dict.fromkeys(said for p in policies if p for said in p.departures))
 
@@ -245,7 +247,7 @@ def _why_empty(records: Records, row: str) -> str:
 
 
 def _rank(competing: dict[str, float], row: str, higher: bool | None) -> int:
-    """By what is printed; equal values share a rank."""
+    """Rank by what is printed; equal values share one."""
     if higher is None or row not in competing:
         return 0
     values = sorted(set(competing.values()), reverse=higher)
@@ -261,8 +263,8 @@ def _text(figure: Figure | None, decimals: int) -> str:
 
 
 def _footnotes(records: Records) -> list[str]:
-    """Why something is not in the tables."""
-    titles = {row.name: row.shown for row in records.plan.suite.rows}
+    """Reasons why something is not in the tables."""
+    titles = {row.name: row.label for row in records.plan.suite.rows}
     notes = [
         f"{titles[row]} failed on {', '.join(captures)}: {reason}"
         for (row, reason), captures in records.failures().items()

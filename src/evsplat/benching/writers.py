@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from evsplat.benching.tables import BenchTable, Heading, Shown
+from evsplat.benching.tables import BenchTable, Heading, TableCell
 from evsplat.evaluation.tables import latex_text, markdown_table
 
 _ARROWS = {True: "↑", False: "↓", None: ""}
@@ -76,7 +76,7 @@ def html(table: BenchTable) -> str:
     ) + (f'<ul class="note">{notes}</ul>' if notes else "")
 
 
-def _marked(cell: Shown, forms: tuple[str, str, str]) -> str:
+def _marked(cell: TableCell, forms: tuple[str, str, str]) -> str:
     return forms[cell.rank].format(cell.text)
 
 

@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import resources
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from evsplat.errors import DataError
 from evsplat.evaluation.tables import REGION_TITLES
 
 Item = TypeVar("Item")
@@ -113,6 +115,15 @@ class Embedder:
             f'<img src="{data_uri(buffer.getvalue(), "image/webp")}" width="{width}" '
             f'height="{height}" alt="{escape(alt)}" decoding="async">'
         )
+
+
+def read_picture(path: Path, remedy: str) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture that was written by an evaluation; ``remedy`` says what to do without it."""
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except OSError as error:
+        raise DataError(f"{path}: not readable ({error}); {remedy}.") from None
 
 
 def data_uri(content: bytes, media_type: str) -> str:

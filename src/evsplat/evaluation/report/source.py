@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from evsplat.capture import Capture, Frame
 from evsplat.config import load_yaml
 from evsplat.errors import DataError
 from evsplat.evaluation.regions import Box, PersonRegions
+from evsplat.evaluation.report.html import read_picture
 from evsplat.files import parse_json, read_json, read_text
 from evsplat.methods.reconstruction import Reconstruction
 
@@ -51,13 +51,7 @@ class Source:
 
     def picture(self, path: str) -> UInt8[np.ndarray, "H W 3"]:
         """A picture that the evaluation wrote, by its path inside the run folder."""
-        try:
-            with Image.open(self.folder / path) as image:
-                return np.asarray(image.convert("RGB"))
-        except OSError as error:
-            raise DataError(
-                f"{self.folder / path}: not readable ({error}); evaluate the run again."
-            ) from error
+        return read_picture(self.folder / path, "evaluate the run again")
 
     def crop(self, frame: Frame) -> Box | None:
         """The box of the person in a frame, enlarged as ``person_crop`` is."""
