@@ -26,8 +26,8 @@ from PIL import Image
 
 import evsplat as ev
 from evsplat.capture import Camera
-from evsplat.export.avatar.avatar import avatar_of
-from evsplat.export.avatar.export import at_rest
+from evsplat.export.avatar import avatar_of
+from evsplat.export.bake import at_rest
 from evsplat.export.cloud import cloud_of
 from evsplat.export.gaussians import file_rotation
 from evsplat.render import render

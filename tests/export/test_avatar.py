@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import DataError
 from evsplat.export import export_run
-from evsplat.export.avatar.avatar import avatar_of, clip_of, recorded_clip
-from evsplat.export.avatar.export import measure_loss
-from evsplat.export.avatar.package import avatar_document
+from evsplat.export.avatar import avatar_document, avatar_of, clip_of, recorded_clip
+from evsplat.export.bake import measure_loss
 from evsplat.export.cloud import cloud_of
 from evsplat.methods.reconstruction import Bakeable
 from evsplat.models.at_rest import SkinnedGaussians, mean_at_rest

@@ -6,7 +6,7 @@ from typing import Any
 
 from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError, DataError
-from evsplat.export.avatar import at_rest, export_avatar
+from evsplat.export.bake import at_rest, export_avatar
 from evsplat.export.clip import export_clip
 from evsplat.export.cloud import cloud_of
 from evsplat.export.gaussians import (

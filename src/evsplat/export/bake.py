@@ -12,8 +12,7 @@ from tqdm import tqdm
 from evsplat.camera import Camera
 from evsplat.capture import Capture
 from evsplat.errors import DataError
-from evsplat.export.avatar.avatar import Avatar, Clip, avatar_of, clip_of, recorded_clip
-from evsplat.export.avatar.package import write_avatar
+from evsplat.export.avatar import Avatar, Clip, avatar_of, clip_of, recorded_clip, write_avatar
 from evsplat.export.gaussians import cloud_at, facts_of, instant_of
 from evsplat.film import camera_at, load_motion_of
 from evsplat.film.camera_path import check_camera
