@@ -73,7 +73,7 @@ def evaluated(path, folder, *, training=True, alone=False, policy=None, change=N
     if policy is not None and policy.use == "everything":
         capture = capture.with_nothing_held_out()
     reconstruction = TruthWithNoise(capture, 0.02)
-    metrics = evaluate(capture, reconstruction, out_dir=folder, alone=alone)
+    metrics = evaluate(capture, reconstruction, out_dir=folder, test_frames_only=alone)
     if policy is not None:
         metrics["policy"] = to_dict(policy)
     if change is not None:

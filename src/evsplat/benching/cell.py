@@ -148,7 +148,7 @@ def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) 
         reconstruction = UNTRAINED[cell.method](load_capture(trained_on).for_training(cell.policy))
     if cell.backdrop:
         reconstruction = OnMedianBackground(reconstruction, seen)
-    measured = evaluate(recorded, reconstruction, out_dir=run, device=device, alone=True)
+    measured = evaluate(recorded, reconstruction, out_dir=run, device=device, test_frames_only=True)
     kept = ("frames", "protocols", "per_frame", "reasons", "weights", "protocol_notes")
     return {**facts, "policy": to_dict(seen.terms), **{key: measured[key] for key in kept}}
 

@@ -225,20 +225,20 @@ def _terms(records: Records, captures: Sequence[str]) -> str:
         next((r["frames"]["test"] for row in rows for r in records.of(c, row.name)), None)
         for c in captures
     ]
-    told = [str(count) for count in counts if count is not None]
+    shown = [str(count) for count in counts if count is not None]
     sentences = [STRICT_TERMS]
     if made:
         span = f"{made[0]:,}" if len(made) == 1 else f"{made[0]:,} to {made[-1]:,}"
         sentences.append(f"{span} training steps, of schedules made for {NOMINAL_ITERATIONS:,}.")
-    if told:
-        sentences.append(f"Test frames: {' + '.join(told)}.")
+    if shown:
+        sentences.append(f"Test frames: {' + '.join(shown)}.")
     return " ".join(sentences)
 
 
 def _own_terms(records: Records, row: SuiteRow, captures: Sequence[str]) -> list[str]:
     """Departures of a row's policy from the strict terms."""
     policies = [policy_of(r) for c in captures for r in records.of(c, row.name)]
-    return list(dict.fromkeys(said for p in policies if p for said in p.departures))
+    return list(dict.fromkeys(text for p in policies if p for text in p.departures))
 
 
 def _why_empty(records: Records, row: str) -> str:

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -60,16 +61,16 @@ def evaluate(
     protocols: Sequence[Protocol] = PROTOCOLS,
     lpips_weights: Path | str | None = None,
     device: torch.device | str = "cpu",
-    alone: bool = False,
+    test_frames_only: bool = False,
     human_only: bool = False,
 ) -> dict[str, Any]:
     """Measure ``reconstruction`` on the test frames and novel views of ``capture``.
 
     Returns what metrics.json holds, less the facts of a run; pictures go to ``out_dir/pictures``.
-    ``alone`` measures the test frames of the reconstruction and nothing else: no trivial rows, no
-    blurry truth, no novel views, no event maps; these keys are left out. ``human_only`` says that
-    it draws a person on black: it is measured once more before the median background ("composited",
-    by protocol), since against a full frame the black alone decides.
+    ``test_frames_only`` leaves out trivial rows, blurry truth, novel views and event maps, and
+    their keys. ``human_only`` says that the reconstruction draws a person on black: it is measured
+    once more before the median background ("composited", by protocol), since against a full frame
+    the black alone decides.
     Every figure is a mean over test frames of per-frame values. What cannot be measured is None,
     with the reason under "reasons" (a path of keys). Pictures are handled one by one, so that
     memory does not grow with the length of the recording.
@@ -85,7 +86,7 @@ def evaluate(
         networks,
         people,
         out_dir,
-        alone=alone,
+        only=test_frames_only,
         human_only=human_only,
     )
     for frame in tqdm(
@@ -99,7 +100,7 @@ def evaluate(
         **test.results(),
     }
     reasons: dict[str, str] = result["reasons"]
-    if not alone:
+    if not test_frames_only:
         result["novel_views"] = _novel_views(
             capture, reconstruction, networks, people, out_dir, reasons
         )
@@ -112,56 +113,47 @@ def evaluate(
     return result
 
 
+@dataclass(eq=False)
 class _TestFrames:
     """All rows and protocols over the test frames."""
 
-    def __init__(
-        self,
-        capture: Capture,
-        reconstruction: Reconstruction,
-        protocols: Sequence[Protocol],
-        networks: Networks,
-        people: PersonRegions,
-        out_dir: Path,
-        *,
-        alone: bool = False,
-        human_only: bool = False,
-    ) -> None:
-        self._alone = alone
-        self._capture = capture
-        self._protocols = protocols
-        self._networks = networks
-        self._people = people
-        self._out_dir = out_dir
-        self._method: Picture = partial(_render, capture, reconstruction)
-        self._human_only = human_only
+    capture: Capture
+    reconstruction: Reconstruction
+    protocols: Sequence[Protocol]
+    """`STANDARD` comes first; the report shows its figures of every frame and row."""
+    networks: Networks
+    people: PersonRegions
+    out_dir: Path
+    only: bool
+    """Measure the reconstruction alone, and no other rows."""
+    human_only: bool
+
+    def __post_init__(self) -> None:
         self._others: dict[str, Picture | Absent] = {}
-        if human_only:
-            self._others[COMPOSITED] = _picture_of(
-                partial(OnMedianBackground, reconstruction), capture
-            )
-        if not alone:
+        if self.human_only:
+            composited = partial(OnMedianBackground, self.reconstruction)
+            self._others[COMPOSITED] = _picture_of(composited, self.capture)
+        if not self.only:
             self._others |= {
-                "median_background": _picture_of(MedianBackground, capture),
-                "nearest_frame": _picture_of(NearestFrame, capture),
-                BLURRY_INPUT: capture.image,
+                "median_background": _picture_of(MedianBackground, self.capture),
+                "nearest_frame": _picture_of(NearestFrame, self.capture),
+                BLURRY_INPUT: self.capture.image,
             }
         rows = ("method", *self._others)
-        self._means = {(row, p.name): MetricMeans() for row in rows for p in protocols}
+        self._means = {(row, p.name): MetricMeans() for row in rows for p in self.protocols}
         self._against_blurry = MetricMeans()
         self._per_frame: list[dict[str, Any]] = []
 
     def measure(self, frame: Frame) -> None:
         """Measure one test frame and write its pictures."""
-        ours = self._method(frame)
-        mask, person = self._people.in_frame(frame)
-        truth = None if frame.sharp is None else self._capture.sharp(frame)
-        # Standard comes first in self._protocols; the report shows it for every frame and row.
+        ours = _render(self.capture, self.reconstruction, frame)
+        mask, person = self.people.in_frame(frame)
+        truth = None if frame.sharp is None else self.capture.sharp(frame)
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
-        for protocol in self._protocols:
+        for protocol in self.protocols:
             reference = (
-                None if truth is None else Truth(protocol, truth, mask, person, self._networks)
+                None if truth is None else Truth(protocol, truth, mask, person, self.networks)
             )
             for row, picture in pictures.items():
                 measured[row][protocol.name] = _compare(reference, picture)
@@ -173,8 +165,8 @@ class _TestFrames:
                 name: without_reasons(values) for name, values in measured["method"].items()
             },
         }
-        if not self._alone:
-            blurry = Truth(STANDARD, self._capture.image(frame), mask, person, self._networks)
+        if not self.only:
+            blurry = Truth(STANDARD, self.capture.image(frame), mask, person, self.networks)
             against_blurry = blurry.measure(ours)
             self._against_blurry.add(against_blurry)
             entry["others"] = {
@@ -195,16 +187,16 @@ class _TestFrames:
         def row(name: str, protocol: Protocol, path: str) -> dict[str, Any]:
             return means(self._means[name, protocol.name], path)
 
-        compat = [protocol for protocol in self._protocols if protocol is not STANDARD]
+        compat = [protocol for protocol in self.protocols if protocol is not STANDARD]
         rows = {"protocols": "method"}
-        if self._human_only:
+        if self.human_only:
             rows["composited"] = COMPOSITED
         method = {
-            key: {p.name: row(name, p, f"{key}.{p.name}") for p in self._protocols}
+            key: {p.name: row(name, p, f"{key}.{p.name}") for p in self.protocols}
             for key, name in rows.items()
         }
         frames = {"per_frame": self._per_frame, "reasons": reasons}
-        if self._alone:
+        if self.only:
             return {**method, **frames}
         return {
             **method,
@@ -232,7 +224,7 @@ class _TestFrames:
         if truth is not None:
             pictures["error"] = error_map(ours, truth)
         for kind, picture in pictures.items():
-            save_png(self._out_dir / "pictures" / f"{stem}_{kind}.png", picture)
+            save_png(self.out_dir / "pictures" / f"{stem}_{kind}.png", picture)
         return {kind: f"pictures/{stem}_{kind}.png" for kind in pictures}
 
 

@@ -62,7 +62,7 @@ def export_avatar(
     clips.insert(0, recorded_clip(source, gaussians, (min(mids), max(mids))))
     loss = measure_loss(source, avatar, capture)
     instant = instant_of(capture, time_s=None, frame=None, camera=camera)
-    scene = cloud_at(source, instant, "scene") if parts == "all" else None
+    scene = cloud_at(source, instant.camera, instant.time_us, "scene") if parts == "all" else None
     facts = {**facts_of(run), "note": loss.sentence(), "loss_db": asdict(loss)}
     facts["low_pass_px2"] = source.low_pass
     page = write_avatar(

@@ -79,9 +79,9 @@ def splat_source(run: Run) -> SplatReconstruction:
     return run.reconstruction
 
 
-def cloud_at(source: SplatReconstruction, instant: Instant, parts: Parts) -> SplatCloud:
-    """The Gaussians of one instant in the capture's world."""
-    splats = source.splats(instant.camera, [instant.time_us], parts=parts)
+def cloud_at(source: SplatReconstruction, camera: Camera, time_us: int, parts: Parts) -> SplatCloud:
+    """The Gaussians of one instant in the capture's world, coloured as ``camera`` sees them."""
+    splats = source.splats(camera, [time_us], parts=parts)
     return joined([cloud_of(layer) for layer in splats])
 
 

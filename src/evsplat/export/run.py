@@ -90,7 +90,7 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
         instant = instant_of(
             capture, time_s=options.time_s, frame=options.frame, camera=options.camera
         )
-        cloud = cloud_at(splat_source(run), instant, parts or "all")
+        cloud = cloud_at(splat_source(run), instant.camera, instant.time_us, parts or "all")
         which = "" if parts in (None, "all") else f"{parts}-"
         label = f"{which}{instant.label}"
         when = f"at {instant.time_us} us, colours as camera {instant.camera_name} sees them"

@@ -87,7 +87,7 @@ def swing(
 
 
 def through(shares: Sequence[float], cameras: Sequence[Camera]) -> CameraPath:
-    """A smooth way through cameras, each at its share of the film; it stands before and after.
+    """A smooth path through cameras, each at its share of the film; it stands before and after.
 
     Centres and intrinsics follow a cubic spline, orientations scipy's rotation spline; with two
     cameras both are straight. The size of the picture is the first camera's.
@@ -105,11 +105,11 @@ def through(shares: Sequence[float], cameras: Sequence[Camera]) -> CameraPath:
         ]
     )
     turn = RotationSpline(at, rotations) if len(at) > 2 else Slerp(at, rotations)
-    way = CubicSpline(at, values, bc_type="natural")
+    spline = CubicSpline(at, values, bc_type="natural")
 
     def camera(share: float) -> Camera:
         share = float(np.clip(share, at[0], at[-1]))
-        center, (fx, fy, cx, cy) = way(share)[:3], way(share)[3:]
+        center, (fx, fy, cx, cy) = spline(share)[:3], spline(share)[3:]
         K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float32)
         return _placed(replace(cameras[0], K=K), turn(share).as_matrix(), center)
 

@@ -68,8 +68,9 @@ def place_motion(
     """``motion`` on the body of ``recorded``: same floor, same spot, same first direction.
 
     ``up`` is the motion's up in the world of ``world_from_source``; None finds the axis nearest to
-    the body's own. The middle of the way comes to the middle of the recorded one, the person starts
-    off facing where the recorded one does at the start, and stands as high. Times begin at 0.
+    the body's own. The middle of the path comes to the middle of the recorded one, the person
+    starts off facing where the recorded one does at the start, and stands as high. Times begin at
+    0.
     """
     body = recorded.body.to("cpu")
     recorded = recorded.to("cpu")

@@ -82,10 +82,10 @@ class FilmPlan:
             return up_axis((recorded or load_body_track(capture)).to("cpu"))
 
         start = camera_at(capture, view, times[0])
-        way = _camera_path(film, capture, start, up, middle)
-        if way is not None:
+        path = _camera_path(film, capture, start, up, middle)
+        if path is not None:
             last = max(1, len(times) - 1)
-            cameras = [way(index / last) for index in range(len(times))]
+            cameras = [path(index / last) for index in range(len(times))]
         elif film.at is None and film.motion is None and not capture.is_static_camera:
             cameras = [camera_at(capture, view, time) for time in times]
         else:

@@ -28,7 +28,7 @@ class Snap:
     position: np.ndarray
     forward: np.ndarray
     arrived: bool = False
-    """The browser has said that it stands there; what it said before is old."""
+    """The browser has reported that place; reports before it are old."""
 
     def left(self, camera: viser.CameraHandle) -> bool:
         """True once the user has moved the browser's camera away."""
@@ -96,7 +96,7 @@ class Client:
 
     @property
     def current(self) -> ViewRequest:
-        """The present request, at the time where it stands."""
+        """The request at the present time."""
         return self.request(time.monotonic())
 
     def request(self, now: float) -> ViewRequest:

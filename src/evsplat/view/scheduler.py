@@ -179,8 +179,8 @@ class DraftResolution:
     def record(self, seconds: float) -> None:
         """Learn from a picture that took ``seconds`` at the present scale.
 
-        A third of the way to what would have met the target, so that one slow picture does not make
-        the next ones coarse.
+        The scale goes a third of the way to one that would have met the target, so that one slow
+        picture does not make the next ones coarse.
         """
         steps = math.log(max(seconds, 1e-4) / self.target_s) / (-2 * math.log(_SCALE_STEP))
         self._wanted += (self._level + steps - self._wanted) / 3

@@ -18,7 +18,7 @@ from evsplat.body import BodyTrack
 from evsplat.camera import Camera
 from evsplat.errors import DataError
 from evsplat.export.cloud import SplatCloud
-from evsplat.export.gaussians import Instant, cloud_at
+from evsplat.export.gaussians import cloud_at
 from evsplat.film import Look, load_motion_of
 from evsplat.film.looks import depth_colours
 from evsplat.methods.reconstruction import (
@@ -47,7 +47,7 @@ class _Posed:
 
 
 class ViewedRun:
-    """Draws one run; for the render thread alone but for what is fixed."""
+    """Draws one run; only the render thread calls what draws or reloads."""
 
     def __init__(self, run: Run, name: str) -> None:
         self.run = run
@@ -119,7 +119,7 @@ class ViewedRun:
         """The Gaussians of one instant in the world, coloured as ``camera`` sees them."""
         drawn = self._moving(time_us, motion, draft=False)
         assert isinstance(drawn, SplatReconstruction)
-        return cloud_at(drawn, Instant(time_us, camera, "the viewer's", ""), parts)
+        return cloud_at(drawn, camera, time_us, parts)
 
     @cached_property
     def _nearest_m(self) -> float:
