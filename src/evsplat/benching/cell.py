@@ -209,20 +209,17 @@ def _restored(bench: BenchFolder, recorded: Capture, cell: Cell) -> Path:
     """Folder of what is trained on: restored once for all rows that want it so."""
     if cell.restore is None:
         return recorded.path
-    asked = [f"{key}-{value}" for key, value in _restored_by(cell.policy).items()]
+    # What restorers see and is not the default.
+    asked = [
+        f"{name}-{value}"
+        for name in ("held_out_events", "thresholds")
+        if (value := getattr(cell.policy, name)) != getattr(Policy(), name)
+    ]
     path = bench.captures / "-".join((cell.capture.name, cell.restore, *asked))
     with exclusive(bench.lock_of(f"captures/{path.name}")):
         if not path.exists():
             restore_capture(recorded.path, path, method=cell.restore, policy=cell.policy)
     return path
-
-
-def _restored_by(policy: Policy) -> dict[str, Any]:
-    """Fields of a policy that restorers read and that are not the default."""
-    strict = Policy()
-    names = ("held_out_events", "thresholds")
-    values = {name: getattr(policy, name) for name in names}
-    return {name: value for name, value in values.items() if value != getattr(strict, name)}
 
 
 def _peak_memory_mb() -> float:

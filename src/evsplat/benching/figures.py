@@ -99,23 +99,6 @@ def metric(protocol: str, region: str, name: str) -> Callable[[Record], float | 
     return lambda record: record["protocols"][protocol][region][name]
 
 
-def train_minutes(record: Record) -> float | None:
-    """Minutes of training; None for rows that do not train."""
-    seconds = record["train_seconds"]
-    return None if seconds is None else seconds / 60
-
-
-def steps(record: Record) -> float | None:
-    """Training steps; None for rows that do not train."""
-    return record["iteration"]
-
-
-def gaussians(record: Record) -> float | None:
-    """Gaussians of person and scene together."""
-    counts = record["gaussians"]
-    return None if counts is None else sum(counts.values())
-
-
 def _mean(values: Iterable[float]) -> float:
     numbers = list(values)
     return sum(numbers) / len(numbers)

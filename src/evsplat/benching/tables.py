@@ -5,15 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from evsplat.benching.figures import (
-    Figure,
-    Record,
-    Records,
-    gaussians,
-    metric,
-    steps,
-    train_minutes,
-)
+from evsplat.benching.figures import Figure, Record, Records, metric
 from evsplat.benching.suite import PublishedTable, SuiteRow
 from evsplat.capture.policy import STRICT_TERMS, policy_of
 from evsplat.evaluation.protocols import PROTOCOLS
@@ -120,13 +112,15 @@ def _published_mean(key: str, published: PublishedTable, row: SuiteRow) -> Figur
 
 def _means(records: Records, protocol: str) -> BenchTable:
     columns = _metric_columns(records, protocol, records.captures, tuple(METRIC_TITLES))
+    # All three are None for rows that do not train.
+    training: dict[tuple[str, int], Callable[[Record], float | None]] = {
+        ("minutes", 1): lambda r: r["train_seconds"] and r["train_seconds"] / 60,
+        ("steps", 0): lambda r: r["iteration"],
+        ("Gaussians", 0): lambda r: r["gaussians"] and sum(r["gaussians"].values()),
+    }
     columns += [
         _Column(Heading("training", title, decimals, None), _reader(records, value))
-        for title, decimals, value in (
-            ("minutes", 1, train_minutes),
-            ("steps", 0, steps),
-            ("Gaussians", 0, gaussians),
-        )
+        for (title, decimals), value in training.items()
     ]
     count = len(records.captures)
     over = f"Mean over {count} captures" if count != 1 else records.captures[0]
@@ -171,9 +165,7 @@ def _metric_columns(
 
 
 def _reader(
-    records: Records,
-    value: Callable[[Record], float | None],
-    captures: Sequence[str] | None = None,
+    records: Records, value: Callable[[Record], float | None], captures: Sequence[str] | None = None
 ) -> Read:
     where = records.captures if captures is None else captures
     return lambda row: records.figure(row.name, value, where)
@@ -208,7 +200,8 @@ def _table(
         if 0 < complete[row.name] < len(captures):
             title_of_row += f" ({complete[row.name]} of {len(captures)} captures)"
         elif not complete[row.name]:
-            title_of_row += f" ({_why_empty(records, row.name)})"
+            failed = any(name == row.name for name, _ in records.failures())
+            title_of_row += " (failed)" if failed else " (not run)"
         titled.append((title_of_row, tuple(shown[row.name])))
     note = next(p.summary for p in PROTOCOLS if p.name == protocol)
     headings = tuple(column.heading for column in columns)
@@ -239,11 +232,6 @@ def _own_terms(records: Records, row: SuiteRow, captures: Sequence[str]) -> list
     """Departures of a row's policy from the strict terms."""
     policies = [policy_of(r) for c in captures for r in records.of(c, row.name)]
     return list(dict.fromkeys(text for p in policies if p for text in p.departures))
-
-
-def _why_empty(records: Records, row: str) -> str:
-    failed = any(name == row for name, _ in records.failures())
-    return "failed" if failed else "not run"
 
 
 def _rank(competing: dict[str, float], row: str, higher: bool | None) -> int:

@@ -133,7 +133,7 @@ def write_avatar(
     """
     path = Path(path)
     document = avatar_document(avatar, clips, track=track, camera=camera, facts=facts)
-    cloud = rest_cloud(avatar)
+    cloud = cloud_of(avatar.gaussians.at_rest())
     page = _page(document, cloud, scene)
     if path.suffix.lower() in (".html", ".htm"):
         write_text(path, page)
@@ -147,11 +147,6 @@ def write_avatar(
             write_ply(folder / "scene.ply", scene, comments=comments)
         write_text(folder / "README.txt", _README)
     return path / "index.html"
-
-
-def rest_cloud(avatar: Avatar) -> SplatCloud:
-    """The person in the canonical pose."""
-    return cloud_of(avatar.gaussians.at_rest())
 
 
 def avatar_document(

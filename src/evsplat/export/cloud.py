@@ -7,11 +7,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from evsplat.body.rotations import (
-    matrix_to_quaternion,
-    quaternion_multiply,
-    quaternion_to_matrix,
-)
+from evsplat.body.rotations import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
 from evsplat.errors import DataError
 from evsplat.render import Splats
 

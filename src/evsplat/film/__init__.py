@@ -1,7 +1,6 @@
 """Films of a reconstruction: camera paths, motions, and the values that pixels show."""
 
 from evsplat.film.camera_path import (
-    PATHS,
     CameraPath,
     camera_at,
     orbit,
@@ -9,14 +8,12 @@ from evsplat.film.camera_path import (
     swing,
     through,
 )
-from evsplat.film.looks import SHOWN, Look
+from evsplat.film.looks import Look
 from evsplat.film.motion import load_motion_of, place_motion
 from evsplat.film.plan import FilmPlan
 from evsplat.options import Film
 
 __all__ = [
-    "PATHS",
-    "SHOWN",
     "CameraPath",
     "Film",
     "FilmPlan",

@@ -33,8 +33,6 @@ from evsplat.files import read_json
 CameraPath = Callable[[float], Camera]
 """The camera at a share of the film, 0 to 1."""
 
-PATHS = ("orbit", "swing", "interpolate")
-"""Paths by name; anything else is a file."""
 _SWING_DEG = 25.0
 
 
@@ -76,10 +74,7 @@ def orbit(start: Camera, middle: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> 
 
 
 def swing(
-    start: Camera,
-    middle: Float[Tensor, "3"],
-    up: Float[Tensor, "3"],
-    degrees: float = _SWING_DEG,
+    start: Camera, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], degrees: float = _SWING_DEG
 ) -> CameraPath:
     """Swing both ways from ``start`` around ``middle``: as far as one camera's recording bears."""
     angle = math.radians(degrees)

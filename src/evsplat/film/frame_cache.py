@@ -5,6 +5,7 @@ import logging
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby, islice
 from pathlib import Path
 
 import numpy as np
@@ -115,11 +116,7 @@ def film_digest(frames: Iterable[FilmFrame], *rest: object) -> str:
 
 
 def _of_one_camera(frames: Sequence[FilmFrame]) -> Iterable[list[FilmFrame]]:
-    batch: list[FilmFrame] = []
-    for frame in frames:
-        if batch and (frame.camera is not batch[0].camera or len(batch) == _TIMES_AT_ONCE):
+    """Batches of neighbouring frames that one camera sees."""
+    for _, neighbours in groupby(frames, key=lambda frame: id(frame.camera)):
+        while batch := list(islice(neighbours, _TIMES_AT_ONCE)):
             yield batch
-            batch = []
-        batch.append(frame)
-    if batch:
-        yield batch

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 import torch
@@ -14,8 +13,6 @@ from evsplat.methods.reconstruction import Parts, Reconstruction, WithDepth
 from evsplat.options.runs import Shown
 from evsplat.pictures import decode, encode, luminance
 from evsplat.pictures.colours import colours
-
-SHOWN: tuple[Shown, ...] = get_args(Shown)
 
 Exposure = np.ndarray
 """A picture as it is cached: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""

@@ -54,9 +54,7 @@ def pose_sliders(body: Body) -> tuple[PoseSlider, ...]:
 
 
 def turned(
-    sliders: tuple[PoseSlider, ...],
-    angles: tuple[float, ...],
-    rotations: Float[Tensor, "J 3 3"],
+    sliders: tuple[PoseSlider, ...], angles: tuple[float, ...], rotations: Float[Tensor, "J 3 3"]
 ) -> Float[Tensor, "J 3 3"]:
     """Local joint rotations with every slider's angle on top."""
     rotations = rotations.clone()
@@ -106,11 +104,8 @@ def _limb(
     bends: Float[np.ndarray, "3"],
 ) -> list[PoseSlider]:
     """Shoulder or hip about the trunk's axes and the bone, elbow or knee towards ``bends``."""
-    upper, lower, end = {
-        "arm": ("upper_arm", "forearm", "hand"),
-        "leg": ("thigh", "shin", "foot"),
-    }[kind]
-    first, second, last = (skeleton.limbs[f"{side}_{part}"] for part in (upper, lower, end))
+    parts = ("upper_arm", "forearm", "hand") if kind == "arm" else ("thigh", "shin", "foot")
+    first, second, last = (skeleton.limbs[f"{side}_{part}"] for part in parts)
     bones = [rest[second] - rest[first], rest[last] - rest[second]]
     along, below = (bone / np.linalg.norm(bone) for bone in bones)
     # A turn about bone x direction takes the bone towards the direction.

@@ -4,7 +4,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -40,12 +40,6 @@ _POLL_S = 1.0
 """A run that is being trained is looked at for newer states this often."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Posed:
-    reconstruction: Reconstruction
-    pose: HeldPose
-
-
 class ViewedRun:
     """Draws one run; only the render thread calls what draws or reloads."""
 
@@ -64,7 +58,7 @@ class ViewedRun:
     def _clear_caches(self) -> None:
         """Begin caches anew: the parameters have changed."""
         self._recorded = _cached(self.run.reconstruction)
-        self._posed: _Posed | None = None
+        self._posed: tuple[Reconstruction, HeldPose] | None = None
 
     @property
     def is_posable(self) -> bool:
@@ -137,13 +131,13 @@ class ViewedRun:
         drawn, made = self._recorded, self.run.reconstruction
         if not motion.is_recorded and isinstance(made, Posable):
             if self._posed is None:
-                pose = HeldPose(made.track)
-                self._posed = _Posed(_cached(made.following(pose)), pose)
+                held = HeldPose(made.track)
+                self._posed = _cached(made.following(held)), held
+            drawn, pose = self._posed
             rotations, transl = self.track(motion.name).at([time_us])
             if any(motion.angles):
                 rotations = turned(self.sliders, motion.angles, rotations[0])[None]
-            self._posed.pose.hold(rotations, transl)
-            drawn = self._posed.reconstruction
+            pose.hold(rotations, transl)
         if isinstance(drawn, GaussianReconstruction):
             assert isinstance(drawn.model, nn.Module)
             set_draft(drawn.model, draft)

@@ -79,10 +79,8 @@ def _held_out_terms(policy: Policy | None) -> str:
         if policy.held_out_events
         else "and no event of the intervals around them"
     )
-    poses = {
-        "given": "given",
-        "interpolated": "interpolated from those of training frames",
-    }[policy.held_out_poses]
+    given = policy.held_out_poses == "given"
+    poses = "given" if given else "interpolated from those of training frames"
     return (
         f"Held out: training saw neither picture nor mask of these times, {events}. The body’s "
         f"poses there were {poses}."
@@ -125,12 +123,7 @@ class FramePictures:
         if frame.sharp is not None:
             pictures["sharp truth"] = to_bytes(source.capture.sharp(frame))
             pictures["error"] = source.picture(entry["pictures"]["error"])
-        return cls(
-            frame,
-            entry["protocols"]["standard"],
-            pictures,
-            source.crop(frame),
-        )
+        return cls(frame, entry["protocols"]["standard"], pictures, source.crop(frame))
 
     def crops(self, aspect: float) -> Pictures:
         """The pictures around the person, at least ``aspect`` times as wide as high.

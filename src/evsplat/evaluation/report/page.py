@@ -249,15 +249,9 @@ def _curves(source: Source) -> str:
 
 
 def _footer(source: Source) -> str:
-    return (
-        "<footer><p>Capture <code>"
-        f"{escape(source.metrics['capture'])}</code>: {escape(_provenance(source))}</p></footer>"
-    )
-
-
-def _provenance(source: Source) -> str:
-    text = source.capture.provenance.get("text")
-    return str(text) if text else "no provenance given."
+    capture = escape(source.metrics["capture"])
+    provenance = escape(str(source.capture.provenance.get("text") or "no provenance given."))
+    return f"<footer><p>Capture <code>{capture}</code>: {provenance}</p></footer>"
 
 
 def _count(value: Any) -> str | None:
