@@ -8,7 +8,7 @@ from PIL import Image
 from evsplat.capture import load_capture
 from evsplat.errors import DataError
 from evsplat.evaluation.protocols import METRICS, REGIONS, STANDARD, Absent, Truth
-from evsplat.evaluation.regions import PersonRegions
+from evsplat.evaluation.regions import HumanRegions
 from evsplat.methods.trivial import MedianBackground, NearestFrame, nearest_in_time
 
 NO_NETWORKS = dict.fromkeys(METRICS[2:], Absent("not needed"))
@@ -30,7 +30,7 @@ def test_published_figures_are_reproduced(captures_root, name):
         pytest.skip(f"no capture {name} there")
     capture = load_capture(captures_root / name)
     rows = (MedianBackground(capture), NearestFrame(capture))
-    people = PersonRegions(capture)
+    people = HumanRegions(capture)
     totals = torch.zeros(3, 3, dtype=torch.float64)
     for frame in capture.test_frames:
         mask, box = people.in_frame(frame)

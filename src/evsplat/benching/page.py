@@ -9,7 +9,7 @@ from evsplat.benching.folder import BenchFolder
 from evsplat.benching.tables import BenchTable
 from evsplat.benching.writers import LEGEND, html
 from evsplat.capture import Capture, Frame, load_capture
-from evsplat.evaluation.regions import Box, PersonRegions
+from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.html import Embedder, document, folded, read_picture, section, spread
 from evsplat.pictures import to_bytes
 
@@ -95,10 +95,12 @@ def _capture(
     of_frame = camera.width * camera.height * (len(rows) + 2)
     frames = spread(capture.test_frames, max(2, budget // of_frame))
     shown = spread(frames, _OPEN)
-    people = PersonRegions(capture)
+    human_regions = HumanRegions(capture)
     # Pictures of many methods: light compression is seen by nobody at this size.
     embed = Embedder(lossless=False)
-    draw = {frame.name: _frame(capture, people, frame, rows, folder, embed) for frame in frames}
+    draw = {
+        frame.name: _frame(capture, human_regions, frame, rows, folder, embed) for frame in frames
+    }
     others = "".join(draw[frame.name] for frame in frames if frame not in shown)
     left = len(capture.test_frames) - len(frames)
     intro = f"{left} more test frames are measured but not shown. " if left else ""
@@ -114,13 +116,13 @@ def _capture(
 
 def _frame(
     capture: Capture,
-    people: PersonRegions,
+    human_regions: HumanRegions,
     frame: Frame,
     rows: Sequence[_Row],
     folder: BenchFolder,
     embed: Embedder,
 ) -> str:
-    box, camera = people.crop(frame), capture.camera(frame)
+    box, camera = human_regions.crop(frame), capture.camera(frame)
     style = "" if box is None else _window(box, camera.height, camera.width)
     tiles = [_tile(embed.image(to_bytes(capture.image(frame)), "blurry input"), style, "recorded")]
     if frame.sharp is not None:

@@ -27,7 +27,7 @@ from evsplat.evaluation.protocols import (
     all_absent,
     without_reasons,
 )
-from evsplat.evaluation.regions import Absent, PersonRegions
+from evsplat.evaluation.regions import Absent, HumanRegions
 from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import MedianBackground, NearestFrame
@@ -78,13 +78,13 @@ def evaluate(
     out_dir = Path(out_dir)
     networks, weights = _load_networks(lpips_weights, device)
     protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
-    people = PersonRegions(capture)
+    human_regions = HumanRegions(capture)
     test = _TestFrames(
         capture,
         reconstruction,
         protocols,
         networks,
-        people,
+        human_regions,
         out_dir,
         only=test_frames_only,
         human_only=human_only,
@@ -102,7 +102,7 @@ def evaluate(
     reasons: dict[str, str] = result["reasons"]
     if not test_frames_only:
         result["novel_views"] = _novel_views(
-            capture, reconstruction, networks, people, out_dir, reasons
+            capture, reconstruction, networks, human_regions, out_dir, reasons
         )
         events = evaluate_event_maps(capture, reconstruction, out_dir=out_dir)
         result["events"] = None if isinstance(events, Absent) else events
@@ -122,7 +122,7 @@ class _TestFrames:
     protocols: Sequence[Protocol]
     """`STANDARD` comes first; the report shows its figures of every frame and row."""
     networks: Networks
-    people: PersonRegions
+    human_regions: HumanRegions
     out_dir: Path
     only: bool
     """Measure the reconstruction alone, and no other rows."""
@@ -147,13 +147,13 @@ class _TestFrames:
     def measure(self, frame: Frame) -> None:
         """Measure one test frame and write its pictures."""
         ours = _render(self.capture, self.reconstruction, frame)
-        mask, person = self.people.in_frame(frame)
+        mask, human = self.human_regions.in_frame(frame)
         truth = None if frame.sharp is None else self.capture.sharp(frame)
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
         for protocol in self.protocols:
             reference = (
-                None if truth is None else Truth(protocol, truth, mask, person, self.networks)
+                None if truth is None else Truth(protocol, truth, mask, human, self.networks)
             )
             for row, picture in pictures.items():
                 measured[row][protocol.name] = _compare(reference, picture)
@@ -166,7 +166,7 @@ class _TestFrames:
             },
         }
         if not self.only:
-            blurry = Truth(STANDARD, self.capture.image(frame), mask, person, self.networks)
+            blurry = Truth(STANDARD, self.capture.image(frame), mask, human, self.networks)
             against_blurry = blurry.measure(ours)
             self._against_blurry.add(against_blurry)
             entry["others"] = {
@@ -238,7 +238,7 @@ def _novel_views(
     capture: Capture,
     reconstruction: Reconstruction,
     networks: Networks,
-    people: PersonRegions,
+    human_regions: HumanRegions,
     out_dir: Path,
     reasons: dict[str, str],
 ) -> dict[str, Any]:
@@ -252,8 +252,8 @@ def _novel_views(
         if isinstance(ours, Absent):
             measured = all_absent(ours.reason)
         else:
-            person = people.in_view(capture.cameras[view.camera], view.time_us)
-            truth = Truth(STANDARD, capture.novel_image(view), None, person, networks)
+            human = human_regions.in_view(capture.cameras[view.camera], view.time_us)
+            truth = Truth(STANDARD, capture.novel_image(view), None, human, networks)
             measured = truth.measure(ours)
         means_by_camera.setdefault(view.camera, MetricMeans(("full", "person_crop"))).add(measured)
         entry = {

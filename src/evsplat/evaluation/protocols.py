@@ -125,7 +125,7 @@ class Truth:
     image: Float[Tensor, "H W 3"]
     mask: Bool[Tensor, "H W"] | None
     """The person's pixels, where the capture has masks."""
-    person: Box | Absent
+    human: Box | Absent
     """Tight box around the person."""
     networks: Networks
 
@@ -154,12 +154,12 @@ class Truth:
         return {"full": full, "person_crop": self._crop(truth), "person_mask": self._masked(truth)}
 
     def _crop(self, truth: Float[Tensor, "H W 3"]) -> "_Region | Absent":
-        if isinstance(self.person, Absent):
-            return self.person
+        if isinstance(self.human, Absent):
+            return self.human
         if self.protocol.crop == "enlarged":
-            box = self.person.enlarged(CROP_MARGIN, *truth.shape[:2])
+            box = self.human.enlarged(CROP_MARGIN, *truth.shape[:2])
         else:
-            box = self.person.without_last()
+            box = self.human.without_last()
         if box.bottom <= box.top or box.right <= box.left:
             return Absent("the person's box is empty")
         return _Region(self.protocol, box.crop(truth), self.networks, box=box)

@@ -82,7 +82,7 @@ def body_box(track: BodyTrack, camera: Camera, time_us: int) -> Box | None:
     return Box(top, bottom, left, right)
 
 
-class PersonRegions:
+class HumanRegions:
     """The person in pictures of a capture: by masks, or by the posed body where there is none."""
 
     def __init__(self, capture: Capture) -> None:

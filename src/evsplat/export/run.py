@@ -98,13 +98,13 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
     if target is None:
         target = run.path / "exports" / f"{label}{_SUFFIXES[kind][0]}"
     write_file(target, kind, cloud, rotation, facts)
-    people = int((cloud.semantic > 0.5).sum())
+    human = int((cloud.semantic > 0.5).sum())
     upright = "y" if kind in ALWAYS_Y_UP else options.up
     logger.info(
         "%d Gaussians (person %d, scene %d) %s; metres, %s.",
         len(cloud),
-        people,
-        len(cloud) - people,
+        human,
+        len(cloud) - human,
         when,
         "axes of the capture" if upright is None else f"{upright} up",
     )

@@ -17,7 +17,7 @@ from evsplat.pictures.colours import colours
 Exposure = np.ndarray
 """A picture as it is cached: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""
 
-_PERSON, _SCENE = (1.0, 0.46, 0.16), (0.16, 0.50, 0.72)
+_HUMAN, _SCENE = (1.0, 0.46, 0.16), (0.16, 0.50, 0.72)
 # Near to far, from light to dark.
 _NEAR_TO_FAR = ((255, 247, 200), (250, 190, 90), (214, 90, 90), (120, 40, 120), (24, 16, 60))
 
@@ -57,7 +57,7 @@ class Look:
             return list((coded * 65_535).round().clamp(0, 65_535).numpy().astype(np.uint16))
         if self.shown == "semantic":
             human = drawn.human.cpu().clamp(0, 1)[..., None]
-            tint = human * torch.tensor(_PERSON) + (1 - human) * torch.tensor(_SCENE)
+            tint = human * torch.tensor(_HUMAN) + (1 - human) * torch.tensor(_SCENE)
             grey = rgb.mean(-1, keepdim=True)
             rgb = (0.3 * alpha[..., None] + 0.7 * grey) * tint
         if self.transparent:

@@ -36,7 +36,7 @@ class FilmPlan:
     """Frames to draw; for events more than are shown."""
     oversampling: int
     """Frames drawn per picture shown."""
-    person_distance_m: Callable[[], float]
+    human_distance_m: Callable[[], float]
     """Distance of the person from the first camera, metres."""
     poses: tuple[object, ...]
     """Times and poses of a motion, for the film's digest; empty for the recorded one."""
@@ -64,18 +64,18 @@ class FilmPlan:
                 track.times_us,
                 *(value.numpy() for value in track.at(track.times_us.tolist())),
             )
-        person = reconstruction.track if isinstance(reconstruction, Posable) else None
+        human = reconstruction.track if isinstance(reconstruction, Posable) else None
         oversampling = 1
         if film.show == "events":
             if film.beside and capture.events is None:
                 raise DataError(f"{capture.path}: has no events to put --beside the rendered ones.")
             oversampling = max(1, int(np.ceil(film.event_hz / (film.fps * film.slow))))
-        names, times, clock = _times(film, capture, person, oversampling)
+        names, times, clock = _times(film, capture, human, oversampling)
         recording = recorded_by(capture, film.camera)[0].camera
         view = film.camera or recording
 
         def middle() -> torch.Tensor:
-            return _middle((person or load_body_track(capture)).to("cpu"), times)
+            return _middle((human or load_body_track(capture)).to("cpu"), times)
 
         def up() -> torch.Tensor:
             # Where people stood in the recording: a motion may be a somersault.

@@ -163,9 +163,9 @@ def _summary(viewed_runs: list[ViewedRun]) -> str:
     lines = [f"**{viewed_runs[0].capture.name}**"]
     for viewed in viewed_runs:
         run = viewed.run
-        people, scene = run.gaussians["human"], run.gaussians["scene"]
+        human, scene = run.gaussians["human"], run.gaussians["scene"]
         lines.append(
-            f"{viewed.name}: step {run.iteration:,}, {people:,} Gaussians of the person, "
+            f"{viewed.name}: step {run.iteration:,}, {human:,} Gaussians of the person, "
             f"{scene:,} of the scene"
         )
     return "  \n".join(lines)

@@ -110,7 +110,7 @@ class FramePictures:
     figures: dict[str, dict[str, float | None]]
     """Figures of protocol standard, by region and metric."""
     pictures: Pictures
-    person: Box | None
+    human: Box | None
 
     @classmethod
     def of(cls, source: Source, entry: dict[str, Any]) -> "FramePictures":
@@ -130,10 +130,10 @@ class FramePictures:
 
         Empty where nobody is seen or where the person fills the picture anyway.
         """
-        if self.person is None:
+        if self.human is None:
             return {}
         height, width = self.pictures[_RENDER].shape[:2]
-        box = self.person.at_least(aspect, height, width)
+        box = self.human.at_least(aspect, height, width)
         if box.right - box.left > _WORTH_ENLARGING * width:
             return {}
         return {
@@ -177,38 +177,20 @@ def frame_by_frame(source: Source) -> str:
         camera = _known(compared, lambda e: e["others"]["blurry_input"][region]["psnr"])
         if camera:
             rows["blurry input itself"] = camera
-    times = {entry["frame"]: entry["time_us"] / 1e6 for entry in entries}
-    charts = []
-    if region is not None:
-        charts.append(
-            line_chart(
-                [_series(name, times, values) for name, values in rows.items()],
-                x_title="time, s",
-                y_title=f"PSNR of the {_REGIONS[region]}, dB",
-                dots=True,
-            )
-        )
+    charts, psnr = "", "" if region is None else f"PSNR of the {_REGIONS[region]}, dB"
+    if rows:
+        times = {entry["frame"]: entry["time_us"] / 1e6 for entry in entries}
+        lines = [_series(name, times, values) for name, values in rows.items()]
+        charts += line_chart(lines, x_title="time, s", y_title=psnr, dots=True)
     if speeds:
-        when = {frame.name: frame.mid_us / 1e6 for frame in source.capture.frames}
-        charts.append(
-            line_chart(
-                [_series("blur", when, speeds)],
-                x_title="time, s",
-                y_title="Longest path of the body during an exposure, pixels",
-            )
-        )
-    if speeds and region is not None:
-        charts.append(
-            line_chart(
-                [_series(name, speeds, values) for name, values in rows.items()],
-                x_title="path during the exposure, pixels",
-                y_title=f"PSNR of the {_REGIONS[region]}, dB",
-                dots=True,
-                lines=False,
-            )
-        )
-    shown = "".join(charts)
-    if not shown:
+        mids = {frame.name: frame.mid_us / 1e6 for frame in source.capture.frames}
+        title = "Longest path of the body during an exposure, pixels"
+        charts += line_chart([_series("blur", mids, speeds)], x_title="time, s", y_title=title)
+    if speeds and rows:
+        lines = [_series(name, speeds, values) for name, values in rows.items()]
+        title = "path during the exposure, pixels"
+        charts += line_chart(lines, x_title=title, y_title=psnr, dots=True, lines=False)
+    if not charts:
         return ""
     intro = (
         "How far the body moves while the shutter is open."
@@ -216,7 +198,7 @@ def frame_by_frame(source: Source) -> str:
         else "Held-out frames. The faster the person, the more of a frame is smeared: a picture of "
         "the camera falls with the speed, a reconstruction should not."
     )
-    return section("Frame by frame", intro, f'<div class="charts">{shown}</div>')
+    return section("Frame by frame", intro, f'<div class="charts">{charts}</div>')
 
 
 def _ours(entry: dict[str, Any], region: str) -> float | None:

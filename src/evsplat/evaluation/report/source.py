@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from evsplat.capture import Capture, Frame
 from evsplat.config import load_yaml
 from evsplat.errors import DataError
-from evsplat.evaluation.regions import Box, PersonRegions
+from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.html import read_picture
 from evsplat.files import parse_json, read_json, read_text
 from evsplat.methods.reconstruction import Reconstruction
@@ -55,7 +55,7 @@ class Source:
 
     def crop(self, frame: Frame) -> Box | None:
         """The box of the person in a frame, enlarged as ``person_crop`` is."""
-        return PersonRegions(self.capture).crop(frame)
+        return HumanRegions(self.capture).crop(frame)
 
 
 def _read_object(path: Path) -> dict[str, Any]:
