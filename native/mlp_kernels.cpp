@@ -1,9 +1,6 @@
 // Networks on panel matrices, for one block of points; compiled once per SIMD level.
 
 #include "kernels.h"
-#if defined(__x86_64__)
-#include <immintrin.h>
-#endif
 
 namespace evsplat {
 namespace EVSPLAT_LEVEL {

@@ -2,10 +2,6 @@
 
 #include "kernels.h"
 
-#if defined(__x86_64__) || defined(__i386__)
-#include <immintrin.h>
-#endif
-
 namespace evsplat {
 namespace EVSPLAT_LEVEL {
 namespace {
@@ -63,7 +59,7 @@ struct Pixel {
             if (now - last[index] < piece.model->refractory_us) return;
             last[index] = now;
         }
-        EventList& list = *piece.events;
+        List<RawEvent>& list = *piece.events;
         if (list.size == list.capacity) list.grow(list);
         list.data[list.size++] = {uint32_t(at_us), index * 2 + (brighter ? 1 : 0)};
     }
