@@ -81,7 +81,6 @@ class E2Vid(FromEvents):
         """Intensity in [0, 1] at the end of a window, which is taken in equal parts."""
         count = max(1, round(len(events) / (EVENTS_PER_PIXEL * height * width)))
         edges = np.linspace(0, len(events), count + 1).round().astype(int)
-        columns = (events.t, events.x, events.y, events.p)
         multiple = 2 ** len(self.network.encoders)
         # evenly on both sides, the odd pixel first
         down, right = -height % multiple, -width % multiple
@@ -89,7 +88,7 @@ class E2Vid(FromEvents):
         picture = torch.empty(0)
         with enough_memory(self.name, height, width, self.device):
             for first, last in zip(edges, edges[1:], strict=False):
-                part = EventStream(*(column[first:last] for column in columns))
+                part = events.take(slice(first, last))
                 grid = voxel_grid(part, height, width, self.network.bins, scaling="standard")
                 padded = F.pad(
                     grid[None].to(self.device),
