@@ -7,6 +7,7 @@ from typing import Any, Literal
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.body.pose_errors import PoseSource
 from evsplat.camera import Camera
 from evsplat.capture.distortion import Distortion
 
@@ -75,5 +76,7 @@ class Metadata:
     body_file: Path
     body_model: str
     """Empty where the capture has no body yet."""
+    body_source: PoseSource | None
+    """Where its poses come from; None where the capture does not say."""
     events: EventsEntry | None
     provenance: dict[str, Any]

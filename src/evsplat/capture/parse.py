@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
 from evsplat.camera import Camera
 from evsplat.capture.distortion import COEFFICIENT_COUNTS, Distortion
 from evsplat.capture.fields import MISSING, RENAME, Fields, brief, is_whole
@@ -83,6 +84,7 @@ class _Parser:
             novel_views=self.novel_views(top, cameras, frames),
             body_file=body_file or self.path / "body.npz",
             body_model=self.body_model(body) if body else "",
+            body_source=self.body_source(body) if body else None,
             events=self.events(document),
             provenance=provenance if isinstance(provenance, dict) else {"text": str(provenance)},
         )
@@ -336,13 +338,21 @@ class _Parser:
                 "All methods need them and will refuse this capture.",
             )
             return None
-        return self.fields("body", top.get("body"), ("file", "model")) if top.has("body") else None
+        keys = ("file", "model", "source")
+        return self.fields("body", top.get("body"), keys) if top.has("body") else None
 
     def body_model(self, body: Fields) -> str:
         model = body.text("model")
         if body.valid and model not in BODY_MODELS:
             body.fail("model", repr(model), f"one of {list(BODY_MODELS)}", "Correct it.")
         return model
+
+    def body_source(self, body: Fields) -> PoseSource | None:
+        source = body.get("source", None)
+        if source is None or source in POSE_SOURCES:
+            return source
+        body.fail("source", brief(source), f"one of {list(POSE_SOURCES)}", "Correct it.")
+        return None
 
     def events(self, document: dict[str, Any]) -> EventsEntry | None:
         value = document.get("events")

@@ -147,7 +147,9 @@ class CaptureReader:
                 "name it under 'body' (docs/capture-format.md)."
             )
         path = self._metadata.body_file
-        return body_from_arrays(path, read_arrays(path), self._metadata.body_model)
+        metadata = self._metadata
+        arrays = read_arrays(path)
+        return body_from_arrays(path, arrays, metadata.body_model, metadata.body_source)
 
     @functools.cached_property
     def dense_body_file(self) -> BodyFile | None:

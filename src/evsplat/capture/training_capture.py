@@ -169,9 +169,7 @@ class TrainingCapture:
                 f"{file.path}: every key pose lies in a held-out interval, so that training sees "
                 "none; give poses of the training frames."
             )
-        return replace(
-            file, times_us=file.times_us[kept], poses=file.poses[kept], transl=file.transl[kept]
-        )
+        return file.at_keys(kept)
 
     @property
     def dense_body_file(self) -> BodyFile | None:

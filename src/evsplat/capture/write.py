@@ -12,6 +12,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evsplat.body.pose_errors import PoseSource
 from evsplat.capture.body_file import RIG_ARRAYS
 from evsplat.capture.parse import FORMAT, VERSION, default_split
 from evsplat.capture.points import write_points
@@ -161,12 +162,16 @@ class CaptureWriter:
         betas: ArrayLike | None = None,
         gender: str | None = None,
         dense: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
+        source: PoseSource | None = None,
+        pose_std_rad: ArrayLike | None = None,
+        transl_std_m: ArrayLike | None = None,
     ) -> None:
         """Give the body and its key poses: times (P,), poses (P, J, 3), root shifts (P, 3).
 
         A "rig" brings ``rig`` with the arrays of docs/capture-format.md, the other models
         ``betas`` (and ``gender``, all but "default"). ``dense`` are times, poses and shifts of the
-        truth between key poses, for evaluation only.
+        truth between key poses, for evaluation only. ``source`` says where the key poses come from;
+        ``pose_std_rad`` (P, J) and ``transl_std_m`` (P, 3), how far they err (`PoseErrors`).
         """
         arrays: dict[str, Any] = {"model": model, **_poses(times_us, poses, transl)}
         if rig is not None:
@@ -175,8 +180,13 @@ class CaptureWriter:
             arrays["betas"] = np.asarray(betas, dtype=np.float64).ravel()
         if gender is not None:
             arrays["gender"] = gender
+        for key, value in (("pose_std_rad", pose_std_rad), ("transl_std_m", transl_std_m)):
+            if value is not None:
+                arrays[key] = np.asarray(value, dtype=np.float32)
         _save_arrays(self._root / "body.npz", arrays)
         self._body = {"file": "body.npz", "model": model}
+        if source is not None:
+            self._body["source"] = source
         if dense is not None:
             _save_arrays(self._root / "body_dense.npz", _poses(*dense))
 
