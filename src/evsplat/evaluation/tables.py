@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from evsplat.capture.policy import policy_of
+from evsplat.evaluation.splits import SplitWords, count_of, name_of, split_of, words_of
 from evsplat.files import write_text
 
 ROW_TITLES = {
     "on_median_background": "the same person on the median background",
     "median_background": "median background (trivial)",
     "nearest_frame": "nearest training frame (trivial)",
-    "blurry_input": "blurry input itself (no method sees it)",
 }
 REGION_TITLES = {"full": "full frame", "person_crop": "person crop", "person_mask": "person mask"}
 
@@ -59,6 +59,8 @@ class Table:
     rows: dict[str, dict[str, dict[str, float | None]]]
     """Row key (the method's name, trivial rows, blurry_input) -> region -> metric -> value."""
     method: str
+    words: SplitWords
+    """Words for the frames that were measured."""
 
     @property
     def groups(self) -> list[tuple[str, int]]:
@@ -98,7 +100,8 @@ class Table:
 
     def title(self, row: str) -> str:
         """Title of a row for readers."""
-        return ROW_TITLES.get(row, row)
+        own = {"blurry_input": self.words.blurry_input}
+        return (ROW_TITLES | own).get(row, row)
 
 
 def tables_of(metrics: dict[str, Any]) -> Iterator[Table]:
@@ -118,7 +121,7 @@ def tables_of(metrics: dict[str, Any]) -> Iterator[Table]:
             if any(row[region][metric] is not None for row in rows.values())
         )
         note = metrics["protocol_notes"][protocol]
-        yield Table(protocol, note, columns, rows, metrics["method"])
+        yield Table(protocol, note, columns, rows, metrics["method"], words_of(metrics))
 
 
 def composited(metrics: dict[str, Any]) -> dict[str, Any]:
@@ -140,16 +143,18 @@ def missing_networks(metrics: dict[str, Any]) -> list[str]:
 
 
 def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
-    """Write metrics.md and metrics.tex."""
-    write_text(folder / "metrics.md", markdown(metrics))
-    write_text(folder / "metrics.tex", latex(metrics))
+    """Write metrics.md and metrics.tex, or those of training frames (metrics_train.md ...)."""
+    split = split_of(metrics)
+    write_text(folder / name_of("metrics", split, ".md"), markdown(metrics))
+    write_text(folder / name_of("metrics", split, ".tex"), latex(metrics))
 
 
 def markdown(metrics: dict[str, Any]) -> str:
     """All tables as Markdown; the best of each column in bold."""
     lines = [f"# {metrics['method']} on {metrics['capture']}", ""]
-    count = metrics["frames"]["test"]
-    means = f"Means over {count} test frames against the sharp truth. " if count else ""
+    count = count_of(metrics)
+    frames = words_of(metrics).title.lower()
+    means = f"Means over {count} {frames} against the sharp truth. " if count else ""
     lines += [f"{means}{terms(metrics)}", ""]
     for table in tables_of(metrics) if count else ():
         lines += [f"## Protocol `{table.protocol}`", "", f"{table.note}.", ""]
@@ -181,8 +186,8 @@ def _novel_markdown(metrics: dict[str, Any]) -> list[str]:
 
 def latex(metrics: dict[str, Any]) -> str:
     """All tables as LaTeX (booktabs)."""
-    lines = [f"% {terms(metrics)}"]
-    for table in tables_of(metrics) if metrics["frames"]["test"] else ():
+    lines = [f"% {words_of(metrics).title}. {terms(metrics)}"]
+    for table in tables_of(metrics) if count_of(metrics) else ():
         groups = [rf"\multicolumn{{{span}}}{{c}}{{{title}}}" for title, span in table.groups]
         names = [
             METRIC_TITLES[c.metric] + (r"$\uparrow$" if c.higher_is_better else r"$\downarrow$")

@@ -137,6 +137,7 @@ class Film:
         return "-".join(words) + ending
 
 
+Split = Literal["test", "train"]
 UpAxis = Literal["y", "z"]
 FileKind = Literal["ply", "spz", "splat", "gltf"]
 Kind = Literal["ply", "spz", "splat", "gltf", "html", "avatar"]

@@ -6,6 +6,7 @@ from typing import Any
 from evsplat.capture.policy import policy_of
 from evsplat.evaluation.report.html import folded, section
 from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import count_of, split_of, words_of
 from evsplat.evaluation.tables import (
     METRIC_TITLES,
     REGION_TITLES,
@@ -34,9 +35,9 @@ def figures(source: Source) -> str:
         if against is not None
         else ""
     )
-    count = metrics["frames"]["test"]
+    count, frames = count_of(metrics), words_of(metrics).frames
     measured = (
-        f"Means over {count} held-out frames against the sharp picture at mid-exposure."
+        f"Means over {count} {frames} against the sharp picture at mid-exposure."
         if first.columns
         else f"{count} frames were held out, and none has a sharp picture to be compared with."
     )
@@ -50,6 +51,8 @@ def figures(source: Source) -> str:
 def no_test_figures(metrics: dict[str, Any]) -> str | None:
     """The reason for no test figures, as HTML that continues a sentence; None where there are."""
     policy = policy_of(metrics)
+    if split_of(metrics) == "train":
+        return None
     if policy is not None and policy.use == "everything":
         return (
             "trained on every frame and every event (<code>--use everything</code>): nothing was "

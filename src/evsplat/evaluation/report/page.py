@@ -22,6 +22,7 @@ from evsplat.evaluation.report.html import (
     spread,
 )
 from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import words_of
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import css_gradient
 
@@ -32,10 +33,11 @@ _PAIRS_MOST = 24
 _NOVEL_SHOWN = 4
 """Novel views shown per camera, evenly spread over time."""
 _HEADLINE = {
-    "full": "on held-out frames",
+    "full": None,
     "person_crop": "on the person’s crop",
     "person_mask": "on the person’s mask",
 }
+"""Where a figure was reached; of the full frame the split says it."""
 _REFERENCES = {
     "trivial": ("the best picture that needs no method", "the best without a method"),
     "camera": ("the camera’s own blurry picture", "the camera’s own"),
@@ -101,7 +103,8 @@ def _summary(metrics: dict[str, Any]) -> str:
             f"{distance(value, theirs, 1)} {_REFERENCES[name][min(len(parts), 1)]}"
             for name, theirs in references(metrics, region).items()
         )
-        parts.append(f"<b>{value:.2f}&nbsp;dB</b> {where}" + (f" ({against})" if against else ""))
+        place = where or words_of(metrics).headline
+        parts.append(f"<b>{value:.2f}&nbsp;dB</b> {place}" + (f" ({against})" if against else ""))
     if not parts:
         return f"{method}: no sharp ground truth to compare with, so the pictures must speak."
     return f"{method} reaches {', '.join(parts)}."
