@@ -1,7 +1,7 @@
 """How often a wrong body is noticed, and how often a right one is called wrong.
 
     python benchmarks/wrong_bodies.py [--characters C ...] [--motions M ...] [--count N] [--size PX]
-        [--seed S] [--captures CAPTURE ...] [--out FOLDER]
+        [--seed S] [--variants V ...] [--captures CAPTURE ...] [--out FOLDER]
 
 Stages captures at random (character, motion, turn, frame rate, exposure, sensor, cloth, shadow, and
 poses that are exact or off as markers or estimators are). Each is judged with its own body and with
@@ -184,8 +184,8 @@ def compare(paths: Sequence[Path], options: argparse.Namespace) -> dict[str, flo
     """Judge staged captures, right and wrong, in all variants."""
     results: dict[str, float] = {}
     spent = []
-    for variant, change in VARIANTS.items():
-        captures = []
+    for variant in options.variants:
+        change, captures = VARIANTS[variant], []
         for path in paths:
             folder = options.out / variant / path.name
             if change is not None and not folder.exists():
@@ -238,6 +238,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
     parser.add_argument("--captures", nargs="*", type=Path, default=[])
     parser.add_argument("--out", type=Path, default=Path("bench/wrong_bodies"))
     options = parser.parse_args()

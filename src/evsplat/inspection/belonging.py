@@ -32,9 +32,9 @@ WIDENED_PX = 2
 """Clothes and hair are taken to be within so many map pixels of the bare body."""
 _OFF_PX, _OFF_FRAMES = 3.5, 1.0
 """Best places so far away, map pixels or frames, are told ..."""
-_LEAST_GAIN, _LEAST_GAIN_OF_ONE_FRAME = 0.025, 0.1
-"""... if so much of the correlation there is missing where the body is. Less than two frames of a
-slow motion are hard to tell."""
+_LEAST_GAIN, _LEAST_GAIN_IN_TIME, _LEAST_GAIN_OF_A_FRAME = 0.025, 0.04, 0.1
+"""... if so much of the correlation there is missing where the body is: for shifts, for delays
+alone, and for those of less than two frames, which slow motions hardly show."""
 _ANOTHER, _DOUBTFUL, _FOLLOWS = 0.75, 0.85, 0.9
 """Order below which a body is another one, below which it may be, and above which it is none."""
 _PARTED = 0.05
@@ -89,16 +89,14 @@ class Belonging:
             return "another"
         if not self.shares or self.best_score < _FAINT:
             return "unknown"
-        order = self.order
-        if self.standing_camera:
-            if order is not None and (
-                order < _ANOTHER or (order < _DOUBTFUL and self.parting > _PARTED)
-            ):
-                return "another"
-            return "off" if self._is_off else "belongs"
         if not self._is_off:
             return "belongs"
-        return "off" if order is not None and order >= _FOLLOWS else "unknown"
+        order = self.order
+        if not self.standing_camera:
+            return "off" if order is not None and order >= _FOLLOWS else "unknown"
+        if order is None or order >= _DOUBTFUL:
+            return "off"
+        return "another" if order < _ANOTHER or self.parting > _PARTED else "off"
 
     @property
     def _is_far(self) -> bool:
@@ -107,9 +105,10 @@ class Belonging:
     @property
     def _is_off(self) -> bool:
         gain, delay = 1 - self.score / self.best_score, abs(self.delay_frames)
-        small = not self._is_far and delay < 2 * _OFF_FRAMES
-        least = _LEAST_GAIN_OF_ONE_FRAME if small else _LEAST_GAIN
-        return (self._is_far or delay >= _OFF_FRAMES) and gain > least
+        if self._is_far:
+            return gain > _LEAST_GAIN
+        least = _LEAST_GAIN_OF_A_FRAME if delay < 2 * _OFF_FRAMES else _LEAST_GAIN_IN_TIME
+        return delay >= _OFF_FRAMES and gain > least
 
     @property
     def where(self) -> str:

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-_LEAST_CHANGE = 0.04
-"""Silhouettes whose order is asked for are at least so far from equal (1 - correlation)."""
+_LEAST_CHANGE = 0.12
+"""Silhouettes whose order is asked for are at least so far from equal (1 - correlation): as far as
+errors of estimated poses change them. Whoever turns on the spot does not."""
 _FEWEST_PAIRS = 20
 
 
