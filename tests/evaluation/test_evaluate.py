@@ -222,6 +222,18 @@ def test_a_person_out_of_sight_in_one_frame_is_left_out_of_the_mean(tiny_capture
     assert reason == "missing in 1 of 3: the person mask is empty"
 
 
+def test_a_person_in_no_test_frame_is_told(tiny_capture, tmp_path, caplog):
+    path = tiny_capture()
+    for frame in load_capture(path).test_frames[1:]:
+        Image.new("L", (32, 24)).save(frame.mask)
+    run(path, tmp_path / "some")
+    assert "the person is in no test frame" not in caplog.text
+    for frame in load_capture(path).test_frames:
+        Image.new("L", (32, 24)).save(frame.mask)
+    run(path, tmp_path / "none")
+    assert f"{path}: the person is in no test frame; check camera and poses." in caplog.text
+
+
 def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
     capture = load_capture(tiny_capture("under_score"))
     out = tmp_path / "run"

@@ -27,6 +27,7 @@ from evsplat.staging.motion import (
     dressed_vertices,
     key_poses,
     place_motion,
+    warn_of_hiding,
 )
 from evsplat.staging.renderer import StageRenderer
 from evsplat.staging.room import load_room
@@ -252,6 +253,13 @@ def test_motion_stands_on_the_floor_in_the_middle(captures_root):
     assert apart.mean() < 0.02
     lowest = [float(dressed_vertices(character, ours, t)[:, 2].min()) for t in times]
     assert -0.05 < np.percentile(lowest, 20) < 0.03
+
+
+def test_a_person_who_is_hidden_is_told(caplog):
+    warn_of_hiding(0.002)
+    assert not caplog.messages
+    warn_of_hiding(0.0004)
+    assert "fills 0.04 % of the pictures" in caplog.text
 
 
 def test_cut_motion_begins_at_zero():

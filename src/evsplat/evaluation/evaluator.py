@@ -173,11 +173,13 @@ class _MeasuredFrames:
         self._means = {(row, p.name): MetricMeans() for row in rows for p in self.protocols}
         self._against_blurry = MetricMeans()
         self._per_frame: list[dict[str, Any]] = []
+        self._nobody = True
 
     def measure(self, frame: Frame) -> None:
         """Measure one frame and write its pictures."""
         ours = _render(self.capture, self.reconstruction, frame)
         mask, human = self.human_regions.in_frame(frame)
+        self._nobody &= isinstance(human, Absent)
         truth = None if frame.sharp is None else self.capture.sharp(frame)
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
@@ -207,6 +209,10 @@ class _MeasuredFrames:
 
     def results(self) -> dict[str, Any]:
         """Means of everything; "trivial" and "blurry_input" are of the protocol standard."""
+        if self._nobody and self._per_frame:
+            logger.warning(
+                "%s: the person is in no test frame; check camera and poses.", self.capture.path
+            )
         reasons: dict[str, str] = {}
 
         def means(frames: MetricMeans, path: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from evsplat.importers.neuman import Neuman
 from evsplat.importers.people_snapshot import PeopleSnapshot
 from evsplat.importers.zju_mocap import ZjuMocap
 from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
+from evsplat.inspection import warn_of_body
 from evsplat.options.declare import given
 
 __all__ = ["KINDS", "Blur", "Importer", "import_capture", "run_importer"]
@@ -111,4 +112,5 @@ def run_importer(
             overwrite=overwrite,
             interpolation=blur.interpolation,
         )
+    warn_of_body(out)
     return out

@@ -41,6 +41,7 @@ from evsplat.staging.motion import (
     height_m,
     key_poses,
     place_motion,
+    warn_of_hiding,
     warn_of_leaving,
 )
 from evsplat.staging.renderer import StageRenderer
@@ -216,6 +217,7 @@ class _Film:
         """Write the pictures frame by frame and give the events of each."""
         settings = self.settings
         sensor = SensorSimulator(*settings.size, PRESETS[settings.events], settings.seed)
+        area = 0.0
         bar = tqdm(self.times, desc="filming", unit="frame", disable=not progress)
         for index, times in enumerate(bar):
             blurry = np.zeros((*reversed(settings.size), 3))
@@ -226,6 +228,7 @@ class _Film:
                 events.append(sensor.step(luminance(torch.from_numpy(picture)), time))
             name = f"{index:04d}"
             sharp, mask = self._draw_at(times.mid_us)
+            area += float(mask.mean()) / len(self.times)
             writer.add_frame(
                 name,
                 "main",
@@ -243,6 +246,7 @@ class _Film:
                     seen, _ = self._draw_at(times.mid_us, view)
                     writer.add_novel_view(camera, name, times.mid_us, _coded(seen))
             yield EventStream.joined(events)
+        warn_of_hiding(area)
 
     def _draw(self, times_us: np.ndarray) -> Iterator[tuple[int, Float32[np.ndarray, "H W 3"]]]:
         """Time and linear picture of the recording camera, drawn in batches."""
