@@ -13,7 +13,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.gaussians import BodyFrames, DensifyLimits, Part
 from evsplat.methods.learning import Learning
 from evsplat.methods.settings import Weight
-from evsplat.models.model import Model
+from evsplat.models.at_rest import Skinned
 from evsplat.objectives import Objective, PackedBounds
 
 Purpose = Literal["train", "resume", "draw"]
@@ -51,7 +51,7 @@ class HeldOut:
 class Composition:
     """A method put together for one capture; the loop knows nothing else of it."""
 
-    model: Model
+    model: Skinned
     objectives: list[Objective]
     weights: dict[str, Weight]
     """Weight per named term; a term without one is an error of the method."""

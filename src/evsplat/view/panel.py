@@ -61,9 +61,8 @@ class Panel:
             self._build_camera()
         with self.gui.add_folder("Show"):
             self._build_show()
-        if client.compositor.viewed.is_posable:
-            with self.gui.add_folder("Motion and pose"):
-                self._build_pose()
+        with self.gui.add_folder("Motion and pose"):
+            self._build_pose()
         with self.gui.add_folder("Save"):
             SavePanel(client)
         client.on_drawn = self._follow
@@ -122,8 +121,7 @@ class Panel:
     def _build_show(self) -> None:
         gui, client = self.gui, self.client
         parts = gui.add_dropdown("Parts", tuple(_PARTS))
-        known = [name for name in _SHOWN if name != "depth" or client.compositor.has_depth]
-        shown = gui.add_dropdown("Colours", tuple(known))
+        shown = gui.add_dropdown("Colours", tuple(_SHOWN))
         others = comparisons(self.capture, list(client.compositor.others))
         compare = gui.add_dropdown("Compare with", (_NOTHING, *others))
         layout = gui.add_dropdown("Layout", ("divided", "side by side"))
