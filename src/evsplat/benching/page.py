@@ -6,11 +6,11 @@ from html import escape
 
 from evsplat.benching.figures import Record, Records
 from evsplat.benching.folder import BenchFolder
-from evsplat.benching.tables import BenchTable
-from evsplat.benching.writers import LEGEND, html
+from evsplat.benching.tables import SPREAD
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.html import Embedder, document, folded, read_picture, section, spread
+from evsplat.evaluation.tables import LEGEND, Table, html
 from evsplat.pictures import to_bytes
 
 _PIXELS = 60_000_000
@@ -54,7 +54,7 @@ class _Row:
     """The reason for no result."""
 
 
-def page(records: Records, tables: Sequence[BenchTable], folder: BenchFolder) -> str:
+def page(records: Records, tables: Sequence[Table], folder: BenchFolder) -> str:
     """The page as HTML; all that comes from the user's files is escaped."""
     suite = records.plan.suite
     title = suite.title or suite.name
@@ -75,7 +75,7 @@ def page(records: Records, tables: Sequence[BenchTable], folder: BenchFolder) ->
         '<input type="checkbox" id="person" checked aria-label="person only">'
         f'<header><p class="kicker">evsplat · bench · {escape(suite.name)}</p>'
         f'<h1>{escape(title)}</h1><p class="lead">{done} of {len(records.plan.cells)} cells. '
-        f"{escape(LEGEND.format(second='underlined'))}</p></header>"
+        f"{LEGEND.format(second='underlined')} {SPREAD}</p></header>"
         f"<main>{figures}{pictures}</main>"
     )
     return document(title, body, style=_STYLE)

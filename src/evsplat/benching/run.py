@@ -21,9 +21,9 @@ from evsplat.benching.local import LocalPool
 from evsplat.benching.page import page
 from evsplat.benching.plan import Plan, make_plan, pending_cells
 from evsplat.benching.suite import read_suite
-from evsplat.benching.tables import make_tables
-from evsplat.benching.writers import latex, markdown
+from evsplat.benching.tables import SPREAD, make_tables
 from evsplat.errors import ConfigError
+from evsplat.evaluation.tables import LEGEND, latex, markdown
 from evsplat.files import read_json, write_json, write_text
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
@@ -220,6 +220,7 @@ def write_output(plan: Plan, folder: BenchFolder) -> None:
     records = Records.read(plan, folder)
     tables = make_tables(records)
     title = plan.suite.title or plan.suite.name
-    write_text(folder.path / "tables.md", markdown(title, tables))
+    intro = f"{LEGEND.format(second='in italics')} {SPREAD}"
+    write_text(folder.path / "tables.md", markdown(title, intro, tables))
     write_text(folder.path / "tables.tex", latex(tables))
     write_text(folder.path / "index.html", page(records, tables, folder))
