@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from evsplat import body
 from evsplat.body import body as skin_module
 from evsplat.models.discs import shading
-from evsplat.models.networks import colour, non_rigid, one_blob, skinning_network
+from evsplat.models.networks import colour, non_rigid, skinning_network
 from evsplat.neighbours import nearest
 from evsplat.objectives import event, isometry, semantic
 from evsplat.pictures import light
@@ -103,7 +103,7 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
     """What lies before and behind the networks' layers, which `benchmarks/networks.py` times."""
     times = 2
     positions = torch.rand(points, 3).requires_grad_()
-    blob = one_blob.OneBlobEncoding()
+    blob = non_rigid.OneBlobEncoding()
     blob_upstream = torch.randn(points, blob.dim)
     softmax = skinning_network.HierarchicalSoftmax(body.default_body().parents.tolist())
     logits = torch.randn(points, softmax.logits).requires_grad_()
@@ -129,7 +129,7 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
 
     joints = softmax(logits).shape[-1]
     return {
-        "one_blob": (encode, in_torch(encode, one_blob)),
+        "one_blob": (encode, in_torch(encode, non_rigid)),
         "skinning_softmax": (tree_softmax, in_torch(tree_softmax, skinning_network)),
         "shape_change": (change_shape, in_torch(change_shape, non_rigid)),
         "view_basis": (view_basis, in_torch(view_basis, colour)),

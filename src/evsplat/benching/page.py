@@ -18,30 +18,6 @@ _PIXELS = 60_000_000
 _OPEN = 3
 """Frames of a capture that show at once; the others are folded."""
 
-_STYLE = """
-td.second { text-decoration: underline; text-underline-offset: 3px; }
-tbody th { min-width: 130px; }
-table { border-collapse: separate; border-spacing: 0; }
-thead .corner, tbody th { position: sticky; left: 0; background: var(--panel); }
-.tiles { display: grid; gap: 10px 8px;
-  grid-template-columns: repeat(auto-fill, minmax(148px, 1fr)); }
-.tile { position: relative; overflow: hidden; border-radius: 5px; background: var(--faint); }
-.tile img { display: block; width: 100%; height: auto; border-radius: 0; }
-#person:checked ~ main .tile[style] { aspect-ratio: var(--a); }
-#person:checked ~ main .tile[style] img { position: absolute; max-width: none; width: var(--w);
-  left: var(--x); top: var(--y); }
-.tile.gap { display: grid; place-items: center; min-height: 120px; padding: 8px; color: var(--soft);
-  font-size: 12px; text-align: center; overflow-wrap: anywhere; }
-figcaption b { color: var(--ink); font-weight: 560; }
-.switch { position: sticky; top: 0; z-index: 2; padding: 10px 0; background: var(--paper); }
-.switch label { cursor: pointer; padding: 7px 14px; border: 1px solid var(--faint);
-  border-radius: 99px; background: var(--panel); }
-#person { position: absolute; opacity: 0; }
-#person:focus-visible ~ main .switch label { outline: 2px solid var(--accent); }
-#person:checked ~ main .whole, #person:not(:checked) ~ main .near { display: none; }
-@media (max-width: 720px) { .tiles { grid-template-columns: repeat(2, 1fr); } }
-"""
-
 
 @dataclass(frozen=True)
 class _Row:
@@ -78,7 +54,7 @@ def page(records: Records, tables: Sequence[Table], folder: BenchFolder) -> str:
         f"{LEGEND.format(second='underlined')} {SPREAD}</p></header>"
         f"<main>{figures}{pictures}</main>"
     )
-    return document(title, body, style=_STYLE)
+    return document(title, body, style="bench.css")
 
 
 def _capture(

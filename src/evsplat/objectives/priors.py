@@ -9,10 +9,10 @@ from evsplat.body import SurfaceSamples
 from evsplat.devices import send
 from evsplat.models.discs import DiscModel
 from evsplat.models.paper import PaperModel
-from evsplat.objectives.base import Stateless, Step
+from evsplat.objectives.base import Objective, Step
 
 
-class PosePrior(Stateless):
+class PosePrior(Objective):
     """Mean over given times, moving joints and axes of squares in units of what is expected.
 
     ``r^2 + stiffness * gap * r''^2``: the negative logarithm of the probability of errors that are
@@ -45,7 +45,7 @@ class PosePrior(Stateless):
         return value + stiffness * self.gap_s * bend
 
 
-class SkinningPrior(Stateless):
+class SkinningPrior(Objective):
     """Mean over surface points of the squared weight error, summed over joints (1.6)."""
 
     def __init__(self, surface: SurfaceSamples, points_per_step: int) -> None:

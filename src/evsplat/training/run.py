@@ -27,36 +27,30 @@ from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.models.model import Model
 from evsplat.render import Backdrop, Splats, choose_device, render
-from evsplat.training.checkpoint import check_fits, latest_checkpoint, load_checkpoint, load_model
+from evsplat.training.checkpoint import (
+    check_fits,
+    counts,
+    latest_checkpoint,
+    load_checkpoint,
+    load_model,
+)
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 
-@dataclass(frozen=True)
 class RunFolder:
     """Paths of the parts of a run."""
 
-    path: Path
-
-    @property
-    def config(self) -> Path:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = path / "config.yaml"
         """Method and its full configuration, YAML."""
-        return self.path / "config.yaml"
-
-    @property
-    def facts(self) -> Path:
+        self.facts = path / "versions.json"
         """Capture, versions, device and threads, JSON."""
-        return self.path / "versions.json"
-
-    @property
-    def log(self) -> Path:
+        self.log = path / "log.jsonl"
         """One JSON object per logged step."""
-        return self.path / "log.jsonl"
-
-    @property
-    def checkpoints(self) -> Path:
+        self.checkpoints = path / "checkpoints"
         """Folder of checkpoints."""
-        return self.path / "checkpoints"
 
     def truncate_log(self, iteration: int) -> None:
         """Drop log lines after ``iteration``, which a resumed run is going to write again."""
@@ -123,23 +117,18 @@ class GaussianReconstruction:
                 drawing = draw(
                     layers, camera, backdrop=self.backdrop, shadow_step_px=self.shadow_step_px
                 )
-                return Rendering(
-                    rgb=_stacked(drawing.rgb).cpu().clamp(0, 1),
-                    alpha=drawing.output.alpha.cpu(),
-                    human=_stacked(drawing.semantic).cpu().clamp(0, 1),
-                )
-            layer = layers.human if parts == "human" else layers.scene
-            output = render(layer, camera, low_pass=layers.low_pass)
-        times = len(times_us)
-
-        def all_times(values: torch.Tensor) -> torch.Tensor:
-            # The scene alone is drawn once.
-            return values.cpu().expand(times, *values.shape[1:])
-
+                rgb, human = _stacked(drawing.rgb), _stacked(drawing.semantic)
+                alpha = drawing.output.alpha
+            else:
+                layer = layers.human if parts == "human" else layers.scene
+                output = render(layer, camera, low_pass=layers.low_pass)
+                rgb, human, alpha = output.image[..., :3], output.image[..., 3], output.alpha
+        # The scene alone is drawn once.
+        shape = len(times_us), camera.height, camera.width
         return Rendering(
-            rgb=all_times(output.image[..., :3].clamp(0, 1)),
-            alpha=all_times(output.alpha),
-            human=all_times(output.image[..., 3].clamp(0, 1)),
+            rgb=rgb.cpu().clamp(0, 1).expand(*shape, 3),
+            alpha=alpha.cpu().expand(shape),
+            human=human.cpu().clamp(0, 1).expand(shape),
         )
 
     def depth(
@@ -288,12 +277,8 @@ def reload_run(run: Run, state: Path) -> Run:
 
 def _progress(model: Model, progress: dict[str, Any]) -> dict[str, Any]:
     """The fields of `Run` that change while it is trained."""
-    sets = model.sets.values()
     return {
         "iteration": progress["clock"]["iteration"],
         "train_seconds": progress["clock"]["seconds"],
-        "gaussians": {
-            "human": sum(rows.human_count for rows in sets),
-            "scene": sum(rows.scene_count for rows in sets),
-        },
+        "gaussians": counts(model),
     }
