@@ -2,7 +2,8 @@
 
 python benchmarks/kernels.py [--points N] [--size PX] [--threads T] [--repeats R]
 
-`benchmarks/networks.py` times the networks' layers, `benchmarks/rasterize.py` the rasteriser. The last line is JSON with a unit in each key.
+`benchmarks/networks.py` times the networks' layers, `benchmarks/rasterize.py` the rasteriser. The
+last line is JSON with a unit in each key.
 """
 
 import evsplat  # noqa: F401 - before torch: it sets how OpenMP's threads wait
@@ -20,7 +21,7 @@ import torch
 from evsplat import body
 from evsplat.body import body as skin_module
 from evsplat.models.discs import shading
-from evsplat.models.networks import colour, non_rigid, one_blob, skinning_network
+from evsplat.models.networks import colour, non_rigid, skinning_network
 from evsplat.objectives import event, isometry, semantic
 from evsplat.pictures import light
 from evsplat.similarity import psnr_ssim
@@ -100,7 +101,7 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
     """What lies before and behind the networks' layers, which `benchmarks/networks.py` times."""
     times = 2
     positions = torch.rand(points, 3).requires_grad_()
-    blob = one_blob.OneBlobEncoding()
+    blob = non_rigid.OneBlobEncoding()
     blob_upstream = torch.randn(points, blob.dim)
     softmax = skinning_network.HierarchicalSoftmax(body.default_body().parents.tolist())
     logits = torch.randn(points, softmax.logits).requires_grad_()
@@ -126,7 +127,7 @@ def network_cases(points: int) -> dict[str, tuple[Call, Call]]:
 
     joints = softmax(logits).shape[-1]
     return {
-        "one_blob": (encode, in_torch(encode, one_blob)),
+        "one_blob": (encode, in_torch(encode, non_rigid)),
         "skinning_softmax": (tree_softmax, in_torch(tree_softmax, skinning_network)),
         "shape_change": (change_shape, in_torch(change_shape, non_rigid)),
         "view_basis": (view_basis, in_torch(view_basis, colour)),

@@ -23,7 +23,8 @@ from types import SimpleNamespace
 import torch
 
 from evsplat import _native
-from evsplat.render import LOW_PASS, PinholeCamera, Splats, render
+from evsplat.camera import Camera
+from evsplat.render import LOW_PASS, Splats, render
 from evsplat.render.splats import join
 
 # Floating-point operations per lane of a patch step, a multiply-add as two: constant, per channel.
@@ -36,7 +37,7 @@ class Scene:
     """One frame's Gaussians and the gradient of its picture."""
 
     splats: Splats
-    camera: PinholeCamera
+    camera: Camera
     image_grad: torch.Tensor
     alpha_grad: torch.Tensor
 
@@ -177,7 +178,7 @@ class TwoLayers:
 
     moving: Splats
     static: Splats
-    camera: PinholeCamera
+    camera: Camera
     image_grad: torch.Tensor
     low_pass: float = LOW_PASS
 

@@ -41,7 +41,7 @@ from evsplat.models.discs import DiscModel
 from evsplat.models.discs import model as discs_model
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.paper import model as paper_model
-from evsplat.objectives.base import Stateless, Step
+from evsplat.objectives.base import Objective, Step
 from evsplat.render import native as native_backend
 from evsplat.shipped import demo_capture
 from evsplat.training.clock import Clock
@@ -178,7 +178,7 @@ def with_scene_count(gaussians: GaussianSet, count: int) -> GaussianSet:
     )
 
 
-class MoreTimes(Stateless):
+class MoreTimes(Objective):
     """Asks for times around a frame until there are enough, with a small loss on each."""
 
     def __init__(self, renders: int) -> None:

@@ -29,59 +29,35 @@ _MOST_NAMED = 5
 
 
 @dataclass(frozen=True)
-class Above:
-    """Range of numbers above a bound: ``Annotated[float, Above(0)]``."""
+class Range:
+    """Numbers that a setting takes, in its annotation: ``Annotated[float, Above(0)]``."""
 
-    bound: float
-
-    def __contains__(self, number: float) -> bool:
-        return number > self.bound
-
-    def __str__(self) -> str:
-        return f"above {self.bound}"
-
-
-@dataclass(frozen=True)
-class AtLeast:
-    """Range of numbers from a bound on."""
-
-    bound: float
+    words: str
+    """Words for it that follow "a number": "above 0"."""
+    holds: Callable[[float], bool]
 
     def __contains__(self, number: float) -> bool:
-        return number >= self.bound
-
-    def __str__(self) -> str:
-        return f"of at least {self.bound}"
+        return self.holds(number)
 
 
-@dataclass(frozen=True)
-class AtMost:
-    """Range of numbers up to a bound."""
-
-    bound: float
-
-    def __contains__(self, number: float) -> bool:
-        return number <= self.bound
-
-    def __str__(self) -> str:
-        return f"of at most {self.bound}"
+def Above(bound: float) -> Range:
+    """Numbers above a bound."""
+    return Range(f"above {bound}", lambda number: number > bound)
 
 
-@dataclass(frozen=True)
-class Within:
-    """Range of numbers between two bounds, both included."""
-
-    low: float
-    high: float
-
-    def __contains__(self, number: float) -> bool:
-        return self.low <= number <= self.high
-
-    def __str__(self) -> str:
-        return f"within {self.low} and {self.high}"
+def AtLeast(bound: float) -> Range:
+    """Numbers from a bound on."""
+    return Range(f"of at least {bound}", lambda number: number >= bound)
 
 
-Range = Above | AtLeast | AtMost | Within
+def AtMost(bound: float) -> Range:
+    """Numbers up to a bound."""
+    return Range(f"of at most {bound}", lambda number: number <= bound)
+
+
+def Within(low: float, high: float) -> Range:
+    """Numbers between two bounds, both included."""
+    return Range(f"within {low} and {high}", lambda number: low <= number <= high)
 
 
 @dataclass(frozen=True)
@@ -287,7 +263,7 @@ def expected(hint: Any, ranges: Sequence[Range] = (), *, many: bool = False) -> 
         str: ("a text", "texts"),
         type(None): ("null", "null"),
     }.get(hint, (str(hint), str(hint)))
-    bounds = " and ".join(str(bound) for bound in ranges if hint in (int, float))
+    bounds = " and ".join(bound.words for bound in ranges if hint in (int, float))
     return f"{several if many else one} {bounds}".rstrip()
 
 

@@ -12,9 +12,9 @@ from evsplat.benching.figures import Records, metric
 from evsplat.benching.plan import Plan
 from evsplat.benching.suite import Published, PublishedTable, Suite, SuiteRow
 from evsplat.benching.tables import make_tables
-from evsplat.benching.writers import html, latex, markdown
 from evsplat.capture import Policy
 from evsplat.evaluation.protocols import METRICS, PROTOCOLS, REGIONS
+from evsplat.evaluation.tables import html, latex, markdown
 
 PSNR = {
     ("one", "good"): {0: 30.0, 1: 32.0},
@@ -76,30 +76,30 @@ def test_mean_is_over_captures_and_spread_over_seeds(records):
     # Seed 0 has the mean 25, seed 1 the mean 28: their standard deviation is 3 / sqrt(2).
     assert figure.mean == pytest.approx(26.5)
     assert figure.spread == pytest.approx(3 / 2**0.5)
-    assert figure.captures == 2
 
 
 def test_best_and_second_are_of_rows_that_have_every_capture(records):
-    table = next(t for t in make_tables(records) if t.name == "means-standard")
-    shown = {name: cells[0] for name, cells in table.rows}
-    assert shown["Good*"].text == "26.50 ± 2.12"
-    assert shown["Good*"].rank == 1
-    assert shown["Poor & Sons†"].rank == 2
-    assert shown["half (1 of 2 captures)"].text.startswith("99.00")
-    assert shown["half (1 of 2 captures)"].rank == 0
-    assert shown["none (failed)"].text == "–"
+    table = next(t for t in make_tables(records) if t.title.endswith("protocol standard"))
+    shown = {row.title: table.cells(row, ("{}", "1: {}", "2: {}"))[0] for row in table.rows}
+    assert shown["Good*"] == "1: 26.50 ± 2.12"
+    assert shown["Poor & Sons†"].startswith("2: ")
+    assert shown["half (1 of 2 captures)"].startswith("99.00")
+    assert shown["none (failed)"] == "–"
 
 
 def test_published_figures_stand_beside_ours_of_the_same_captures(records):
     table = make_tables(records)[0]
     assert table.groups[0] == ("published", 3)
-    rows = {name: [cell.text for cell in cells] for name, cells in table.rows}
+    rows = {row.title: table.cells(row, ("{}", "{}", "{}")) for row in table.rows}
     assert rows["Good*"][:4] == ["31.91", "0.9736", "0.0726", "31.00 ± 1.41"]
     assert rows["Poor & Sons†"][:3] == ["–", "–", "–"]
     assert any("1 of the 2 published captures; missing: other" in note for note in table.footnotes)
     without = replace(records.plan.suite, published=PublishedTable("Table 1", ("other",)))
     plan = replace(records.plan, suite=without)
-    assert make_tables(replace(records, plan=plan))[0].name == "means-standard"
+    assert (
+        make_tables(replace(records, plan=plan))[0].title
+        == "Mean over 2 captures, protocol standard"
+    )
 
 
 def test_every_gap_has_its_reason(records):
@@ -123,7 +123,7 @@ def test_latex_rows_have_as_many_cells_as_columns_and_nothing_unescaped(records)
 
 
 def test_markdown_and_html_escape_what_users_write(records):
-    text = markdown("T", make_tables(records))
+    text = markdown("T", "", make_tables(records))
     assert "it\\_broke" in text and "Good\\*" in text
     width = {line.count("|") for line in text.splitlines() if line.startswith("|")}
     assert min(width) > 4
@@ -150,6 +150,6 @@ def test_the_caption_says_the_terms_and_a_row_where_it_departs_from_them(records
     for key, record in records.by_cell.items():
         if key[1] == "poor":
             record["policy"] = departing
-    titles = [title for title, _ in make_tables(records)[1].rows]
+    titles = [row.title for row in make_tables(records)[1].rows]
     assert titles[0] == "Good*"
     assert titles[1] == "Poor & Sons†; events of held-out intervals seen; masks given"

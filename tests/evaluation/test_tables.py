@@ -1,7 +1,7 @@
 """Markdown and LaTeX tables."""
 
 from evsplat.evaluation.protocols import METRICS, REGIONS
-from evsplat.evaluation.tables import Column, latex, markdown, tables_of
+from evsplat.evaluation.tables import Heading, tables_of, write_tables
 
 
 def row(psnr: float, ssim: float, lpips: float | None = None) -> dict:
@@ -27,30 +27,33 @@ def test_best_is_by_what_is_printed_and_the_blurry_input_does_not_compete():
     (table,) = tables_of(metrics())
 
     def best(metric):
-        column = Column("full", metric)
-        return {name for name in table.rows if table.is_best(name, column)}
+        column = table.headings.index(Heading.of("full", metric))
+        return [row.title for row in table.rows if table.rank(row, column) == 1]
 
-    assert best("psnr") == {"my_method", "nearest_frame"}  # both are printed as 30.00
-    assert best("ssim") == {"median_background"}
-    assert best("lpips_vgg") == {"my_method"}
+    # Two are printed as 30.00.
+    assert best("psnr") == ["my_method", "nearest training frame (trivial)"]
+    assert best("ssim") == ["median background (trivial)"]
+    assert best("lpips_vgg") == ["my_method"]
 
 
 def test_columns_without_any_figure_are_left_out():
     (table,) = tables_of(metrics())
-    assert {column.metric for column in table.columns} == {"psnr", "ssim", "lpips_vgg"}
+    assert {heading.title for heading in table.headings} == {"PSNR", "SSIM", "LPIPS-VGG"}
 
 
-def test_markdown_names_protocol_rows_novel_views_and_what_is_missing():
-    text = markdown(metrics())
-    assert "## Protocol `standard`" in text and "blurry input itself" in text
+def test_markdown_names_protocol_rows_novel_views_and_what_is_missing(tmp_path):
+    write_tables(tmp_path, metrics())
+    text = (tmp_path / "metrics.md").read_text()
+    assert "## Protocol standard" in text and "blurry input itself" in text
     assert "| side | 18.00 | 0.5000 |" in text and "- fetch it" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert len({line.count("|") for line in lines[:6]}) == 1
     assert "| **30.00** |" in text and "| – |" in text
 
 
-def test_latex_is_escaped_and_every_row_has_all_cells():
-    text = latex(metrics())
+def test_latex_is_escaped_and_every_row_has_all_cells(tmp_path):
+    write_tables(tmp_path, metrics())
+    text = (tmp_path / "metrics.tex").read_text()
     assert r"my\_method" in text
     body = text[text.index(r"\midrule") : text.index(r"\bottomrule")].splitlines()[1:]
     assert len(body) == 4 and {line.count("&") for line in body} == {9}

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from evsplat.body import BodyTrack, default_body
 from evsplat.capture import Camera, Frame
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import render_run, rendering
@@ -67,6 +68,7 @@ class _Clock:
     """A reconstruction whose grey level tells the time: one level per millisecond."""
 
     name = "clock"
+    track = BodyTrack(default_body(), np.zeros(1), np.zeros((1, 31, 3)), np.zeros((1, 3)))
 
     def render(self, camera, times_us, *, parts="all"):
         levels = torch.tensor([time / 1000 / 255 for time in times_us])

@@ -10,7 +10,6 @@ from evsplat.body import up_axis
 from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import export_run
-from evsplat.methods.trivial import NearestFrame
 from evsplat.render import render
 
 from .clouds import read_ply
@@ -121,13 +120,4 @@ def test_up_turns_the_world_and_says_how(run, up, axis):
 def test_bad_options_are_one_sentence_and_write_nothing(run, kind, options, message):
     with pytest.raises((ConfigError, DataError), match=message):
         export_run(run.path, kind, **options)
-    assert not list(run.path.iterdir())
-
-
-def test_a_method_without_gaussians_says_so(run):
-    run.reconstruction = NearestFrame(run.capture)
-    with pytest.raises(DataError, match="hands over no Gaussians"):
-        export_run(run.path, "ply")
-    with pytest.raises(DataError, match="no avatar to export"):
-        export_run(run.path, "avatar")
     assert not list(run.path.iterdir())

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.capture import Camera
 from evsplat.errors import DataError
-from evsplat.film import orbit, read_camera_path, swing, through
+from evsplat.film.camera_path import orbit, read_camera_path, swing, through
 
 
 def _camera(seed: int) -> Camera:

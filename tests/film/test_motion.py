@@ -11,7 +11,7 @@ from evsplat.body import BodyTrack, default_body
 from evsplat.body.motion import load_motion
 from evsplat.body.smpl_skeleton import JOINTS
 from evsplat.errors import ConfigError, DataError
-from evsplat.film import load_motion_of, place_motion
+from evsplat.film.motion import load_motion_of, place_motion
 from evsplat.staging.assets import find_motion
 
 

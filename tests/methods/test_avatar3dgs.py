@@ -13,11 +13,11 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation.run import evaluate_run
 from evsplat.methods import TRAINABLE
 from evsplat.methods.avatar3dgs import AvatarConfig
-from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.settings import weight_at
+from evsplat.methods.trivial import OnMedianBackground
 from evsplat.models.drawing import draw
-from evsplat.models.networks import deformation
-from evsplat.models.networks.deformation import draw_pose_noise
+from evsplat.models.networks import non_rigid
+from evsplat.models.networks.non_rigid import draw_pose_noise
 from evsplat.objectives import perceptual
 from evsplat.training import load_run, train
 from evsplat.training.clock import Clock
@@ -89,7 +89,7 @@ def test_settings_are_those_of_the_release(tiny_capture):
     assert config.iterations == 15_000
 
     assert (model.non_rigid_start, model.residual_start) == (3_000, 5_000)
-    assert (model.pose_noise, deformation._NOISE_PROBABILITY) == (0.1, 0.5)
+    assert (model.pose_noise, non_rigid._NOISE_PROBABILITY) == (0.1, 0.5)
     generator = torch.Generator().manual_seed(0)
     noises = [draw_pose_noise(3, 0.1, generator, torch.device("cpu")) for _ in range(400)]
     drawn = torch.stack([noise for noise in noises if torch.is_tensor(noise)])

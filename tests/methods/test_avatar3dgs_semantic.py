@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from evsplat.capture import load_body_track, load_capture
-from evsplat.methods.avatar3dgs_semantic import AvatarSemanticConfig
+from evsplat.methods.avatar3dgs import AvatarSemanticConfig
 from evsplat.methods.starts import as_person, scene_start
 from evsplat.training import load_run, train
 

@@ -17,7 +17,7 @@ def frame(start: int = 1_000, end: int = 31_000) -> SimpleNamespace:
 @pytest.mark.parametrize("seed", range(3))
 def test_times_are_stratified_with_the_middle_among_them(count, seed):
     generator = torch.Generator().manual_seed(seed)
-    objective = Exposure(None, {"a": count}, generator)
+    objective = Exposure(None, lambda frame: count, generator)
     drawn = [objective.times(frame(), 0.0) for _ in range(50)]
     width = 30_000 / count
     for times in drawn:
@@ -46,7 +46,7 @@ def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
         linear=pictures**2.2,
         observed=lambda _: observed,
     )
-    terms = Exposure(None, {"a": 3}, generator).loss(step)
+    terms = Exposure(None, lambda frame: 3, generator).loss(step)
     blurry = (pictures[1:] ** 2.2).mean(0) ** (1 / 2.2)
     assert float(terms["l1"]) == pytest.approx(float((blurry - observed).abs().mean()), rel=1e-9)
     assert float(terms["dssim"]) == pytest.approx(1 - float(ssim(blurry, observed)), rel=1e-9)
@@ -74,7 +74,7 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
         linear=linear,
         observed=lambda _: observed,
     )
-    terms = Exposure(None, {"a": 3}, generator).loss(step)
+    terms = Exposure(None, lambda frame: 3, generator).loss(step)
     seen = torch.tensor([1_000 <= time < 31_000 for time in times])
     blurry = (pictures[seen] ** 2.2).mean(0) ** (1 / 2.2)
     assert terms["l1"].item() == pytest.approx(float((blurry - observed).abs().mean()), rel=1e-9)
@@ -91,5 +91,5 @@ def test_a_black_exposure_has_a_finite_gradient():
         linear=pictures,
         observed=lambda _: torch.ones(16, 16, 3),
     )
-    Exposure(None, {"a": 3}, torch.Generator()).loss(step)["l1"].backward()
+    Exposure(None, lambda frame: 3, torch.Generator()).loss(step)["l1"].backward()
     assert pictures.grad.isfinite().all()

@@ -17,7 +17,7 @@ def make(seed: int, *, dssim: bool = True):
     capture = SimpleNamespace(train_frames=frames, image=lambda frame: pictures[frame.name])
     rgb = torch.rand(3, 20, 24, 3, generator=generator)
     step = SimpleNamespace(capture=capture, times_us=(10, 15, 20), rgb=rgb, observed=capture.image)
-    return Photometric(capture, {}, dssim=dssim, perceptual=None), step, pictures
+    return Photometric(capture, lambda frame: None, dssim=dssim, perceptual=None), step, pictures
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -44,7 +44,7 @@ def test_cross_entropy_is_the_closed_form(probability):
         semantic=torch.full((2, 40, 50), probability),
         model=SimpleNamespace(gaussians=SimpleNamespace(semantics=lambda: soft)),
     )
-    terms = RenderedSemantics({20: PackedBounds.of(disc(8), 5)}).loss(step)
+    terms = RenderedSemantics({20: lambda: PackedBounds.of(disc(8), 5)}).loss(step)
     inside, outside = (float(mask.float().mean()) for mask in bounds)
     expected = -inside * math.log(probability) - outside * math.log(1 - probability)
     assert float(terms["semantic"]) == pytest.approx(expected, rel=1e-5)

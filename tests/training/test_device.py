@@ -32,7 +32,6 @@ def without_native(monkeypatch):
         "evsplat.objectives.event",
         "evsplat.objectives.isometry",
         "evsplat.objectives.semantic",
-        "evsplat.models.networks.one_blob",
         "evsplat.similarity.psnr_ssim",
     ):
         monkeypatch.setattr(f"{module}.runs_native", lambda tensor: False)

@@ -5,7 +5,6 @@ import resource
 import shutil
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -15,26 +14,19 @@ import torch
 
 import evsplat
 from evsplat.benching.folder import BenchFolder, exclusive
-from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
+from evsplat.capture import Capture, Policy, load_capture
 from evsplat.config import override, to_dict
 from evsplat.errors import ConfigError, EvsplatError
 from evsplat.evaluation.evaluator import evaluate
 from evsplat.files import read_json, write_json
 from evsplat.methods import method_config
-from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
-from evsplat.methods.trivial import MedianBackground, NearestFrame
+from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
 from evsplat.render import choose_device
 from evsplat.restore import restore_capture
 from evsplat.staging import StageSettings, stage
 
 logger = logging.getLogger(__name__)
-
-UNTRAINED: dict[str, Callable[[TrainingCapture], Reconstruction]] = {
-    "median_background": MedianBackground,
-    "nearest_frame": NearestFrame,
-}
-"""Methods that have nothing to train."""
 
 DONE, FAILED = "done", "failed"
 
@@ -74,7 +66,7 @@ class Cell:
     @property
     def trains(self) -> bool:
         """True for methods that are trained."""
-        return self.method not in UNTRAINED
+        return self.method not in TRIVIAL
 
     @property
     def policy(self) -> Policy:
@@ -145,7 +137,7 @@ def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) 
     if cell.trains:
         reconstruction, facts = _trained(run, trained_on, cell, threads, device)
     else:
-        reconstruction = UNTRAINED[cell.method](load_capture(trained_on).for_training(cell.policy))
+        reconstruction = TRIVIAL[cell.method](load_capture(trained_on).for_training(cell.policy))
     if cell.backdrop:
         reconstruction = OnMedianBackground(reconstruction, seen)
     measured = evaluate(recorded, reconstruction, out_dir=run, device=device, test_frames_only=True)

@@ -1,27 +1,17 @@
 """Records of cells put together: means over captures with their spread over seeds."""
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from statistics import fmean, stdev
 from typing import Any
 
 from evsplat.benching.cell import DONE
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.plan import Plan
+from evsplat.evaluation.tables import Figure
 from evsplat.files import read_json
 
 Record = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A mean over captures; of each capture over its seeds."""
-
-    mean: float
-    spread: float | None
-    """Standard deviation over seeds of the mean over captures; None with one seed."""
-    captures: int
-    """Captures that it is a mean over."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +57,10 @@ class Records:
                 by_capture.append(known)
         if not by_capture:
             return None
-        mean = _mean(_mean(values.values()) for values in by_capture)
         seeds = set.intersection(*(set(values) for values in by_capture))
-        per_seed = [_mean(values[seed] for values in by_capture) for seed in seeds]
-        spread = None
-        if len(per_seed) > 1:
-            centre = _mean(per_seed)
-            squares = sum((value - centre) ** 2 for value in per_seed)
-            spread = math.sqrt(squares / (len(per_seed) - 1))
-        return Figure(mean, spread, len(by_capture))
+        per_seed = [fmean(values[seed] for values in by_capture) for seed in seeds]
+        mean = fmean(fmean(values.values()) for values in by_capture)
+        return Figure(mean, stdev(per_seed) if len(per_seed) > 1 else None)
 
     def reason_for_gap(self, capture: str, row: str) -> str:
         """The reason why a place in the table is empty."""
@@ -97,8 +82,3 @@ class Records:
 def metric(protocol: str, region: str, name: str) -> Callable[[Record], float | None]:
     """The value of a metric in a record."""
     return lambda record: record["protocols"][protocol][region][name]
-
-
-def _mean(values: Iterable[float]) -> float:
-    numbers = list(values)
-    return sum(numbers) / len(numbers)

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class LocalPool:
     _running: set["subprocess.Popen[bytes]"] = field(default_factory=set)
     _stopping: bool = False
 
-    def run(self, cells: Sequence["Cell"]) -> Iterator[tuple["Cell", str | None]]:
+    def run(self, cells: Sequence["Cell"]) -> Generator[tuple["Cell", str | None]]:
         """Each cell as it ends, with the reason where its process ended without a record.
 
         Closing the iterator, and Ctrl-C, stop what runs: training is saved first. A second Ctrl-C

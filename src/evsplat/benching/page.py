@@ -6,41 +6,17 @@ from html import escape
 
 from evsplat.benching.figures import Record, Records
 from evsplat.benching.folder import BenchFolder
-from evsplat.benching.tables import BenchTable
-from evsplat.benching.writers import LEGEND, html
+from evsplat.benching.tables import SPREAD
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.html import Embedder, document, folded, read_picture, section, spread
+from evsplat.evaluation.tables import LEGEND, Table, html
 from evsplat.pictures import to_bytes
 
 _PIXELS = 60_000_000
 """Pixels of all pictures of the page; beyond, captures show fewer frames, evenly spread."""
 _OPEN = 3
 """Frames of a capture that show at once; the others are folded."""
-
-_STYLE = """
-td.second { text-decoration: underline; text-underline-offset: 3px; }
-tbody th { min-width: 130px; }
-table { border-collapse: separate; border-spacing: 0; }
-thead .corner, tbody th { position: sticky; left: 0; background: var(--panel); }
-.tiles { display: grid; gap: 10px 8px;
-  grid-template-columns: repeat(auto-fill, minmax(148px, 1fr)); }
-.tile { position: relative; overflow: hidden; border-radius: 5px; background: var(--faint); }
-.tile img { display: block; width: 100%; height: auto; border-radius: 0; }
-#person:checked ~ main .tile[style] { aspect-ratio: var(--a); }
-#person:checked ~ main .tile[style] img { position: absolute; max-width: none; width: var(--w);
-  left: var(--x); top: var(--y); }
-.tile.gap { display: grid; place-items: center; min-height: 120px; padding: 8px; color: var(--soft);
-  font-size: 12px; text-align: center; overflow-wrap: anywhere; }
-figcaption b { color: var(--ink); font-weight: 560; }
-.switch { position: sticky; top: 0; z-index: 2; padding: 10px 0; background: var(--paper); }
-.switch label { cursor: pointer; padding: 7px 14px; border: 1px solid var(--faint);
-  border-radius: 99px; background: var(--panel); }
-#person { position: absolute; opacity: 0; }
-#person:focus-visible ~ main .switch label { outline: 2px solid var(--accent); }
-#person:checked ~ main .whole, #person:not(:checked) ~ main .near { display: none; }
-@media (max-width: 720px) { .tiles { grid-template-columns: repeat(2, 1fr); } }
-"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +30,7 @@ class _Row:
     """The reason for no result."""
 
 
-def page(records: Records, tables: Sequence[BenchTable], folder: BenchFolder) -> str:
+def page(records: Records, tables: Sequence[Table], folder: BenchFolder) -> str:
     """The page as HTML; all that comes from the user's files is escaped."""
     suite = records.plan.suite
     title = suite.title or suite.name
@@ -75,10 +51,10 @@ def page(records: Records, tables: Sequence[BenchTable], folder: BenchFolder) ->
         '<input type="checkbox" id="person" checked aria-label="person only">'
         f'<header><p class="kicker">evsplat · bench · {escape(suite.name)}</p>'
         f'<h1>{escape(title)}</h1><p class="lead">{done} of {len(records.plan.cells)} cells. '
-        f"{escape(LEGEND.format(second='underlined'))}</p></header>"
+        f"{LEGEND.format(second='underlined')} {SPREAD}</p></header>"
         f"<main>{figures}{pictures}</main>"
     )
-    return document(title, body, style=_STYLE)
+    return document(title, body, style="bench.css")
 
 
 def _capture(

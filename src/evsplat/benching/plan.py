@@ -7,11 +7,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from evsplat.benching.cell import FAILED, UNTRAINED, CaptureSource, Cell
+from evsplat.benching.cell import FAILED, CaptureSource, Cell
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.suite import Suite, SuiteCapture, SuiteRow, check_names
 from evsplat.errors import ConfigError
 from evsplat.files import read_json
+from evsplat.methods.trivial import TRIVIAL
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.shipped import demo_capture
@@ -100,16 +101,16 @@ def _cells(suite: Suite, sources: Iterable[CaptureSource]) -> list[Cell]:
             seed,
             row.method,
             row.restore,
-            row.settings if row.method not in UNTRAINED else (),
-            suite.iterations if row.method not in UNTRAINED else None,
-            suite.max_minutes if row.method not in UNTRAINED else None,
+            row.settings if row.method not in TRIVIAL else (),
+            suite.iterations if row.method not in TRIVIAL else None,
+            suite.max_minutes if row.method not in TRIVIAL else None,
             row.backdrop,
         )
         for seed in suite.seeds
         for source in sources
         for row in suite.rows
         # What is not trained has no seed.
-        if row.method not in UNTRAINED or seed == suite.seeds[0]
+        if row.method not in TRIVIAL or seed == suite.seeds[0]
     ]
     return sorted(cells, key=lambda cell: cell.trains)
 

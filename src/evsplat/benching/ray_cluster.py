@@ -2,7 +2,7 @@
 
 import os
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ class RayCluster:
     gpus: float
     device: str
 
-    def run(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, str | None]]:
+    def run(self, cells: Sequence[Cell]) -> Generator[tuple[Cell, str | None]]:
         """Each cell as it ends, with the reason where its worker died for good.
 
         Closing the iterator, and Ctrl-C, stop what runs: training is saved first.

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -20,28 +20,20 @@ from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.benching.local import LocalPool
 from evsplat.benching.page import page
 from evsplat.benching.plan import Plan, make_plan, pending_cells
+from evsplat.benching.ray_cluster import RayCluster
 from evsplat.benching.suite import read_suite
-from evsplat.benching.tables import make_tables
-from evsplat.benching.writers import latex, markdown
+from evsplat.benching.tables import SPREAD, make_tables
 from evsplat.errors import ConfigError
+from evsplat.evaluation.tables import LEGEND, latex, markdown
 from evsplat.files import read_json, write_json, write_text
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.render import choose_device
 
+Executor = LocalPool | RayCluster
+"""Processes that cells run in."""
 _REFRESH_S = 1.0
 _REASON_LENGTH = 200
-
-
-class Executor(Protocol):
-    """Processes that cells run in: of this machine or of a cluster."""
-
-    def run(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, str | None]]:
-        """Each cell as it ends, with the reason where its process ended without a record.
-
-        Closing the iterator stops what runs, after saving.
-        """
-        ...
 
 
 class Stopped(KeyboardInterrupt):
@@ -90,7 +82,7 @@ def _run(plan: Plan, todo: Sequence[Cell], folder: BenchFolder, executor: Execut
     with (
         _stopped_by_signals(),
         Progress(plan, todo, folder) as progress,
-        closing(executor.run(todo)) as ends,  # type: ignore[type-var]
+        closing(executor.run(todo)) as ends,
     ):
         for cell, reason in ends:
             if not folder.record_of(cell.id).exists():
@@ -103,8 +95,6 @@ def _executor(folder: BenchFolder, cells: int, options: BenchOptions) -> Executo
     """The executor of ``cells`` cells that the options ask for."""
     cpus, path = options.cpus_per_cell, folder.path.resolve()
     if options.ray is not None:
-        from evsplat.benching.ray_cluster import RayCluster
-
         gpus = options.gpus_per_cell or 0
         return RayCluster(path, options.ray, cpus or 1, gpus, options.device)
     device = choose_device(options.device)
@@ -220,6 +210,7 @@ def write_output(plan: Plan, folder: BenchFolder) -> None:
     records = Records.read(plan, folder)
     tables = make_tables(records)
     title = plan.suite.title or plan.suite.name
-    write_text(folder.path / "tables.md", markdown(title, tables))
+    intro = f"{LEGEND.format(second='in italics')} {SPREAD}"
+    write_text(folder.path / "tables.md", markdown(title, intro, tables))
     write_text(folder.path / "tables.tex", latex(tables))
     write_text(folder.path / "index.html", page(records, tables, folder))

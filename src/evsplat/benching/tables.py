@@ -1,71 +1,24 @@
-"""Tables of a bench in the layout of the paper's: what every column holds and who is best."""
+"""Tables of a bench in the layout of the paper's: what every column holds."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from evsplat.benching.figures import Figure, Record, Records, metric
+from evsplat.benching.figures import Record, Records, metric
 from evsplat.benching.suite import PublishedTable, SuiteRow
 from evsplat.capture.policy import STRICT_TERMS, policy_of
 from evsplat.evaluation.protocols import PROTOCOLS
-from evsplat.evaluation.tables import METRIC_TITLES, REGION_TITLES, Column
+from evsplat.evaluation.tables import METRIC_TITLES, REGION_TITLES, Figure, Heading, Row, Table
 from evsplat.methods import NOMINAL_ITERATIONS
 
-Read = Callable[[SuiteRow], Figure | None]
+Column = tuple[Heading, Callable[[SuiteRow], Figure | None]]
+"""Its head, and the figure of a row."""
 _PUBLISHED = "published"
+SPREAD = "± is the standard deviation over seeds."
 
 
-@dataclass(frozen=True)
-class TableCell:
-    """A cell as it is printed."""
-
-    text: str
-    rank: int = 0
-    """1: best of the column, 2: second best, 0: neither."""
-
-
-@dataclass(frozen=True)
-class Heading:
-    """Head of a column."""
-
-    group: str
-    title: str
-    decimals: int
-    higher_is_better: bool | None
-    """None: there is no better."""
-
-
-@dataclass(frozen=True)
-class BenchTable:
-    """One table, ready to be written in any language."""
-
-    name: str
-    title: str
-    note: str
-    headings: tuple[Heading, ...]
-    rows: tuple[tuple[str, tuple[TableCell, ...]], ...]
-    footnotes: tuple[str, ...] = field(default=())
-
-    @property
-    def groups(self) -> list[tuple[str, int]]:
-        """Titles over neighbouring columns, and how many each spans."""
-        spans: list[tuple[str, int]] = []
-        for heading in self.headings:
-            if spans and spans[-1][0] == heading.group:
-                spans[-1] = (heading.group, spans[-1][1] + 1)
-            else:
-                spans.append((heading.group, 1))
-        return spans
-
-
-@dataclass(frozen=True)
-class _Column:
-    heading: Heading
-    read: Read
-
-
-def make_tables(records: Records) -> list[BenchTable]:
+def make_tables(records: Records) -> list[Table]:
     """The published layout where the suite has one, then means and single captures."""
     published = records.plan.suite.published
     shared = [name for name in records.captures if published and name in published.captures]
@@ -78,13 +31,11 @@ def make_tables(records: Records) -> list[BenchTable]:
     return [replace(tables[0], footnotes=(*tables[0].footnotes, *notes)), *tables[1:]]
 
 
-def _published(records: Records, published: PublishedTable, shared: list[str]) -> BenchTable:
+def _published(records: Records, published: PublishedTable, shared: list[str]) -> Table:
     """Figures of the publication beside ours of the same captures, full frame first."""
     protocol = "avatar-compat"
-    columns = [
-        _Column(
-            Heading(_PUBLISHED, title, decimals, higher), partial(_published_mean, key, published)
-        )
+    columns: list[Column] = [
+        (Heading(_PUBLISHED, title, decimals, higher), partial(_published_mean, key))
         for key, title, decimals, higher in (
             ("psnr", "PSNR", 2, True),
             ("ssim", "SSIM", 4, True),
@@ -100,17 +51,15 @@ def _published(records: Records, published: PublishedTable, shared: list[str]) -
             f"Ours covers {len(shared)} of the {len(published.captures)} published captures; "
             f"missing: {', '.join(missing)}."
         )
-    table = _table(records, "published", "Beside the published figures", protocol, columns, shared)
+    table = _table(records, "Beside the published figures", protocol, columns, shared)
     return replace(table, footnotes=tuple(notes))
 
 
-def _published_mean(key: str, published: PublishedTable, row: SuiteRow) -> Figure | None:
-    if row.published is None:
-        return None
-    return Figure(getattr(row.published, key), None, len(published.captures))
+def _published_mean(key: str, row: SuiteRow) -> Figure | None:
+    return None if row.published is None else Figure(getattr(row.published, key))
 
 
-def _means(records: Records, protocol: str) -> BenchTable:
+def _means(records: Records, protocol: str) -> Table:
     columns = _metric_columns(records, protocol, records.captures, tuple(METRIC_TITLES))
     # All three are None for rows that do not train.
     training: dict[tuple[str, int], Callable[[Record], float | None]] = {
@@ -119,18 +68,18 @@ def _means(records: Records, protocol: str) -> BenchTable:
         ("Gaussians", 0): lambda r: r["gaussians"] and sum(r["gaussians"].values()),
     }
     columns += [
-        _Column(Heading("training", title, decimals, None), _reader(records, value))
+        (Heading("training", title, decimals, None), _reader(records, value, records.captures))
         for (title, decimals), value in training.items()
     ]
     count = len(records.captures)
     over = f"Mean over {count} captures" if count != 1 else records.captures[0]
     title = f"{over}, protocol {protocol}"
-    return _table(records, f"means-{protocol}", title, protocol, columns, records.captures)
+    return _table(records, title, protocol, columns, records.captures)
 
 
-def _per_capture(records: Records) -> BenchTable:
+def _per_capture(records: Records) -> Table:
     columns = [
-        _Column(
+        (
             Heading(capture, REGION_TITLES[region], 2, True),
             _reader(records, metric("standard", region, "psnr"), [capture]),
         )
@@ -138,7 +87,7 @@ def _per_capture(records: Records) -> BenchTable:
         for region in REGION_TITLES
     ]
     title = "PSNR of every capture, dB"
-    return _table(records, "captures", title, "standard", columns, records.captures[:1])
+    return _table(records, title, "standard", columns, records.captures[:1])
 
 
 def _metric_columns(
@@ -148,65 +97,49 @@ def _metric_columns(
     names: Sequence[str],
     *,
     keep: bool = False,
-) -> list[_Column]:
+) -> list[Column]:
     """Columns of all regions; those without any figure are left out unless ``keep``."""
     columns = []
-    for region, region_title in REGION_TITLES.items():
+    for region in REGION_TITLES:
         for name in names:
-            shape = Column(region, name)
-            heading = Heading(
-                region_title, METRIC_TITLES[name], shape.decimals, shape.higher_is_better
-            )
-            column = _Column(heading, _reader(records, metric(protocol, region, name), captures))
-            known = any(column.read(row) is not None for row in records.plan.suite.rows)
+            read = _reader(records, metric(protocol, region, name), captures)
+            known = any(read(row) is not None for row in records.plan.suite.rows)
             if known or (keep and region == "full"):
-                columns.append(column)
+                columns.append((Heading.of(region, name), read))
     return columns
 
 
 def _reader(
-    records: Records, value: Callable[[Record], float | None], captures: Sequence[str] | None = None
-) -> Read:
-    where = records.captures if captures is None else captures
-    return lambda row: records.figure(row.name, value, where)
+    records: Records, value: Callable[[Record], float | None], captures: Sequence[str]
+) -> Callable[[SuiteRow], Figure | None]:
+    return lambda row: records.figure(row.name, value, captures)
 
 
 def _table(
     records: Records,
-    name: str,
     title: str,
     protocol: str,
-    columns: Sequence[_Column],
+    columns: Sequence[Column],
     captures: Sequence[str],
-) -> BenchTable:
-    """Read, rank and format; a row that lacks some of ``captures`` does not compete."""
-    rows = records.plan.suite.rows
-    complete = {row.name: sum(bool(records.of(c, row.name)) for c in captures) for row in rows}
-    shown: dict[str, list[TableCell]] = {row.name: [] for row in rows}
-    for column in columns:
-        figures = {row.name: column.read(row) for row in rows}
-        competing = {
-            key: round(figure.mean, column.heading.decimals)
-            for key, figure in figures.items()
-            if figure is not None
-            and (complete[key] == len(captures) or column.heading.group == _PUBLISHED)
-        }
-        for key, figure in figures.items():
-            rank = _rank(competing, key, column.heading.higher_is_better)
-            shown[key].append(TableCell(_text(figure, column.heading.decimals), rank))
-    titled = []
-    for row in rows:
-        title_of_row = "; ".join([row.label, *_own_terms(records, row, captures)])
-        if 0 < complete[row.name] < len(captures):
-            title_of_row += f" ({complete[row.name]} of {len(captures)} captures)"
-        elif not complete[row.name]:
+) -> Table:
+    """Read all figures; a row that lacks some of ``captures`` does not compete."""
+    rows = []
+    for row in records.plan.suite.rows:
+        done = sum(bool(records.of(c, row.name)) for c in captures)
+        figures = []
+        for heading, read in columns:
+            figure, competes = read(row), done == len(captures) or heading.group == _PUBLISHED
+            figures.append(figure and replace(figure, competes=competes))
+        row_title = "; ".join([row.label, *_own_terms(records, row, captures)])
+        if 0 < done < len(captures):
+            row_title += f" ({done} of {len(captures)} captures)"
+        elif not done:
             failed = any(name == row.name for name, _ in records.failures())
-            title_of_row += " (failed)" if failed else " (not run)"
-        titled.append((title_of_row, tuple(shown[row.name])))
+            row_title += " (failed)" if failed else " (not run)"
+        rows.append(Row(row_title, tuple(figures)))
     note = next(p.summary for p in PROTOCOLS if p.name == protocol)
-    headings = tuple(column.heading for column in columns)
     caption = f"{protocol}: {note}. {_terms(records, captures)}"
-    return BenchTable(name, title, caption, headings, tuple(titled))
+    return Table(title, caption, tuple(heading for heading, _ in columns), tuple(rows))
 
 
 def _terms(records: Records, captures: Sequence[str]) -> str:
@@ -232,22 +165,6 @@ def _own_terms(records: Records, row: SuiteRow, captures: Sequence[str]) -> list
     """Departures of a row's policy from the strict terms."""
     policies = [policy_of(r) for c in captures for r in records.of(c, row.name)]
     return list(dict.fromkeys(text for p in policies if p for text in p.departures))
-
-
-def _rank(competing: dict[str, float], row: str, higher: bool | None) -> int:
-    """Rank by what is printed; equal values share one."""
-    if higher is None or row not in competing:
-        return 0
-    values = sorted(set(competing.values()), reverse=higher)
-    place = values.index(competing[row]) + 1
-    return place if place <= 2 and len(competing) > 1 else 0
-
-
-def _text(figure: Figure | None, decimals: int) -> str:
-    if figure is None:
-        return "–"
-    text = f"{figure.mean:.{decimals}f}"
-    return text if figure.spread is None else f"{text} ± {figure.spread:.{decimals}f}"
 
 
 def _footnotes(records: Records) -> list[str]:

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.capture import Capture, Frame, NovelView, Policy, TrainingCapture
+from evsplat.capture import Capture, Frame, Policy, TrainingCapture
 from evsplat.errors import DataError
-from evsplat.evaluation.event_maps import evaluate_event_maps
+from evsplat.evaluation.event_maps import drawn, evaluate_event_maps
 from evsplat.evaluation.protocols import (
     METRICS,
     PROTOCOLS,
@@ -28,9 +28,8 @@ from evsplat.evaluation.protocols import (
     without_reasons,
 )
 from evsplat.evaluation.regions import Absent, HumanRegions
-from evsplat.methods.backdrop import OnMedianBackground
 from evsplat.methods.reconstruction import Reconstruction
-from evsplat.methods.trivial import MedianBackground, NearestFrame
+from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
 from evsplat.names import file_stem
 from evsplat.options.runs import Split
 from evsplat.pictures import error_map, to_bytes
@@ -42,7 +41,6 @@ from evsplat.weights import MissingWeights
 
 logger = logging.getLogger(__name__)
 
-TRIVIAL_ROWS = ("median_background", "nearest_frame")
 BLURRY_INPUT = "blurry_input"
 """The picture that the camera took at the test time: no method, for no method sees it."""
 COMPOSITED = "on_median_background"
@@ -163,8 +161,7 @@ class _MeasuredFrames:
             self._others[COMPOSITED] = _picture_of(composited, self.capture)
         if not self.only:
             self._others |= {
-                "median_background": _picture_of(MedianBackground, self.capture),
-                "nearest_frame": _picture_of(NearestFrame, self.capture),
+                **{name: _picture_of(kind, self.capture) for name, kind in TRIVIAL.items()},
                 BLURRY_INPUT: self.capture.image,
             }
             if self.split == "train":
@@ -238,7 +235,7 @@ class _MeasuredFrames:
             **method,
             "trivial": {
                 name: row(name, STANDARD, f"trivial.{name}")
-                for name in TRIVIAL_ROWS
+                for name in TRIVIAL
                 if name in self._others
             },
             BLURRY_INPUT: row(BLURRY_INPUT, STANDARD, BLURRY_INPUT),
@@ -292,11 +289,14 @@ def _novel_views(
     means_by_camera: dict[str, MetricMeans] = {}
     per_view: dict[str, list[dict[str, Any]]] = {}
     for view in tqdm(views, desc="novel views", unit="picture", leave=False, disable=None):
-        ours = _render_view(capture, reconstruction, view)
-        if isinstance(ours, Absent):
-            measured = all_absent(ours.reason)
-        else:
-            human = human_regions.in_view(capture.cameras[view.camera], view.time_us)
+        camera = capture.cameras[view.camera]
+        ours: Tensor | None = None
+        try:
+            ours = drawn(reconstruction, camera, view.time_us)
+        except DataError as error:  # trivial methods know the recording camera only
+            measured = all_absent(str(error))
+        if ours is not None:
+            human = human_regions.in_view(camera, view.time_us)
             truth = Truth(STANDARD, capture.novel_image(view), None, human, networks)
             measured = truth.measure(ours)
         means_by_camera.setdefault(view.camera, MetricMeans(("full", "person_crop"))).add(measured)
@@ -308,7 +308,7 @@ def _novel_views(
             "psnr_person_crop": without_reasons(measured)["person_crop"]["psnr"],
             "pictures": {},
         }
-        if not isinstance(ours, Absent):
+        if ours is not None:
             path = f"pictures/{file_stem('novel', view.camera, f'{view.index:04d}')}_render.png"
             save_png(out_dir / path, to_bytes(ours))
             entry["pictures"] = {"render": path}
@@ -323,20 +323,8 @@ def _novel_views(
     return result
 
 
-@torch.no_grad()
 def _render(capture: Capture, source: Reconstruction, frame: Frame) -> Float[Tensor, "H W 3"]:
-    return source.render(capture.camera(frame), [frame.mid_us]).rgb[0].cpu()
-
-
-@torch.no_grad()
-def _render_view(
-    capture: Capture, source: Reconstruction, view: NovelView
-) -> Float[Tensor, "H W 3"] | Absent:
-    """The view as the method draws it; trivial methods know the recording camera only."""
-    try:
-        return source.render(capture.cameras[view.camera], [view.time_us]).rgb[0].cpu()
-    except DataError as error:
-        return Absent(str(error))
+    return drawn(source, capture.camera(frame), frame.mid_us)
 
 
 def _picture_of(

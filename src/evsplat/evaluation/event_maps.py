@@ -1,7 +1,5 @@
 """The recorded event map between two frames beside the one that the reconstruction explains."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Camera, Capture, Frame
 from evsplat.evaluation.regions import Absent
 from evsplat.events import count_map
 from evsplat.methods.reconstruction import Reconstruction
@@ -19,29 +17,6 @@ from evsplat.pictures.files import save_png
 from evsplat.pictures.light import log_brightness_change
 
 _TRAIN_PAIRS_SHOWN = 3
-
-
-@dataclass(frozen=True, eq=False)
-class EventPair:
-    """Two event maps of one window, in events per pixel."""
-
-    before: Frame
-    after: Frame
-    given: Float[Tensor, "H W"]
-    """Signed count of the recorded events between the two mid-exposures."""
-    rendered: Float[Tensor, "H W"]
-    """Rendered change of log brightness over the contrast threshold."""
-
-    @property
-    def split(self) -> str:
-        """Split of the pair: test where one of the two frames was held out."""
-        return "test" if "test" in (self.before.split, self.after.split) else "train"
-
-    @property
-    def similarity(self) -> float | None:
-        """Cosine of the two maps as vectors; None where one is all zero."""
-        norms = self.given.norm() * self.rendered.norm()
-        return float((self.given * self.rendered).sum() / norms) if norms > 0 else None
 
 
 def evaluate_event_maps(
@@ -56,20 +31,24 @@ def evaluate_event_maps(
     if absent is not None:
         return absent
     pairs: list[dict[str, Any]] = []
-    for pair in _pairs(capture, reconstruction):
-        stem = file_stem("events", pair.before.name, pair.after.name)
+    for before, after in chosen_pairs(capture):
+        given, rendered = _maps(capture, reconstruction, before, after)
+        stem = file_stem("events", before.name, after.name)
         # The brightest percent would make the rest invisible; both maps get the same scale.
-        busy = pair.given[pair.given != 0].abs()
+        busy = given[given != 0].abs()
         scale = max(1.0, float(busy.quantile(0.95))) if len(busy) else 1.0
         paths = {}
-        for kind, values in (("given", pair.given), ("rendered", pair.rendered)):
+        for kind, values in (("given", given), ("rendered", rendered)):
             save_png(out_dir / "pictures" / f"{stem}_{kind}.png", signed_map(values, scale))
             paths[kind] = f"pictures/{stem}_{kind}.png"
+        norms = given.norm() * rendered.norm()
         pairs.append(
             {
-                "frames": [pair.before.name, pair.after.name],
-                "split": pair.split,
-                "similarity": pair.similarity,
+                "frames": [before.name, after.name],
+                # Of the test where one of the two frames was held out.
+                "split": "test" if "test" in (before.split, after.split) else "train",
+                # Cosine of the two maps as vectors.
+                "similarity": float((given * rendered).sum() / norms) if norms > 0 else None,
                 "full_scale": scale,
                 "pictures": paths,
             }
@@ -94,18 +73,27 @@ def _missing_input(capture: Capture) -> Absent | None:
     return None
 
 
-def _pairs(capture: Capture, reconstruction: Reconstruction) -> Iterator[EventPair]:
-    for before, after in chosen_pairs(capture):
-        assert capture.events is not None
-        stream = capture.events.between(before.mid_us, after.mid_us)
-        given = count_map(stream, capture.events.height, capture.events.width)
-        with torch.no_grad():
-            first, second = (
-                reconstruction.render(capture.camera(frame), [frame.mid_us]).rgb[0].cpu()
-                for frame in (before, after)
-            )
-        change = log_brightness_change(first.clamp(0, 1), second.clamp(0, 1)).float()
-        yield EventPair(before, after, given, change / _threshold(capture, given, change))
+def _maps(
+    capture: Capture, reconstruction: Reconstruction, before: Frame, after: Frame
+) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """Events per pixel, with their sign, between two mid-exposures: recorded and rendered.
+
+    Rendered is the change of log brightness over the contrast threshold.
+    """
+    assert capture.events is not None
+    stream = capture.events.between(before.mid_us, after.mid_us)
+    given = count_map(stream, capture.events.height, capture.events.width)
+    first, second = (
+        drawn(reconstruction, capture.camera(frame), frame.mid_us) for frame in (before, after)
+    )
+    change = log_brightness_change(first.clamp(0, 1), second.clamp(0, 1)).float()
+    return given, change / _threshold(capture, given, change)
+
+
+@torch.no_grad()
+def drawn(source: Reconstruction, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
+    """One instant as a camera sees it, sRGB."""
+    return source.render(camera, [time_us]).rgb[0].cpu()
 
 
 def chosen_pairs(capture: Capture) -> list[tuple[Frame, Frame]]:

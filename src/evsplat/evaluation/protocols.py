@@ -221,24 +221,18 @@ class _Region:
         network = self.networks[name]
         if isinstance(network, Absent):
             return network
-        truth = self._truth_features[name]
-        if isinstance(truth, Absent):
-            return truth
-        with torch.no_grad():
-            return float(network.compare(network.features(self._ranged(image)), truth))
+        try:
+            with torch.no_grad():
+                if name not in self._truth_features:
+                    self._truth_features[name] = network.features(self._ranged(self.truth))
+                features = network.features(self._ranged(image))
+                return float(network.compare(features, self._truth_features[name]))
+        except ValueError as error:
+            return Absent(str(error))
 
     @cached_property
-    def _truth_features(self) -> dict[str, Features | Absent]:
-        features: dict[str, Features | Absent] = {}
-        for name in self.protocol.perceptual:
-            network = self.networks[name]
-            if isinstance(network, PerceptualMetric):
-                try:
-                    with torch.no_grad():
-                        features[name] = network.features(self._ranged(self.truth))
-                except ValueError as error:
-                    features[name] = Absent(str(error))
-        return features
+    def _truth_features(self) -> dict[str, Features]:
+        return {}
 
     def _ranged(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         low, high = self.protocol.perceptual_range

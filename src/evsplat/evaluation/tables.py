@@ -1,12 +1,14 @@
-"""The figures as Markdown and LaTeX tables, one per protocol, trivial rows included."""
+"""Tables in Markdown, LaTeX (booktabs) and HTML; those of a run's figures, one per protocol."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from html import escape
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from evsplat.capture.policy import policy_of
-from evsplat.evaluation.splits import SplitWords, count_of, name_of, split_of, words_of
+from evsplat.evaluation.splits import count_of, name_of, split_of, words_of
 from evsplat.files import write_text
 
 ROW_TITLES = {
@@ -15,31 +17,6 @@ ROW_TITLES = {
     "nearest_frame": "nearest training frame (trivial)",
 }
 REGION_TITLES = {"full": "full frame", "person_crop": "person crop", "person_mask": "person mask"}
-
-
-@dataclass(frozen=True)
-class Column:
-    """One figure of one region."""
-
-    region: str
-    metric: str
-
-    @property
-    def higher_is_better(self) -> bool:
-        """PSNR and SSIM grow with likeness, distances shrink."""
-        return self.metric in ("psnr", "ssim")
-
-    @property
-    def arrow(self) -> str:
-        """The direction of better values."""
-        return "↑" if self.higher_is_better else "↓"
-
-    @property
-    def decimals(self) -> int:
-        """Digits after the point."""
-        return 2 if self.metric == "psnr" else 4
-
-
 METRIC_TITLES = {
     "psnr": "PSNR",
     "ssim": "SSIM",
@@ -47,65 +24,101 @@ METRIC_TITLES = {
     "lpips_vgg": "LPIPS-VGG",
     "st_lpips": "ST-LPIPS",
 }
+LEGEND = "Best of a column bold, second best {second}."
+_ARROWS = {True: "↑", False: "↓", None: ""}
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    **{character: "\\" + character for character in "&%$#_{}"},
+    **{"–": "--", "±": r"$\pm$", "†": r"$^\dagger$", "·": r"$\cdot$"},
+    **{"↑": r"$\uparrow$", "↓": r"$\downarrow$"},
+}
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Head of a column."""
+
+    group: str
+    title: str
+    decimals: int
+    higher_is_better: bool | None
+    """None: there is no better."""
+
+    @classmethod
+    def of(cls, region: str, metric: str) -> "Heading":
+        """Head of a metric in a region; PSNR and SSIM grow with likeness, distances shrink."""
+        decimals, higher = (2 if metric == "psnr" else 4), metric in ("psnr", "ssim")
+        return cls(REGION_TITLES[region], METRIC_TITLES[metric], decimals, higher)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Number in a cell."""
+
+    mean: float
+    spread: float | None = None
+    """Standard deviation of the mean over seeds; None with one seed."""
+    competes: bool = True
+    """Whether it may be the best of its column."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table; None where there is no figure."""
+
+    title: str
+    figures: tuple[Figure | None, ...]
+    kind: str = ""
+    """Its class in HTML."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of one protocol; columns without any figure are left out."""
+    """One table, to be written in any language."""
 
-    protocol: str
+    title: str
     note: str
-    columns: tuple[Column, ...]
-    rows: dict[str, dict[str, dict[str, float | None]]]
-    """Row key (the method's name, trivial rows, blurry_input) -> region -> metric -> value."""
-    method: str
-    words: SplitWords
-    """Words for the frames that were measured."""
+    headings: tuple[Heading, ...]
+    rows: tuple[Row, ...]
+    footnotes: tuple[str, ...] = ()
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """Titles of the regions over neighbouring columns, and how many each spans."""
-        spans = {r: sum(column.region == r for column in self.columns) for r in REGION_TITLES}
-        return [(REGION_TITLES[region], span) for region, span in spans.items() if span]
+        """Titles over neighbouring columns, and how many each spans."""
+        groups = groupby(self.headings, key=lambda heading: heading.group)
+        return [(group, len(list(headings))) for group, headings in groups]
 
-    def value(self, row: str, column: Column) -> float | None:
-        """Value of one cell; None where nothing was measured."""
-        return self.rows[row][column.region][column.metric]
+    def rank(self, row: Row, column: int) -> int:
+        """1: best of the column as it is printed, 2: second best, 0: neither; equal ones share."""
+        heading, figure = self.headings[column], row.figures[column]
+        figures = [other.figures[column] for other in self.rows]
+        competing = [round(f.mean, heading.decimals) for f in figures if f and f.competes]
+        better = heading.higher_is_better
+        if better is None or figure is None or not figure.competes or len(competing) < 2:
+            return 0
+        ranked = sorted(set(competing), reverse=better)
+        place = ranked.index(round(figure.mean, heading.decimals)) + 1
+        return place if place <= 2 else 0
 
-    def text(self, row: str, column: Column) -> str:
-        """One cell, formatted; a dash where nothing was measured."""
-        value = self.value(row, column)
-        return "–" if value is None else f"{value:.{column.decimals}f}"
-
-    def is_best(self, row: str, column: Column) -> bool:
-        """True for the best row of a column as it is printed; the blurry input does not compete."""
-        if row == "blurry_input" or self.value(row, column) is None:
-            return False
-        shown = [
-            round(value, column.decimals)
-            for name in self.rows
-            if name != "blurry_input" and (value := self.value(name, column)) is not None
-        ]
-        best = max(shown) if column.higher_is_better else min(shown)
-        return float(self.text(row, column)) == best
-
-    def cells(self, row: str, best: str) -> list[str]:
-        """Texts of a row; ``best`` is the form of the best of a column."""
-        return [
-            best.format(self.text(row, column))
-            if self.is_best(row, column)
-            else self.text(row, column)
-            for column in self.columns
-        ]
-
-    def title(self, row: str) -> str:
-        """Title of a row for readers."""
-        own = {"blurry_input": self.words.blurry_input}
-        return (ROW_TITLES | own).get(row, row)
+    def cells(
+        self, row: Row, forms: Sequence[str], escaped: Callable[[str], str] = str
+    ) -> list[str]:
+        """Texts of a row, in the form of their rank."""
+        cells = []
+        for column, (heading, figure) in enumerate(zip(self.headings, row.figures, strict=True)):
+            text = "–" if figure is None else f"{figure.mean:.{heading.decimals}f}"
+            if figure is not None and figure.spread is not None:
+                text += f" ± {figure.spread:.{heading.decimals}f}"
+            cells.append(forms[self.rank(row, column)].format(escaped(text)))
+        return cells
 
 
-def tables_of(metrics: dict[str, Any]) -> Iterator[Table]:
+def tables_of(metrics: dict[str, Any]) -> list[Table]:
     """One table per protocol, `standard` first; with other rows where they were measured."""
+    titles = ROW_TITLES | {"blurry_input": words_of(metrics).blurry_input}
+    tables = []
     for protocol, ours in metrics["protocols"].items():
         if protocol == "standard":
             others = {**composited(metrics), **metrics.get("trivial", {})}
@@ -114,14 +127,33 @@ def tables_of(metrics: dict[str, Any]) -> Iterator[Table]:
         else:
             others = metrics.get("compat_rows", {}).get(protocol, {})
         rows = {metrics["method"]: ours, **others}
-        columns = tuple(
-            Column(region, metric)
-            for region in REGION_TITLES
-            for metric in METRIC_TITLES
-            if any(row[region][metric] is not None for row in rows.values())
-        )
-        note = metrics["protocol_notes"][protocol]
-        yield Table(protocol, note, columns, rows, metrics["method"], words_of(metrics))
+        note = f"{metrics['protocol_notes'][protocol]}."
+        tables.append(_table(f"Protocol {protocol}", note, rows, titles, metrics["method"]))
+    return tables
+
+
+def _table(
+    title: str,
+    note: str,
+    rows: dict[str, Any],
+    titles: dict[str, str],
+    method: str | None = None,
+) -> Table:
+    """Rows of region -> metric -> value; columns without any figure are left out."""
+    columns = [
+        (region, metric)
+        for region in REGION_TITLES
+        for metric in METRIC_TITLES
+        if any(row.get(region, {}).get(metric) is not None for row in rows.values())
+    ]
+    lines = []
+    for name, row in rows.items():
+        competes = method is not None and name != "blurry_input"
+        values = [row[region][metric] for region, metric in columns]
+        figures = (None if v is None else Figure(v, competes=competes) for v in values)
+        kind = "aside" if name == "blurry_input" else "ours" if name == method else "other"
+        lines.append(Row(titles.get(name, name), tuple(figures), kind))
+    return Table(title, note, tuple(Heading.of(*column) for column in columns), tuple(lines))
 
 
 def composited(metrics: dict[str, Any]) -> dict[str, Any]:
@@ -144,86 +176,97 @@ def missing_networks(metrics: dict[str, Any]) -> list[str]:
 
 def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
     """Write metrics.md and metrics.tex, or those of training frames (metrics_train.md ...)."""
-    split = split_of(metrics)
-    write_text(folder / name_of("metrics", split, ".md"), markdown(metrics))
-    write_text(folder / name_of("metrics", split, ".tex"), latex(metrics))
-
-
-def markdown(metrics: dict[str, Any]) -> str:
-    """All tables as Markdown; the best of each column in bold."""
-    lines = [f"# {metrics['method']} on {metrics['capture']}", ""]
-    count = count_of(metrics)
-    frames = words_of(metrics).title.lower()
+    count, words, split = count_of(metrics), words_of(metrics), split_of(metrics)
+    tables = tables_of(metrics) if count else []
+    if views := metrics["novel_views"]:
+        tables.append(_table("Novel views", "Protocol standard.", views, {}))
+    frames = words.title.lower()
     means = f"Means over {count} {frames} against the sharp truth. " if count else ""
-    lines += [f"{means}{terms(metrics)}", ""]
-    for table in tables_of(metrics) if count else ():
-        lines += [f"## Protocol `{table.protocol}`", "", f"{table.note}.", ""]
+    intro = f"{means}{terms(metrics)} {LEGEND.format(second='in italics')}"
+    title = f"{metrics['method']} on {metrics['capture']}"
+    page = markdown(title, intro, tables, missing_networks(metrics))
+    write_text(folder / name_of("metrics", split, ".md"), page)
+    page = f"% {words.title}. {terms(metrics)}\n{latex(tables)}"
+    write_text(folder / name_of("metrics", split, ".tex"), page)
+
+
+def markdown(title: str, intro: str, tables: Iterable[Table], notes: Sequence[str] = ()) -> str:
+    """All tables as one Markdown page, with ``notes`` at its end."""
+    lines = [f"# {title}", "", intro, ""]
+    for table in tables:
+        lines += [f"## {table.title}", "", table.note, ""]
         head = [
-            f"{REGION_TITLES[c.region]} {METRIC_TITLES[c.metric]} {c.arrow}" for c in table.columns
+            _markdown_text(f"{h.group} {h.title} {_ARROWS[h.higher_is_better]}")
+            for h in table.headings
         ]
-        rows = [(table.title(row), table.cells(row, "**{}**")) for row in table.rows]
-        lines += [*markdown_table("", head, rows), ""]
-    lines += _novel_markdown(metrics)
-    lines += [f"- {reason}" for reason in missing_networks(metrics)]
-    return "\n".join(lines).rstrip() + "\n"
+        rows = [["", *head], ["---", *["---:"] * len(head)]]
+        for row in table.rows:
+            rows.append([_markdown_text(row.title), *table.cells(row, ("{}", "**{}**", "*{}*"))])
+        lines += [f"| {' | '.join(row)} |" for row in rows]
+        lines += ["", *_markdown_list(table.footnotes)]
+    return "\n".join([*lines, *_markdown_list(notes)]).rstrip() + "\n"
 
 
-def _novel_markdown(metrics: dict[str, Any]) -> list[str]:
-    if not metrics["novel_views"]:
-        return []
-    head = ("full PSNR", "full SSIM", "person crop PSNR", "person crop SSIM")
-    rows = []
-    for camera, regions in metrics["novel_views"].items():
-        cells = [
-            "–" if (value := regions[region][metric]) is None else f"{value:.{digits}f}"
-            for region in ("full", "person_crop")
-            for metric, digits in (("psnr", 2), ("ssim", 4))
-        ]
-        rows.append((camera, cells))
-    title = "## Novel views, protocol `standard`"
-    return [title, "", *markdown_table("camera", head, rows), ""]
+def _markdown_list(items: Sequence[str]) -> list[str]:
+    return [*(f"- {_markdown_text(item)}" for item in items), ""] if items else []
 
 
-def latex(metrics: dict[str, Any]) -> str:
-    """All tables as LaTeX (booktabs)."""
-    lines = [f"% {words_of(metrics).title}. {terms(metrics)}"]
-    for table in tables_of(metrics) if count_of(metrics) else ():
-        groups = [rf"\multicolumn{{{span}}}{{c}}{{{title}}}" for title, span in table.groups]
-        names = [
-            METRIC_TITLES[c.metric] + (r"$\uparrow$" if c.higher_is_better else r"$\downarrow$")
-            for c in table.columns
-        ]
+def _markdown_text(text: str) -> str:
+    escaped = "".join("\\" + c if c in "|*_`<" else c for c in text)
+    return " ".join(escaped.split())
+
+
+def latex(tables: Sequence[Table]) -> str:
+    """All tables as LaTeX ``tabular`` environments."""
+    lines: list[str] = []
+    for table in tables:
+        rules, groups, first = [], [], 2
+        for group, span in table.groups:
+            rules.append(rf"\cmidrule(lr){{{first}-{first + span - 1}}}")
+            groups.append(rf"\multicolumn{{{span}}}{{c}}{{{_latex_text(group)}}}")
+            first += span
+        heads = [_latex_text(h.title + _ARROWS[h.higher_is_better]) for h in table.headings]
+        forms = ("{}", r"\textbf{{{}}}", r"\underline{{{}}}")
         lines += [
-            f"% protocol {table.protocol}: {table.note}",
-            rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}",
+            *(f"% {text}" for text in (table.title, table.note, *table.footnotes)),
+            rf"\begin{{tabular}}{{l{'r' * len(table.headings)}}}",
             r"\toprule",
-            " & ".join([f"protocol {table.protocol}", *groups]) + r" \\",
-            " & ".join(["", *names]) + r" \\",
+            " & ".join(["", *groups]) + r" \\",
+            "".join(rules),
+            " & ".join(["", *heads]) + r" \\",
             r"\midrule",
         ]
         for row in table.rows:
-            cells = [cell.replace("–", "--") for cell in table.cells(row, r"\textbf{{{}}}")]
-            lines.append(" & ".join([latex_text(table.title(row)), *cells]) + r" \\")
+            cells = [_latex_text(row.title), *table.cells(row, forms, _latex_text)]
+            lines.append(" & ".join(cells) + r" \\")
         lines += [r"\bottomrule", r"\end{tabular}", ""]
     return "\n".join(lines)
 
 
-def markdown_table(
-    corner: str, head: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]
-) -> list[str]:
-    """Lines of a Markdown table; each row has a title and its cells."""
-    lines = ["| " + " | ".join([title, *cells]) + " |" for title, cells in ((corner, head), *rows)]
-    return [lines[0], "|" + "|".join(["---", *["---:"] * len(head)]) + "|", *lines[1:]]
-
-
-_LATEX_SPECIAL = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    **{character: "\\" + character for character in "&%$#_{}"},
-}
-
-
-def latex_text(text: str) -> str:
+def _latex_text(text: str) -> str:
     """``text`` with everything escaped that LaTeX would take for its own."""
-    return "".join(_LATEX_SPECIAL.get(character, character) for character in text)
+    return "".join(_LATEX.get(character, character) for character in text)
+
+
+def html(table: Table, corner: str = "") -> str:
+    """One table as HTML that scrolls sideways on a narrow screen."""
+    groups = "".join(
+        f'<th colspan="{span}" scope="colgroup">{escape(group)}</th>'
+        for group, span in table.groups
+    )
+    heads = "".join(
+        f'<th scope="col">{escape(h.title)}&thinsp;{_ARROWS[h.higher_is_better]}</th>'
+        for h in table.headings
+    )
+    forms = ("<td>{}</td>", '<td class="best">{}</td>', '<td class="second">{}</td>')
+    rows = "".join(
+        f'<tr class="{row.kind}"><th scope="row">{escape(row.title)}</th>'
+        f"{''.join(table.cells(row, forms, escape))}</tr>"
+        for row in table.rows
+    )
+    notes = "".join(f"<li>{escape(note)}</li>" for note in table.footnotes)
+    return (
+        '<div class="scroll"><table><thead><tr>'
+        f'<th rowspan="2" class="corner">{escape(corner)}</th>{groups}</tr>'
+        f"<tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
+    ) + (f'<ul class="note">{notes}</ul>' if notes else "")

@@ -21,9 +21,9 @@ from evsplat.errors import DataError
 from evsplat.export.cloud import SplatCloud, cloud_of
 from evsplat.export.formats import write_ply
 from evsplat.files import new_folder, write_json, write_text
-from evsplat.methods.reconstruction import Bakeable
 from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.models.discs.shading import SurfaceLight
+from evsplat.training.run import GaussianReconstruction
 
 BONES_EACH = 4
 _MOST_JOINTS = 256
@@ -85,7 +85,9 @@ def avatar_of(gaussians: SkinnedGaussians) -> Avatar:
     )
 
 
-def recorded_clip(source: Bakeable, gaussians: SkinnedGaussians, times_us: tuple[int, int]) -> Clip:
+def recorded_clip(
+    source: GaussianReconstruction, gaussians: SkinnedGaussians, times_us: tuple[int, int]
+) -> Clip:
     """The recorded motion from the first to the second time, as the method corrected it."""
     times = _even_times(*times_us)
     rotations, bones = source.pose(times)

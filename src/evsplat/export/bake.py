@@ -16,11 +16,11 @@ from evsplat.export.avatar import Avatar, Clip, avatar_of, clip_of, recorded_cli
 from evsplat.export.gaussians import cloud_at, facts_of, instant_of
 from evsplat.film import camera_at, load_motion_of
 from evsplat.film.camera_path import check_camera
-from evsplat.methods.reconstruction import Bakeable, Parts
+from evsplat.methods.reconstruction import Parts
 from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.render import Splats, render
 from evsplat.similarity import psnr
-from evsplat.training.run import Run
+from evsplat.training.run import GaussianReconstruction, Run
 
 logger = logging.getLogger(__name__)
 
@@ -34,24 +34,14 @@ def at_rest(run: Run, camera: str | None) -> SkinnedGaussians:
         (frame.mid_us, camera_at(capture, camera or frame.camera, frame.mid_us))
         for frame in capture.train_frames
     ]
-    return bakeable(run).at_rest(views)
-
-
-def bakeable(run: Run) -> Bakeable:
-    """The run's reconstruction, where its person can be taken apart from its poses."""
-    if not isinstance(run.reconstruction, Bakeable):
-        raise DataError(
-            f"{run.path}: method {run.method} has no Gaussians that follow a skeleton; there is no "
-            "avatar to export. Use 'evsplat render'."
-        )
-    return run.reconstruction
+    return run.reconstruction.at_rest(views)
 
 
 def export_avatar(
     run: Run, path: Path, parts: Parts, camera: str | None, motion: str | None
 ) -> Path:
     """Write the avatar of a run, say what it drops, and return its page."""
-    capture, source = run.capture, bakeable(run)
+    capture, source = run.capture, run.reconstruction
     track = source.track
     clips: list[Clip] = []
     if motion is not None:
@@ -118,7 +108,7 @@ class Loss:
 
 
 @torch.no_grad()
-def measure_loss(source: Bakeable, avatar: Avatar, capture: Capture) -> Loss:
+def measure_loss(source: GaussianReconstruction, avatar: Avatar, capture: Capture) -> Loss:
     """Draw model and avatar on the test frames, or on all frames where none is held out."""
     frames = [f for f in capture.frames if f.split == "test"] or list(capture.frames)
     rows: dict[str, list[Psnr]] = {"avatar": [], "model_truth": [], "avatar_truth": []}

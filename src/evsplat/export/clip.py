@@ -13,7 +13,7 @@ from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Camera, load_body_track
 from evsplat.errors import ConfigError
 from evsplat.export.cloud import SplatCloud, cloud_of
-from evsplat.export.gaussians import instant_of, splat_source
+from evsplat.export.gaussians import instant_of
 from evsplat.files import write_text
 from evsplat.methods.reconstruction import Parts
 from evsplat.training.run import Run
@@ -37,7 +37,7 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
         raise ConfigError(
             "An html clip needs the package viser; get it with: pip install 'evsplat[view]'."
         ) from None
-    capture, source = run.capture, splat_source(run)
+    capture, source = run.capture, run.reconstruction
     track = load_body_track(capture)
     middle = instant_of(capture, time_s=None, frame=None, camera=camera)
     mids = sorted(frame.mid_us for frame in capture.frames)

@@ -81,20 +81,13 @@ def cloud_of(splats: Splats, time: int = 0) -> SplatCloud:
     )
     values = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities[:, None], cloud.rgb)
     good = np.isfinite(np.concatenate(values, axis=1)).all(1) & (cloud.scales > 0).all(1)
-    return cloud if good.all() else _rows(cloud, good)
+    return SplatCloud(*(column[good] for column in vars(cloud).values()))
 
 
 def joined(clouds: list[SplatCloud]) -> SplatCloud:
     """All Gaussians of several clouds, in their order."""
-    names = SplatCloud.__dataclass_fields__
-    return SplatCloud(
-        **{name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in names}
-    )
-
-
-def _rows(cloud: SplatCloud, rows: np.ndarray) -> SplatCloud:
-    names = SplatCloud.__dataclass_fields__
-    return SplatCloud(**{name: getattr(cloud, name)[rows] for name in names})
+    columns = zip(*(vars(cloud).values() for cloud in clouds), strict=True)
+    return SplatCloud(*map(np.concatenate, columns))
 
 
 def _positive(quaternions: Tensor) -> Float32[np.ndarray, "N 4"]:

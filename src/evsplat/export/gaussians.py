@@ -15,9 +15,9 @@ from evsplat.export.cloud import SplatCloud, cloud_of, joined
 from evsplat.export.formats import write_gltf, write_ply, write_splat, write_spz
 from evsplat.film import camera_at
 from evsplat.film.camera_path import check_camera
-from evsplat.methods.reconstruction import Parts, SplatReconstruction
+from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import FileKind, UpAxis
-from evsplat.training.run import Run
+from evsplat.training.run import GaussianReconstruction, Run
 
 _AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 ALWAYS_Y_UP = {"spz": "right, up, back (RUB)", "gltf": "+Y up"}
@@ -69,17 +69,9 @@ def instant_of(
     return Instant(time_us, camera_at(capture, name, time_us), name, label)
 
 
-def splat_source(run: Run) -> SplatReconstruction:
-    """The run's reconstruction, where its method has Gaussians to hand over."""
-    if not isinstance(run.reconstruction, SplatReconstruction):
-        raise DataError(
-            f"{run.path}: method {run.method} draws pictures and hands over no Gaussians; "
-            "nothing can be exported. Use 'evsplat render'."
-        )
-    return run.reconstruction
-
-
-def cloud_at(source: SplatReconstruction, camera: Camera, time_us: int, parts: Parts) -> SplatCloud:
+def cloud_at(
+    source: GaussianReconstruction, camera: Camera, time_us: int, parts: Parts
+) -> SplatCloud:
     """The Gaussians of one instant in the capture's world, coloured as ``camera`` sees them."""
     splats = source.splats(camera, [time_us], parts=parts)
     return joined([cloud_of(layer) for layer in splats])

@@ -118,7 +118,7 @@ def _write(
         names = [f"{index:05d}" for index in range(len(frames))]
         pictures: Iterator[Picture] = _event_pictures(store, plan)
     elif film.show == "depth" and not folder:
-        nearest = _NEAREST * plan.human_distance_m()
+        nearest = _NEAREST * plan.human_distance_m
         pictures = (depth_colours(cache.read(frame), nearest) for frame in frames)
     else:
         pictures = (cache.read(frame) for frame in frames)

@@ -16,7 +16,6 @@ from evsplat.export.gaussians import (
     file_rotation,
     instant_of,
     rest_track,
-    splat_source,
     write_file,
 )
 from evsplat.options import ExportOptions
@@ -90,7 +89,7 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
         instant = instant_of(
             capture, time_s=options.time_s, frame=options.frame, camera=options.camera
         )
-        cloud = cloud_at(splat_source(run), instant.camera, instant.time_us, parts or "all")
+        cloud = cloud_at(run.reconstruction, instant.camera, instant.time_us, parts or "all")
         which = "" if parts in (None, "all") else f"{parts}-"
         label = f"{which}{instant.label}"
         when = f"at {instant.time_us} us, colours as camera {instant.camera_name} sees them"

@@ -17,8 +17,8 @@ from evsplat.camera import Camera
 from evsplat.errors import DataError
 from evsplat.files import atomic_path, read_json, write_json
 from evsplat.film.looks import Exposure, Look
-from evsplat.methods.reconstruction import Reconstruction
 from evsplat.names import checked_name
+from evsplat.training.run import GaussianReconstruction
 
 logger = logging.getLogger(__name__)
 
@@ -76,7 +76,9 @@ class FrameCache:
         shutil.rmtree(self.path)
 
     @torch.no_grad()
-    def fill(self, reconstruction: Reconstruction, look: Look, frames: Sequence[FilmFrame]) -> None:
+    def fill(
+        self, reconstruction: GaussianReconstruction, look: Look, frames: Sequence[FilmFrame]
+    ) -> None:
         """Draw what is missing, several times at once where the camera stands still."""
         missing = [frame for frame in frames if not self.file(frame).is_file()]
         try:

@@ -9,10 +9,11 @@ from jaxtyping import Float, UInt16
 
 from evsplat.camera import Camera
 from evsplat.errors import ConfigError
-from evsplat.methods.reconstruction import Parts, Reconstruction, WithDepth
+from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import Shown
 from evsplat.pictures import decode, encode, luminance
 from evsplat.pictures.colours import colours
+from evsplat.training.run import GaussianReconstruction
 
 Exposure = np.ndarray
 """A picture as it is cached: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""
@@ -36,18 +37,13 @@ class Look:
             raise ConfigError(f"--transparent: goes with --show rgb or semantic, not {self.shown}.")
 
     def expose(
-        self, reconstruction: Reconstruction, camera: Camera, times_us: Sequence[int]
+        self, reconstruction: GaussianReconstruction, camera: Camera, times_us: Sequence[int]
     ) -> list[Exposure]:
         """Pictures as they are cached: colours in 8 bit; depth in millimetres and light in 16 bit.
 
         Light (for events) is linear luminance, coded by the exponent 1/2.2.
         """
         if self.shown == "depth":
-            if not isinstance(reconstruction, WithDepth):
-                raise ConfigError(
-                    f"--show depth: method {reconstruction.name} does not know the depth of what "
-                    "it draws."
-                )
             depth = reconstruction.depth(camera, times_us, parts=self.parts)
             return list((depth * 1000).round().clamp(0, 65_535).numpy().astype(np.uint16))
         drawn = reconstruction.render(camera, times_us, parts=self.parts)

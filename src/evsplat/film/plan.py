@@ -1,6 +1,6 @@
 """The frames of a film of one run: the motion, and time and camera of each frame."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from evsplat.body import BodyTrack, up_axis
-from evsplat.capture import Camera, Capture, Frame, load_body_track
+from evsplat.capture import Camera, Capture, Frame
 from evsplat.errors import ConfigError, DataError
 from evsplat.film.camera_path import (
     CameraPath,
@@ -20,8 +20,8 @@ from evsplat.film.camera_path import (
 )
 from evsplat.film.frame_cache import FilmFrame
 from evsplat.film.motion import load_motion_of
-from evsplat.methods.reconstruction import Posable, Reconstruction
 from evsplat.options import Film
+from evsplat.training.run import GaussianReconstruction
 
 _HELD_SECONDS = 4.0
 
@@ -31,58 +31,48 @@ class FilmPlan:
     """The frames of a film of one run."""
 
     capture: Capture
-    reconstruction: Reconstruction
+    reconstruction: GaussianReconstruction
     frames: list[FilmFrame]
     """Frames to draw; for events more than are shown."""
     oversampling: int
     """Frames drawn per picture shown."""
-    human_distance_m: Callable[[], float]
+    human_distance_m: float
     """Distance of the person from the first camera, metres."""
     poses: tuple[object, ...]
     """Times and poses of a motion, for the film's digest; empty for the recorded one."""
 
     @classmethod
-    def of(cls, film: Film, capture: Capture, reconstruction: Reconstruction) -> "FilmPlan":
+    def of(cls, film: Film, capture: Capture, reconstruction: GaussianReconstruction) -> "FilmPlan":
         """Choose the motion, and time and camera of every frame.
 
         Raises:
             ConfigError: the capture or the method cannot give what is asked for.
         """
         poses: tuple[object, ...] = ()
-        recorded = reconstruction.track if isinstance(reconstruction, Posable) else None
+        recorded = reconstruction.track.to("cpu")
         if film.motion is not None:
-            if not isinstance(reconstruction, Posable):
-                raise ConfigError(
-                    f"--motion: method {reconstruction.name} draws the recorded motion only; it "
-                    "cannot be posed freely."
-                )
             track = load_motion_of(
-                film.motion, reconstruction.track, fps=film.motion_fps, in_place=film.in_place
+                film.motion, recorded, fps=film.motion_fps, in_place=film.in_place
             )
             reconstruction = reconstruction.following(track)
             poses = (
                 track.times_us,
                 *(value.numpy() for value in track.at(track.times_us.tolist())),
             )
-        human = reconstruction.track if isinstance(reconstruction, Posable) else None
+        track = reconstruction.track.to("cpu")
         oversampling = 1
         if film.show == "events":
             if film.beside and capture.events is None:
                 raise DataError(f"{capture.path}: has no events to put --beside the rendered ones.")
             oversampling = max(1, int(np.ceil(film.event_hz / (film.fps * film.slow))))
-        names, times, clock = _times(film, capture, human, oversampling)
+        names, times, clock = _times(film, capture, track, oversampling)
         recording = recorded_by(capture, film.camera)[0].camera
         view = film.camera or recording
 
-        def middle() -> torch.Tensor:
-            return _middle((human or load_body_track(capture)).to("cpu"), times)
-
-        def up() -> torch.Tensor:
-            # Where people stood in the recording: a motion may be a somersault.
-            return up_axis((recorded or load_body_track(capture)).to("cpu"))
-
+        middle = _middle(track, times)
         start = camera_at(capture, view, times[0])
-        path = _camera_path(film, capture, start, up, middle)
+        # Up is where people stood in the recording: a motion may be a somersault.
+        path = _camera_path(film, capture, start, up_axis(recorded), middle)
         if path is not None:
             last = max(1, len(times) - 1)
             cameras = [path(index / last) for index in range(len(times))]
@@ -96,7 +86,7 @@ class FilmPlan:
             reconstruction,
             frames,
             oversampling,
-            lambda: float((middle() - cameras[0].center().cpu()).norm()),
+            float((middle - cameras[0].center().cpu()).norm()),
             poses,
         )
 
@@ -106,7 +96,7 @@ class FilmPlan:
 
 
 def _times(
-    film: Film, capture: Capture, track: BodyTrack | None, oversampling: int
+    film: Film, capture: Capture, track: BodyTrack, oversampling: int
 ) -> tuple[list[str], list[int], list[int]]:
     """Name, time of the person and time on the film's clock of every frame."""
     times: list[int]
@@ -118,7 +108,6 @@ def _times(
         times = [frame.mid_us for frame in held_out]
         return [frame.name for frame in held_out], times, times
     if film.motion is not None:
-        assert track is not None
         first, last = 0, int(track.times_us[-1])
     else:
         mids = [frame.mid_us for frame in recorded_by(capture, film.camera)]
@@ -152,14 +141,14 @@ def _camera_path(
     film: Film,
     capture: Capture,
     start: Camera,
-    up: Callable[[], torch.Tensor],
-    middle: Callable[[], torch.Tensor],
+    up: torch.Tensor,
+    middle: torch.Tensor,
 ) -> CameraPath | None:
     if film.path is None:
         return None
     if film.path in ("orbit", "swing"):
         around = orbit if film.path == "orbit" else swing
-        return around(start, middle(), up())
+        return around(start, middle, up)
     if film.path == "interpolate":
         return interpolated(capture)
     if not Path(film.path).is_file():

@@ -7,7 +7,7 @@ from typing import Any
 
 from evsplat.config import from_dict
 from evsplat.errors import ConfigError
-from evsplat.methods import avatar3dgs, avatar3dgs_semantic, hugs, paper
+from evsplat.methods import avatar3dgs, hugs, paper
 from evsplat.methods.base import Composition, MethodConfig, Purpose
 from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.evsplat import build as build_evsplat
@@ -26,9 +26,7 @@ class Method:
 
 TRAINABLE = {
     "avatar3dgs": Method(avatar3dgs.AvatarConfig, avatar3dgs.build),
-    "avatar3dgs_semantic": Method(
-        avatar3dgs_semantic.AvatarSemanticConfig, avatar3dgs_semantic.build
-    ),
+    "avatar3dgs_semantic": Method(avatar3dgs.AvatarSemanticConfig, avatar3dgs.build_semantic),
     "evsplat": Method(EvsplatConfig, build_evsplat),
     "hugs": Method(hugs.HugsConfig, hugs.build),
     "paper": Method(paper.PaperConfig, paper.build),

@@ -3,23 +3,24 @@
 Numbers of the form 1.5 are sections of the reference that docs/baselines.md quotes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
 import torch
 
 from evsplat.body import BodyTrack, SurfaceSamples
-from evsplat.capture import TrainingCapture
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.gaussians import GaussianSet
 from evsplat.methods.base import Purpose
 from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
 from evsplat.methods.prefit import fit_skinning
 from evsplat.methods.settings import Nominal, NotNegative, Weight
-from evsplat.models.paper import PaperModel, Released, Semantics
+from evsplat.models.paper import PaperModel, Semantics
 from evsplat.objectives import Isometry, Objective, Photometric, SkinningPrior
 from evsplat.objectives.perceptual import PerceptualChoice, choose_perceptual
+from evsplat.objectives.photometric import Box
 
 SURFACE_SAMPLES = 100_000
 """Body surface points drawn once for the skinning prior."""
@@ -77,20 +78,6 @@ class AvatarTerms:
     isometry_samples: Annotated[int, AtLeast(1)] = 1_024
     """Gaussians whose isometry is looked at per step."""
 
-    def isometry(self) -> list[Objective]:
-        """The objective of isometry, where either weight asks for it."""
-        if self.isometry_centers == 0.0 and self.isometry_covariances == 0.0:
-            return []
-        return [Isometry(refresh=ISOMETRY_REFRESH, samples=self.isometry_samples)]
-
-    def weights(self) -> dict[str, Weight]:
-        """Weights by the names of terms, but the perceptual one's."""
-        return {
-            "skinning": self.skinning,
-            "isometry_centers": self.isometry_centers,
-            "isometry_covariances": self.isometry_covariances,
-        }
-
 
 @dataclass(frozen=True)
 class AvatarRates:
@@ -126,67 +113,58 @@ RELEASED_RATES = AvatarRates(features=1e-3, constant=0.0, gaussians_final=1.0)
 """Rates of the released 3DGS-Avatar (1.10)."""
 
 
-def fitted_avatar(
-    gaussians: GaussianSet,
+def avatar(
+    capture: TrainingCapture,
     track: BodyTrack,
-    times_us: Sequence[int],
+    gaussians: GaussianSet,
     surface: SurfaceSamples,
     generator: torch.Generator,
+    box_of: Callable[[Frame], Box | None],
     *,
     semantics: Semantics,
-    networks: Networks,
+    released: bool,
     scene_direction_dropout: float,
-    released: Released,
-    skinning_steps: int,
-    device: torch.device | str,
-) -> tuple[PaperModel, SkinningPrior]:
-    """The model at its start, skinning brought to the body's weights, and the prior of these.
-
-    ``times_us`` are the mid-exposures of the training frames.
-    """
-    model = PaperModel(
-        track,
-        times_us,
-        gaussians,
-        semantics=semantics,
-        width=networks.width,
-        colour_width=networks.colour_width,
-        non_rigid_start=networks.non_rigid_start,
-        pose_noise=networks.pose_noise,
-        scene_direction_dropout=scene_direction_dropout,
-        pose_start=networks.pose_start,
-        released=released,
-    ).to(device)
-    prior = SkinningPrior(surface.to(device), SKINNING_POINTS)
-    fit_skinning(model, prior, skinning_steps, generator)
-    return model, prior
-
-
-def picture_terms(
-    capture: TrainingCapture,
-    boxes: dict[str, tuple[int, int, int, int]],
+    networks: Networks,
     terms: AvatarTerms,
     l1: Weight,
     dssim: Weight,
-    *,
     device: torch.device | str,
     purpose: Purpose,
-) -> tuple[Photometric, dict[str, Weight]]:
-    """The terms that compare pictures, perceptual distance in ``boxes``, and their weights."""
+) -> tuple[PaperModel, list[Objective], dict[str, Weight]]:
+    """The model at its start, its skinning brought to the body's weights; losses and their weights.
+
+    The first of the losses compares pictures, perceptual distance in boxes; the others are priors.
+    """
+    model = PaperModel(
+        track,
+        [frame.mid_us for frame in capture.train_frames],
+        gaussians,
+        semantics=semantics,
+        scene_direction_dropout=scene_direction_dropout,
+        released=released,
+        **vars(networks),
+    ).to(device)
+    prior = SkinningPrior(surface.to(device), SKINNING_POINTS)
+    fit_skinning(model, prior, terms.skinning_prefit_steps if purpose == "train" else 0, generator)
     # Weights of a perceptual network need not be there to draw.
     choice = "none" if purpose == "draw" else terms.perceptual
     name, perceptual = choose_perceptual(choice, device=device)
-    objective = Photometric(
-        capture,
-        boxes if perceptual else {},
-        dssim=dssim != 0.0,
-        perceptual=perceptual,
-        perceptual_term=name,
+    pictures = Photometric(
+        capture, box_of, dssim=dssim != 0.0, perceptual=perceptual, perceptual_term=name
     )
-    weights: dict[str, Weight] = {"l1": l1, "dssim": dssim}
+    objectives: list[Objective] = [pictures, prior]
+    if terms.isometry_centers != 0.0 or terms.isometry_covariances != 0.0:
+        objectives.append(Isometry(refresh=ISOMETRY_REFRESH, samples=terms.isometry_samples))
+    weights = {
+        "l1": l1,
+        "dssim": dssim,
+        "skinning": terms.skinning,
+        "isometry_centers": terms.isometry_centers,
+        "isometry_covariances": terms.isometry_covariances,
+    }
     if perceptual is not None:
         weights[name] = terms.perceptual_weight
-    return objective, weights
+    return model, objectives, weights
 
 
 def learning_of(model: PaperModel, rates: AvatarRates) -> Learning:

@@ -1,7 +1,8 @@
 """Contract of a method: a configuration, and what it is put together to for one capture."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Literal, Protocol
 
 import torch
@@ -13,7 +14,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.gaussians import BodyFrames, DensifyLimits, Part
 from evsplat.methods.learning import Learning
 from evsplat.methods.settings import Weight
-from evsplat.models.model import Model
+from evsplat.models.at_rest import Skinned
 from evsplat.objectives import Objective, PackedBounds
 
 Purpose = Literal["train", "resume", "draw"]
@@ -51,7 +52,7 @@ class HeldOut:
 class Composition:
     """A method put together for one capture; the loop knows nothing else of it."""
 
-    model: Model
+    model: Skinned
     objectives: list[Objective]
     weights: dict[str, Weight]
     """Weight per named term; a term without one is an error of the method."""
@@ -94,15 +95,17 @@ def body_frames(track: BodyTrack, times_us: Sequence[int]) -> BodyFrames:
 
 def semantic_bounds(
     capture: TrainingCapture, track: BodyTrack, band_px_at_256: float
-) -> dict[int, PackedBounds]:
+) -> dict[int, Callable[[], PackedBounds]]:
     """Places of the person by the posed body, for each training frame's mid-exposure.
 
-    ``band_px_at_256``: width of the undecided band around it, for a picture 256 pixels high.
+    ``band_px_at_256``: width of the undecided band around it, for a picture 256 pixels high. They
+    are found when they are first asked for.
     """
-    bounds = {}
-    for frame in capture.train_frames:
+
+    def found(frame: Frame) -> PackedBounds:
         camera = capture.camera(frame)
         mask = silhouette(track.vertices(frame.mid_us), track.body.faces, camera)
         band = max(1, round(band_px_at_256 * camera.height / 256))
-        bounds[frame.mid_us] = PackedBounds.of(mask.numpy(), band)
-    return bounds
+        return PackedBounds.of(mask.numpy(), band)
+
+    return {frame.mid_us: cache(partial(found, frame)) for frame in capture.train_frames}

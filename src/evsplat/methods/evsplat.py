@@ -7,13 +7,14 @@ own, the person's by how the surface is turned and where it stands; the person c
 
 import logging
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated, ClassVar, Literal
 
 import torch
 
 from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate
-from evsplat.capture import Policy, TrainingCapture, estimate_sensor
+from evsplat.capture import Frame, Policy, TrainingCapture, estimate_sensor
 from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
@@ -240,17 +241,13 @@ def build(
         steps = config.scene.prefit_steps
         fit_scene(model.gaussians, camera, picture, steps, low_pass=config.low_pass)
 
-    renders = {
-        frame.name: renders_for(
-            motion_px(capture.camera(frame), poses.track, frame),
-            config.px_per_render,
-            config.most_renders,
-        )
-        for frame in capture.train_frames
-    }
+    def renders(frame: Frame) -> int:
+        motion = motion_px(capture.camera(frame), poses.track, frame)
+        return renders_for(motion, config.px_per_render, config.most_renders)
+
     bounds = semantic_bounds(capture, poses.track, config.semantic_band_px_at_256)
     objectives: list[Objective] = [
-        Exposure(capture, renders, generator),
+        Exposure(capture, cache(renders), generator),
         RenderedSemantics(bounds),
     ]
     if poses.correction is not None:

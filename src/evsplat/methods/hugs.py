@@ -27,10 +27,10 @@ from evsplat.methods.base import (
 from evsplat.methods.dropped import HUGS
 from evsplat.methods.learning import Learning, Network, Rate, RowRate
 from evsplat.methods.settings import NOMINAL_ITERATIONS, Densify, Positive, Weight
-from evsplat.methods.starts import HumanStart, SceneStart, Surface, human_start, scene_start
+from evsplat.methods.starts import HumanStart, SceneStart, Surface, cube, human_start, scene_start
 from evsplat.models.hugs import HugsModel, SphericalScene, TriplaneHuman
 from evsplat.models.hugs.start import fit_to_body
-from evsplat.objectives.hugs import HumanPicture, JointPicture, Perceptual, SkinningTarget
+from evsplat.objectives.hugs import HumanPicture, JointPicture, SkinningTarget
 from evsplat.objectives.perceptual import PerceptualName, make_perceptual
 
 FIT_SAMPLES = 50_000
@@ -118,7 +118,9 @@ def build(
     generator = start_of_randomness(seed)
     track = load_body_track(capture)
     human, spacing = _human(config, capture, track, generator)
-    extent = _extent(config, capture, track)
+    # The scene's size, that rates and limits are relative to: the released code takes how far the
+    # cameras are from each other, which is 0 for a static one; this reading works (2.9).
+    _, extent = cube(config.scene, capture, track)
     scene = _scene(config, capture, track, generator)
     times_us = [frame.mid_us for frame in capture.train_frames]
     model = HugsModel(human, scene, track, times_us).to(device)
@@ -133,8 +135,7 @@ def build(
         )
     # Weights of a perceptual network need not be there to draw.
     name: PerceptualName = "none" if purpose == "draw" else config.perceptual
-    metric = make_perceptual(name, device=device)
-    perceptual = None if metric is None else Perceptual(metric)
+    perceptual = make_perceptual(name, device=device)
     return Composition(
         model=model,
         objectives=[
@@ -185,21 +186,6 @@ def _resolution(capture: TrainingCapture, track: BodyTrack, half_side_m: float) 
     depth = float(camera.project(track.vertices(frame.mid_us))[1].median().clamp_min(0.1))
     pixel_m = depth / float(camera.K[0, 0])
     return min(FINEST, 2 ** max(4, round(math.log2(2 * half_side_m / pixel_m))))
-
-
-def _extent(config: HugsConfig, capture: TrainingCapture, track: BodyTrack) -> float:
-    """The scene's size, metres, that its rates and limits are relative to.
-
-    The released code takes how far the cameras are from each other, which is 0 for a static one;
-    half the side of the random cube is the reading that works (2.9).
-    """
-    frames = capture.train_frames
-    centers = torch.stack([capture.camera(frame).center() for frame in frames])
-    if config.scene.cube_half_side_m:
-        return config.scene.cube_half_side_m
-    translation = track.at(torch.tensor([frame.mid_us for frame in frames]))[1]
-    middle = (track.body.rest_joints[0] + translation).mean(0)
-    return max(2.0, 1.5 * float((middle - centers[0]).norm()))
 
 
 def _scene(

@@ -66,7 +66,6 @@ def row_rates(
     rates: Mapping[str, float],
     *,
     means: float,
-    semantic_logits: float = 1e-2,
     final: float,
     means_final: float,
     constant: float,
@@ -74,8 +73,8 @@ def row_rates(
     """Rates of a `GaussianSet`, each falling to ``final`` of it after a ``constant`` share."""
     rows = {name: RowRate(Rate(rate, final, constant)) for name, rate in rates.items()}
     rows["means"] = RowRate(Rate(means, means_final, constant))
-    semantic = Rate(semantic_logits, final, constant)
-    return rows | {"semantic_logits": RowRate(semantic, SEMANTICS_WINDOW)}
+    rows["semantic_logits"] = RowRate(Rate(1e-2, final, constant), SEMANTICS_WINDOW)
+    return rows
 
 
 def parameters_of(*parts: nn.Module | None) -> list[nn.Parameter]:

@@ -18,9 +18,8 @@ from evsplat.methods.avatar_parts import (
     AvatarRates,
     AvatarTerms,
     Networks,
-    fitted_avatar,
+    avatar,
     learning_of,
-    picture_terms,
 )
 from evsplat.methods.base import (
     Composition,
@@ -42,7 +41,7 @@ from evsplat.methods.settings import (
     Weight,
 )
 from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start, scene_start
-from evsplat.models.paper import Released, Semantics
+from evsplat.models.paper import Semantics
 from evsplat.objectives import EventChange, Objective, RenderedSemantics
 
 _RENDERED = ReadIf("semantics", "rendered", lambda semantics: semantics == "rendered")
@@ -133,18 +132,22 @@ def build(
     surface = track.body.sample_surface(SURFACE_SAMPLES, generator)
     human = human_start(config.human, Surface(), capture, track, generator, label)
     scene, colours = scene_start(config.scene, capture, track, generator, -label)
-    model, prior = fitted_avatar(
-        GaussianSet(human, scene),
+    model, (pictures, *priors), weights = avatar(
+        capture,
         track,
-        times_us,
+        GaussianSet(human, scene),
         surface,
         generator,
+        lambda frame: body_box(track.vertices(frame.mid_us), capture.camera(frame)),
         semantics=config.semantics,
-        networks=config.networks,
+        released=False,
         scene_direction_dropout=config.scene_direction_dropout,
-        released=Released(),
-        skinning_steps=config.terms.skinning_prefit_steps if fit else 0,
+        networks=config.networks,
+        terms=config.terms,
+        l1=config.l1_weight,
+        dssim=config.dssim_weight,
         device=device,
+        purpose=purpose,
     )
     if fit and config.scene.kind == "median_backdrop":
         steps = config.scene.prefit_steps
@@ -154,20 +157,6 @@ def build(
         fit_scene_colours(network, gaussians, camera, colours.to(device), steps, generator)
         fit_scene(gaussians, camera, picture, steps, low_pass=model.low_pass, network=network)
 
-    boxes = {
-        frame.name: box
-        for frame in capture.train_frames
-        if (box := body_box(track.vertices(frame.mid_us), capture.camera(frame))) is not None
-    }
-    pictures, weights = picture_terms(
-        capture,
-        boxes,
-        config.terms,
-        config.l1_weight,
-        config.dssim_weight,
-        device=device,
-        purpose=purpose,
-    )
     objectives: list[Objective] = [pictures]
     if config.event_weight != 0.0:
         objectives.append(_events(config, capture))
@@ -176,10 +165,9 @@ def build(
         objectives.append(RenderedSemantics(bounds))
     return Composition(
         model=model,
-        objectives=[*objectives, prior, *config.terms.isometry()],
+        objectives=[*objectives, *priors],
         weights={
             **weights,
-            **config.terms.weights(),
             "event": config.event_weight,
             "semantic": config.semantic_weight,
             "binarise": config.binarise_weight,

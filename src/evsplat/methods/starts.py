@@ -124,6 +124,14 @@ def _automatic_count(config: HumanStart, capture: TrainingCapture, track: BodyTr
     return int(min(max(count, 2_000), MOST_SAMPLES))
 
 
+def cube(start: SceneStart, capture: TrainingCapture, track: BodyTrack) -> tuple[Tensor, float]:
+    """Middle of the random cube, where the person goes, and half its side, metres."""
+    translation = track.at([frame.mid_us for frame in capture.train_frames])[1]
+    middle = (track.body.rest_joints[0] + translation).mean(0)
+    distance = float((middle - capture.camera(capture.train_frames[0]).center()).norm())
+    return middle, start.cube_half_side_m or max(2.0, 1.5 * distance)
+
+
 def scene_start(
     start: SceneStart,
     capture: TrainingCapture,
@@ -135,13 +143,8 @@ def scene_start(
     """Start values of the scene's Gaussians, and the colours they shall show."""
     frames = capture.train_frames
     camera = capture.camera(frames[0])
-    _, translation = track.at(torch.tensor([frame.mid_us for frame in frames]))
     if start.kind == "random_cube":
-        roots = track.body.rest_joints[0] + translation
-        center = roots.mean(0)
-        distance = float((center - camera.center()).norm())
-        half_side = start.cube_half_side_m or max(2.0, 1.5 * distance)
-        points, colours = random_cube(center, half_side, start.cube_count, generator)
+        points, colours = random_cube(*cube(start, capture, track), start.cube_count, generator)
         scales = nearest_spacing(points)[:, None].repeat(1, 3)
         opacity = CUBE_OPACITY
     else:

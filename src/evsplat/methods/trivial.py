@@ -1,6 +1,7 @@
-"""Rows that need no reconstruction: what any method must beat to have done anything."""
+"""Rows that need no reconstruction: what any method must beat; and a person before one of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -9,7 +10,7 @@ from torch import Tensor
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
-from evsplat.methods.reconstruction import Parts, Rendering
+from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
 
 
 class MedianBackground:
@@ -31,6 +32,33 @@ class MedianBackground:
         if not _same_view(camera, self._camera):
             raise DataError("median_background draws the recording camera only, not another one.")
         return _flat_rendering([self._image] * len(times_us), parts)
+
+
+class OnMedianBackground:
+    """A human-only reconstruction composited over the temporal median of the training frames.
+
+    What the method shows of the person is neither helped nor hurt by a black surround then. Only
+    for one camera that stands still, and for the view that it recorded; else a `DataError`.
+    """
+
+    def __init__(self, person: Reconstruction, capture: TrainingCapture) -> None:
+        self._person, self._background = person, MedianBackground(capture)
+
+    @property
+    def name(self) -> str:
+        """Name of the method, and that it stands before the median."""
+        return f"{self._person.name} on median background"
+
+    def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
+        """See `Reconstruction`; the background shines through where the person is not opaque."""
+        person = self._person.render(camera, times_us, parts=parts)
+        if parts == "human":
+            return person
+        behind = self._background.render(camera, times_us)
+        if parts == "scene":
+            return behind
+        through = (1 - person.alpha)[..., None]
+        return replace(behind, rgb=person.rgb + through * behind.rgb, human=person.human)
 
 
 class NearestFrame:
@@ -58,6 +86,12 @@ class NearestFrame:
             )
         nearest = [nearest_in_time(frames, time) for time in times_us]
         return _flat_rendering([capture.image(frame) for frame in nearest], parts)
+
+
+TRIVIAL: dict[str, Callable[[TrainingCapture], Reconstruction]] = {
+    kind.name: kind for kind in (MedianBackground, NearestFrame)
+}
+"""Rows that need no training, by name."""
 
 
 def nearest_in_time(frames: Sequence[Frame], time_us: int) -> Frame:

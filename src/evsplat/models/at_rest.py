@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from evsplat.body import Body, BodyTrack, skin
 from evsplat.capture import Camera
 from evsplat.models.discs.shading import SurfaceLight
-from evsplat.models.layers import Layers
+from evsplat.models.model import Model
 from evsplat.render import Splats
 
 
@@ -62,20 +62,11 @@ class SkinnedGaussians:
         )
 
 
-@runtime_checkable
-class Skinned(Protocol):
+class Skinned(Model, Protocol):
     """A model whose person follows bones by weights that it can tell."""
 
-    track: BodyTrack
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the Gaussians."""
-
-    def at(
-        self, times_us: Sequence[int], camera_center: Float[Tensor, "3"], *, hard_semantics: bool
-    ) -> Layers:
-        """All Gaussians in world space; see `evsplat.models.model.Model`."""
+    def following(self, track: BodyTrack) -> "Skinned":
+        """A copy whose person does what ``track`` says; see `Model`."""
         ...
 
     def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:

@@ -8,8 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from evsplat.camera import Camera
 from evsplat.models.layers import Layers
-from evsplat.render import Backdrop, PinholeCamera, RenderOutput, Splats, render, split_channels
+from evsplat.render import Backdrop, RenderOutput, Splats, render, split_channels
 
 SHADOW_STEP_PX = 2
 """Shadows are soft: they are looked up at every second pixel and interpolated."""
@@ -41,7 +42,7 @@ class Drawing:
 
 def draw(
     layers: Layers,
-    camera: PinholeCamera,
+    camera: Camera,
     *,
     center_gradients: bool = False,
     background: Float[Tensor, "3"] | None = None,
@@ -92,7 +93,7 @@ def _behind(rgb: Float[Tensor, "3"], layer: Splats) -> Float[Tensor, "C"]:
 
 
 def draw_depth(
-    layers: Layers, camera: PinholeCamera, *, parts: Literal["all", "human", "scene"] = "all"
+    layers: Layers, camera: Camera, *, parts: Literal["all", "human", "scene"] = "all"
 ) -> Float[Tensor, "T H W"]:
     """Mean of z in the camera over what each pixel shows, metres; 0 where it shows nothing.
 
@@ -107,7 +108,7 @@ def draw_depth(
     return output.image[..., 0] / covered * (output.alpha > _LEAST_SCENE)
 
 
-def _showing_depth(layer: Splats, camera: PinholeCamera) -> Splats:
+def _showing_depth(layer: Splats, camera: Camera) -> Splats:
     pose = camera.world_to_camera
     return replace(layer, channels=(layer.means @ pose[2, :3] + pose[2, 3])[..., None])
 
@@ -127,7 +128,7 @@ def shadowed_scene(layers: Layers) -> Splats:
     return replace(scene, channels=torch.cat(channels, -1))
 
 
-def _apart(human: Splats, scene: Splats, camera: PinholeCamera) -> tuple[Splats, Splats]:
+def _apart(human: Splats, scene: Splats, camera: Camera) -> tuple[Splats, Splats]:
     """Channels person's RGB, scene's RGB, scene's depth and share, semantic attribute."""
     rgb, semantic = human.channels.split((3, 1), -1)
     nothing = rgb.new_zeros(*rgb.shape[:2], 5)
@@ -140,9 +141,7 @@ def _apart(human: Splats, scene: Splats, camera: PinholeCamera) -> tuple[Splats,
     return human, replace(scene, channels=torch.cat(parts, -1))
 
 
-def _places(
-    depth: Float[Tensor, "H W 2"], camera: PinholeCamera, step: int
-) -> Float[Tensor, "h w 3"]:
+def _places(depth: Float[Tensor, "H W 2"], camera: Camera, step: int) -> Float[Tensor, "h w 3"]:
     """World places of the scene at every ``step``-th pixel."""
     sums = F.avg_pool2d(depth.movedim(-1, 0), step, ceil_mode=True, count_include_pad=False)
     z = sums[0] / sums[1].clamp_min(_LEAST_SCENE)
@@ -159,9 +158,7 @@ def _places(
     return (rays * z[..., None] - pose[:3, 3]) @ pose[:3, :3]
 
 
-def _enlarge(
-    light: Float[Tensor, "T h w"], camera: PinholeCamera, step: int
-) -> Float[Tensor, "T H W"]:
+def _enlarge(light: Float[Tensor, "T h w"], camera: Camera, step: int) -> Float[Tensor, "T H W"]:
     full = F.interpolate(light[:, None], scale_factor=step, mode="bilinear")
     return full[:, 0, : camera.height, : camera.width]
 

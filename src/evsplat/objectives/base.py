@@ -1,9 +1,9 @@
-"""The protocol of objectives: they name times, and compare what was rendered there."""
+"""The base of objectives: they name times, and compare what was rendered there."""
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -79,50 +79,80 @@ def picture(capture: TrainingCapture, frame: Frame) -> tuple[Hashable, Callable[
     return ("image", frame.name), partial(capture.image, frame)
 
 
-class Objective(Protocol):
-    """A loss with one or several named terms, before weighting."""
+class Objective:
+    """A loss with one or several named terms, before weighting.
+
+    By default it asks for no renders and remembers nothing between steps.
+    """
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """Times, microseconds, whose renders the objective needs for a drawn frame."""
-        ...
-
-    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
-        """Ask for the recorded data that the loss of a later step, of ``frame``, will need."""
-        ...
-
-    def loss(self, step: Step) -> dict[str, Tensor]:
-        """Named scalar terms, unweighted; a term that does not apply is left out."""
-        ...
-
-    def rows_changed(self) -> None:
-        """Called after Gaussians were added, removed or moved between the classes."""
-        ...
-
-    def state(self) -> dict[str, Tensor]:
-        """Values that a checkpoint must hold for a resume to repeat the same steps."""
-        ...
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state` gave."""
-        ...
-
-
-class Stateless:
-    """Base of objectives that remember nothing between steps; by default they ask for nothing."""
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """No renders of its own."""
         return ()
 
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
-        """Nothing recorded is needed."""
+        """Ask for the recorded data that the loss of a later step, of ``frame``, will need."""
+
+    def loss(self, step: Step) -> dict[str, Tensor]:
+        """Named scalar terms, unweighted; a term that does not apply is left out."""
+        raise NotImplementedError
 
     def rows_changed(self) -> None:
-        """Nothing refers to rows."""
+        """Called after Gaussians were added, removed or moved between the classes."""
 
     def state(self) -> dict[str, Tensor]:
-        """No values."""
+        """Values that a checkpoint must hold for a resume to repeat the same steps."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Nothing to take."""
+        """Take back what `state` gave."""
+
+
+class OfMiddle(Objective):
+    """Base of objectives that compare the middle of the drawn frame's exposure with its picture."""
+
+    def __init__(self, capture: TrainingCapture) -> None:
+        """Pictures are those of ``capture``."""
+        self.capture = capture
+
+    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
+        """The middle of the drawn frame's exposure."""
+        return (frame.mid_us,)
+
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """The recorded picture."""
+        data.prefetch(*picture(self.capture, frame))
+
+
+class LookedUp(Objective):
+    """Base of objectives that look a value up per Gaussian and keep it for some steps.
+
+    ``refresh`` steps, or until densification: centres move slowly.
+    """
+
+    name: str
+    """Name of the value in a checkpoint."""
+
+    def __init__(self, *, refresh: int) -> None:
+        """Nothing is looked up before the first step."""
+        self.refresh, self.age = refresh, 0
+        self.kept = torch.zeros(0, 0)
+
+    def looked_up(self, find: Callable[[], Tensor], device: torch.device) -> Tensor:
+        """What ``find`` gives or gave, in this step."""
+        if self.age == 0 or self.age >= self.refresh:
+            self.kept, self.age = find(), 0
+        self.age += 1
+        self.kept = self.kept.to(device)  # after a resume
+        return self.kept
+
+    def rows_changed(self) -> None:
+        """Row numbers mean other Gaussians now."""
+        self.age = 0
+
+    def state(self) -> dict[str, Tensor]:
+        """The value and how many steps ago it was looked up."""
+        return {self.name: self.kept, "age": torch.tensor(self.age)}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state` gave."""
+        self.kept, self.age = state[self.name], int(state["age"])

@@ -1,8 +1,7 @@
 """The event term: rendered brightness change against the events between two times (eq. 8-9)."""
 
-from collections import OrderedDict
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import torch
@@ -14,7 +13,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.compiled import native, runs_native
 from evsplat.devices import DeviceCache
 from evsplat.events import count_map, polarity_counts
-from evsplat.objectives.base import Stateless, Step
+from evsplat.objectives.base import Objective, Step
 from evsplat.pictures import log_brightness_change
 
 CACHED_MAPS = 256
@@ -66,7 +65,7 @@ class _NativeEventLoss(torch.autograd.Function):
         return gradient, None, None
 
 
-class EventChange(Stateless):
+class EventChange(Objective):
     """Event loss between consecutive training frames, at their mid-exposures (A13).
 
     Where events have no polarity, the size of the change is compared with their number.
@@ -86,8 +85,8 @@ class EventChange(Stateless):
         assert capture.events is not None
         self.capture, self.events = capture, capture.events
         self.start, self.floor, self.eps = start, floor, eps
-        self.min_active = min_active
-        self._maps: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+        self.weight_by_activity, self.min_active = weight_by_activity, min_active
+        self._map = lru_cache(CACHED_MAPS)(self._count)
         self.partner: dict[str, Frame] = {}
         frames = capture.frames
         train = capture.train_frames
@@ -100,15 +99,20 @@ class EventChange(Stateless):
         for first, second in pairs:
             # The last frame of a run has no successor: it looks back instead.
             self.partner.setdefault(second.name, first)
+
+    @cached_property
+    def weights(self) -> dict[tuple[int, int], float]:
+        """Weight of each pair of mid-exposures by its share of active pixels (A16, A17)."""
+        partnered = [f for f in self.capture.train_frames if f.name in self.partner]
         activity = {
             pair: float((self._map(*pair) != 0).float().mean())
-            for pair in {self._pair(frame) for frame in train if frame.name in self.partner}
+            for pair in {self._pair(frame) for frame in partnered}
         }
         positive = [share for share in activity.values() if share > 0]
         median = float(torch.tensor(positive).median()) if positive else 1.0
-        self.weights = {
-            pair: (min(max(share / median, 0.25), 4.0) if weight_by_activity else 1.0)
-            * (share >= min_active)
+        return {
+            pair: (min(max(share / median, 0.25), 4.0) if self.weight_by_activity else 1.0)
+            * (share >= self.min_active)
             for pair, share in activity.items()
         }
 
@@ -144,16 +148,9 @@ class EventChange(Stateless):
         times = sorted((frame.mid_us, self.partner[frame.name].mid_us))
         return times[0], times[1]
 
-    def _map(self, start_us: int, end_us: int) -> Float[Tensor, "H W"]:
-        """Signed event count between two times, from a bounded cache; unsigned without polarity."""
-        key = (start_us, end_us)
-        if key not in self._maps:
-            window = self.events.between(start_us, end_us)
-            size = self.events.height, self.events.width
-            signed = self.events.has_polarity
-            self._maps[key] = (
-                count_map(window, *size) if signed else polarity_counts(window, *size).sum(0)
-            )
-            if len(self._maps) > CACHED_MAPS:
-                self._maps.popitem(last=False)
-        return self._maps[key]
+    def _count(self, start_us: int, end_us: int) -> Float[Tensor, "H W"]:
+        """Signed event count between two times; unsigned without polarity."""
+        window = self.events.between(start_us, end_us)
+        size = self.events.height, self.events.width
+        signed = self.events.has_polarity
+        return count_map(window, *size) if signed else polarity_counts(window, *size).sum(0)

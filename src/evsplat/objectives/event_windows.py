@@ -11,7 +11,7 @@ from torch import Tensor
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import send
 from evsplat.events import EventStream, begun_counts, polarity_counts
-from evsplat.objectives.base import Stateless, Step
+from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event_sensor import EventNoise, EventSensor
 from evsplat.pictures import luminance
 
@@ -21,7 +21,7 @@ RENDERS = 3
 """Rendered times around a held-out frame."""
 
 
-class EventWindows(Stateless):
+class EventWindows(Objective):
     """Mean absolute difference between rendered change and events, amplitude kept (eq. 3).
 
     Windows lie between neighbouring rendered times and from the first to the last. Besides the
@@ -157,7 +157,7 @@ class EventWindows(Stateless):
         return send(torch.stack(maps), device)
 
 
-class HeldOutWindows(Stateless):
+class HeldOutWindows(Objective):
     """Events around a held-out frame, counted from the nearest training exposure on.
 
     Windows between neighbouring times say how the person moves; sums of them from a training

@@ -1,7 +1,7 @@
 """The picture term of a camera that integrates: blurry frame against the mean over its exposure."""
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from torch import Tensor
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.devices import DeviceCache
-from evsplat.objectives.base import Stateless, Step, picture
+from evsplat.objectives.base import Objective, Step, picture
 from evsplat.pictures import encode
 from evsplat.similarity.psnr_ssim import l1_and_ssim
 
@@ -37,7 +37,7 @@ def renders_for(motion: float, px_per_render: float, most: int) -> int:
     return 2 * int((wanted - 1) / 2 + 0.5) + 1
 
 
-class Exposure(Stateless):
+class Exposure(Objective):
     """L1 and D-SSIM between a blurry frame and the mean, in linear light, of K renders.
 
     The exposure is cut into K equal strata; a render lies at a random place of each but the middle
@@ -48,16 +48,16 @@ class Exposure(Stateless):
     def __init__(
         self,
         capture: TrainingCapture,
-        renders: dict[str, int],
+        renders: Callable[[Frame], int],
         generator: torch.Generator,
     ) -> None:
-        """``renders``: K per training frame's name, odd."""
+        """``renders``: K of a training frame, odd."""
         self.capture, self.renders, self.generator = capture, renders, generator
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """K distinct times, the middle of the exposure among them."""
         start, end = frame.exposure_us
-        count = self.renders[frame.name]
+        count = self.renders(frame)
         places = torch.arange(count) + torch.rand(count, generator=self.generator)
         drawn = [start + int(share * (end - start) / count) for share in places.tolist()]
         # Other objectives and the non-rigid network look at the middle, which must be among them.

@@ -1,6 +1,5 @@
 """HUGS's losses: both sets against the picture, the person alone against its pixels (2.4)."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -11,7 +10,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.devices import DeviceCache, send
 from evsplat.models.hugs.model import HugsDrawing, HugsModel
 from evsplat.models.hugs.start import body_weights
-from evsplat.objectives.base import Stateless, Step, picture
+from evsplat.objectives.base import LookedUp, OfMiddle, Step
 from evsplat.render import render
 from evsplat.similarity.perceptual import PerceptualMetric
 from evsplat.similarity.psnr_ssim import l1_and_ssim
@@ -29,27 +28,18 @@ def mask_of(capture: TrainingCapture, frame: Frame) -> Float[Tensor, "H W"]:
     return (mask > 0.5).float()
 
 
-class Perceptual:
-    """Mean perceptual distance of random squares, most of them on the person."""
-
-    def __init__(self, metric: PerceptualMetric) -> None:
-        self.metric = metric
-
-    def __call__(
-        self,
-        image: Float[Tensor, "H W 3"],
-        reference: Float[Tensor, "H W 3"],
-        mask: Float[Tensor, "H W"],
-        generator: torch.Generator,
-    ) -> Float[Tensor, ""]:
-        """Distance of ``image`` from ``reference``, both in [0, 1]."""
-        # To the [-1, 1] that the networks expect; the released code leaves it out.
-        image, reference = 2 * image - 1, 2 * reference - 1
-        squares = draw_squares(mask.cpu() > 0.5, generator)
-        distances = [
-            self.metric(image[rows, cols], reference[rows, cols]) for rows, cols in squares
-        ]
-        return torch.stack(distances).mean()
+def perceptual_distance(
+    metric: PerceptualMetric,
+    image: Float[Tensor, "H W 3"],
+    reference: Float[Tensor, "H W 3"],
+    mask: Float[Tensor, "H W"],
+    generator: torch.Generator,
+) -> Float[Tensor, ""]:
+    """Mean distance, over random squares, of two pictures in [0, 1]; most are on the person."""
+    # To the [-1, 1] that the networks expect; the released code leaves it out.
+    image, reference = 2 * image - 1, 2 * reference - 1
+    squares = draw_squares(mask.cpu() > 0.5, generator)
+    return torch.stack([metric(image[place], reference[place]) for place in squares]).mean()
 
 
 def draw_squares(
@@ -71,16 +61,27 @@ def draw_squares(
     return squares
 
 
-class JointPicture(Stateless):
+class _Picture(OfMiddle):
+    """The recorded picture and the mask, for a perceptual distance on squares as well."""
+
+    def __init__(self, capture: TrainingCapture, perceptual: PerceptualMetric | None) -> None:
+        """Pictures and masks are the capture's."""
+        super().__init__(capture)
+        self.perceptual = perceptual
+
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """The recorded picture and the mask."""
+        super().prefetch(frame, nominal, data)
+        data.prefetch(("mask", frame.name), lambda: mask_of(self.capture, frame))
+
+    def mask(self, step: Step) -> Float[Tensor, "H W"]:
+        """The drawn frame's mask on the model's device."""
+        frame = step.frame
+        return step.data.get(("mask", frame.name), lambda: mask_of(self.capture, frame))
+
+
+class JointPicture(_Picture):
     """Everything, over the step's random colour, against the recorded picture."""
-
-    def __init__(self, capture: TrainingCapture, perceptual: Perceptual | None) -> None:
-        """Pictures and, for the perceptual squares, masks are the capture's."""
-        self.capture, self.perceptual = capture, perceptual
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """The middle of the exposure."""
-        return (frame.mid_us,)
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``l1``, ``dssim`` and ``perceptual``, means over the picture."""
@@ -89,28 +90,15 @@ class JointPicture(Stateless):
         l1, similarity = l1_and_ssim(drawn, observed)
         terms = {"l1": l1, "dssim": 1 - similarity}
         if self.perceptual is not None:
-            mask = step.data.get(
-                ("mask", step.frame.name), lambda: mask_of(self.capture, step.frame)
+            mask = self.mask(step)
+            terms["perceptual"] = perceptual_distance(
+                self.perceptual, drawn, observed, mask, step.generator
             )
-            terms["perceptual"] = self.perceptual(drawn, observed, mask, step.generator)
         return terms
 
 
-class HumanPicture(Stateless):
+class HumanPicture(_Picture):
     """The person alone against its pixels, both over a random colour of the step."""
-
-    def __init__(self, capture: TrainingCapture, perceptual: Perceptual | None) -> None:
-        """Pictures and masks are the capture's."""
-        self.capture, self.perceptual = capture, perceptual
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """The middle of the exposure."""
-        return (frame.mid_us,)
-
-    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
-        """The recorded picture and the mask."""
-        data.prefetch(*picture(self.capture, frame))
-        data.prefetch(("mask", frame.name), lambda: mask_of(self.capture, frame))
 
     def loss(self, step: Step[HugsModel]) -> dict[str, Tensor]:
         """``human_l1``, ``human_dssim`` and ``human_perceptual``.
@@ -120,7 +108,7 @@ class HumanPicture(Stateless):
         distance sees noise in place of the colour.
         """
         index, observed = step.index(step.frame.mid_us), step.observed(step.frame)
-        mask = step.data.get(("mask", step.frame.name), lambda: mask_of(self.capture, step.frame))
+        mask = self.mask(step)
         colour = send(torch.rand(3, generator=step.generator), mask.device)
         drawn, inside = self._drawn(step, index, colour).clamp(0, 1), mask[..., None]
         expected = observed * inside + colour * (1 - inside)
@@ -132,7 +120,9 @@ class HumanPicture(Stateless):
         if self.perceptual is not None:
             noise = send(torch.rand(expected.shape, generator=step.generator), mask.device)
             shown, wanted = (noise * (1 - inside) + value * inside for value in (drawn, observed))
-            terms["human_perceptual"] = self.perceptual(shown, wanted, mask, step.generator)
+            terms["human_perceptual"] = perceptual_distance(
+                self.perceptual, shown, wanted, mask, step.generator
+            )
         return terms
 
     def _drawn(
@@ -152,46 +142,22 @@ class HumanPicture(Stateless):
         return render(human, camera, background=colour).image[0]
 
 
-class SkinningTarget:
+class SkinningTarget(LookedUp):
     """Mean squared difference of the decoded skinning weights from the body's.
 
-    The body's weights at the Gaussians are looked up every ``refresh`` steps and after
-    densification, as centres move slowly; the released code does it at every step.
+    The body's weights at the Gaussians are looked up now and then; the released code does it at
+    every step.
     """
 
-    def __init__(self, *, refresh: int) -> None:
-        """Nothing is looked up before the first step."""
-        self.refresh, self.age = refresh, 0
-        self.target = torch.zeros(0, 0)
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """None of its own."""
-        return ()
-
-    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
-        """Nothing recorded is needed."""
+    name = "target"
 
     def loss(self, step: Step[HugsModel]) -> dict[str, Tensor]:
         """``skinning``, mean over Gaussians and joints."""
         assert isinstance(step.drawing, HugsDrawing)
         decoded = step.drawing.decoded
-        if self.age == 0 or self.age >= self.refresh:
-            places = (step.model.human.means + decoded.offsets).detach()
-            body = step.model.track.body
-            self.target = body_weights(places, body.canonical_vertices(), body.weights)
-            self.age = 0
-        self.age += 1
-        self.target = self.target.to(decoded.weights.device)  # after a resume
-        return {"skinning": (decoded.weights - self.target).square().mean()}
-
-    def rows_changed(self) -> None:
-        """Row numbers mean other Gaussians now."""
-        self.age = 0
-
-    def state(self) -> dict[str, Tensor]:
-        """The weights and how many steps ago they were looked up."""
-        return {"target": self.target, "age": torch.tensor(self.age)}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state` gave."""
-        self.target, self.age = state["target"], int(state["age"])
+        body = step.model.track.body
+        places = (step.model.human.means + decoded.offsets).detach()
+        target = self.looked_up(
+            lambda: body_weights(places, body.canonical_vertices(), body.weights), places.device
+        )
+        return {"skinning": (decoded.weights - target).square().mean()}

@@ -1,6 +1,5 @@
 """As isometric as possible: neighbours keep their distances and covariances when posed."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -9,12 +8,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import quaternion_to_matrix
-from evsplat.capture import Frame
 from evsplat.compiled import native, runs_native
-from evsplat.devices import DeviceCache, send
+from evsplat.devices import send
 from evsplat.models.paper import PaperModel
 from evsplat.neighbours import nearest
-from evsplat.objectives.base import Step
+from evsplat.objectives.base import LookedUp, Step
 
 NEIGHBOURS = 4
 MOST_TIMES = 2
@@ -87,27 +85,20 @@ def _rows(values: Tensor, rows: Tensor, axis: int) -> Tensor:
     return values.index_select(axis, rows.flatten()).unflatten(axis, rows.shape)
 
 
-class Isometry:
+class Isometry(LookedUp):
     """L1 between pairwise distances in canonical space and posed (3DGS-Avatar, 1.9).
 
-    Four neighbours per Gaussian, found among the canonical centres; the search is repeated only
-    every ``refresh`` steps and after densification, since centres move slowly. Each step looks at
+    Four neighbours per Gaussian, looked up among the canonical centres. Each step looks at
     ``samples`` random Gaussians, an unbiased estimate of the full mean, or at all if there are
-    fewer.
+    fewer, at whatever times are posed.
     """
+
+    name = "neighbours"
 
     def __init__(self, *, refresh: int, samples: int) -> None:
         """Nothing is searched before the first step."""
-        self.refresh, self.samples = refresh, samples
-        self.neighbours = torch.zeros(0, NEIGHBOURS, dtype=torch.long)
-        self.age = 0
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """None of its own: it looks at whatever is posed."""
-        return ()
-
-    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
-        """Nothing recorded is needed."""
+        super().__init__(refresh=refresh)
+        self.samples = samples
 
     def loss(self, step: Step[PaperModel]) -> dict[str, Tensor]:
         """``isometry_centers`` and ``isometry_covariances``."""
@@ -116,16 +107,14 @@ class Isometry:
         if count <= NEIGHBOURS:
             return {}
         canonical = gaussians.means  # the person's rows come first
-        if self.age == 0 or self.age >= self.refresh:
-            self.neighbours = nearest(canonical[:count], NEIGHBOURS)[1]
-            self.age = 0
-        self.age += 1
-        self.neighbours = self.neighbours.to(canonical.device)  # after a resume
+        neighbours = self.looked_up(
+            lambda: nearest(canonical[:count], NEIGHBOURS)[1], canonical.device
+        )
         chosen = torch.arange(count)
         if self.samples < count:
             chosen = torch.randint(count, (self.samples,), generator=step.generator)
         chosen = send(chosen, canonical.device)
-        rows = torch.cat([chosen[:, None], self.neighbours[chosen]], dim=1)
+        rows = torch.cat([chosen[:, None], neighbours[chosen]], dim=1)
 
         at_rest = (gaussians.means, gaussians.quaternions, gaussians.scales_log)
         # Two of the times are enough: a step's lie close to each other.
@@ -138,15 +127,3 @@ class Isometry:
         )
         centers, covariances = isometry_change(rows, at_rest, moved)
         return {"isometry_centers": centers, "isometry_covariances": covariances}
-
-    def rows_changed(self) -> None:
-        """Row numbers mean other Gaussians now: search again."""
-        self.age = 0
-
-    def state(self) -> dict[str, Tensor]:
-        """The neighbours and how many steps ago they were found."""
-        return {"neighbours": self.neighbours, "age": torch.tensor(self.age)}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state` gave."""
-        self.neighbours, self.age = state["neighbours"], int(state["age"])

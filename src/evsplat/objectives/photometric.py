@@ -1,6 +1,6 @@
 """Picture terms at mid-exposure: renders against recorded pictures, coverage against masks."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -9,12 +9,15 @@ from torch import Tensor
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.devices import DeviceCache
-from evsplat.objectives.base import Stateless, Step, picture
+from evsplat.objectives.base import OfMiddle, Step
 from evsplat.similarity.perceptual import PerceptualMetric
 from evsplat.similarity.psnr_ssim import l1_and_ssim
 
+Box = tuple[int, int, int, int]
+"""Pixels (x0, y0, x1, y1), ends exclusive."""
 
-class Photometric(Stateless):
+
+class Photometric(OfMiddle):
     """L1, D-SSIM and an optional perceptual distance on the person's box (A18, A19).
 
     The paper's reading: one sharp-time render is compared with the blurry frame. Every rendered
@@ -25,28 +28,20 @@ class Photometric(Stateless):
     def __init__(
         self,
         capture: TrainingCapture,
-        boxes: dict[str, tuple[int, int, int, int]],
+        box_of: Callable[[Frame], Box | None],
         *,
         dssim: bool,
         perceptual: PerceptualMetric | None,
         perceptual_term: str = "perceptual",
     ) -> None:
-        """``boxes``: the person's pixel box (x0, y0, x1, y1) per training frame that shows one.
+        """``box_of``: the person's pixel box (x0, y0, x1, y1) in a training frame that shows one.
 
         ``perceptual_term`` is what that term is called.
         """
-        self.capture = capture
+        super().__init__(capture)
         self.frames = {frame.mid_us: frame for frame in capture.train_frames}
-        self.boxes, self.dssim, self.perceptual = boxes, dssim, perceptual
+        self.box_of, self.dssim, self.perceptual = box_of, dssim, perceptual
         self.perceptual_term = perceptual_term
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """The middle of the drawn frame's exposure."""
-        return (frame.mid_us,)
-
-    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
-        """The recorded picture."""
-        data.prefetch(*picture(self.capture, frame))
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``l1``, ``dssim`` and ``perceptual`` as configured, means over pictures and pixels."""
@@ -65,9 +60,9 @@ class Photometric(Stateless):
         if self.perceptual is not None:
             values = []
             for frame, a, b in seen:
-                if frame.name not in self.boxes:
+                if (box := self.box_of(frame)) is None:
                     continue
-                x0, y0, x1, y1 = self.boxes[frame.name]
+                x0, y0, x1, y1 = box
                 crops = (a[y0:y1, x0:x1], b[y0:y1, x0:x1])
                 if min(crops[0].shape[:2]) >= self.perceptual.network.min_side:
                     values.append(self.perceptual(2 * crops[0] - 1, 2 * crops[1] - 1))
@@ -76,20 +71,14 @@ class Photometric(Stateless):
         return terms
 
 
-class Alpha(Stateless):
+class Alpha(OfMiddle):
     """L1 between the person's alpha picture and the mask (3DGS-Avatar; reference 1.9).
 
     The alpha picture is the channel of the semantic attribute, for a set that is nothing but the
     person: the released code draws it as a second picture with all colours white.
     """
 
-    def __init__(self, capture: MaskedCapture) -> None:
-        """Masks are those of ``capture``."""
-        self.capture = capture
-
-    def times(self, frame: Frame, nominal: float) -> Sequence[int]:
-        """The middle of the drawn frame's exposure."""
-        return (frame.mid_us,)
+    capture: MaskedCapture
 
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
         """The mask."""

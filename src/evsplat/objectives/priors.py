@@ -7,10 +7,10 @@ from evsplat.body import SurfaceSamples
 from evsplat.devices import send
 from evsplat.models.discs import DiscModel
 from evsplat.models.paper import PaperModel
-from evsplat.objectives.base import Stateless, Step
+from evsplat.objectives.base import Objective, Step
 
 
-class PosePrior(Stateless):
+class PosePrior(Objective):
     """Squared residuals of the poses in units of what is expected."""
 
     def loss(self, step: Step[DiscModel]) -> dict[str, Tensor]:
@@ -20,7 +20,7 @@ class PosePrior(Stateless):
         return {"pose_prior": step.model.residual.price()}
 
 
-class SkinningPrior(Stateless):
+class SkinningPrior(Objective):
     """Mean over surface points of the squared weight error, summed over joints (1.6)."""
 
     def __init__(self, surface: SurfaceSamples, points_per_step: int) -> None:

@@ -1,5 +1,6 @@
 """Teaches the semantic attribute where the person is, without any mask (A8)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from evsplat.compiled import native, runs_native
 from evsplat.devices import DeviceCache
 from evsplat.models.discs import DiscModel
 from evsplat.models.paper import PaperModel
-from evsplat.objectives.base import Stateless, Step
+from evsplat.objectives.base import Objective, Step
 
 LEAST_SHARE = 1e-4
 """A share of the person is held so far from 0 and 1, where the logarithm has no end."""
@@ -93,7 +94,7 @@ class _NativeMembership(torch.autograd.Function):
         return slope * (-upstream[0] / slope.numel()), None
 
 
-class RenderedSemantics(Stateless):
+class RenderedSemantics(Objective):
     """Cross-entropy of the rendered attribute against the posed body's bounds (A2 iii, A8).
 
     It looks at the mid-exposures that other objectives render.
@@ -101,7 +102,7 @@ class RenderedSemantics(Stateless):
 
     def __init__(
         self,
-        bounds: dict[int, PackedBounds],
+        bounds: dict[int, Callable[[], PackedBounds]],
     ) -> None:
         """``bounds`` of the posed body, by mid-exposure (microseconds) of the training frames."""
         self.bounds = bounds
@@ -109,7 +110,7 @@ class RenderedSemantics(Stateless):
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
         """The bounds at the frame's mid-exposure."""
         if frame.mid_us in self.bounds:
-            data.prefetch(("bounds", frame.mid_us), self.bounds[frame.mid_us].masks)
+            data.prefetch(("bounds", frame.mid_us), lambda: self.bounds[frame.mid_us]().masks())
 
     def loss(self, step: Step[PaperModel | DiscModel]) -> dict[str, Tensor]:
         """``semantic`` and the pressure ``binarise`` = mean m (1 - m) (A2)."""
@@ -117,7 +118,7 @@ class RenderedSemantics(Stateless):
         for time, drawn in zip(step.times_us, step.semantic, strict=True):
             if time not in self.bounds:
                 continue
-            packed = self.bounds[time]
+            packed = self.bounds[time]()
             masks = packed if runs_native(drawn) else step.data.get(("bounds", time), packed.masks)
             values.append(membership_loss(drawn, masks))
         soft = step.model.gaussians.semantics()

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -37,30 +38,48 @@ def write_video(
             "'pip install --force-reinstall --only-binary av av', or write PNG files "
             "by giving --out a folder."
         )
-    count = 0
-    with (
-        atomic_path(path) as temporary,
-        av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container,
-    ):
-        stream = None
+    with atomic_path(path) as temporary:
+        container = av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"})
+        even = map(_even, pictures)
+        count = _encode(container, "libx264", even, fps, "ITU709", crf=str(crf), preset="medium")
+        if not count:
+            raise DataError(f"{path}: there is no picture to write.")
+    return count
+
+
+def _encode(
+    container: Any,
+    codec: str,
+    pictures: Iterable[UInt8[np.ndarray, "H W C"]],
+    fps: float,
+    colours: str,
+    **options: str,
+) -> int:
+    """Encode RGB or RGBA pictures into an open container and close it; gives their number."""
+    import av
+
+    count, stream = 0, None
+    with container:
         for picture in pictures:
-            picture = _even(picture)
+            opaque = picture.shape[2] == 3
             if stream is None:
-                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+                stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
                 stream.height, stream.width = picture.shape[:2]
-                stream.pix_fmt = "yuv420p"
-                stream.options = {"crf": str(crf), "preset": "medium"}
-                context = stream.codec_context
-                context.colorspace = context.color_primaries = context.color_trc = _BT709
-                context.color_range = _LIMITED_RANGE
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
-                format="yuv420p", dst_colorspace="ITU709", dst_color_range=_LIMITED_RANGE
+                stream.pix_fmt = "yuv420p" if opaque else "yuva420p"
+                stream.options = options
+                if colours == "ITU709":
+                    context = stream.codec_context
+                    context.colorspace = context.color_primaries = context.color_trc = _BT709
+                    context.color_range = _LIMITED_RANGE
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24" if opaque else "rgba")
+            frame = frame.reformat(
+                format=stream.pix_fmt, dst_colorspace=colours, dst_color_range=_LIMITED_RANGE
             )
+            frame.pts = count
             container.mux(stream.encode(frame))
             count += 1
-        if stream is None:
-            raise DataError(f"{path}: there is no picture to write.")
-        container.mux(stream.encode())
+        if stream is not None:
+            container.mux(stream.encode())
     return count
 
 
@@ -94,29 +113,9 @@ def _write_webp(path: Path, pictures: Iterable[UInt8[np.ndarray, "H W C"]], fps:
             "The installed PyAV has no encoder of animated WebP (libwebp_anim): install the wheel "
             "with 'pip install --force-reinstall --only-binary av av', or give --out a .gif."
         )
-    count = 0
-    # for a name in .webp alone a picture's format is guessed; 0: for ever
-    with av.open(str(path), "w", format="webp", options={"loop": "0"}) as container:
-        stream = None
-        for picture in pictures:
-            opaque = picture.shape[2] == 3
-            if stream is None:
-                rate = Fraction(fps).limit_denominator(1001)
-                stream = container.add_stream("libwebp_anim", rate=rate)
-                stream.height, stream.width = picture.shape[:2]
-                stream.pix_fmt = "yuv420p" if opaque else "yuva420p"
-                stream.options = {"quality": "90"}
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24" if opaque else "rgba")
-            # libwebp takes BT.601 in limited range
-            frame = frame.reformat(
-                format=stream.pix_fmt, dst_colorspace="ITU601", dst_color_range=_LIMITED_RANGE
-            )
-            frame.pts = count
-            container.mux(stream.encode(frame))
-            count += 1
-        if stream is not None:
-            container.mux(stream.encode())
-    return count
+    # For a name in .webp alone a picture's format is guessed; 0: for ever. libwebp takes BT.601.
+    container = av.open(str(path), "w", format="webp", options={"loop": "0"})
+    return _encode(container, "libwebp_anim", pictures, fps, "ITU601", quality="90")
 
 
 def _write_gif(path: Path, pictures: Iterable[UInt8[np.ndarray, "H W C"]], fps: float) -> int:
@@ -160,22 +159,18 @@ def write_pictures(
     if not replace and folder.is_dir() and any(folder.iterdir()):
         raise DataError(f"{folder}: the folder is not empty; give a new one to --out.")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
-    try:
-        count = 0
+    count = 0
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
+        made = Path(temporary) / folder.name
+        made.mkdir()
         for name, picture in pictures:
-            file = temporary / f"{checked_name(name, 'a picture')}.png"
-            Image.fromarray(picture).save(file)
+            Image.fromarray(picture).save(made / f"{checked_name(name, 'a picture')}.png")
             count += 1
         if not count:
             raise DataError(f"{folder}: there is no picture to write.")
-        temporary.chmod(0o755)
         if folder.exists():
             shutil.rmtree(folder)
-        temporary.rename(folder)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+        made.rename(folder)
     return count
 
 

@@ -3,13 +3,12 @@
 from evsplat.render.api import BackendName, choose_device, render
 from evsplat.render.job import Backdrop
 from evsplat.render.native import rows_in_view
-from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats, split_channels
+from evsplat.render.splats import LOW_PASS, RenderOutput, Splats, split_channels
 
 __all__ = [
     "LOW_PASS",
     "BackendName",
     "Backdrop",
-    "PinholeCamera",
     "RenderOutput",
     "Splats",
     "choose_device",

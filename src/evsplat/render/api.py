@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.camera import Camera
 from evsplat.cuda_support import needs, what_is_missing
 from evsplat.errors import BackendError, ConfigError
 from evsplat.render import cuda, native, reference
 from evsplat.render.job import Backdrop, RenderJob
-from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats
+from evsplat.render.splats import LOW_PASS, RenderOutput, Splats
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +24,7 @@ _BACKEND_OF_DEVICE = {"cpu": "native", "cuda": "gsplat"}
 
 def render(
     splats: Splats,
-    camera: PinholeCamera,
+    camera: Camera,
     *,
     static: Splats | None = None,
     background: Float[Tensor, "C"] | Float[Tensor, "H W C"] | None = None,
@@ -124,7 +125,7 @@ def _check_alike(splats: Splats, static: Splats) -> None:
         raise BackendError(f"render: static has {more} channels, but splats has {channels}.")
 
 
-def _check_camera(splats: Splats, camera: PinholeCamera, background: Tensor | None) -> None:
+def _check_camera(splats: Splats, camera: Camera, background: Tensor | None) -> None:
     width, height, channels = camera.width, camera.height, splats.channels.shape[-1]
     if width < 1 or height < 1:
         raise BackendError(f"render: the camera's image is {width} x {height} pixels.")

@@ -6,7 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from evsplat.render.splats import PinholeCamera, Splats
+from evsplat.camera import Camera
+from evsplat.render.splats import Splats
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,7 @@ class RenderJob:
     static: Splats | None
     times: int
     """Number of pictures."""
-    camera: PinholeCamera
+    camera: Camera
     background: Tensor | None
     near: float
     """Least depth of what is drawn, metres."""

@@ -8,10 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from evsplat.camera import Camera
 from evsplat.compiled import import_error, native, runs_native
 from evsplat.errors import BackendError
 from evsplat.render.job import RenderJob
-from evsplat.render.splats import PinholeCamera, RenderOutput, Splats
+from evsplat.render.splats import RenderOutput, Splats
 
 
 def render(job: RenderJob) -> RenderOutput:
@@ -35,7 +36,7 @@ def render(job: RenderJob) -> RenderOutput:
 
 
 def rows_in_view(
-    means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], camera: PinholeCamera
+    means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], camera: Camera
 ) -> Int[Tensor, " V"] | None:
     """Rows that may reach into the picture, whatever their rotation and opacity; None for all.
 

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.camera import Camera
 from evsplat.render.job import RenderJob
-from evsplat.render.splats import LOW_PASS, PinholeCamera, RenderOutput, Splats, join
+from evsplat.render.splats import LOW_PASS, RenderOutput, Splats, join
 
 # The rules of gsplat 1.5.3 (cuda/csrc/ProjectionEWA3DGSFused.cu, RasterizeToPixels3DGSFwd.cu).
 MIN_ALPHA = 1 / 255
@@ -84,7 +85,7 @@ def project(
     quaternions: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
     linear: Float[Tensor, "N 3 3"] | None,
-    camera: PinholeCamera,
+    camera: Camera,
     low_pass: float = LOW_PASS,
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2 2"], Float[Tensor, "N"]]:
     """EWA splatting: centres in px, covariances in px^2 with the low-pass, depths in metres."""
@@ -131,7 +132,7 @@ def _extents(
     covariance: Tensor,
     depth: Tensor,
     opacities: Tensor,
-    camera: PinholeCamera,
+    camera: Camera,
     near: float,
 ) -> tuple[Tensor, Tensor]:
     """Reach of each Gaussian in x and y, whole pixels, and which Gaussians are drawn."""

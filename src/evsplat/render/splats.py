@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -11,26 +11,6 @@ from torch.autograd.function import once_differentiable
 
 LOW_PASS = 0.3
 """Low-pass filter of 3DGS and most viewers, px^2: see `render`."""
-
-
-class PinholeCamera(Protocol):
-    """The part of a camera that rendering reads (`evsplat.capture.Camera` has it)."""
-
-    @property
-    def width(self) -> int:
-        """Image width, pixels."""
-
-    @property
-    def height(self) -> int:
-        """Image height, pixels."""
-
-    @property
-    def K(self) -> Float[Tensor, "3 3"]:
-        """Focal lengths and principal point in pixels; pixel centres at +0.5, no skew."""
-
-    @property
-    def world_to_camera(self) -> Float[Tensor, "4 4"]:
-        """Rigid transform, OpenCV axes; may require a gradient."""
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,17 @@ def save_checkpoint(
 ) -> Path:
     """Write one checkpoint atomically and drop all but the newest `KEEP`."""
     path = folder / f"{iteration:06d}.safetensors"
-    with atomic_path(path) as temporary:
-        save_file(
-            {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
-            temporary,
-            metadata={"state": json.dumps(state)},
-        )
+    write_state(path, tensors, state)
     for old in sorted(folder.glob("[0-9]*.safetensors"))[:-KEEP]:
         old.unlink()
     return path
+
+
+def write_state(path: Path, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:
+    """Write tensors and state as `load_checkpoint` reads them, whole or not at all."""
+    kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    with atomic_path(path) as temporary:
+        save_file(kept, temporary, metadata={"state": json.dumps(state)})
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
@@ -73,6 +75,15 @@ def load_model(model: Model, tensors: dict[str, Tensor], human_count: int) -> No
         values = {key: entries[f"{name}.{key}"].to(device) for key in rows.attributes}
         rows.set_rows(values, human_count)
     model.load_state_dict(entries)
+
+
+def counts(model: Model) -> dict[str, int]:
+    """Number of Gaussians per class."""
+    sets = model.sets.values()
+    return {
+        "human": sum(rows.human_count for rows in sets),
+        "scene": sum(rows.scene_count for rows in sets),
+    }
 
 
 def flatten(prefix: str, state: dict[Any, Any]) -> dict[str, Tensor]:

@@ -22,41 +22,35 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.files import read_json, write_json, write_text
 from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
-from evsplat.methods.reconstruction import Parts, Reconstruction, Rendering
+from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.models.model import Model
 from evsplat.render import Backdrop, Splats, choose_device, render
-from evsplat.training.checkpoint import check_fits, latest_checkpoint, load_checkpoint, load_model
+from evsplat.training.checkpoint import (
+    check_fits,
+    counts,
+    latest_checkpoint,
+    load_checkpoint,
+    load_model,
+)
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 
-@dataclass(frozen=True)
 class RunFolder:
     """Paths of the parts of a run."""
 
-    path: Path
-
-    @property
-    def config(self) -> Path:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = path / "config.yaml"
         """Method and its full configuration, YAML."""
-        return self.path / "config.yaml"
-
-    @property
-    def facts(self) -> Path:
+        self.facts = path / "versions.json"
         """Capture, versions, device and threads, JSON."""
-        return self.path / "versions.json"
-
-    @property
-    def log(self) -> Path:
+        self.log = path / "log.jsonl"
         """One JSON object per logged step."""
-        return self.path / "log.jsonl"
-
-    @property
-    def checkpoints(self) -> Path:
+        self.checkpoints = path / "checkpoints"
         """Folder of checkpoints."""
-        return self.path / "checkpoints"
 
     def truncate_log(self, iteration: int) -> None:
         """Drop log lines after ``iteration``, which a resumed run is going to write again."""
@@ -108,7 +102,7 @@ class GaussianReconstruction:
     """A trained model, drawn from any camera at any time of the recording."""
 
     name: str
-    model: Model
+    model: Skinned
     backdrop: Backdrop | None = None
     """What the scene looked like to the picture before, for a camera that mostly stands still."""
     shadow_step_px: int = SHADOW_STEP_PX
@@ -123,29 +117,24 @@ class GaussianReconstruction:
                 drawing = draw(
                     layers, camera, backdrop=self.backdrop, shadow_step_px=self.shadow_step_px
                 )
-                return Rendering(
-                    rgb=_stacked(drawing.rgb).cpu().clamp(0, 1),
-                    alpha=drawing.output.alpha.cpu(),
-                    human=_stacked(drawing.semantic).cpu().clamp(0, 1),
-                )
-            layer = layers.human if parts == "human" else layers.scene
-            output = render(layer, camera, low_pass=layers.low_pass)
-        times = len(times_us)
-
-        def all_times(values: torch.Tensor) -> torch.Tensor:
-            # The scene alone is drawn once.
-            return values.cpu().expand(times, *values.shape[1:])
-
+                rgb, human = _stacked(drawing.rgb), _stacked(drawing.semantic)
+                alpha = drawing.output.alpha
+            else:
+                layer = layers.human if parts == "human" else layers.scene
+                output = render(layer, camera, low_pass=layers.low_pass)
+                rgb, human, alpha = output.image[..., :3], output.image[..., 3], output.alpha
+        # The scene alone is drawn once.
+        shape = len(times_us), camera.height, camera.width
         return Rendering(
-            rgb=all_times(output.image[..., :3].clamp(0, 1)),
-            alpha=all_times(output.alpha),
-            human=all_times(output.image[..., 3].clamp(0, 1)),
+            rgb=rgb.cpu().clamp(0, 1).expand(*shape, 3),
+            alpha=alpha.cpu().expand(shape),
+            human=human.cpu().clamp(0, 1).expand(shape),
         )
 
     def depth(
         self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
     ) -> Float[Tensor, "T H W"]:
-        """Mean depth of what is drawn; see `WithDepth`."""
+        """Mean of z in the camera over what a pixel shows, metres; 0 where it shows nothing."""
         with torch.no_grad():
             camera = camera.to(self.model.device)
             layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
@@ -158,19 +147,23 @@ class GaussianReconstruction:
         return self.model.track
 
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
-        """The same person doing what ``track`` says; see `Posable`."""
+        """The same person and scene with the motion ``track`` (same body, own times) instead."""
         return GaussianReconstruction(self.name, self.model.following(track))
 
     @property
     def low_pass(self) -> float:
-        """See `SplatReconstruction`."""
+        """Variance of the filter of a pixel in its pictures, px^2; viewers of others take 0.3."""
         return self.model.low_pass
 
     @torch.no_grad()
     def splats(
         self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
     ) -> list[Splats]:
-        """Gaussians at the given times; see `SplatReconstruction`."""
+        """Gaussians that `render` draws, world metres; the person first.
+
+        Channels are R, G, B (sRGB) and the semantic attribute (1 = person). Colours that depend on
+        the direction are those seen from ``camera``.
+        """
         center = camera.to(self.model.device).center()
         layers = self.model.at(list(times_us), center, hard_semantics=True)
         if parts == "all":
@@ -178,22 +171,19 @@ class GaussianReconstruction:
         return [layers.human if parts == "human" else layers.scene]
 
     def at_rest(self, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
-        """The person's mean in canonical space; see `Bakeable`."""
-        return mean_at_rest(self._skinned(), views)
+        """The person's mean over ``views`` (times in us and their cameras), in canonical space."""
+        return mean_at_rest(self.model, views)
 
     @torch.no_grad()
-    def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """The recorded motion as it was corrected; see `Bakeable`."""
-        rotations, bones = self._skinned().pose(list(times_us))
-        return rotations.cpu(), bones.cpu()
+    def pose(
+        self, times_us: Sequence[int]
+    ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T J 4 4"]]:
+        """The recorded motion with what the method corrected of it.
 
-    def _skinned(self) -> Skinned:
-        if isinstance(self.model, Skinned):
-            return self.model
-        raise DataError(
-            f"Method {self.name} does not tell the skinning weights of its Gaussians, so that its "
-            "person cannot be taken apart from its poses; export an instant or an html clip."
-        )
+        Rotations of joints against their parents, and bone transforms canonical to world.
+        """
+        rotations, bones = self.model.pose(list(times_us))
+        return rotations.cpu(), bones.cpu()
 
 
 def _stacked(pictures: tuple[Tensor, ...]) -> Tensor:
@@ -212,7 +202,7 @@ class Run:
     """What training saw, as the capture could meet it."""
     capture: Capture
     """All of it, for evaluation and looking; without test frames where everything trained."""
-    reconstruction: Reconstruction
+    reconstruction: GaussianReconstruction
     iteration: int
     train_seconds: float
     device: str
@@ -279,7 +269,6 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
 
 def reload_run(run: Run, state: Path) -> Run:
     """The run at another checkpoint or snapshot of it; its model gets other parameters in place."""
-    assert isinstance(run.reconstruction, GaussianReconstruction)
     model = run.reconstruction.model
     tensors, progress = load_checkpoint(state)
     load_model(model, tensors, progress["human_count"])
@@ -288,12 +277,8 @@ def reload_run(run: Run, state: Path) -> Run:
 
 def _progress(model: Model, progress: dict[str, Any]) -> dict[str, Any]:
     """The fields of `Run` that change while it is trained."""
-    sets = model.sets.values()
     return {
         "iteration": progress["clock"]["iteration"],
         "train_seconds": progress["clock"]["seconds"],
-        "gaussians": {
-            "human": sum(rows.human_count for rows in sets),
-            "scene": sum(rows.scene_count for rows in sets),
-        },
+        "gaussians": counts(model),
     }

@@ -18,7 +18,7 @@ from evsplat.methods.settings import weight_at
 from evsplat.models.drawing import Drawing
 from evsplat.objectives import Objective, Step
 from evsplat.training.bad_steps import BadSteps
-from evsplat.training.checkpoint import below, flatten, load_model
+from evsplat.training.checkpoint import below, counts, flatten, load_model
 from evsplat.training.clock import Clock
 from evsplat.training.optimiser import Optimiser
 
@@ -163,11 +163,7 @@ class Trainer:
 
     def counts(self) -> dict[str, int]:
         """Number of Gaussians per class."""
-        sets = self.model.sets.values()
-        return {
-            "human": sum(rows.human_count for rows in sets),
-            "scene": sum(rows.scene_count for rows in sets),
-        }
+        return counts(self.model)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """All tensors and all numbers that a resume needs."""

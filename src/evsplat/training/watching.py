@@ -5,7 +5,6 @@ The only thing that trainer and watcher share is the run folder. While it trains
 writes the model to ``snapshot.safetensors`` every few seconds. It never waits for a watcher.
 """
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -13,11 +12,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import save_file
 from torch import Tensor
 
-from evsplat.files import atomic_path
-from evsplat.training.checkpoint import latest_checkpoint
+from evsplat.training.checkpoint import latest_checkpoint, write_state
 
 SNAPSHOT_SECONDS = 3.0
 """Time between snapshots."""
@@ -66,9 +63,7 @@ class Showcase:
         if now >= self._watched_until or now - self._shown < self._pause:
             return
         tensors, state = snapshot()
-        with atomic_path(self.file) as temporary:
-            kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-            save_file(kept, temporary, metadata={"state": json.dumps(state)})
+        write_state(self.file, tensors, state)
         self._shown = self._clock()
         self._pause = max(SNAPSHOT_SECONDS, (self._shown - now) / LARGEST_SHARE)
 

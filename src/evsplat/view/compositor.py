@@ -53,11 +53,6 @@ class Compositor:
         self.viewed, self.others = viewed, dict(others)
         self.capture = viewed.capture
 
-    @property
-    def has_depth(self) -> bool:
-        """True where every run that is shown can show its depth."""
-        return all(viewed.has_depth for viewed in (self.viewed, *self.others.values()))
-
     def compose(
         self, request: ViewRequest, size: tuple[int, int], *, draft: bool
     ) -> UInt8[np.ndarray, "H W 3"]:

@@ -10,6 +10,7 @@ import viser
 from evsplat.capture import Frame
 from evsplat.film import Look, camera_at
 from evsplat.film.looks import Shown
+from evsplat.film.plan import recorded_by
 from evsplat.methods.reconstruction import Parts
 from evsplat.methods.trivial import nearest_in_time
 from evsplat.staging.assets import motions
@@ -19,15 +20,7 @@ from evsplat.view.compositor import comparisons
 from evsplat.view.request import Playback
 from evsplat.view.save_panel import SavePanel
 
-SPEEDS = {
-    "as recorded": 1.0,
-    "1/2": 1 / 2,
-    "1/5": 1 / 5,
-    "1/10": 1 / 10,
-    "1/20": 1 / 20,
-    "1/50": 1 / 50,
-    "1/100": 1 / 100,
-}
+SPEEDS = {"as recorded": 1.0, **{f"1/{slower}": 1 / slower for slower in (2, 5, 10, 20, 50, 100)}}
 _PARTS: dict[str, Parts] = {"person and scene": "all", "person": "human", "scene": "scene"}
 _SHOWN: dict[str, Shown] = {"colour": "rgb", "person / scene": "semantic", "depth": "depth"}
 _WHOLE, _EXPOSURE = "the recording", "this exposure"
@@ -50,8 +43,7 @@ class Panel:
         self.gui = client.handle.gui
         self._slider_moved_s = 0.0
         self._status = ""
-        self._frames = sorted(self.capture.frames, key=lambda frame: frame.mid_us)
-        self._frames = [f for f in self._frames if f.camera == self._frames[0].camera]
+        self._frames = recorded_by(self.capture, None)
         self._recording_us = self._frames[0].mid_us, self._frames[-1].mid_us
         self._start_us, self._end_us = self._recording_us
         self._motion: str | None = None
@@ -61,9 +53,8 @@ class Panel:
             self._build_camera()
         with self.gui.add_folder("Show"):
             self._build_show()
-        if client.compositor.viewed.is_posable:
-            with self.gui.add_folder("Motion and pose"):
-                self._build_pose()
+        with self.gui.add_folder("Motion and pose"):
+            self._build_pose()
         with self.gui.add_folder("Save"):
             SavePanel(client)
         client.on_drawn = self._follow
@@ -122,8 +113,7 @@ class Panel:
     def _build_show(self) -> None:
         gui, client = self.gui, self.client
         parts = gui.add_dropdown("Parts", tuple(_PARTS))
-        known = [name for name in _SHOWN if name != "depth" or client.compositor.has_depth]
-        shown = gui.add_dropdown("Colours", tuple(known))
+        shown = gui.add_dropdown("Colours", tuple(_SHOWN))
         others = comparisons(self.capture, list(client.compositor.others))
         compare = gui.add_dropdown("Compare with", (_NOTHING, *others))
         layout = gui.add_dropdown("Layout", ("divided", "side by side"))

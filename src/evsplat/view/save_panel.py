@@ -28,9 +28,8 @@ class SavePanel:
         """Build the controls in the folder that is open."""
         self.client, gui = client, client.handle.gui
         picture = gui.add_button("Picture (PNG)", icon=viser.Icon.DOWNLOAD)
-        known = client.compositor.viewed.has_splats
-        self.format = gui.add_dropdown("Format", tuple(_FORMATS), visible=known)
-        gaussians = gui.add_button("Gaussians", icon=viser.Icon.DOWNLOAD, visible=known)
+        self.format = gui.add_dropdown("Format", tuple(_FORMATS))
+        gaussians = gui.add_button("Gaussians", icon=viser.Icon.DOWNLOAD)
 
         async def save_picture(_: viser.GuiEvent) -> None:
             client.scheduler.submit(self._send_picture)

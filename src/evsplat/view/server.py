@@ -14,9 +14,9 @@ import numpy as np
 import viser
 
 from evsplat.body import up_axis
-from evsplat.capture import Capture, load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.film import camera_at
+from evsplat.film.plan import recorded_by
 from evsplat.training.run import Run
 from evsplat.training.watching import is_training
 from evsplat.view.camera import forward, vertical_fov
@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 
 _PORTS_TRIED = 20
 _ALL_INTERFACES = ("", "0.0.0.0", "::")
-_DEFAULT_DISTANCE_M = 3.0
 
 
 class _Server(viser.ViserServer):
@@ -49,7 +48,11 @@ class Viewer:
         main, *others = self.viewed
         self.capture = main.capture
         self.compositor = Compositor(main, {other.name: other for other in others})
-        self.pivot, up = _pivot_and_up(self.capture)
+        track = main.track(None).to("cpu")
+        transl = track.at([frame.mid_us for frame in self.capture.train_frames])[1]
+        # The view turns about where the person was.
+        self.pivot = (track.body.rest_joints[0] + transl).mean(0).double().numpy()
+        up = up_axis(track).double().numpy()
         self.scheduler = RenderScheduler()
         self.port = _free_port(host, port)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
@@ -101,10 +104,10 @@ class Viewer:
         self._summary = server.gui.add_markdown(_summary(self.viewed))
 
     async def _connected(self, handle: viser.ClientHandle) -> None:
-        frames = self.capture.frames
-        times = [frame.mid_us for frame in frames if frame.camera == frames[0].camera]
-        request = ViewRequest(**view_of(handle.camera), time_us=min(times))
-        playback = Playback(min(times), max(times), min(times), speed=SPEEDS["1/5"])
+        frames = recorded_by(self.capture, None)
+        first, last = frames[0].mid_us, frames[-1].mid_us
+        request = ViewRequest(**view_of(handle.camera), time_us=first)
+        playback = Playback(first, last, first, speed=SPEEDS["1/5"])
         client = Client(handle, self.compositor, self.scheduler, request, playback)
         Panel(client, self.pivot).look_through(frames[0].camera)
         self._clients[handle.client_id] = client
@@ -169,23 +172,6 @@ def _summary(viewed_runs: list[ViewedRun]) -> str:
             f"{scene:,} of the scene"
         )
     return "  \n".join(lines)
-
-
-def _pivot_and_up(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
-    """Point about which the view turns, and the up direction, both in the world."""
-    frames = capture.train_frames or capture.frames
-    if capture.has_body:
-        track = load_body_track(capture)
-        _, transl = track.at([frame.mid_us for frame in frames])
-        root = (track.body.rest_joints[0] + transl).mean(0)
-        return root.double().numpy(), up_axis(track).double().numpy()
-    camera = capture.camera(frames[0])
-    to_world = camera.world_to_camera[:3, :3].T.double().numpy()
-    centre = camera.center().double().numpy()
-    up = np.zeros(3)
-    axis = int(np.abs(to_world[:, 1]).argmax())
-    up[axis] = -np.sign(to_world[axis, 1])
-    return centre + _DEFAULT_DISTANCE_M * to_world[:, 2], up
 
 
 def _free_port(host: str, port: int) -> int:

@@ -21,13 +21,7 @@ from evsplat.export.cloud import SplatCloud
 from evsplat.export.gaussians import cloud_at
 from evsplat.film import Look, load_motion_of
 from evsplat.film.looks import depth_colours
-from evsplat.methods.reconstruction import (
-    Parts,
-    Posable,
-    Reconstruction,
-    SplatReconstruction,
-    WithDepth,
-)
+from evsplat.methods.reconstruction import Parts
 from evsplat.render import Backdrop
 from evsplat.training.run import GaussianReconstruction, Run, load_run, reload_run
 from evsplat.training.watching import is_training, newest_state, watch
@@ -58,37 +52,20 @@ class ViewedRun:
     def _clear_caches(self) -> None:
         """Begin caches anew: the parameters have changed."""
         self._recorded = _cached(self.run.reconstruction)
-        self._posed: tuple[Reconstruction, HeldPose] | None = None
-
-    @property
-    def is_posable(self) -> bool:
-        """True where the person can be made to move otherwise than it was recorded."""
-        return isinstance(self.run.reconstruction, Posable)
-
-    @property
-    def has_depth(self) -> bool:
-        """True where depth can be shown."""
-        return isinstance(self.run.reconstruction, WithDepth)
-
-    @property
-    def has_splats(self) -> bool:
-        """True where its Gaussians can be had as a file."""
-        return isinstance(self.run.reconstruction, SplatReconstruction)
+        self._posed: tuple[GaussianReconstruction, HeldPose] | None = None
 
     @cached_property
     def sliders(self) -> tuple[PoseSlider, ...]:
         """Angles by which the person can be posed."""
-        made = self.run.reconstruction
-        return pose_sliders(made.track.body) if isinstance(made, Posable) else ()
+        return pose_sliders(self.run.reconstruction.track.body)
 
     def track(self, motion: str | None) -> BodyTrack:
         """A motion on the person's body, placed where the recording was."""
-        made = self.run.reconstruction
-        assert isinstance(made, Posable)
+        recorded = self.run.reconstruction.track
         if motion is None:
-            return made.track
+            return recorded
         if motion not in self._motions:
-            self._motions[motion] = load_motion_of(motion, made.track)
+            self._motions[motion] = load_motion_of(motion, recorded)
         return self._motions[motion]
 
     def picture(
@@ -99,7 +76,7 @@ class ViewedRun:
         A ``draft`` evaluates networks for a part of the Gaussians only and has softer shadows.
         """
         drawn = self._moving(time_us, motion, draft=draft)
-        if draft and isinstance(drawn, GaussianReconstruction):
+        if draft:
             drawn = replace(drawn, shadow_step_px=_DRAFT_SHADOW_STEP_PX)
         with torch.no_grad():
             if look.shown == "rgb":
@@ -111,25 +88,21 @@ class ViewedRun:
 
     def cloud(self, camera: Camera, time_us: int, motion: Motion, parts: Parts) -> SplatCloud:
         """The Gaussians of one instant in the world, coloured as ``camera`` sees them."""
-        drawn = self._moving(time_us, motion, draft=False)
-        assert isinstance(drawn, SplatReconstruction)
-        return cloud_at(drawn, camera, time_us, parts)
+        return cloud_at(self._moving(time_us, motion, draft=False), camera, time_us, parts)
 
     @cached_property
     def _nearest_m(self) -> float:
         """Depth that is shown brightest, the same in all pictures: the person's at its nearest."""
         frame = self.capture.frames[0]
         camera = self.capture.camera(frame)
-        made = self.run.reconstruction
-        assert isinstance(made, WithDepth)
-        depth = made.depth(camera, [frame.mid_us])
+        depth = self.run.reconstruction.depth(camera, [frame.mid_us])
         seen = depth[depth > 0]
         return 0.8 * float(seen.quantile(0.02)) if len(seen) else 1.0
 
-    def _moving(self, time_us: int, motion: Motion, *, draft: bool) -> Reconstruction:
+    def _moving(self, time_us: int, motion: Motion, *, draft: bool) -> GaussianReconstruction:
         """The reconstruction that shows a motion at a time, as a draft or exactly."""
         drawn, made = self._recorded, self.run.reconstruction
-        if not motion.is_recorded and isinstance(made, Posable):
+        if not motion.is_recorded:
             if self._posed is None:
                 held = HeldPose(made.track)
                 self._posed = _cached(made.following(held)), held
@@ -138,15 +111,12 @@ class ViewedRun:
             if any(motion.angles):
                 rotations = turned(self.sliders, motion.angles, rotations[0])[None]
             pose.hold(rotations, transl)
-        if isinstance(drawn, GaussianReconstruction):
-            assert isinstance(drawn.model, nn.Module)
-            set_draft(drawn.model, draft)
+        assert isinstance(drawn.model, nn.Module)
+        set_draft(drawn.model, draft)
         return drawn
 
 
-def _cached(reconstruction: Reconstruction) -> Reconstruction:
-    if not isinstance(reconstruction, GaussianReconstruction):
-        return reconstruction
+def _cached(reconstruction: GaussianReconstruction) -> GaussianReconstruction:
     assert isinstance(reconstruction.model, nn.Module)
     model: Any = with_cached_networks(reconstruction.model)
     return replace(reconstruction, model=model, backdrop=Backdrop())

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from evsplat.body import SurfaceSamples
-from evsplat.models.discs.shading import Shading, SurfaceLight
-from evsplat.models.discs.surface import NearestSurface
+from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
 
 
 def sphere(count: int, generator: torch.Generator) -> SurfaceSamples:

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from evsplat.body import SurfaceSamples
-from evsplat.models.discs.lamps import Lamps
-from evsplat.models.discs.shadow import BodyShadow
+from evsplat.models.discs.shadow import BodyShadow, Lamps
 
 LAMP = torch.tensor([[0.3, -0.2, 3.5]], dtype=torch.float64)
 

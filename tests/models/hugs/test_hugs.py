@@ -8,7 +8,7 @@ import torch
 from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import load_capture
 from evsplat.errors import DataError
-from evsplat.objectives.hugs import PATCH_PX, Perceptual, draw_squares
+from evsplat.objectives.hugs import PATCH_PX, draw_squares, perceptual_distance
 from evsplat.render import render
 from evsplat.similarity.psnr_ssim import ssim
 from evsplat.training import load_run, train
@@ -65,7 +65,7 @@ def test_terms_are_those_of_the_description(tiny_capture):
     torch.testing.assert_close(terms["human_dssim"], dssim, rtol=1e-3, atol=1e-5)
     weights = step.drawing.decoded.weights.detach()
     assert weights.shape[1] == len(step.model.track.body.parents)
-    target = composition.objectives[-1].target
+    target = composition.objectives[-1].kept
     torch.testing.assert_close(terms["skinning"], (weights - target).square().mean())
 
 
@@ -105,7 +105,7 @@ def test_the_perceptual_distance_sees_pictures_between_minus_one_and_one():
 
     pictures = torch.rand(2, 40, 40, 3).round()
     generator = torch.Generator().manual_seed(0)
-    Perceptual(metric)(*pictures, torch.ones(40, 40), generator)
+    perceptual_distance(metric, *pictures, torch.ones(40, 40), generator)
     assert (min(seen), max(seen)) == (-1.0, 1.0)
 
 

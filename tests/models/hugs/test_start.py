@@ -6,7 +6,7 @@ import torch
 from evsplat.body import skin
 from evsplat.body.rotations import matrix_to_six, six_to_matrix
 from evsplat.capture import load_body_track, load_capture
-from evsplat.models.hugs.human import TriplaneHuman
+from evsplat.models.hugs.gaussians import TriplaneHuman
 from evsplat.models.hugs.start import START_OPACITY, body_weights, fit_to_body
 
 

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from evsplat.models.networks.non_rigid import NonRigid, NonRigidNetwork
-from evsplat.models.networks.one_blob import OneBlobEncoding
+from evsplat.models.networks.non_rigid import NonRigid, NonRigidNetwork, OneBlobEncoding
 
 
 def test_start_changes_almost_nothing_unless_asked_for():
@@ -12,11 +11,10 @@ def test_start_changes_almost_nothing_unless_asked_for():
     positions, pose = torch.rand(500, 3) * 2 - 1, torch.randn(2, 144)
     quiet = NonRigidNetwork(144)(positions, pose)
     loud = NonRigidNetwork(144, last_layer_std=None)(positions, pose)
-    assert quiet.offset.shape == quiet.log_scale.shape == (2, 500, 3)
-    assert quiet.rotation.shape == (2, 500, 4) and quiet.feature.shape == (2, 500, 16)
-    assert quiet.offset.abs().max() < 0.005  # metres
-    assert loud.offset.abs().max() > 0.03  # the centimetres of method.md 1.5
-    assert (quiet.rotation[..., 0] == 1).all() and quiet.rotation[..., 1:].abs().max() < 0.02
+    assert quiet.changes.shape == (2, 500, 3 + 3 + 3 + 16)
+    assert quiet.changes[..., :3].abs().max() < 0.005  # metres
+    assert loud.changes[..., :3].abs().max() > 0.03  # the centimetres of method.md 1.5
+    assert quiet.changes[..., 6:9].abs().max() < 0.02
 
 
 def test_output_equals_the_plain_network_on_encoding_and_pose():
@@ -31,8 +29,7 @@ def test_output_equals_the_plain_network_on_encoding_and_pose():
         hidden = inputs @ torch.cat((mlp.point_weight, mlp.time_weight), 1).T + mlp.first_bias
         for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
             hidden = torch.nn.functional.leaky_relu(hidden, 0.01) @ weight.T + bias
-        parts = (out.offset, out.log_scale, out.rotation[..., 1:], out.feature)
-        assert torch.allclose(torch.cat([part[time] for part in parts], -1), hidden, atol=1e-6)
+        assert torch.allclose(out.changes[time], hidden, atol=1e-6)
 
 
 def test_gradcheck():
@@ -44,8 +41,7 @@ def test_gradcheck():
     leaves = (positions, pose, *(p for p in network.parameters() if p.numel()))
 
     def run(positions, pose, *_):
-        out = network(positions, pose)
-        return out.offset, out.log_scale, out.rotation, out.feature
+        return network(positions, pose).changes
 
     assert torch.autograd.gradcheck(run, leaves)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.integrate import quad
 
-from evsplat.models.networks.one_blob import OneBlobEncoding
+from evsplat.models.networks.non_rigid import OneBlobEncoding
 
 
 def quartic_cdf(x, inverse_radius):

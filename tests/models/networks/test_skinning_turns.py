@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from evsplat.models.networks.skinning_turns import SkinningTurns
+from evsplat.models.networks.skinning_network import SkinningTurns
 
 
 def make(seed: int, rows: int = 23) -> tuple[torch.nn.Module, torch.Tensor]:

@@ -8,9 +8,9 @@ from evsplat.evaluation.report.html import folded, section
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import count_of, split_of, words_of
 from evsplat.evaluation.tables import (
-    METRIC_TITLES,
     REGION_TITLES,
     Table,
+    html,
     missing_networks,
     tables_of,
     terms,
@@ -26,7 +26,7 @@ def figures(source: Source) -> str:
     if why is not None:
         return section("Figures", why[0].upper() + why[1:], "")
     first, *others = tables_of(metrics)
-    compat = "".join(folded(f"Protocol {table.protocol}", _table(table)) for table in others)
+    compat = "".join(folded(table.title, _with_note(table)) for table in others)
     missing = "".join(f"<li>{escape(reason)}</li>" for reason in missing_networks(metrics))
     against = metrics.get("blurry_ground_truth", {}).get("full", {}).get("psnr")
     blurry = (
@@ -38,13 +38,13 @@ def figures(source: Source) -> str:
     count, frames = count_of(metrics), words_of(metrics).frames
     measured = (
         f"Means over {count} {frames} against the sharp picture at mid-exposure."
-        if first.columns
+        if first.headings
         else f"{count} frames were held out, and none has a sharp picture to be compared with."
     )
     return section(
         "Figures",
         f"{measured} <b>{escape(terms(metrics))}</b>",
-        f'{_cards(metrics)}{_table(first)}{compat}<ul class="note">{blurry}{missing}</ul>',
+        f'{_cards(metrics)}{_with_note(first)}{compat}<ul class="note">{blurry}{missing}</ul>',
     )
 
 
@@ -103,29 +103,8 @@ def _cards(metrics: dict[str, Any]) -> str:
     return f'<div class="cards">{"".join(cards)}</div>' if cards else ""
 
 
-def _table(table: Table) -> str:
-    if not table.columns:
+def _with_note(table: Table) -> str:
+    if not table.headings:
         return ""
-    groups = "".join(
-        f'<th colspan="{span}" scope="colgroup">{title}</th>' for title, span in table.groups
-    )
-    names = "".join(
-        f'<th scope="col">{METRIC_TITLES[c.metric]}&thinsp;{c.arrow}</th>' for c in table.columns
-    )
-    rows = []
-    for row in table.rows:
-        cells = "".join(
-            f"<td{' class=best' if table.is_best(row, c) else ''}>{table.text(row, c)}</td>"
-            for c in table.columns
-        )
-        kind = "ours" if row == table.method else "other"
-        if row == "blurry_input":
-            kind = "aside"
-        rows.append(
-            f'<tr class="{kind}"><th scope="row">{escape(table.title(row))}</th>{cells}</tr>'
-        )
-    return (
-        f'<div class="scroll"><table><thead><tr><th rowspan="2" class="corner">protocol '
-        f"<code>{escape(table.protocol)}</code></th>{groups}</tr><tr>{names}</tr></thead>"
-        f'<tbody>{"".join(rows)}</tbody></table></div><p class="note">{escape(table.note)}.</p>'
-    )
+    corner = table.title[0].lower() + table.title[1:]
+    return f'{html(table, corner)}<p class="note">{escape(table.note)}</p>'

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from evsplat.capture import Frame, Policy, load_body_track
 from evsplat.capture.policy import policy_of
-from evsplat.evaluation.regions import Box
+from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.figures import no_test_figures
 from evsplat.evaluation.report.html import (
@@ -130,7 +130,12 @@ class FramePictures:
         if frame.sharp is not None:
             pictures["sharp truth"] = to_bytes(source.capture.sharp(frame))
             pictures["error"] = source.picture(entry["pictures"]["error"])
-        return cls(frame, entry["protocols"]["standard"], pictures, source.crop(frame))
+        return cls(
+            frame,
+            entry["protocols"]["standard"],
+            pictures,
+            HumanRegions(source.capture).crop(frame),
+        )
 
     def crops(self, aspect: float) -> Pictures:
         """The pictures around the person, at least ``aspect`` times as wide as high.

@@ -22,14 +22,16 @@ _LOSSLESS_PIXELS = 6_000_000
 """Up to this many pixels in all, pictures are embedded without loss; beyond, at quality 92."""
 
 
-def document(title: str, body: str, *, style: str = "") -> str:
-    """The whole page with the style sheet of reports and ``style`` after it; ``body`` is HTML."""
-    shared = (resources.files("evsplat") / "data" / "report.css").read_text(encoding="utf-8")
+def document(title: str, body: str, *, style: str | None = None) -> str:
+    """The whole page; ``style`` is a sheet of `evsplat.data` after that of reports."""
+    data = resources.files("evsplat") / "data"
+    sheets = ("report.css", *([style] if style else []))
+    styles = "".join((data / name).read_text(encoding="utf-8") for name in sheets)
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{shared}{style}</style></head><body>{body}"
+        f"<title>{escape(title)}</title><style>{styles}</style></head><body>{body}"
         "</body></html>\n"
     )
 

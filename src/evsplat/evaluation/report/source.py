@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from evsplat.capture import Capture, Frame
+from evsplat.capture import Capture
 from evsplat.config import load_yaml
 from evsplat.errors import DataError
-from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.html import read_picture
 from evsplat.evaluation.splits import name_of
 from evsplat.files import parse_json, read_json, read_text
@@ -61,10 +60,6 @@ class Source:
     def picture(self, path: str) -> UInt8[np.ndarray, "H W 3"]:
         """A picture that the evaluation wrote, by its path inside the run folder."""
         return read_picture(self.folder / path, "evaluate the run again")
-
-    def crop(self, frame: Frame) -> Box | None:
-        """The box of the person in a frame, enlarged as ``person_crop`` is."""
-        return HumanRegions(self.capture).crop(frame)
 
 
 def _read_object(path: Path) -> dict[str, Any]:

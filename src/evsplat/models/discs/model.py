@@ -16,17 +16,15 @@ from torch import Tensor, nn
 from evsplat.body import BodyTrack, skin, up_axis
 from evsplat.capture import Camera, Frame
 from evsplat.gaussians import GaussianSet
-from evsplat.models.discs.lamps import Lamps
-from evsplat.models.discs.shading import Shading, SurfaceLight
-from evsplat.models.discs.shadow import BodyShadow
-from evsplat.models.discs.surface import NearestSurface
+from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
+from evsplat.models.discs.shadow import BodyShadow, Lamps
 from evsplat.models.drawing import Drawing, draw
 from evsplat.models.layers import Layers, SceneShadow, human_splats, scene_splats
 from evsplat.models.model import PosedModel, RowCache
 from evsplat.models.networks.colour import SceneColour, scene_rgb
-from evsplat.models.networks.deformation import PoseDeformation, draw_pose_noise
+from evsplat.models.networks.non_rigid import PoseDeformation, draw_pose_noise
 from evsplat.models.pose_correction import PoseCorrection
-from evsplat.render import PinholeCamera, rows_in_view
+from evsplat.render import rows_in_view
 
 NORMAL_SAMPLES = 20_000
 """Points of the body's surface among which a Gaussian finds its normal and its bones."""
@@ -42,7 +40,7 @@ class _View:
 
     center: Float[Tensor, "3"]
     hide_direction: bool = False
-    shown: PinholeCamera | None = None
+    shown: Camera | None = None
     """Only this camera's picture is asked for."""
 
 
@@ -176,7 +174,7 @@ class DiscModel(PosedModel):
         bones: Float[Tensor, "T J 4 4"],
         rotations: Float[Tensor, "#T J 3 3"],
         lit_at: slice,
-        view: "_View",
+        view: _View,
         *,
         hard_semantics: bool,
     ) -> Layers:
@@ -221,7 +219,7 @@ class DiscModel(PosedModel):
         colours: Float[Tensor, "S C"],
         means: Float[Tensor, "S 3"],
         scales: Float[Tensor, "S 3"],
-        view: "_View",
+        view: _View,
     ) -> Float[Tensor, "S 3"]:
         """Colours of the scene; those by the network may be black outside of the picture."""
         if self.scene_colour is None:

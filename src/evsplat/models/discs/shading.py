@@ -1,4 +1,4 @@
-"""Brightness of the person's surface by its place and its normal."""
+"""The person's surface: which of its points Gaussians lie on, and its brightness by its normal."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,8 +8,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from evsplat.body.surface import SurfaceSamples
 from evsplat.compiled import native, runs_native
 from evsplat.models.networks.spherical_harmonics import sh_basis
+from evsplat.neighbours import nearest
 
 _NORMAL_DIM = 9
 _DARKEST, _BRIGHTEST = 0.2, 3.0
@@ -140,3 +142,48 @@ class _NativeLight(torch.autograd.Function):
             )
         )
         return None, None, None, None, *parts, by_lit
+
+
+class NearestSurface:
+    """Normals and bones of Gaussians by the nearest point of the canonical body's surface.
+
+    Looked up again only after rows have changed: between two densifications a Gaussian moves by
+    less than what turns the surface or changes the bones it hangs on.
+    """
+
+    def __init__(self, surface: SurfaceSamples) -> None:
+        """``surface``: samples of the canonical body."""
+        self.surface = surface
+        self.index = torch.zeros(0, dtype=torch.long)
+        self._found: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def normals(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Unit normals at the canonical centres of all Gaussians."""
+        return self._at_all(means)[0]
+
+    def weights(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
+        """Skinning weights at the canonical centres of all Gaussians."""
+        return self._at_all(means)[1]
+
+    def _at_all(self, means: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor]:
+        if self.surface.points.device != means.device:
+            self.surface = self.surface.to(means.device)
+        if len(self.index) != len(means):
+            self.index = nearest(self.surface.points, 1, means.detach())[1][:, 0]
+        self.index = self.index.to(means.device)  # after a resume it is on the CPU
+        if self._found is None or self._found[2] is not self.index:
+            found = self.surface.normals[self.index], self.surface.weights[self.index]
+            self._found = (*found, self.index)
+        return self._found[:2]
+
+    def rows_changed(self) -> None:
+        """Row numbers mean other Gaussians now."""
+        self.index = self.index[:0]
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors that a resume needs."""
+        return {"index": self.index}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state` gave."""
+        self.index = state["index"]

@@ -14,8 +14,7 @@ from evsplat.capture import Camera, Frame
 from evsplat.devices import send
 from evsplat.gaussians import OneClassRows
 from evsplat.models.drawing import Drawing, draw
-from evsplat.models.hugs.human import Decoded, TriplaneHuman
-from evsplat.models.hugs.scene import SphericalScene
+from evsplat.models.hugs.gaussians import Decoded, SphericalScene, TriplaneHuman
 from evsplat.models.layers import Layers, human_splats, scene_splats
 from evsplat.models.model import PosedModel, RowCache
 from evsplat.render import LOW_PASS

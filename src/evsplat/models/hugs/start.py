@@ -8,7 +8,7 @@ from evsplat.body import SurfaceSamples
 from evsplat.body.rotations import matrix_to_six, quaternion_to_matrix
 from evsplat.devices import send
 from evsplat.gaussians.initialise import facing
-from evsplat.models.hugs.human import TriplaneHuman
+from evsplat.models.hugs.gaussians import TriplaneHuman
 from evsplat.neighbours import nearest
 
 START_COLOUR, START_OPACITY = 0.5, 0.1

@@ -40,13 +40,13 @@ class PointMLP(nn.Module):
     ) -> None:
         super().__init__()
         fan_in = per_point + per_time + per_both
-        self.point_weight = nn.Parameter(_uniform((width, per_point), fan_in))
-        self.time_weight = nn.Parameter(_uniform((width, per_time), fan_in))
-        self.both_weight = nn.Parameter(_uniform((width, per_both), fan_in))
-        self.first_bias = nn.Parameter(_uniform((width,), fan_in))
+        self.point_weight = nn.Parameter(uniform((width, per_point), fan_in))
+        self.time_weight = nn.Parameter(uniform((width, per_time), fan_in))
+        self.both_weight = nn.Parameter(uniform((width, per_both), fan_in))
+        self.first_bias = nn.Parameter(uniform((width,), fan_in))
         sizes = [width] * depth + [out]
-        self.weights = nn.ParameterList(_uniform((o, i), i) for i, o in pairwise(sizes))
-        self.biases = nn.ParameterList(_uniform((o,), i) for i, o in pairwise(sizes))
+        self.weights = nn.ParameterList(uniform((o, i), i) for i, o in pairwise(sizes))
+        self.biases = nn.ParameterList(uniform((o,), i) for i, o in pairwise(sizes))
         if last_std is not None:
             nn.init.normal_(self.weights[-1], std=last_std)
             nn.init.zeros_(self.biases[-1])
@@ -132,7 +132,7 @@ def _plain(tensor: Tensor) -> Tensor:
     return tensor.detach().contiguous()
 
 
-def _uniform(shape: tuple[int, ...], fan_in: int) -> Tensor:
+def uniform(shape: tuple[int, ...], fan_in: int) -> Tensor:
     """PyTorch's default start of linear layers."""
     bound = 1 / math.sqrt(max(fan_in, 1))
     return torch.empty(shape).uniform_(-bound, bound)

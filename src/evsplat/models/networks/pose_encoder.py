@@ -1,6 +1,5 @@
 """Pose vector of a skeleton: small networks along the kinematic tree (LEAP)."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -8,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.body.tree import level_inverse, tree_levels
+from evsplat.models.networks.mlp import uniform
 
 
 def normalise_joints(
@@ -62,12 +62,12 @@ class PoseEncoder(nn.Module):
         for depth, level in enumerate(levels):
             self.register_buffer(f"slots_{depth}", level.parent_slots, persistent=False)
         inputs = 13 + joint_dim
-        self.root_weight = nn.Parameter(_uniform((joint_dim, 12 * joints), 12 * joints))
-        self.root_bias = nn.Parameter(_uniform((joint_dim,), 12 * joints))
-        self.first_weight = nn.Parameter(_uniform((joints, inputs, inputs), inputs))
-        self.first_bias = nn.Parameter(_uniform((joints, 1, inputs), inputs))
-        self.second_weight = nn.Parameter(_uniform((joints, inputs, joint_dim), inputs))
-        self.second_bias = nn.Parameter(_uniform((joints, 1, joint_dim), inputs))
+        self.root_weight = nn.Parameter(uniform((joint_dim, 12 * joints), 12 * joints))
+        self.root_bias = nn.Parameter(uniform((joint_dim,), 12 * joints))
+        self.first_weight = nn.Parameter(uniform((joints, inputs, inputs), inputs))
+        self.first_bias = nn.Parameter(uniform((joints, 1, inputs), inputs))
+        self.second_weight = nn.Parameter(uniform((joints, inputs, joint_dim), inputs))
+        self.second_bias = nn.Parameter(uniform((joints, 1, joint_dim), inputs))
 
     def forward(self, rotations: Float[Tensor, "T J 3 3"]) -> Float[Tensor, "T P"]:
         """Pose vectors (P = ``dim``, joint by joint) of local rotations; the root's is ignored."""
@@ -99,9 +99,3 @@ class PoseEncoder(nn.Module):
             feature = torch.baddbmm(second_bias[depth], inner, second_weight[depth])
             features.append(feature)
         return torch.cat(features).index_select(0, self.inverse).transpose(0, 1).flatten(1)
-
-
-def _uniform(shape: tuple[int, ...], fan_in: int) -> Tensor:
-    """PyTorch's default start of linear layers."""
-    bound = 1 / math.sqrt(fan_in)
-    return torch.empty(shape).uniform_(-bound, bound)

@@ -23,12 +23,11 @@ from evsplat.models.networks.colour import (
     view_directions,
     view_jitter,
 )
-from evsplat.models.networks.deformation import PoseDeformation, draw_pose_noise
-from evsplat.models.networks.skinning_network import SkinningNetwork
-from evsplat.models.networks.skinning_turns import SkinningTurns
+from evsplat.models.networks.non_rigid import PoseDeformation, draw_pose_noise
+from evsplat.models.networks.skinning_network import SkinningNetwork, SkinningTurns
 from evsplat.models.paper.per_frame import FrameLatents, FramePoses, UnseenFrames
-from evsplat.models.paper.placement import ByLabel, Placement, StraightThrough
-from evsplat.render import LOW_PASS, PinholeCamera, rows_in_view
+from evsplat.models.paper.placement import Placement, StraightThrough
+from evsplat.render import LOW_PASS, rows_in_view
 
 LATENT_DIM = 16
 """Size of the per-frame latent of the person's colour (1.7)."""
@@ -37,25 +36,6 @@ COLOUR_FEATURE_DIM = 16
 
 Semantics = Literal["fixed", "ste", "rendered"]
 """Teacher of the attribute: none, straight-through placement, the rendered attribute."""
-
-
-@dataclass(frozen=True)
-class Released:
-    """Choices in which the released 3DGS-Avatar differs from the better reading of its paper."""
-
-    last_std: float | None = 1e-3
-    """Start of the non-rigid network's last layer; None starts it at random as released, which
-    makes every point jump when the network is switched on (1.5)."""
-    symmetric_view_noise: bool = True
-    """False: the third angle of the view noise is drawn from 0 to 45 degrees only (1.7)."""
-    unseen_frames: UnseenFrames = "interpolated"
-    """Latent and pose residual of instants that are not the middle of a training frame (A22)."""
-    skinning_turns: int = 4
-    """A training step looks up the skinning weights of one row in so many, in turns; released: of
-    all, 1."""
-
-
-RELEASED = Released(None, False, "released", 1)
 
 
 @dataclass(frozen=True)
@@ -87,30 +67,37 @@ class PaperModel(PosedModel):
         pose_noise: float,
         scene_direction_dropout: float,
         pose_start: float | None,
-        released: Released,
+        released: bool,
     ) -> None:
         """Start at ``gaussians``, which have an attribute ``features``.
 
         ``frame_times_us`` are the mid-exposures of the training frames, the anchors of latents and
         pose residuals; these are learned from nominal iteration ``pose_start`` on, None: never.
+        ``released``: as the released 3DGS-Avatar, where it differs from the better reading of its
+        paper. Its last layer starts at random, so that every point jumps when the non-rigid network
+        is switched on (1.5); its view noise is not symmetric (1.7); of instants that are not the
+        middle of a training frame it knows nothing (A22); it looks all skinning weights up at every
+        step, not one row in four in turns.
         """
         super().__init__(track)
         body = track.body
         self.gaussians, self.semantics, self.released = gaussians, semantics, released
+        unseen: UnseenFrames = "released" if released else "interpolated"
         self.non_rigid_start, self.pose_noise = non_rigid_start, pose_noise
         self.scene_direction_dropout = scene_direction_dropout
-        self.placement: Placement = StraightThrough() if semantics == "ste" else ByLabel()
+        self.placement = StraightThrough() if semantics == "ste" else Placement()
+        last_std = None if released else 1e-3
         self.deformation = PoseDeformation(
-            body, width=width, feature_dim=COLOUR_FEATURE_DIM, last_std=released.last_std
+            body, width=width, feature_dim=COLOUR_FEATURE_DIM, last_std=last_std
         )
         self.skinning = SkinningNetwork(body.parents.tolist(), width=width)
-        self.skinning_turns = SkinningTurns(released.skinning_turns)
+        self.skinning_turns = SkinningTurns(1 if released else 4)
         self.human_colour = HumanColour(
             nonrigid_dim=COLOUR_FEATURE_DIM, latent_dim=LATENT_DIM, width=colour_width
         )
         self.scene_colour = SceneColour(width=colour_width)
-        self.latents = FrameLatents(frame_times_us, LATENT_DIM, released.unseen_frames)
-        self.residual = FramePoses(frame_times_us, len(body.parents), released.unseen_frames)
+        self.latents = FrameLatents(frame_times_us, LATENT_DIM, unseen)
+        self.residual = FramePoses(frame_times_us, len(body.parents), unseen)
         self.residual_start = float("inf") if pose_start is None else pose_start
 
     @property
@@ -187,7 +174,7 @@ class PaperModel(PosedModel):
     def _draw_noise(self, generator: torch.Generator) -> _Noise:
         joints = len(self.track.body.parents)
         rotations = draw_pose_noise(joints, self.pose_noise, generator, self.device)
-        turn = view_jitter(generator, symmetric=self.released.symmetric_view_noise)
+        turn = view_jitter(generator, symmetric=not self.released)
         hide = float(torch.rand((), generator=generator)) < self.scene_direction_dropout
         return _Noise(rotations, send(turn, self.device), hide)
 
@@ -199,7 +186,7 @@ class PaperModel(PosedModel):
         *,
         hard_semantics: bool = False,
         noise: _Noise | None = None,
-        shown: PinholeCamera | None = None,
+        shown: Camera | None = None,
     ) -> Layers:
         """Both classes at given times, with skinning weights by ``weights_at``.
 

@@ -1,23 +1,24 @@
 """Places of Gaussians by their class: how the semantic attribute decides between two (A2)."""
 
-from typing import Protocol
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from evsplat.gaussians import GaussianSet
-from evsplat.models.networks.deformation import PoseDeformation
+from evsplat.models.networks.non_rigid import PoseDeformation
 
 
-class Placement(Protocol):
-    """Which rows of the scene are posed beside the person's, and where both classes are drawn."""
+class Placement:
+    """Which rows of the scene are posed beside the person's, and where both classes are drawn.
+
+    By the label: the person's rows are posed, the scene's stay, and the attribute learns nothing.
+    """
 
     def posed_scene_rows(
         self, gaussians: GaussianSet, deformation: PoseDeformation
     ) -> Int[Tensor, " K"] | None:
         """Rows of the scene to pose after the person's; None: none."""
-        ...
+        return None
 
     def places(
         self,
@@ -27,27 +28,10 @@ class Placement(Protocol):
         scene: Float[Tensor, "S 3"],
     ) -> tuple[Float[Tensor, "T H 3"], Float[Tensor, "S 3"]]:
         """Centres of person and scene, from posed centres and those of the scene as it stands."""
-        ...
-
-
-class ByLabel:
-    """The person's rows are posed, the scene's stay: placement tells the attribute nothing."""
-
-    def posed_scene_rows(self, gaussians: GaussianSet, deformation: PoseDeformation) -> None:
-        """None."""
-
-    def places(
-        self,
-        gaussians: GaussianSet,
-        rows: Int[Tensor, " K"] | None,
-        posed: Float[Tensor, "T H 3"],
-        scene: Float[Tensor, "S 3"],
-    ) -> tuple[Float[Tensor, "T H 3"], Float[Tensor, "S 3"]]:
-        """Both as given."""
         return posed, scene
 
 
-class StraightThrough:
+class StraightThrough(Placement):
     """Both placements of each row, chosen by the hard label, with the gradient of m (A2 ii).
 
     Forward: ``h * deformed + (1 - h) * canonical`` with the hard label h; backward: dm/dl. Rows
