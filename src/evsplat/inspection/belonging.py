@@ -6,33 +6,26 @@ elsewhere; another recording's body fits a frame no better in its own pose than 
 Limits are from staged captures (benchmarks/wrong_bodies.py).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Int
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.inspection.figure import Coarse, Figure, grown, outlines
-from evsplat.inspection.matching import Correlations, normalised, own_time_order
 from evsplat.inspection.movement import looked_at, movement, spread, stands
+from evsplat.inspection.search import DELAYS, NOW, REACH_PX, BestPlace, drawn, in_picture
 
-Kind = TypeVar("Kind", bound=np.ndarray)
 Verdict = Literal["belongs", "off", "another", "unknown"]
 
-REACH_PX = 24
-"""Shifts of so many map pixels each way are tried: 30 % of the body's height."""
-DELAYS = tuple(step / 2 for step in range(-8, 9))
-"""Delays that are tried, in frames."""
-NOW = DELAYS.index(0.0)
 WIDENED_PX = 2
 """Clothes and hair are taken to be within so many map pixels of the bare body."""
 _OFF_PX, _OFF_FRAMES = 3.5, 1.0
 """Best places so far away, map pixels or frames, are told ..."""
-_LEAST_GAIN, _LEAST_GAIN_IN_TIME, _LEAST_GAIN_OF_A_FRAME = 0.025, 0.04, 0.1
+_LEAST_GAIN, _LEAST_GAIN_IN_TIME, _LEAST_GAIN_OF_A_FRAME = 0.025, 0.05, 0.1
 """... if so much of the correlation there is missing where the body is: for shifts, for delays
 alone, and for those of less than two frames, which slow motions hardly show."""
 _ANOTHER, _DOUBTFUL, _FOLLOWS = 0.75, 0.85, 0.9
@@ -162,7 +155,10 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
     """Compare the posed body with what moves in the training frames and in their events.
 
     ``track`` is the capture's own where it is left out. Of at most `MOST_FRAMES` frames and the
-    20 ms of events about the middle of each; a second or two of one core.
+    20 ms of events about the middle of each; a second of one core, more where the camera moves.
+
+    Raises:
+        DataError: there is no training frame, or no body.
     """
     figure = Figure(load_body_track(capture) if track is None else track)
     frames = looked_at(capture)
@@ -174,12 +170,12 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
     times_us, owner, row = _times(mids_us, period_us, together=stands(frames))
     posed = figure.maps(times_us, [cameras[k] for k in owner], coarse, REACH_PX)
     edges = outlines(posed)
-    now = _window(posed[row[:, NOW]], (coarse.height, coarse.width), 0, 0)
+    now = in_picture(posed[row[:, NOW]], (coarse.height, coarse.width), 0, 0)
     for _ in range(WIDENED_PX):
         now = grown(now)
-    best = _Best.of(
+    best = BestPlace.of(
         found,
-        lambda kind, rows: _drawn(kind, posed[rows], edges[rows]),
+        lambda kind, rows: drawn(kind, posed[rows], edges[rows]),
         np.abs(mids_us[:, None] - mids_us) >= _APART * period_us,
         row,
     )
@@ -228,69 +224,3 @@ def _times(
     _, first, row = np.unique(grid, return_index=True, return_inverse=True)
     owner = first // len(DELAYS)
     return wanted.ravel()[first].tolist(), owner.tolist(), row.reshape(wanted.shape)
-
-
-@dataclass(frozen=True)
-class _Best:
-    """The place where silhouettes fit best, and how well."""
-
-    delay: int = NOW
-    down: int = 0
-    right: int = 0
-    given_score: float = 0.0
-    score: float = 0.0
-    order: float | None = None
-    parting: float = 0.0
-
-    @classmethod
-    def of(
-        cls,
-        found: Mapping[str, Float32[np.ndarray, "K h w"]],
-        drawn: Callable[[str, Int[np.ndarray, "K"]], Float32[np.ndarray, "K H W"]],
-        far: Bool[np.ndarray, "K K"],
-        row: Int[np.ndarray, "K D"],
-    ) -> "_Best":
-        """Of kinds of movement, which count alike, and what ``drawn`` gives for rows."""
-        if not found:
-            return cls()
-        half = (len(row) + 1) // 2
-        halves = (slice(half), slice(half, None))
-        # counts of events have a long tail, which a root shortens
-        maps = {k: normalised(np.sqrt(m) if k == "events" else m) for k, m in found.items()}
-        searched = [
-            Correlations.of(m, partial(drawn, kind), row, REACH_PX, halves)
-            for kind, m in maps.items()
-        ]
-        overall = np.mean([one.overall for one in searched], axis=0)
-        grouped = np.mean([one.grouped for one in searched], axis=0)
-        place = np.unravel_index(overall.argmax(), overall.shape)
-        delay, down, right = int(place[0]), int(place[1]) - REACH_PX, int(place[2]) - REACH_PX
-        highest = np.maximum(grouped.max((1, 2, 3)), 1e-9)
-        orders = [
-            own_time_order(m, _window(drawn(kind, row[:, delay]), m.shape[1:], down, right), far)
-            for kind, m in maps.items()
-        ]
-        told = [order for order in orders if order is not None]
-        return cls(
-            delay,
-            down,
-            right,
-            given_score=float(overall[NOW, REACH_PX, REACH_PX]),
-            score=float(overall[place]),
-            order=float(np.mean(told)) if told else None,
-            parting=float((1 - grouped[:, *place] / highest).max()),
-        )
-
-
-def _drawn(
-    kind: str, posed: Bool[np.ndarray, "K H W"], edges: Bool[np.ndarray, "K H W"]
-) -> Float32[np.ndarray, "K H W"]:
-    """Where a body is expected to show: pictures change inside; events come most at the outline."""
-    inside = posed.astype(np.float32)
-    return inside if kind == "frames" else 0.5 * inside + edges
-
-
-def _window(posed: Kind, size: tuple[int, ...], down: int, right: int) -> Kind:
-    """The picture's part of wider silhouettes that are moved ``down`` and ``right``."""
-    top, left = REACH_PX - down, REACH_PX - right
-    return posed[:, top : top + size[0], left : left + size[1]]

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from evsplat.capture import Frame, TrainingCapture
+from evsplat.errors import DataError
 from evsplat.events import EventStore, EventStream, polarity_counts
 from evsplat.inspection.figure import Coarse
 
@@ -19,6 +20,11 @@ _FEWEST_FOR_BACKGROUND = 3
 
 def looked_at(capture: TrainingCapture) -> tuple[Frame, ...]:
     """At most `MOST_FRAMES` training frames of one camera, evenly spread."""
+    if not capture.train_frames:
+        raise DataError(
+            f"{capture.path / 'capture.json'}: has no frame of split 'train', expected at least "
+            "one; change the split, or train with --use everything."
+        )
     name = capture.train_frames[0].camera
     return spread([frame for frame in capture.train_frames if frame.camera == name])
 
@@ -46,7 +52,8 @@ def movement(
     found = {}
     if stands(frames):
         found["frames"] = _differences(capture, frames, coarse)
-    if capture.events is not None:
+    # events are of the first frame's camera
+    if capture.events is not None and frames[0].camera == capture.frames[0].camera:
         found["events"] = _event_counts(capture, frames, coarse)
     return {name: maps for name, maps in found.items() if np.ptp(maps, axis=(1, 2)).any()}
 
