@@ -2,7 +2,8 @@
 
 python benchmarks/kernels.py [--points N] [--size PX] [--threads T] [--repeats R]
 
-`benchmarks/networks.py` times the networks' layers, `benchmarks/rasterize.py` the rasteriser. The last line is JSON with a unit in each key.
+`benchmarks/networks.py` times the networks' layers, `benchmarks/rasterize.py` the rasteriser. The
+last line is JSON with a unit in each key.
 """
 
 import evsplat  # noqa: F401 - before torch: it sets how OpenMP's threads wait
