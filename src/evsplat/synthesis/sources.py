@@ -1,10 +1,11 @@
 """Sharp pictures and what they bring along into the new capture: footage, or a sharp capture."""
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int64
@@ -30,36 +31,41 @@ class RecordedEvents:
     simulated: bool
 
 
-class Source(Protocol):
+class Source(ABC):
     """Sharp pictures with what belongs to them."""
 
     footage: Footage
     camera: str
     """Name of the camera that took them."""
 
+    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """Facts about the source for the provenance."""
-        ...
 
+    @abstractmethod
     def declare(self, writer: CaptureWriter) -> None:
         """Add the cameras."""
-        ...
 
     def extras(self, index: int) -> dict[str, Any]:
         """Options of `CaptureWriter.add_frame` that go with the source picture of that index."""
-        ...
+        return {}
 
     def split(self, index: int) -> Literal["train", "test"]:
         """The source's own split; `ConfigError` where it has none."""
-        ...
+        raise self._has_no("split")
 
     def events(self) -> RecordedEvents:
         """The source's own events; `ConfigError` where it has none."""
-        ...
+        raise self._has_no("events")
 
+    @abstractmethod
     def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
         """Add the body and the rest; ``frames`` are names and mid-exposures of those made."""
-        ...
+
+    def _has_no(self, what: str) -> ConfigError:
+        return ConfigError(
+            f"--{what} source: {self.footage.path} is no capture and has no {what} of its own."
+        )
 
 
 def set_body(
@@ -90,7 +96,7 @@ def set_body(
 _PIECE_US = 100_000
 
 
-class CaptureSource:
+class CaptureSource(Source):
     """Camera, poses, masks, other views and first points go on to the new capture (`Source`).
 
     The sharp pictures are the frames' ``sharp`` where all have one, else their ``image``.
@@ -199,7 +205,7 @@ _NOMINAL_FOV_DEG = 60.0
 _CAMERA_KEYS = ("width", "height", "K", "world_to_camera")
 
 
-class FootageSource:
+class FootageSource(Source):
     """Footage with a camera and body poses, if the user has them (`Source`).
 
     ``body`` is an npz like body.npz of a capture, on the footage's clock; ``camera`` a JSON file
@@ -245,18 +251,6 @@ class FootageSource:
         K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
         writer.add_camera(self.camera, width, height, K)
 
-    def extras(self, index: int) -> dict[str, Any]:
-        """See `Source`."""
-        return {}
-
-    def split(self, index: int) -> Literal["train", "test"]:
-        """See `Source`."""
-        self._has_no("split")
-
-    def events(self) -> RecordedEvents:
-        """See `Source`."""
-        self._has_no("events")
-
     def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
         """See `Source`."""
         if self._body is None:
@@ -264,11 +258,6 @@ class FootageSource:
             writer.leave_out_body()
             return
         set_body(writer, self._body, None, np.array(list(frames.values())))
-
-    def _has_no(self, what: str) -> NoReturn:
-        raise ConfigError(
-            f"--{what} source: {self.footage.path} is no capture and has no {what} of its own."
-        )
 
 
 def _read_body(path: Path, source: PoseSource | None) -> BodyFile:
