@@ -1,0 +1,1 @@
+"""Motion of a person from the pictures and events of one camera."""
