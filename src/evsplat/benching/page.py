@@ -10,7 +10,7 @@ from evsplat.benching.tables import BenchTable
 from evsplat.benching.writers import LEGEND, html
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.evaluation.regions import Box, HumanRegions
-from evsplat.evaluation.report.html import Embedder, document, folded, read_picture, section, spread
+from evsplat.pages import Embedder, document, folded, read_picture, section, spread
 from evsplat.pictures import to_bytes
 
 _PIXELS = 60_000_000

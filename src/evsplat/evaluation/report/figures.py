@@ -1,10 +1,10 @@
 """The figures: large cards, one table per protocol, and what could not be measured."""
 
+from collections.abc import Mapping
 from html import escape
 from typing import Any
 
 from evsplat.capture.policy import policy_of
-from evsplat.evaluation.report.html import folded, section
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.tables import (
     METRIC_TITLES,
@@ -14,6 +14,7 @@ from evsplat.evaluation.tables import (
     tables_of,
     terms,
 )
+from evsplat.pages import folded, section
 
 _REFERENCES = {"trivial": "the best trivial row", "camera": "the camera’s own blurry picture"}
 
@@ -126,3 +127,13 @@ def _table(table: Table) -> str:
         f"<code>{escape(table.protocol)}</code></th>{groups}</tr><tr>{names}</tr></thead>"
         f'<tbody>{"".join(rows)}</tbody></table></div><p class="note">{escape(table.note)}.</p>'
     )
+
+
+def frame_figures(figures: Mapping[str, Mapping[str, float | None]]) -> str:
+    """PSNR per region as text that continues a line; empty where nothing is known."""
+    parts = [
+        f"{title} {value:.2f} dB"
+        for region, title in REGION_TITLES.items()
+        if region in figures and (value := figures[region]["psnr"]) is not None
+    ]
+    return " · " + " · ".join(parts) if parts else ""

@@ -12,9 +12,9 @@ from evsplat.capture import Capture, Frame
 from evsplat.config import load_yaml
 from evsplat.errors import DataError
 from evsplat.evaluation.regions import Box, HumanRegions
-from evsplat.evaluation.report.html import read_picture
 from evsplat.files import parse_json, read_json, read_text
 from evsplat.methods.reconstruction import Reconstruction
+from evsplat.pages import read_picture
 
 
 @dataclass(frozen=True)
