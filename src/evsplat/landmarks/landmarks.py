@@ -5,6 +5,7 @@ Left and right are the person's own. Points that several sets share have one nam
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -55,6 +56,16 @@ BLAZEPOSE_33 = (
     *_sides("hip", "knee", "ankle", "heel", "foot_index"),
 )
 """Landmarks of BlazePose (Bazarevsky et al., 2020), in its order."""
+
+KeypointSet = Literal["coco17", "wholebody133", "openpose25", "blazepose33"]
+
+SETS: dict[KeypointSet, tuple[str, ...]] = {
+    "coco17": COCO_17,
+    "wholebody133": WHOLEBODY_133,
+    "openpose25": OPENPOSE_25,
+    "blazepose33": BLAZEPOSE_33,
+}
+"""Names of each set of points; each has another count."""
 
 
 @dataclass(frozen=True, eq=False)

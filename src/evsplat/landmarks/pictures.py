@@ -89,7 +89,7 @@ def _thresholds(capture: TrainingCapture) -> tuple[float, float] | None:
 
 def _instants(frame: Frame, fractions: Sequence[float]) -> list[int]:
     start, end = frame.exposure_us
-    return [round(start + fraction * (end - start)) for fraction in fractions]
+    return [start + int(fraction * (end - start)) for fraction in fractions]
 
 
 def _in_exposure(

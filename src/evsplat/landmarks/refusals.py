@@ -115,8 +115,8 @@ def refuse_two_people(
 
     The first is painted over with the background; in what else moves another is searched for.
     """
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, _EXAMINED).round().astype(int))
-    chosen = [k for k in chosen if found[k].flag >= _LEAST_FLAG]
+    spread = np.unique(np.linspace(0, len(pictures) - 1, _EXAMINED).round().astype(int))
+    chosen = [k for k in spread if found[k].flag >= _LEAST_FLAG]
     seconds = [
         person
         for k in chosen
