@@ -31,7 +31,7 @@ from evsplat.posing.prior import PosePrior, pose_prior
 from evsplat.posing.problem import FitSettings, Problem, State, descend
 from evsplat.posing.rig import ROWS, Attachments, Rig, attach, default_rig
 from evsplat.posing.splines import UniformSpline
-from evsplat.posing.start import first_trunk
+from evsplat.posing.start import TRUNK, first_trunk
 from evsplat.posing.views import Views
 
 _SIZE_SHARE = 0.012
@@ -138,10 +138,6 @@ def fit_landmarks(
         )
     attached = attach(rig, landmarks.names)
     views = Views.of(cameras)
-    places = torch.from_numpy(np.asarray(landmarks.places, np.float64))
-    world = landmarks.world
-    space = None if world is None else torch.from_numpy(np.asarray(world, np.float64))
-    trunk = first_trunk(rig, views, landmarks.names, places, space)
     problem = Problem(
         rig,
         prior or pose_prior(),
@@ -149,7 +145,7 @@ def fit_landmarks(
         UniformSpline.over(span_us[0] * 1e-6, span_us[1] * 1e-6, settings.knot_s),
         settings,
     )
-    state = problem.state(*trunk)
+    state = problem.state(*_first_trunk(rig, landmarks, cameras))
     state, _ = descend(problem.blunted(_BLUNT), state, _STEPS[0])
     state, price = descend(problem, state, _STEPS[1])
     doubts: tuple[Doubt, ...] = ()
@@ -160,13 +156,36 @@ def fit_landmarks(
     return PoseFit(problem, state, price, doubts)
 
 
+def _first_trunk(
+    rig: Rig, landmarks: Landmarks, cameras: Sequence[Camera]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Times (s) at which shoulders and hips were found, and the trunk there."""
+    names = list(landmarks.names)
+    lacking = [name for name in TRUNK if name not in names]
+    if lacking:
+        raise DataError(f"landmarks: hold no {', '.join(lacking)}, which a fit begins with.")
+    seen = np.asarray(landmarks.seen)[:, [names.index(name) for name in TRUNK]]
+    found = np.flatnonzero((seen > 0).all(1))
+    if len(found) < _FEWEST:
+        raise DataError(
+            f"landmarks: shoulders and hips are seen in {len(found)} of {len(seen)} pictures, "
+            f"expected at least {_FEWEST}; a motion cannot be fitted to so few."
+        )
+    views = Views.of([cameras[index] for index in found])
+    places = torch.from_numpy(np.asarray(landmarks.places, np.float64)[found])
+    world = landmarks.world
+    space = None if world is None else torch.from_numpy(np.asarray(world, np.float64)[found])
+    trunk = first_trunk(rig, views, names, places, space)
+    return _seconds(landmarks.times_us[found]), *trunk
+
+
 def make_evidence(landmarks: Landmarks, views: Views, attached: Attachments) -> Evidence:
     """Of landmarks, which err by 1.2 % of the person's height at least, whatever they say."""
     index = attached.index
     places = torch.from_numpy(np.asarray(landmarks.places, np.float64))
-    tall = (places[:, index, 1].amax(1) - places[:, index, 1].amin(1)).median()
     said = torch.from_numpy(np.asarray(landmarks.sigma_px, np.float64))[:, index]
     seen = torch.from_numpy(np.asarray(landmarks.seen, np.float64))[:, index]
+    tall = _tall(places[:, index, 1], seen > 0)
     hips = [list(landmarks.names).index(f"{side}_hip") for side in ("left", "right")]
     depths = None
     if landmarks.world is not None:
@@ -182,6 +201,14 @@ def make_evidence(landmarks: Landmarks, views: Views, attached: Attachments) -> 
         depths=depths,
         hips=(index.tolist().index(hips[0]), index.tolist().index(hips[1])),
     )
+
+
+def _tall(rows: Float[Tensor, "T L"], seen: Tensor) -> float:
+    """Height of what is seen of the person, pixels: the median over the pictures."""
+    nan = torch.full_like(rows, math.nan)
+    high, low = (torch.where(seen, rows, sign * math.inf) for sign in (-1, 1))
+    spans = high.amax(1) - low.amin(1)
+    return float(torch.where(seen.any(1), spans, nan[:, 0]).nanmedian())
 
 
 def fit_focal(fit: PoseFit, focals_px: Sequence[float]) -> tuple[float, PoseFit]:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from evsplat.body.rotations import nearest_axis_angle
-from evsplat.posing.kinematics import Posed, pose, row_slice
+from evsplat.posing.kinematics import pose, row_slice
 from evsplat.posing.problem import Problem, State, descend
 
 _BONES = {
@@ -86,7 +86,7 @@ def _stretches(problem: Problem, state: State) -> Iterator[_Stretch]:
     """Runs of times in which a bone points one way in depth, and does so clearly somewhere."""
     rig = problem.rig
     posed = pose(rig, problem.grid.of(state.control), state.betas)
-    away = _away(problem, posed)
+    away = problem.away(posed)
     for part, (begin, end) in _BONES.items():
         bone = posed.joints[:, rig.joint(end)] - posed.joints[:, rig.joint(begin)]
         depth = (bone * away).sum(-1)
@@ -103,7 +103,7 @@ def _turned_over(problem: Problem, state: State, stretch: _Stretch) -> State:
     rig, times = problem.rig, slice(stretch.first, stretch.last + 1)
     vectors = problem.grid.of(state.control)
     posed = pose(rig, vectors, state.betas)
-    away = _away(problem, posed)
+    away = problem.away(posed)
     turned = posed.turned.clone()
     parts = [stretch.part] + ([_WITH_NEXT[stretch.part]] if stretch.with_next else [])
     for part in parts:
@@ -134,7 +134,7 @@ def _differ(problem: Problem, state: State, other: State, stretch: _Stretch) -> 
     for one in (state, other):
         posed = pose(problem.rig, problem.grid.of(one.control), one.betas)
         bone = posed.joints[:, end] - posed.joints[:, begin]
-        depth = (bone * _away(problem, posed)).sum(-1)
+        depth = (bone * problem.away(posed)).sum(-1)
         deep.append(float(depth[stretch.first : stretch.last + 1].mean()))
     return deep[0] * deep[1] < 0
 
@@ -144,11 +144,6 @@ def _affected(parts: list[str]) -> list[str]:
     side, last = parts[-1].split("_", 1)
     after = {"thigh": "shin", "shin": "foot", "upper_arm": "forearm", "forearm": "hand"}[last]
     return [*parts, f"{side}_{after}"]
-
-
-def _away(problem: Problem, posed: Posed) -> Float[Tensor, "G 3"]:
-    """Direction of depth at the person, at the times of the grid."""
-    return torch.nn.functional.normalize(posed.joints[:, 0] - problem.centre, dim=-1)
 
 
 def _smallest_turns(

@@ -9,7 +9,7 @@ of the same matrix is the covariance of what was found.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import torch
@@ -45,7 +45,7 @@ class FitSettings:
     """Weight of squared shape coefficients."""
     height_m: Annotated[float, Above(0)] | None = None
     """Known stature, crown to sole."""
-    independent_s: Annotated[float, Above(0)] = 0.1
+    independent_s: Annotated[float, Above(0)] = 0.2
     """Time after which a detector's errors are new: it divides the covariance."""
 
 
@@ -84,9 +84,10 @@ class Problem:
     """Factor on the landmarks' standard deviations; more lets a first guess come nearer."""
     _kept: dict = field(default_factory=dict)
 
-    def state(self, root: Tensor, place: Tensor) -> State:
-        """The mean pose on a first guess of the trunk at the pictures' times."""
-        times = self.evidence.times_s
+    def state(
+        self, times: Float[Tensor, "N"], root: Float[Tensor, "N 3 3"], place: Float[Tensor, "N 3"]
+    ) -> State:
+        """The mean pose on a first guess of the trunk at some times (s)."""
         control = torch.zeros(self.spline.count, SIZE, dtype=torch.float64)
         control[:, SIX] = self.spline.through(times, root[:, :2].flatten(1))
         control[:, PLACE] = self.spline.through(times, place)
@@ -95,13 +96,15 @@ class Problem:
 
     def blunted(self, factor: float) -> "Problem":
         """The same with landmarks that are trusted less."""
-        return Problem(
-            self.rig, self.prior, self.evidence, self.spline, self.settings, factor * self.blunt
-        )
+        return replace(self, blunt=factor * self.blunt, _kept={})
 
     def with_evidence(self, evidence: Evidence) -> "Problem":
         """The same with other evidence."""
-        return Problem(self.rig, self.prior, evidence, self.spline, self.settings, self.blunt)
+        return replace(self, evidence=evidence, _kept={})
+
+    def away(self, posed: Posed) -> Float[Tensor, "T 3"]:
+        """Direction of depth at a posed person."""
+        return torch.nn.functional.normalize(posed.joints[:, 0] - self.centre, dim=-1)
 
     @property
     def independent_pictures(self) -> float:

@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.errors import DataError
 from evsplat.posing.rig import Rig
 from evsplat.posing.views import Views
 
-_TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
+TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
+"""Landmarks that a fit begins with."""
 
 
 def first_trunk(
@@ -24,14 +24,8 @@ def first_trunk(
 
     From the detector's own points in space where it gives any; else the trunk is taken as upright
     in the picture, turned by how narrow it looks and to the side where the nose is.
-
-    Raises:
-        DataError: shoulders or hips are not among the landmarks.
     """
-    lacking = [name for name in _TRUNK if name not in names]
-    if lacking:
-        raise DataError(f"landmarks: hold no {', '.join(lacking)}, which a fit begins with.")
-    trunk = [list(names).index(name) for name in _TRUNK]
+    trunk = [list(names).index(name) for name in TRUNK]
     width, height = _trunk_size(rig)
     if world is not None:
         left, up, scale = _from_space(world[:, trunk], places[:, trunk], world, places)
