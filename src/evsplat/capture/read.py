@@ -143,8 +143,9 @@ class CaptureReader:
         """The body and its key poses as stored; a `DataError` where there are none."""
         if not self.has_body:
             raise DataError(
-                f"{self.path / 'capture.json'}: has no body; write body.npz with the poses and "
-                "name it under 'body' (docs/capture-format.md)."
+                f"{self.path / 'capture.json'}: nobody has posed the person yet; find "
+                f"the poses with: evsplat poses {self.path} --out NEW. Or write body.npz and name "
+                "it under 'body' (docs/capture-format.md)."
             )
         path = self._metadata.body_file
         metadata = self._metadata

@@ -1,10 +1,10 @@
 """The figures: large cards, one table per protocol, and what could not be measured."""
 
+from collections.abc import Mapping
 from html import escape
 from typing import Any
 
 from evsplat.capture.policy import policy_of
-from evsplat.evaluation.report.html import folded, section
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import count_of, split_of, words_of
 from evsplat.evaluation.tables import (
@@ -15,6 +15,7 @@ from evsplat.evaluation.tables import (
     tables_of,
     terms,
 )
+from evsplat.pages import folded, section
 
 _REFERENCES = {"trivial": "the best trivial row", "camera": "the camera’s own blurry picture"}
 
@@ -108,3 +109,13 @@ def _with_note(table: Table) -> str:
         return ""
     corner = table.title[0].lower() + table.title[1:]
     return f'{html(table, corner)}<p class="note">{escape(table.note)}</p>'
+
+
+def frame_figures(figures: Mapping[str, Mapping[str, float | None]]) -> str:
+    """PSNR per region as text that continues a line; empty where nothing is known."""
+    parts = [
+        f"{title} {value:.2f} dB"
+        for region, title in REGION_TITLES.items()
+        if region in figures and (value := figures[region]["psnr"]) is not None
+    ]
+    return " · " + " · ".join(parts) if parts else ""

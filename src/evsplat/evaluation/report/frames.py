@@ -11,21 +11,20 @@ from evsplat.capture import Frame, Policy, load_body_track
 from evsplat.capture.policy import policy_of
 from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.charts import Series, line_chart
-from evsplat.evaluation.report.figures import no_test_figures
-from evsplat.evaluation.report.html import (
+from evsplat.evaluation.report.figures import frame_figures, no_test_figures
+from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import split_of, words_of
+from evsplat.objectives import motion_px
+from evsplat.pages import (
     Embedder,
     compare,
     figure,
     folded,
-    frame_figures,
     legend,
     more,
     section,
     spread,
 )
-from evsplat.evaluation.report.source import Source
-from evsplat.evaluation.splits import split_of, words_of
-from evsplat.objectives import motion_px
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import ERROR_FULL_SCALE, css_gradient
 

@@ -7,22 +7,27 @@ from typing import Any
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
 from evsplat.evaluation.report.configuration import configuration, duration, made_with
-from evsplat.evaluation.report.figures import distance, figures, no_test_figures, references
+from evsplat.evaluation.report.figures import (
+    distance,
+    figures,
+    frame_figures,
+    no_test_figures,
+    references,
+)
 from evsplat.evaluation.report.frames import frame_by_frame, test_frames
-from evsplat.evaluation.report.html import (
+from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import words_of
+from evsplat.pages import (
     Embedder,
     data_uri,
     document,
     figure,
     folded,
-    frame_figures,
     legend,
     more,
     section,
     spread,
 )
-from evsplat.evaluation.report.source import Source
-from evsplat.evaluation.splits import words_of
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import css_gradient
 

@@ -11,11 +11,11 @@ from jaxtyping import UInt8
 from evsplat.capture import Capture
 from evsplat.config import load_yaml
 from evsplat.errors import DataError
-from evsplat.evaluation.report.html import read_picture
 from evsplat.evaluation.splits import name_of
 from evsplat.files import parse_json, read_json, read_text
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.options.runs import Split
+from evsplat.pages import read_picture
 
 
 @dataclass(frozen=True)
