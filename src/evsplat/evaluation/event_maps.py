@@ -104,7 +104,9 @@ def _pairs(capture: Capture, reconstruction: Reconstruction) -> Iterator[EventPa
                 reconstruction.render(capture.camera(frame), [frame.mid_us]).rgb[0].cpu()
                 for frame in (before, after)
             )
-        change = log_brightness_change(first.clamp(0, 1), second.clamp(0, 1)).float()
+        change = log_brightness_change(
+            first.clamp(0, 1), second.clamp(0, 1), transfer=capture.transfer(before)
+        ).float()
         yield EventPair(before, after, given, change / _threshold(capture, given, change))
 
 

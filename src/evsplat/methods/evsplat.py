@@ -13,7 +13,12 @@ import torch
 
 from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate
-from evsplat.capture import Policy, TrainingCapture, estimate_sensor
+from evsplat.capture import (
+    Policy,
+    TrainingCapture,
+    estimate_sensor,
+    warn_of_linear_frames,
+)
 from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
@@ -365,6 +370,7 @@ def _windows(
         estimate = None
         if capture.contrast_threshold is None or config.clock != "never":
             estimate = estimate_sensor(capture)
+            warn_of_linear_frames(capture, estimate)
         known = _thresholds(capture, estimate)
         late_us = _late_us(config, estimate)
         if not capture.events.has_polarity:

@@ -17,6 +17,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture
 from evsplat.pictures.files import read_image
+from evsplat.pictures.light import Transfer
 
 logger = logging.getLogger(__name__)
 
@@ -41,8 +42,13 @@ class Source(Protocol):
         """Facts about the source for the provenance."""
         ...
 
-    def declare(self, writer: CaptureWriter) -> None:
-        """Add the cameras."""
+    @property
+    def transfer(self) -> Transfer | None:
+        """From values to light, as the camera states it."""
+        ...
+
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
+        """Add the cameras, with that curve from values to light."""
         ...
 
     def extras(self, index: int) -> dict[str, Any]:
@@ -105,7 +111,12 @@ class CaptureSource:
         """See `Source`."""
         return {"capture": self._capture.name, "provenance": self._capture.provenance}
 
-    def declare(self, writer: CaptureWriter) -> None:
+    @property
+    def transfer(self) -> Transfer | None:
+        """See `Source`."""
+        return self._capture.metadata.transfers.get(self.camera)
+
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
         """See `Source`; lenses stay, pictures are handled as they were recorded."""
         for name, camera in self._capture.cameras.items():
             lens = self._capture.metadata.distortions.get(name)
@@ -116,6 +127,7 @@ class CaptureSource:
                 camera.K,
                 camera.world_to_camera,
                 distortion=None if lens is None else lens.coefficients,
+                transfer=transfer,
             )
 
     def extras(self, index: int) -> dict[str, Any]:
@@ -141,7 +153,10 @@ class CaptureSource:
         """See `Source`."""
         capture = self._capture
         middles = np.array(list(frames.values()))
-        set_body(writer, capture.body_file, capture.dense_body_file, middles)
+        if capture.has_body:
+            set_body(writer, capture.body_file, capture.dense_body_file, middles)
+        else:
+            writer.leave_out_body()
         for view in capture.novel_views:
             if view.frame in frames:
                 writer.add_novel_view(view.camera, view.frame, view.time_us, view.image)
@@ -230,11 +245,16 @@ class FootageSource:
         """See `Source`."""
         return {"footage": self.footage.path.name, "camera_known": self._camera is not None}
 
-    def declare(self, writer: CaptureWriter) -> None:
+    @property
+    def transfer(self) -> Transfer | None:
+        """See `Source`."""
+        return None if self._camera is None else self._camera["transfer"]
+
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
         """See `Source`."""
         width, height = self.footage.width, self.footage.height
         if self._camera is not None:
-            writer.add_camera(self.camera, width, height, **self._camera)
+            writer.add_camera(self.camera, width, height, **{**self._camera, "transfer": transfer})
             return
         logger.warning(
             "No camera is given: one with %g degrees of view is written. Correct it in "
@@ -243,7 +263,7 @@ class FootageSource:
         )
         focal = max(width, height) / 2 / np.tan(np.radians(_NOMINAL_FOV_DEG) / 2)
         K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
-        writer.add_camera(self.camera, width, height, K)
+        writer.add_camera(self.camera, width, height, K, transfer=transfer)
 
     def extras(self, index: int) -> dict[str, Any]:
         """See `Source`."""
@@ -260,7 +280,10 @@ class FootageSource:
     def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
         """See `Source`."""
         if self._body is None:
-            logger.warning("No body poses are given; 'evsplat train' will need them.")
+            logger.warning(
+                "No body poses are given; 'evsplat train' will need them, 'evsplat poses' finds "
+                "them."
+            )
             writer.leave_out_body()
             return
         set_body(writer, self._body, None, np.array(list(frames.values())))
