@@ -296,6 +296,13 @@ def test_unknown_key_names_the_nearest(
         (("novel_views", 0, "frame"), "77", "novel_views[0].frame", "'77'", "valid frame"),
         (("novel_views", 0, "frame"), "0008", "novel_views[1].frame", "second view", "one view"),
         (("body", "model"), "star", "body.model", "'star'", "'rig'"),
+        (
+            ("cameras", "main", "transfer"),
+            "gamma",
+            "cameras.main.transfer",
+            "'gamma'",
+            "['power', 'srgb', 'linear']",
+        ),
         (("body", "file"), ..., "body.file", "nothing", "a value"),
         (("body", "source"), "guess", "body.source", "'guess'", "['exact', 'markers', 'estimated'"),
         (("body", "source"), [1], "body.source", "[1]", "['exact', 'markers', 'estimated'"),

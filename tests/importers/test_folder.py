@@ -128,6 +128,23 @@ def test_a_rig_of_ones_own(recording: Path, tmp_path: Path, tiny_capture: Callab
     assert np.array_equal(body.rest_vertices, tiny.body_file.rest_vertices)
 
 
+@pytest.mark.parametrize("how", ["absent", "not wanted"])
+def test_without_poses_the_body_is_left_out(recording: Path, tmp_path: Path, how: str) -> None:
+    options: dict[str, Any] = {"fps": 25.0, "exposure_us": 3e4, "transfer": "linear"}
+    if how == "absent":
+        (recording / "poses.npz").unlink()
+        (recording / "camera.json").unlink()
+    else:
+        options |= {"no_poses": True}
+    import_capture("folder", recording, tmp_path / "out", **options)
+    capture = load_capture(tmp_path / "out")
+    assert not capture.has_body and len(capture.frames) == COUNT
+    assert capture.transfer(capture.frames[0]) == "linear"
+    assert capture.events is not None and len(capture.events) == 400
+    origin = {"absent": "guessed", "not wanted": "calibrated"}[how]
+    assert capture.provenance["focal"] == origin
+
+
 def rewrite_camera(root: Path, **changes) -> None:
     path = root / "camera.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
@@ -142,11 +159,11 @@ FAULTS = {
         "images: not found, expected a folder of pictures, or one video",
     ),
     "no rate": (lambda root: None, {"exposure_us": 1e4}, ConfigError, "--fps"),
-    "no poses": (
-        lambda root: (root / "poses.npz").unlink(),
-        {},
-        DataError,
-        r"mine: holds no poses\.\*, poses/ or body.npz",
+    "poses and none": (
+        lambda root: None,
+        {"fps": 25.0, "exposure_us": 3e4, "no_poses": True, "poses": Path("poses.npz")},
+        ConfigError,
+        "--no-poses: contradicts --poses poses.npz",
     ),
     "no camera": (
         lambda root: (root / "camera.json").unlink(),

@@ -359,7 +359,7 @@ def test_footage_without_poses_gives_a_capture_to_look_at(tmp_path, caplog):
     assert "No camera is given" in caplog.text and "No body poses are given" in caplog.text
     capture = load_capture(out)
     assert not capture.has_body and capture.dense_body_file is None
-    with pytest.raises(DataError, match="nobody has posed the person yet"):
+    with pytest.raises(DataError, match="has no body; find the person's poses with: evsplat poses"):
         _ = capture.body_file
     report = inspect_capture(out, tmp_path / "inspect")
     assert report.usable and "body       none" in report.summary

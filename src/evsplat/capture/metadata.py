@@ -10,6 +10,7 @@ from torch import Tensor
 from evsplat.body.pose_errors import PoseSource
 from evsplat.camera import Camera
 from evsplat.capture.distortion import Distortion
+from evsplat.pictures.light import Transfer
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,8 @@ class Metadata:
     name: str
     cameras: dict[str, Camera]
     distortions: dict[str, Distortion]
+    transfers: dict[str, Transfer]
+    """From the values of pictures to light, of cameras for which capture.json says it."""
     frames: tuple[Frame, ...]
     novel_views: tuple[NovelView, ...]
     body_file: Path

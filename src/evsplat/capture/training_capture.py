@@ -20,6 +20,7 @@ from evsplat.capture.policy import Policy
 from evsplat.capture.read import CaptureReader
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS, EventStore, Span
+from evsplat.pictures.light import Transfer
 
 _KEPT_MASKS = 64
 """Estimated masks kept in memory; the least recently used one goes first."""
@@ -106,6 +107,10 @@ class TrainingCapture:
     def camera(self, frame: Frame | str) -> Camera:
         """The pinhole camera of any frame, held out or not (`Capture.camera`)."""
         return self._source.camera(self._name(frame))
+
+    def transfer(self, frame: Frame | str) -> Transfer:
+        """From the values of a frame's pictures to light (`Capture.transfer`)."""
+        return self._source.transfer(self._name(frame))
 
     @property
     def is_static_camera(self) -> bool:

@@ -33,7 +33,7 @@ from evsplat.inspection.drawing import (
     to_picture,
 )
 from evsplat.inspection.plots import draw_timeline
-from evsplat.inspection.sensor import clock_findings, sensor_lines
+from evsplat.inspection.sensor import clock_findings, contrast_findings, sensor_lines
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +72,11 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     capture = Capture(metadata)
     seen = capture.for_training(Policy(use="everything"))
     estimate = estimate_sensor(seen)
-    findings = (*found, *clock_findings(capture, estimate))
+    findings = (
+        *found,
+        *clock_findings(capture, estimate),
+        *contrast_findings(capture, estimate),
+    )
     track = load_body_track(capture) if capture.has_body else None
     fitting = None if track is None else judge_body(seen, track)
     drawings = {"contact_sheet": _contact_sheet(capture)}
@@ -128,7 +132,8 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
     lines = [
         f"{capture.name}   {capture.path}",
         f"frames     {len(frames)}: {len(capture.train_frames)} train, {len(capture.test_frames)} "
-        f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera",
+        f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera"
+        f"{_transfer_text(capture)}",
         f"time       {(end - start) / 1e6:.3f} s{rate}, exposure {exposure / 1000:.4g} ms",
         f"events     {_events_text(capture)}",
         *(sensor_lines(estimate, capture.clock_offset_us) if capture.events is not None else []),
@@ -149,6 +154,12 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
     if "text" in capture.provenance:
         lines.append(f"made       {capture.provenance['text']}")
     return "\n".join(lines)
+
+
+def _transfer_text(capture: Capture) -> str:
+    """The curve from values to light, where capture.json says it."""
+    stated = {capture.metadata.transfers.get(frame.camera) for frame in capture.frames} - {None}
+    return f"; values: {', '.join(sorted(str(one) for one in stated))}" if stated else ""
 
 
 def _events_text(capture: Capture) -> str:

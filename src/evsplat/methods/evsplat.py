@@ -14,7 +14,13 @@ import torch
 
 from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate
-from evsplat.capture import Frame, Policy, TrainingCapture, estimate_sensor
+from evsplat.capture import (
+    Frame,
+    Policy,
+    TrainingCapture,
+    estimate_sensor,
+    warn_of_linear_frames,
+)
 from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
@@ -366,6 +372,7 @@ def _windows(
         estimate = None
         if capture.contrast_threshold is None or config.clock != "never":
             estimate = estimate_sensor(capture)
+            warn_of_linear_frames(capture, estimate)
         known = _thresholds(capture, estimate)
         late_us = _late_us(config, estimate)
         if not capture.events.has_polarity:

@@ -1,6 +1,6 @@
 """Coded values of pictures, linear light, luminance and its logarithm, which events report."""
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ Transfer = Literal["power", "srgb", "linear"]
 """``power``: exponent 2.2 (paper eq. 8); ``srgb``: the exact piecewise curve of IEC 61966-2-1;
 ``linear``: the values are light as they stand."""
 
+TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
 GAMMA = 2.2
 REC709 = (0.2126, 0.7152, 0.0722)
 DARKEST = 1.0 / 255.0

@@ -3,7 +3,7 @@
 import functools
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +71,13 @@ def synthesize(
     source, out = Path(source), Path(out)
     opened = _open(source, source_fps, body, pose_source, camera)
     interpolator = _interpolator(settings, weights)
+    settings = _with_own_transfer(settings, opened)
     plan = plan_exposures(opened.footage.times_us, settings)
     recorded = opened.events() if settings.events == "source" else None
     if settings.split == "source":
         opened.split(0)
     with CaptureWriter(out, overwrite=overwrite) as writer:
-        opened.declare(writer)
+        opened.declare(writer, settings.transfer)
         making = _Making(opened, settings, plan, interpolator, writer)
         subframes = making.subframes(progress)
         events = recorded
@@ -193,6 +194,19 @@ def _open(
         if value is not None:
             raise ConfigError(f"--{name}: {source} is a capture and has its own; leave it out.")
     return CaptureSource(source)
+
+
+def _with_own_transfer(settings: SynthesisSettings, source: Source) -> SynthesisSettings:
+    """The settings with the curve that the source's camera states, if it states one."""
+    own = source.transfer
+    if own is None:
+        return settings
+    if settings.transfer not in ("power", own):
+        raise ConfigError(
+            f"--transfer {settings.transfer}: the camera of {source.footage.path} says {own!r}; "
+            "leave the option out or correct the camera."
+        )
+    return replace(settings, transfer=own)
 
 
 def _interpolator(settings: SynthesisSettings, weights: Path | str | None) -> Interpolator | None:

@@ -18,6 +18,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture
 from evsplat.pictures.files import read_image
+from evsplat.pictures.light import Transfer
 
 logger = logging.getLogger(__name__)
 
@@ -42,9 +43,14 @@ class Source(ABC):
     def describe(self) -> dict[str, Any]:
         """Facts about the source for the provenance."""
 
+    @property
     @abstractmethod
-    def declare(self, writer: CaptureWriter) -> None:
-        """Add the cameras."""
+    def transfer(self) -> Transfer | None:
+        """From values to light, as the camera states it."""
+
+    @abstractmethod
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
+        """Add the cameras, with that curve from values to light."""
 
     def extras(self, index: int) -> dict[str, Any]:
         """Options of `CaptureWriter.add_frame` that go with the source picture of that index."""
@@ -111,7 +117,12 @@ class CaptureSource(Source):
         """See `Source`."""
         return {"capture": self._capture.name, "provenance": self._capture.provenance}
 
-    def declare(self, writer: CaptureWriter) -> None:
+    @property
+    def transfer(self) -> Transfer | None:
+        """See `Source`."""
+        return self._capture.metadata.transfers.get(self.camera)
+
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
         """See `Source`; lenses stay, pictures are handled as they were recorded."""
         for name, camera in self._capture.cameras.items():
             lens = self._capture.metadata.distortions.get(name)
@@ -122,6 +133,7 @@ class CaptureSource(Source):
                 camera.K,
                 camera.world_to_camera,
                 distortion=None if lens is None else lens.coefficients,
+                transfer=transfer,
             )
 
     def extras(self, index: int) -> dict[str, Any]:
@@ -147,7 +159,10 @@ class CaptureSource(Source):
         """See `Source`."""
         capture = self._capture
         middles = np.array(list(frames.values()))
-        set_body(writer, capture.body_file, capture.dense_body_file, middles)
+        if capture.has_body:
+            set_body(writer, capture.body_file, capture.dense_body_file, middles)
+        else:
+            writer.leave_out_body()
         for view in capture.novel_views:
             if view.frame in frames:
                 writer.add_novel_view(view.camera, view.frame, view.time_us, view.image)
@@ -236,11 +251,16 @@ class FootageSource(Source):
         """See `Source`."""
         return {"footage": self.footage.path.name, "camera_known": self._camera is not None}
 
-    def declare(self, writer: CaptureWriter) -> None:
+    @property
+    def transfer(self) -> Transfer | None:
+        """See `Source`."""
+        return None if self._camera is None else self._camera["transfer"]
+
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
         """See `Source`."""
         width, height = self.footage.width, self.footage.height
         if self._camera is not None:
-            writer.add_camera(self.camera, width, height, **self._camera)
+            writer.add_camera(self.camera, width, height, **{**self._camera, "transfer": transfer})
             return
         logger.warning(
             "No camera is given: one with %g degrees of view is written. Correct it in "
@@ -249,12 +269,15 @@ class FootageSource(Source):
         )
         focal = max(width, height) / 2 / np.tan(np.radians(_NOMINAL_FOV_DEG) / 2)
         K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
-        writer.add_camera(self.camera, width, height, K)
+        writer.add_camera(self.camera, width, height, K, transfer=transfer)
 
     def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
         """See `Source`."""
         if self._body is None:
-            logger.warning("No body poses are given; 'evsplat train' will need them.")
+            logger.warning(
+                "No body poses are given; 'evsplat train' will need them, 'evsplat poses' finds "
+                "them."
+            )
             writer.leave_out_body()
             return
         set_body(writer, self._body, None, np.array(list(frames.values())))
