@@ -5,7 +5,6 @@ upright, the points are refined by the heat map around them, and two points that
 span the region in which the person is looked for next.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,15 +13,20 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.landmarks.landmarks import BLAZEPOSE_33
+from evsplat.landmarks.landmarks import BLAZEPOSE_33, LIMB_POINTS
 from evsplat.landmarks.network import HEAT_SIDE, POINTS, SIDE, LandmarkNetwork, NetworkOutput
 
 _CENTRE, _RIM = 33, 34
 """Points of the network between the hips, and as far from it as a circle around the person."""
 _MARGIN = 1.25
+COPIES = ((0.0, False), (0.0, True), (-0.25, False), (0.25, True))
+"""Turns (radians) and mirroring of the copies that are read: those that are turned disagree with
+the others where a point is hidden."""
 _HEAT_REACH = 3
 """Cells on each side of a point whose heat refines it."""
 _LEAST_HEAT = 0.5
+LEAST_FLAG = 0.5
+"""Below it there is no person in a region, says the network."""
 
 
 def _other_side(name: str) -> str:
@@ -64,7 +68,7 @@ class Found:
     """The person as the network found it in one picture."""
 
     places: Float[np.ndarray, "33 2"]
-    """Pixels of the picture; the mean over copies."""
+    """Pixels of the picture; the median over copies."""
     spread: Float[np.ndarray, "33"]
     """Disagreement of the copies, pixels per axis (standard deviation)."""
     visible: Float[np.ndarray, "33"]
@@ -76,16 +80,26 @@ class Found:
     region: Region
     """Where it would be read next."""
 
+    @property
+    def doubt(self) -> float:
+        """Disagreement of the copies about half of the limbs' joints, over the region's side.
+
+        It tells a wrong upright, which the flag does not: a cartwheel has a flag of 1 however the
+        region is turned, and one tenth of the disagreement where it is turned with the person.
+        """
+        return float(np.median(self.spread[list(LIMB_POINTS)])) / self.region.side
+
 
 def find_in(
     network: LandmarkNetwork,
     picture: Float[Tensor, "H W 3"],
     region: Region,
-    *,
-    turns: Sequence[float] = (0.0,),
 ) -> Found:
-    """The person in a region, from plain and mirrored copies at each of ``turns`` (radians)."""
-    copies = [(region.turned(turn), mirrored) for turn in turns for mirrored in (False, True)]
+    """The person in a region, from `COPIES` of it.
+
+    Places are medians: where limbs hide each other a copy may take one for another.
+    """
+    copies = [(region.turned(turn), mirrored) for turn, mirrored in COPIES]
     crops = torch.stack([crop(picture, *copy) for copy in copies])
     output = network(crops)
     points = refined(output)
@@ -93,21 +107,20 @@ def find_in(
     places = np.stack([reading[0] for reading in readings])
     world = np.stack([reading[1] for reading in readings])
     visible = np.stack([reading[2] for reading in readings])
-    mean = places.mean(0)
-    rim = mean[_RIM] - mean[_CENTRE]
+    median = np.median(places, axis=0)
+    rim = median[_RIM] - median[_CENTRE]
     following = Region(
-        mean[_CENTRE],
+        median[_CENTRE],
         max(2 * _MARGIN * float(np.hypot(*rim)), 1.0),
         float(np.arctan2(rim[0], -rim[1])),
     )
     body = slice(len(BLAZEPOSE_33))
-    # two copies tell half of what the spread is: the standard deviation with n - 1
     spread = np.sqrt(places.var(0, ddof=1).mean(-1))
     return Found(
-        mean[body],
+        median[body],
         spread[body],
         visible.mean(0)[body],
-        world.mean(0)[body],
+        np.median(world, axis=0)[body],
         float(output.flag.mean()),
         following,
     )

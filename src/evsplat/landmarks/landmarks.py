@@ -57,6 +57,9 @@ BLAZEPOSE_33 = (
 )
 """Landmarks of BlazePose (Bazarevsky et al., 2020), in its order."""
 
+LIMB_POINTS = tuple(BLAZEPOSE_33.index(name) for name in _LIMBS)
+"""Shoulders, elbows, wrists, hips, knees and ankles of BlazePose."""
+
 KeypointSet = Literal["coco17", "wholebody133", "openpose25", "blazepose33"]
 
 SETS: dict[KeypointSet, tuple[str, ...]] = {

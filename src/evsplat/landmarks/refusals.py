@@ -10,14 +10,13 @@ from torch import Tensor
 
 from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
-from evsplat.landmarks.detect import Found, Region
-from evsplat.landmarks.landmarks import BLAZEPOSE_33
+from evsplat.landmarks.detect import LEAST_FLAG, Found, Region
+from evsplat.landmarks.landmarks import LIMB_POINTS
 from evsplat.landmarks.motion import Box, Motion, global_shift
 from evsplat.landmarks.pictures import SharpPicture
 
 logger = logging.getLogger(__name__)
 
-_LEAST_FLAG = 0.5
 _SECOND_FLAG = 0.9
 _SECOND_SIZE = 0.35
 """A second person is at least this tall beside the first."""
@@ -26,18 +25,13 @@ _EXAMINED = 8
 _LEAST_SHIFT_PX = 2.0
 _HALF_OUT = 0.25
 """Share of limb joints beyond the border of which a picture shows too little."""
-_LIMBS = [
-    index
-    for index, name in enumerate(BLAZEPOSE_33)
-    if name.split("_")[-1] in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-]
 
 
 def refuse_nobody(
     capture: TrainingCapture, pictures: Sequence[SharpPicture], flags: Float[np.ndarray, "N"]
 ) -> None:
     """A `DataError` where most pictures show no person."""
-    missed = int((flags < _LEAST_FLAG).sum())
+    missed = int((flags < LEAST_FLAG).sum())
     if 2 * missed > len(pictures):
         raise DataError(
             f"{capture.path}: nobody was found in {missed} of {len(pictures)} pictures, expected "
@@ -51,7 +45,7 @@ def refuse_half_out_of_view(
 ) -> None:
     """A `DataError` where most pictures show only part of the person."""
     height, width = pictures[0].image.shape[:2]
-    limbs = places[:, _LIMBS]
+    limbs = places[:, LIMB_POINTS]
     outside = ((limbs < 0) | (limbs > np.array([width, height]))).any(-1).mean(1)
     cut = int((outside > _HALF_OUT).sum())
     if 2 * cut > len(pictures):
@@ -116,7 +110,7 @@ def refuse_two_people(
     The first is painted over with the background; in what else moves another is searched for.
     """
     spread = np.unique(np.linspace(0, len(pictures) - 1, _EXAMINED).round().astype(int))
-    chosen = [k for k in spread if found[k].flag >= _LEAST_FLAG]
+    chosen = [k for k in spread if found[k].flag >= LEAST_FLAG]
     seconds = [
         person
         for k in chosen

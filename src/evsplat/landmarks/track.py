@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
-from evsplat.landmarks.detect import Found, Region, find_in
+from evsplat.landmarks.detect import LEAST_FLAG, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
 from evsplat.landmarks.motion import Motion
 from evsplat.landmarks.network import LandmarkNetwork
@@ -26,13 +26,11 @@ logger = logging.getLogger(__name__)
 
 SURE = 0.9
 """The person is tracked on from pictures with at least this flag, and searched for below it."""
-LEAST_FLAG = 0.5
-"""Below it there is no person in a region, says the network."""
 _TURNS = (0.0, np.pi / 2, -np.pi / 2, np.pi)
 """Uprights of a search: cartwheels and handstands are found by the last three."""
+_CLEAR = 0.008
+"""Beyond this doubt other uprights are tried."""
 _BOX_MARGIN = 1.25
-_COPY_TURNS = (-0.1, 0.1)
-"""Radians: copies that are turned differently disagree where a point is hidden."""
 _SETTLED = 0.08
 """A region is read again where the next one is off by more than this share of its side."""
 _BASE_SIGMA = 0.008
@@ -95,42 +93,43 @@ class _Tracker:
         self._last: Region | None = None
 
     def find(self, picture: SharpPicture) -> Found:
-        """From the last region, or by a search where that fails."""
+        """From the last region, turned otherwise where that is doubtful, or by a search."""
         best = None if self._last is None else self.settle(picture.image, self._last)
+        if best is not None and best.flag >= LEAST_FLAG and not _is_clear(best):
+            around = Region(best.region.centre, best.region.side)
+            best = min(best, self.search(picture.image, [around]), key=_badness)
         if best is None or best.flag < SURE:
-            searched = self._searched(picture)
-            # the tracked one stays where the search is no better: limbs that hide each other
-            best = searched if best is None or searched.flag > best.flag + 0.1 else best
+            starts = starts_of(self._motion, picture)
+            searched = self.search(picture.image, list(starts))
+            best = searched if best is None else min(best, searched, key=_badness)
         self._last = best.region if best.flag >= SURE else None
         return best
 
     def look_back(self, pictures: Sequence[SharpPicture], found: list[Found]) -> None:
-        """Read doubtful pictures again in the regions of sure ones after them."""
+        """Read doubtful pictures again in the regions of clear ones after them."""
         for index in range(len(found) - 2, -1, -1):
             following = found[index + 1]
-            if found[index].flag < SURE <= following.flag:
+            if _is_clear(following) and not _is_clear(found[index]):
                 again = self.settle(pictures[index].image, following.region)
-                if again.flag > found[index].flag:
-                    found[index] = again
+                found[index] = min(found[index], again, key=_badness)
 
     def search(self, image: Float[Tensor, "H W 3"], starts: Sequence[Region]) -> Found:
-        """The surest person in any of the starts, upright, turned or upside down."""
+        """The clearest person in any of the starts, upright, turned or upside down."""
         best: Found | None = None
         for start in starts:
             for turn in _TURNS:
-                found = self.settle(image, start.turned(turn), rounds=3)
-                if best is None or found.flag > best.flag:
-                    best = found
-                if best.flag >= SURE:
+                found = self.settle(image, start.turned(turn))
+                best = found if best is None else min(best, found, key=_badness)
+                if _is_clear(best):
                     return best
         assert best is not None
         return best
 
-    def settle(self, image: Float[Tensor, "H W 3"], region: Region, rounds: int = 2) -> Found:
+    def settle(self, image: Float[Tensor, "H W 3"], region: Region, rounds: int = 3) -> Found:
         """Read a region, and again the one that follows from it until they are the same."""
         best: Found | None = None
         for _ in range(rounds):
-            found = find_in(self._network, image, region, turns=_COPY_TURNS)
+            found = find_in(self._network, image, region)
             if best is not None and found.flag < min(best.flag, SURE):
                 break
             best = found
@@ -140,15 +139,19 @@ class _Tracker:
         assert best is not None
         return best
 
-    def _searched(self, picture: SharpPicture) -> Found:
-        return self.search(
-            picture.image, list(starts_of(self._motion, picture, self._motion.background.shape))
-        )
+
+def _is_clear(found: Found) -> bool:
+    return found.flag >= SURE and found.doubt <= _CLEAR
 
 
-def starts_of(motion: Motion, picture: SharpPicture, shape: Sequence[int]) -> Iterator[Region]:
+def _badness(found: Found) -> float:
+    """Lower is better: belief that there is a person counts first, then agreement of the copies."""
+    return found.doubt + max(0.0, SURE - found.flag)
+
+
+def starts_of(motion: Motion, picture: SharpPicture) -> Iterator[Region]:
     """Regions to begin a search in: what moves, then the whole picture, then its centre square."""
-    height, width = shape[:2]
+    height, width = picture.image.shape[:2]
     for box in motion.boxes(picture.time_us)[:2]:
         yield Region(box.centre, _BOX_MARGIN * box.side)
     centre = np.array([width, height]) / 2
