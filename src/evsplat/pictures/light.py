@@ -54,11 +54,13 @@ def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
 
 
 def log_brightness(
-    rgb_srgb: Float[Tensor, "*shape 3"], *, eps: float = 1e-5
+    rgb_srgb: Float[Tensor, "*shape 3"], *, eps: float = 1e-5, transfer: Transfer = "power"
 ) -> Float[Tensor, "*shape"]:
     """Natural logarithm of the luminance of sRGB-coded pictures in [0, 1] (A11)."""
-    result: Tensor = _PowerLogBrightness.apply(rgb_srgb, eps)
-    return result
+    if transfer == "power":
+        result: Tensor = _PowerLogBrightness.apply(rgb_srgb, eps)
+        return result
+    return torch.log(luminance(decode(rgb_srgb.clamp_min(DARKEST), transfer)) + eps)
 
 
 def log_brightness_change(
@@ -66,9 +68,11 @@ def log_brightness_change(
     after_srgb: Float[Tensor, "*shape 3"],
     *,
     eps: float = 1e-5,
+    transfer: Transfer = "power",
 ) -> Float[Tensor, "*shape"]:
     """``log Y(after) - log Y(before)``, the left side of the event model (paper eq. 8)."""
-    return log_brightness(after_srgb, eps=eps) - log_brightness(before_srgb, eps=eps)
+    after = log_brightness(after_srgb, eps=eps, transfer=transfer)
+    return after - log_brightness(before_srgb, eps=eps, transfer=transfer)
 
 
 class _NativePower(torch.autograd.Function):
