@@ -164,6 +164,7 @@ def markdown(metrics: dict[str, Any]) -> str:
         rows = [(table.title(row), table.cells(row, "**{}**")) for row in table.rows]
         lines += [*markdown_table("", head, rows), ""]
     lines += _novel_markdown(metrics)
+    lines += [f"- {remark}" for remark in metrics.get("remarks", ())]
     lines += [f"- {reason}" for reason in missing_networks(metrics)]
     return "\n".join(lines).rstrip() + "\n"
 
