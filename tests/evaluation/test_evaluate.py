@@ -91,6 +91,17 @@ def test_training_frames_without_truth_are_refused(tiny_capture, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_person_who_is_in_no_frame_is_remarked(tiny_capture, tmp_path, caplog):
+    path = tiny_capture()
+    assert run(path, tmp_path / "a")["remarks"] == []
+    for mask in (path / "masks").iterdir():
+        Image.new("L", Image.open(mask).size).save(mask)
+    metrics = run(path, tmp_path / "b")
+    (remark,) = metrics["remarks"]
+    assert "the person is in no test frame" in remark and remark in caplog.text
+    assert remark in markdown({**metrics, "policy": {}})
+
+
 def test_missing_weights_are_null_with_the_reason(tiny_capture, tmp_path):
     metrics = run(tiny_capture(), tmp_path / "run")
     assert metrics["protocols"]["standard"]["full"]["lpips_vgg"] is None

@@ -184,6 +184,7 @@ def _body_text(capture: Capture, track: BodyTrack | None) -> str:
     return (
         f"{capture.body_file.model}: {len(body.parents)} joints, {len(body.rest_vertices):,} "
         f"vertices; {len(times)} key poses from {times[0] / 1e6:.3f} to {times[-1] / 1e6:.3f} s"
+        + ("" if track.errors is None else f", {track.errors.source}")
         + (f"; {len(dense.times_us)} dense true poses" if dense is not None else "")
     )
 

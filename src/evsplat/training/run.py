@@ -37,6 +37,9 @@ from evsplat.training.checkpoint import (
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
+_NAMED_RUNS = 5
+"""Runs that an error about the folder above them names, at most."""
+
 
 class RunFolder:
     """Paths of the parts of a run."""
@@ -212,10 +215,21 @@ class Run:
     """Whether the method learned nothing but the person and draws it on black."""
 
 
+def _runs_below(path: Path) -> str:
+    """A sentence that names the runs one level below, the newest first; empty where none is."""
+    runs = sorted(path.glob("*/config.yaml"), key=lambda file: -file.stat().st_mtime)
+    if not runs:
+        return ""
+    names = ", ".join(str(file.parent) for file in runs[:_NAMED_RUNS])
+    return f" A run lies below: {names}." if len(runs) == 1 else f" Runs lie below: {names}."
+
+
 def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     """Method, configuration and facts of a run folder."""
     if not folder.config.exists():
-        raise DataError(f"{folder.path}: not a run folder, config.yaml is missing.")
+        raise DataError(
+            f"{folder.path}: not a run folder, config.yaml is missing.{_runs_below(folder.path)}"
+        )
     values = load_yaml(folder.config)
     method = values.pop("method", DEFAULT_METHOD)
     try:
