@@ -139,6 +139,7 @@ def test_pictures_of_another_motion_correct_it_and_are_explained_better(body):
     gain, gain_error = _gain(descent, descent.targets.rows(range(0, len(TIMES), 3)))
     assert gain - 2 * gain_error > 0.3
     errors = descent.errors()
+    errors.check(len(descent.correction.key_times), len(body.parents), "test")
     assert errors.joint_rad.max() < 0.08
     assert errors.root_m.max() < 0.02
 

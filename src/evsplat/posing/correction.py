@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
@@ -72,10 +72,8 @@ class Correction(nn.Module):
 
     @torch.no_grad()
     def corrected(self, errors: PoseErrors | None = None) -> BodyTrack:
-        """The track with its own keys and those of the correction's knots moved."""
-        own = self.track.times_us
-        gap = float(np.median(np.diff(own))) if len(own) > 1 else self._knot_us
-        times = own if gap < 1.5 * self._knot_us else self._between(own)
+        """The corrected motion with keys at `key_times`."""
+        times = self.key_times
         rotations, transl = self.at(times.tolist())
         vectors = Rotation.from_matrix(rotations.flatten(0, 1).double().numpy()).as_rotvec()
         poses = nearest_axis_angle(vectors.reshape(len(times), -1, 3))
@@ -88,8 +86,10 @@ class Correction(nn.Module):
             errors=errors,
         )
 
-    def _between(self, own: np.ndarray) -> np.ndarray:
-        """Times of keys, with more between them where they are farther apart than knots."""
+    @property
+    def key_times(self) -> Int64[np.ndarray, "P"]:
+        """Times of the track's keys, with more between them where they are farther apart."""
+        own = self.track.times_us
         parts = [
             np.linspace(a, b, max(1, round((b - a) / self._knot_us)), endpoint=False)
             for a, b in zip(own, own[1:], strict=False)

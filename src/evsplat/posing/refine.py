@@ -23,7 +23,7 @@ from evsplat.posing.correction import Correction
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets, find_targets
 
-DISCS = 5_000
+DISCS = 4_000
 COARSE_PX = 64
 """Least side of the pictures that are compared first."""
 UNKNOWN_RAD, UNKNOWN_M = 0.05, 0.02
@@ -31,11 +31,13 @@ UNKNOWN_RAD, UNKNOWN_M = 0.05, 0.02
 LEAST_GAIN = 0.12
 """Share by which pictures kept aside must be explained better, for certain, for a motion to count
 as better. What discs cannot show of a person changes true motions, to a gain below it."""
+_LEAST_RAD, _LEAST_M = 0.006, 0.004
+"""Errors that discs make of true motions, per axis: clothes, hair and hands are not the body's."""
 _MISFIT = 0.06
 """Difference of coded colours from which on more of it counts little."""
 _PIXEL_SHARE = 0.05
 """Independent values that a pixel's three colours count for: neighbours err alike."""
-_STEPS = (120, 160)
+_STEPS = (80, 120)
 _LOOK_STEPS = 30
 """Steps in which the look alone is learned, at the start and where two motions are compared."""
 _RATES = {"motion": 0.05, "colours": 0.03, "offsets": 0.1, "light": 0.01}
@@ -217,13 +219,13 @@ class _Descent:
         # What pictures say of a coordinate goes with its share of the variance.
         shares = correction.mixing.square().mean(0)
         rates = [one.mean(0).clamp_min(0) / shares.mean() for one in total]
-        times = correction.track.times_us.tolist()
+        times = correction.key_times.tolist()
         weights = correction.weights(times).square()
         known = [1 / (1 + torch.einsum("m,...->m...", shares, rate)) for rate in rates]
-        joint = (
-            torch.einsum("tm,mjc->tjc", weights, known[0]).mean(-1).sqrt() * correction.joint_rad
-        )
-        root = (weights @ known[1]).sqrt() * correction.root_m
+        joint = correction.joint_rad.square() * torch.einsum("tm,mjc->tj", weights, known[0]) / 3
+        root = correction.root_m.square() * (weights @ known[1])
+        joint = torch.minimum(joint + _LEAST_RAD**2, correction.joint_rad.square()).sqrt()
+        root = torch.minimum(root + _LEAST_M**2, correction.root_m.square()).sqrt()
         joint_rad = np.zeros((len(times), len(correction.track.body.parents)))
         joint_rad[:, correction.joints.numpy()] = joint.detach().numpy()
         return PoseErrors("estimated", joint_rad, root.detach().double().numpy())
