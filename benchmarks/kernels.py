@@ -1,9 +1,9 @@
-"""Time of a step's native kernels beside plain torch, of the neighbour search beside SciPy's.
+"""Time of a step's native kernels beside plain torch, forward and backward.
 
 python benchmarks/kernels.py [--points N] [--size PX] [--threads T] [--repeats R]
 
-All but the search are forward and backward. `benchmarks/networks.py` times the networks' layers,
-`benchmarks/rasterize.py` the rasteriser. The last line is JSON with a unit in each key.
+`benchmarks/networks.py` times the networks' layers, `benchmarks/rasterize.py` the rasteriser. The
+last line is JSON with a unit in each key.
 """
 
 import evsplat  # noqa: F401 - before torch: it sets how OpenMP's threads wait
@@ -17,13 +17,11 @@ from types import ModuleType
 from unittest import mock
 
 import torch
-from scipy.spatial import cKDTree
 
 from evsplat import body
 from evsplat.body import body as skin_module
 from evsplat.models.discs import shading
 from evsplat.models.networks import colour, non_rigid, skinning_network
-from evsplat.neighbours import nearest
 from evsplat.objectives import event, isometry, semantic
 from evsplat.pictures import light
 from evsplat.similarity import psnr_ssim
@@ -146,7 +144,6 @@ def body_cases(points: int) -> dict[str, tuple[Call, Call]]:
     moved = [torch.randn(times, points, n).requires_grad_() for n in (3, 4, 3, 16)]
     moved[3] = moved[3].detach().unflatten(-1, (4, 4)).requires_grad_()
     rows = torch.randint(points, (1_024, 5))
-    places = positions.detach()
 
     def skinning() -> None:
         carried, blended = skin_module.skin(positions, weights, bones)
@@ -173,10 +170,6 @@ def body_cases(points: int) -> dict[str, tuple[Call, Call]]:
         "surface_light": (surface_light, in_torch(surface_light, shading)),
         "skinning": (skinning, in_torch(skinning, skin_module)),
         "isometry": (isometric, in_torch(isometric, isometry)),
-        "neighbours": (
-            lambda: nearest(places, 4),
-            lambda: cKDTree(places.numpy()).query(places.numpy(), k=5),
-        ),
     }
 
 

@@ -5,10 +5,13 @@
 
 #include <cstdint>
 #include <cstdlib>
+#include <cstring>
 #include <mutex>
 #include <new>
 #include <utility>
 #include <vector>
+
+#include "list.h"
 
 namespace evsplat {
 
@@ -104,6 +107,28 @@ class Buffer {
 
     T* data_ = nullptr;
     size_t bytes_ = 0, size_ = 0;
+};
+
+// A list that doubles its memory where it is full.
+template <class T>
+struct GrowingList : List<T> {
+    GrowingList() {
+        this->grow = [](List<T>& list) {
+            Buffer<T>& memory = static_cast<GrowingList&>(list).memory;
+            Buffer<T> larger(list.capacity ? 2 * list.capacity : 2048);
+            if (list.size) std::memcpy(larger.data(), list.data, list.size * sizeof(T));
+            memory.swap(larger);
+            list.data = memory.data(), list.capacity = memory.size();
+        };
+    }
+    GrowingList(const GrowingList&) = delete;
+
+    void swap(GrowingList& o) {
+        memory.swap(o.memory);
+        std::swap<List<T>>(*this, o);
+    }
+
+    Buffer<T> memory;
 };
 
 }  // namespace evsplat

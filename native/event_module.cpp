@@ -1,23 +1,14 @@
-#include "event_module.h"
+// Python bindings of the event decoders; evsplat/events/formats/words.py and text.py call them.
 
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/tuple.h>
-#include <nanobind/stl/vector.h>
-
-#include <stdexcept>
 #include <tuple>
 
+#include "bindings.h"
 #include "event_text.h"
 #include "event_words.h"
-
-namespace nb = nanobind;
 
 namespace evsplat {
 namespace {
 
-template <class T>
-using Column = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using State = nb::ndarray<int64_t, nb::shape<sizeof(EventState) / sizeof(int64_t)>, nb::c_contig, nb::device::cpu>;
 
 EventWords words_of(const std::string& kind) {
@@ -31,8 +22,7 @@ std::tuple<size_t, size_t> decode(const std::string& kind, Column<const uint8_t>
                                   Column<uint16_t> x, Column<uint16_t> y, Column<int8_t> p) {
     const EventWords words = words_of(kind);
     const size_t capacity = t.size();
-    if (x.size() != capacity || y.size() != capacity || p.size() != capacity)
-        throw std::invalid_argument("evsplat._native: columns of different length");
+    require(x.size() == capacity && y.size() == capacity && p.size() == capacity, "the columns");
     size_t events = 0;
     nb::gil_scoped_release release;
     const size_t taken = decode_events(words, data.data(), data.size(), *reinterpret_cast<EventState*>(state.data()),
@@ -43,10 +33,8 @@ std::tuple<size_t, size_t> decode(const std::string& kind, Column<const uint8_t>
 std::tuple<size_t, size_t, int, int> parse(Column<const uint8_t> text, bool last, std::vector<int> roles,
                                            const std::string& delimiter, int time_exponent,
                                            nb::ndarray<int64_t, nb::ndim<2>, nb::c_contig, nb::device::cpu> columns) {
-    if (columns.shape(0) != kTextComponents || roles.empty())
-        throw std::invalid_argument("evsplat._native: columns are t, x, y, p");
-    for (const int role : roles)
-        if (role < -1 || role >= kTextComponents) throw std::invalid_argument("evsplat._native: no such role");
+    require(columns.shape(0) == kTextComponents && !roles.empty(), "the columns t, x, y, p");
+    for (const int role : roles) require(role >= -1 && role < kTextComponents, "the roles");
     int64_t* pointers[kTextComponents];
     for (int i = 0; i < kTextComponents; ++i) pointers[i] = columns.data() + i * columns.shape(1);
     const TextLayout layout = {roles.data(), int(roles.size()), delimiter.empty() ? '\0' : delimiter[0], time_exponent};

@@ -2,30 +2,18 @@
 
 #include <string.h>
 
+#include <array>
+
 namespace evsplat {
 namespace {
 
 constexpr int kMaxDigits = 18;  // that always fit in 64 bits
 
-constexpr int64_t kPowers[kMaxDigits + 1] = {1,
-                                             10,
-                                             100,
-                                             1000,
-                                             10000,
-                                             100000,
-                                             1000000,
-                                             10000000,
-                                             100000000,
-                                             1000000000,
-                                             10000000000,
-                                             100000000000,
-                                             1000000000000,
-                                             10000000000000,
-                                             100000000000000,
-                                             1000000000000000,
-                                             10000000000000000,
-                                             100000000000000000,
-                                             1000000000000000000};
+constexpr auto kPowers = [] {  // of ten
+    std::array<int64_t, kMaxDigits + 1> powers = {1};
+    for (int i = 1; i <= kMaxDigits; ++i) powers[i] = 10 * powers[i - 1];
+    return powers;
+}();
 
 struct Decimal {
     int64_t digits = 0;

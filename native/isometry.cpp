@@ -211,12 +211,11 @@ IsometryMeans isometry(const IsometryInputs& in, int threads, float* gradients) 
     const float* arrays[7] = {in.means,       in.quaternions,        in.scales_log, in.posed_means,
                               in.posed_quaternions, in.posed_scales, in.transforms};
     std::vector<IsometryMeans> sums(in.samples);
-    constexpr size_t kPiece = 32;
-    parallel_for(threads, (in.samples + kPiece - 1) / kPiece, [&](size_t piece) {
+    in_pieces(threads, in.samples, 32, [&](size_t begin, size_t end) {
         Buffer<float> copy(floats);
         float* c = copy.data();
         const int64_t own[kRows] = {0, 1, 2, 3, 4};
-        for (size_t s = piece * kPiece; s < std::min(in.samples, (piece + 1) * kPiece); ++s) {
+        for (size_t s = begin; s < end; ++s) {
             layout.rows(in.rows + s * kRows, in.times, in.points, [&](int a, size_t from, size_t to) {
                 std::copy_n(arrays[a] + from, Layout::kWidth[a], c + to);
             });

@@ -5,10 +5,6 @@
 
 #include "kernels.h"
 
-#if defined(__x86_64__) || defined(__i386__)
-#include <immintrin.h>
-#endif
-
 namespace evsplat {
 namespace EVSPLAT_LEVEL {
 namespace {
@@ -140,7 +136,7 @@ INLINE uint64_t patches_reached(const Projected& p, float kx, float ky, float x0
 INLINE I tile_at(F pixel, int last) { return to_int(min(max(pixel * (1.f / kTile), F{}), splat(float(last)))); }
 
 void project(const View& view, const Gaussians& g, uint32_t begin, uint32_t end, Projected* projected,
-             int32_t* radii, uint32_t* first_slot, SlotList& slots) {
+             int32_t* radii, uint32_t* first_slot, List<Slot>& slots) {
     for (uint32_t i = begin; i < end; i += W) {
         const uint32_t n = end - i < uint32_t(W) ? end - i : uint32_t(W);
         Projection p;
@@ -749,12 +745,9 @@ double multiply_add(int64_t rounds, float* sink) {
 
 }  // namespace
 
-const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,         project, forward,
-                         backward,     project_backward, multiply_add, mlp_forward,
-                         mlp_backward, ssim_band,    log_brightness, power, add_sign,
-                         membership,   square_sums,    difference_sums, difference_slope,
-                         view_directions, sh_rows, tree_softmax, skin, skin_backward,
-                         surface_light, surface_light_backward, sensor_step};
+#define EVSPLAT_ENTRY(result, name, arguments) name,
+const Kernels kernels = {EVSPLAT_NAME, W, kPatches, project, forward, backward, project_backward, multiply_add,
+                         EVSPLAT_KERNELS(EVSPLAT_ENTRY)};
 
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

@@ -4,6 +4,11 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#if defined(__x86_64__) || defined(__i386__)
+#include <immintrin.h>
+#endif
+
+#include "list.h"
 #include "mlp_kernels.h"
 #include "picture.h"
 #include "posing.h"
@@ -47,12 +52,6 @@ struct alignas(32) Projected {
 struct Slot {
     uint32_t tile, gaussian;
     uint64_t patches;
-};
-
-struct SlotList {
-    Slot* data = nullptr;
-    size_t size = 0, capacity = 0;
-    void (*grow)(SlotList&) = nullptr;
 };
 
 // One Gaussian in one tile, in the order of compositing.
@@ -110,12 +109,37 @@ struct GaussianGrads {
     float* view;                  // (blocks, 12): rotation row-major, translation; written, not added
 };
 
+// Kernels outside of kernels.cpp: KERNEL(result, name, arguments) of each.
+#define EVSPLAT_KERNELS(KERNEL) \
+    KERNEL(void, mlp_forward, (const MlpShape&, const MlpForward&, size_t block, float* scratch)) \
+    KERNEL(void, mlp_backward, (const MlpShape&, const MlpBackward&, size_t block, const MlpSums&, float* scratch)) \
+    /* Sums over a band, and the gradient of the similarity. */ \
+    KERNEL(SsimSums, ssim_band, (const SsimBand&)) \
+    KERNEL(void, log_brightness, (const LogBrightness&, size_t begin, size_t end)) \
+    KERNEL(void, power, (const Power&, size_t begin, size_t end)) \
+    KERNEL(void, add_sign, (const float*, const float*, float, float, size_t, float*)) \
+    KERNEL(double, membership, (const Membership&, size_t begin, size_t end)) /* begin: a multiple of 16 */ \
+    /* Of two maps: squares; absolute differences and their signs times the first; the gradient of those. */ \
+    KERNEL(PairOfSums, square_sums, (const float*, const float*, size_t)) \
+    KERNEL(PairOfSums, difference_sums, (const float*, const float*, float, float, size_t)) \
+    KERNEL(void, difference_slope, (const float*, const float*, float, float, float, float, size_t, float*)) \
+    KERNEL(void, view_directions, (const ViewDirections&, size_t begin, size_t end)) \
+    KERNEL(void, sh_rows, (const ShRows&, size_t begin, size_t end)) \
+    KERNEL(void, tree_softmax, (const TreeSoftmax&, size_t begin, size_t end, float* scratch)) \
+    /* Points [begin, end). */ \
+    KERNEL(void, skin, (const Skinning&, size_t begin, size_t end, float* moved, float* blended)) \
+    KERNEL(void, skin_backward, (const Skinning&, const SkinningGrads&, const float* blended, size_t begin, size_t end)) \
+    KERNEL(void, surface_light, (const SurfaceLight&, size_t begin, size_t end, float* factors)) \
+    /* Sums over the points, and the gradient of the shares unless `lit` is null. */ \
+    KERNEL(void, surface_light_backward, (const SurfaceLight&, size_t begin, size_t end, const float* above, float* sums, float* lit)) \
+    KERNEL(void, sensor_step, (const SensorPiece&))
+
 struct Kernels {
     const char* name;
     int lanes, patches;
     // Projects [begin, end), appends its slots; first_slot[i] is relative to the list's start.
     void (*project)(const View&, const Gaussians&, uint32_t begin, uint32_t end, Projected*,
-                    int32_t* radii, uint32_t* first_slot, SlotList&);
+                    int32_t* radii, uint32_t* first_slot, List<Slot>&);
     void (*forward)(const ForwardJob&, const TileWork&);
     // Writes the entries' slots; with `add` those of Gaussians that stand still are added to.
     void (*backward)(const BackwardJob&, const TileWork&, bool add);
@@ -125,52 +149,15 @@ struct Kernels {
                              int channels, const GaussianGrads&);
     // Independent multiply-adds for `rounds`; returns the floating-point operations done.
     double (*multiply_add)(int64_t rounds, float* sink);
-    void (*mlp_forward)(const MlpShape&, const MlpForward&, size_t block, float* scratch);
-    void (*mlp_backward)(const MlpShape&, const MlpBackward&, size_t block, const MlpSums&, float* scratch);
-    // Sums over a band, and the gradient of the similarity.
-    SsimSums (*ssim)(const SsimBand&);
-    void (*log_brightness)(const LogBrightness&, size_t begin, size_t end);
-    void (*power)(const Power&, size_t begin, size_t end);
-    void (*add_sign)(const float*, const float*, float, float, size_t, float*);
-    double (*membership)(const Membership&, size_t begin, size_t end);  // begin: a multiple of 16
-    // Of two maps: squares; absolute differences and their signs times the first; the gradient of those.
-    PairOfSums (*square_sums)(const float*, const float*, size_t);
-    PairOfSums (*difference_sums)(const float*, const float*, float, float, size_t);
-    void (*difference_slope)(const float*, const float*, float, float, float, float, size_t, float*);
-    void (*view_directions)(const ViewDirections&, size_t begin, size_t end);
-    void (*sh_rows)(const ShRows&, size_t begin, size_t end);
-    void (*tree_softmax)(const TreeSoftmax&, size_t begin, size_t end, float* scratch);
-    // Points [begin, end).
-    void (*skin)(const Skinning&, size_t begin, size_t end, float* moved, float* blended);
-    void (*skin_backward)(const Skinning&, const SkinningGrads&, const float* blended, size_t begin, size_t end);
-    void (*surface_light)(const SurfaceLight&, size_t begin, size_t end, float* factors);
-    // Sums over the points, and the gradient of the shares unless it is null.
-    void (*surface_light_backward)(const SurfaceLight&, size_t begin, size_t end, const float* above, float* sums,
-                                   float* lit);
-    void (*sensor_step)(const SensorPiece&);
+#define EVSPLAT_POINTER(result, name, arguments) result(*name) arguments;
+    EVSPLAT_KERNELS(EVSPLAT_POINTER)
 };
 
-#define EVSPLAT_LEVEL_TABLE(level)               \
-    namespace level {                            \
-    extern const Kernels kernels;                \
-    void mlp_forward(const MlpShape&, const MlpForward&, size_t, float*);                        \
-    void mlp_backward(const MlpShape&, const MlpBackward&, size_t, const MlpSums&, float*);      \
-    SsimSums ssim_band(const SsimBand&);         \
-    void log_brightness(const LogBrightness&, size_t, size_t);                      \
-    void power(const Power&, size_t, size_t);                                       \
-    void add_sign(const float*, const float*, float, float, size_t, float*);        \
-    double membership(const Membership&, size_t, size_t);                           \
-    PairOfSums square_sums(const float*, const float*, size_t);                     \
-    PairOfSums difference_sums(const float*, const float*, float, float, size_t);   \
-    void difference_slope(const float*, const float*, float, float, float, float, size_t, float*);  \
-    void view_directions(const ViewDirections&, size_t, size_t);                    \
-    void sh_rows(const ShRows&, size_t, size_t);                                    \
-    void tree_softmax(const TreeSoftmax&, size_t, size_t, float*);                  \
-    void skin(const Skinning&, size_t, size_t, float*, float*);                                  \
-    void skin_backward(const Skinning&, const SkinningGrads&, const float*, size_t, size_t);     \
-    void surface_light(const SurfaceLight&, size_t, size_t, float*);                             \
-    void surface_light_backward(const SurfaceLight&, size_t, size_t, const float*, float*, float*); \
-    void sensor_step(const SensorPiece&);        \
+#define EVSPLAT_FUNCTION(result, name, arguments) result name arguments;
+#define EVSPLAT_LEVEL_TABLE(level)        \
+    namespace level {                     \
+    extern const Kernels kernels;         \
+    EVSPLAT_KERNELS(EVSPLAT_FUNCTION)     \
     }
 EVSPLAT_LEVEL_TABLE(portable)
 #ifdef EVSPLAT_X86

@@ -24,13 +24,14 @@ void to_panels(const float* from, int rows, int columns, int row_step, int colum
             }
 }
 
-// Hands out consecutive pieces of one buffer.
+// Hands out consecutive pieces of one buffer; without one it counts their floats.
 struct Pieces {
-    float* next;
+    float* buffer = nullptr;
+    size_t taken = 0;
+
     float* take(size_t count) {
-        float* piece = next;
-        next += count;
-        return piece;
+        taken += count;
+        return buffer ? buffer + taken - count : nullptr;
     }
 };
 
@@ -48,26 +49,15 @@ MlpWeight pack_weight(const float* weight, const float* bias, int out, int in, i
     return {forward, backward, padded};
 }
 
-size_t sum_floats(int out, int in, int lanes) {
-    return size_t(panels_of(out, lanes)) * lanes * (size_t(panels_of(in, lanes)) * lanes + 1);
-}
-
-size_t floats_of_sums(const MlpShape& s) {
-    size_t floats = sum_floats(s.width, s.per_point, s.lanes) + sum_floats(s.width, s.per_both, s.lanes) +
-                    s.times * s.width_panels * s.lanes;
-    for (int l = 0; l < s.layers; ++l) floats += sum_floats(s.columns(l), s.width, s.lanes);
-    return floats;
-}
-
-MlpSums sums_in(const MlpShape& s, float* floats) {
-    Pieces pieces{floats};
+MlpSums sums_in(const MlpShape& s, Pieces& pieces) {
+    const size_t width = size_t(s.width_panels) * s.lanes;
     MlpSums sums = {};
-    sums.point_weight = pieces.take(sum_floats(s.width, s.per_point, s.lanes));
-    sums.both_weight = pieces.take(sum_floats(s.width, s.per_both, s.lanes));
-    sums.bias = pieces.take(s.times * s.width_panels * s.lanes);
+    sums.point_weight = pieces.take(width * s.point_panels * s.lanes);
+    sums.both_weight = pieces.take(width * s.both_panels * s.lanes);
+    sums.bias = pieces.take(s.times * width);
     for (int l = 0; l < s.layers; ++l) {
         const size_t rows = size_t(s.panels(l)) * s.lanes;
-        sums.weight[l] = pieces.take(rows * s.width_panels * s.lanes);
+        sums.weight[l] = pieces.take(rows * width);
         sums.layer_bias[l] = pieces.take(rows);
     }
     return sums;
@@ -132,24 +122,25 @@ void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
     const MlpBackward job = {job_, output_grad, grads.point, grads.both};
 
     const size_t groups = std::max<size_t>(1, std::min(kMostGroups, s.blocks / kBlocksPerGroup));
-    const size_t floats = floats_of_sums(s);
+    Pieces counted;
+    sums_in(s, counted);
+    const size_t floats = counted.taken;
     Buffer<float> sums(groups * floats);
     parallel_for(threads_, groups, [&](size_t group) {
         Buffer<float> scratch(mlp_scratch(s));
-        float* mine = sums.data() + group * floats;
-        std::fill(mine, mine + floats, 0.f);
+        Pieces mine{sums.data() + group * floats};
+        std::fill_n(mine.buffer, floats, 0.f);
         const MlpSums parts = sums_in(s, mine);
         for (size_t block = s.blocks * group / groups; block < s.blocks * (group + 1) / groups; ++block)
             kernels_.mlp_backward(s, job, block, parts, scratch.data());
     });
     // Pieces of the vector of sums, each over the groups in order.
-    constexpr size_t kPiece = 4096;
-    parallel_for(threads_, (floats + kPiece - 1) / kPiece, [&](size_t piece) {
-        const size_t begin = piece * kPiece, end = std::min(floats, begin + kPiece);
+    in_pieces(threads_, floats, 4096, [&](size_t begin, size_t end) {
         for (size_t group = 1; group < groups; ++group)
             for (size_t i = begin; i < end; ++i) sums[i] += sums[group * floats + i];
     });
-    const MlpSums total = sums_in(s, sums.data());
+    Pieces first{sums.data()};
+    const MlpSums total = sums_in(s, first);
     from_panels(total.point_weight, s.width, s.per_point, s.lanes, grads.point_weight);
     if (in_.both) from_panels(total.both_weight, s.width, s.per_both, s.lanes, grads.both_weight);
     for (size_t t = 0; t < s.times; ++t)

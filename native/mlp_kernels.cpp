@@ -1,9 +1,6 @@
 // Networks on panel matrices, for one block of points; compiled once per SIMD level.
 
 #include "kernels.h"
-#if defined(__x86_64__)
-#include <immintrin.h>
-#endif
 
 namespace evsplat {
 namespace EVSPLAT_LEVEL {
@@ -111,18 +108,10 @@ INLINE F leaky_slope(F activation, F v, F slope) { return select(activation > 0.
 void pack(const float* from, size_t first, size_t rows, int columns, int panels, float* to) {
     const size_t have = rows - first < size_t(R) ? rows - first : R;
     for (int p = 0; p < panels; ++p) {
-        const int n = columns - p * W < W ? columns - p * W : W;
+        const size_t n = columns - p * W;
         float* panel = to + p * kPanel;
-        for (size_t r = 0; r < have; ++r) {
-            const float* source = from + (first + r) * columns + p * W;
-            float* target = panel + r * W;
-            if (n == W) {
-                store(target, load(source));
-            } else {
-                for (int l = 0; l < n; ++l) target[l] = source[l];
-                for (int l = n; l < W; ++l) target[l] = 0.f;
-            }
-        }
+        for (size_t r = 0; r < have; ++r)
+            store(panel + r * W, load_some(from + (first + r) * columns + p * W, n));
         for (size_t r = have; r < size_t(R); ++r) store(panel + r * W, F{});
     }
 }
@@ -130,16 +119,9 @@ void pack(const float* from, size_t first, size_t rows, int columns, int panels,
 void unpack(const float* from, size_t first, size_t rows, int columns, float* to) {
     const size_t have = rows - first < size_t(R) ? rows - first : R;
     for (int p = 0; p * W < columns; ++p) {
-        const int n = columns - p * W < W ? columns - p * W : W;
-        for (size_t r = 0; r < have; ++r) {
-            const float* source = from + p * kPanel + r * W;
-            float* target = to + (first + r) * columns + p * W;
-            if (n == W) {
-                store(target, load(source));
-            } else {
-                for (int l = 0; l < n; ++l) target[l] = source[l];
-            }
-        }
+        const size_t n = columns - p * W;
+        for (size_t r = 0; r < have; ++r)
+            store_some(to + (first + r) * columns + p * W, load(from + p * kPanel + r * W), n);
     }
 }
 

@@ -1,52 +1,28 @@
-// Python bindings of the native kernels; evsplat/render/native.py and evsplat/deform/mlp.py call them.
-
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/array.h>
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/pair.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/unique_ptr.h>
-#include <nanobind/stl/vector.h>
+// Python bindings of the rasteriser, of networks and of kernels on pictures.
 
 #include <memory>
-#include <optional>
-#include <stdexcept>
 
-#include "event_module.h"
+#include "bindings.h"
 #include "levels.h"
 #include "mlp.h"
-#include "neighbours.h"
 #include "picture.h"
 #include "rasterizer.h"
-#include "sensor_module.h"
 #include "skinning.h"
 #include "ssim.h"
-#include "step_module.h"
-#include "zbuffer_module.h"
 
-namespace nb = nanobind;
 using namespace evsplat;
 
 namespace {
 
-using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Fields = std::vector<std::optional<In>>;  // means, quaternions, scales, opacities, channels, linear, offset
-using Strided = nb::ndarray<const float, nb::device::cpu>;
-using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using OutFields = std::vector<std::optional<Out>>;
-using OutInt = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
+using OutInt = Array<int32_t>;
 using Camera = nb::ndarray<const float, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
 
-// Shapes and steps of the arrays of one render; Python has checked the meaning, this guards memory.
-void require(bool ok, const char* what) {
-    if (!ok) throw std::invalid_argument(std::string("evsplat._native: bad shape of ") + what);
-}
-
 // (T or 1, count, inner...) with `inner` floats per Gaussian.
-template <class Array>
-size_t step_of(const Array& a, size_t times, size_t count, size_t inner, const char* what) {
+template <class Given>
+size_t step_of(const Given& a, size_t times, size_t count, size_t inner, const char* what) {
     require(a.ndim() >= 1 && (a.shape(0) == times || a.shape(0) == 1), what);
     require(a.size() == a.shape(0) * count * inner, what);
     return a.shape(0) == 1 ? 0 : count * inner;
@@ -241,7 +217,7 @@ class PyMlp {
                     both_weight.size() == both_weight_.size() && layers.size() == layers_.size(),
                 "the gradients of parameters");
         MlpGrads grads = {};
-        grads.point = point ? point->data() : nullptr, grads.both = both ? both->data() : nullptr;
+        grads.point = data_of(point), grads.both = data_of(both);
         grads.bias = bias.data(), grads.point_weight = point_weight.data(), grads.both_weight = both_weight.data();
         for (size_t l = 0; l < layers.size(); ++l) {
             require(layers[l].size() == layers_[l].size(), "a layer's gradient");
@@ -268,7 +244,7 @@ std::pair<double, double> ssim(In image, In reference, In window, float c1, floa
     require(!grad || grad->size() == image.size(), "the gradient");
     nb::gil_scoped_release release;
     const SsimSums sums = ssim_planes(planes, int(height), int(width), image.data(), reference.data(), window.data(),
-                                      c1, c2, threads, grad ? grad->data() : nullptr);
+                                      c1, c2, threads, data_of(grad));
     return {sums.similarity, sums.difference};
 }
 
@@ -282,7 +258,7 @@ void picture_power(In from, float exponent, Out value, std::optional<Out> slope,
     require(value.size() == from.size() && (!slope || slope->size() == from.size()), "the picture");
     require(exponent > 1.f, "the exponent: above 1");
     nb::gil_scoped_release release;
-    power({from.data(), exponent, value.data(), slope ? slope->data() : nullptr}, from.size(), threads);
+    power({from.data(), exponent, value.data(), data_of(slope)}, from.size(), threads);
 }
 
 // Planes (3, pixels).
@@ -298,8 +274,6 @@ void picture_log_brightness(In coded, const std::array<float, 3>& weight, float 
     nb::gil_scoped_release release;
     log_brightness(job, count, threads);
 }
-
-using OutIndex = nb::ndarray<int64_t, nb::c_contig, nb::device::cpu>;
 
 Skinning skinning(const In& position, const In& weight, const In& bones) {
     require(bones.ndim() == 4 && bones.shape(2) == 4 && bones.shape(3) == 4, "the bones");
@@ -332,25 +306,10 @@ void blend_skin_backward(In position, In weight, In bones, In blended, std::opti
                 (!weight_grad || weight_grad->size() == weight.size()) &&
                 (!bones_grad || bones_grad->size() == bones.size()),
             "the gradients");
-    const auto given = [](const std::optional<In>& array) { return array ? array->data() : nullptr; };
-    const auto asked = [](const std::optional<Out>& array) { return array ? array->data() : nullptr; };
-    const SkinningGrads grads = {given(moved_grad), given(blended_grad), asked(position_grad), asked(weight_grad),
-                                 asked(bones_grad), nullptr, 0};
+    const SkinningGrads grads = {data_of(moved_grad),  data_of(blended_grad), data_of(position_grad),
+                                 data_of(weight_grad), data_of(bones_grad),   nullptr, 0};
     nb::gil_scoped_release release;
     skin_backward(job, blended.data(), grads, threads);
-}
-
-void nearest(In points, std::optional<In> queries, OutIndex index, Out square, int threads) {
-    require(points.ndim() == 2 && points.shape(1) == 3 && points.shape(0) < UINT32_MAX, "the points");
-    require(!queries || (queries->ndim() == 2 && queries->shape(1) == 3), "the queries");
-    const size_t count = points.shape(0), rows = queries ? queries->shape(0) : count;
-    require(index.ndim() == 2 && index.shape(0) == rows && square.size() == index.size(), "the result");
-    require(index.shape(1) >= 1 && index.shape(1) + (queries ? 0 : 1) <= count, "the result: too few points");
-    if (!rows) return;  // an empty array has no address, which would read as no queries
-    nb::gil_scoped_release release;
-    find_neighbours({points.data(), queries ? queries->data() : nullptr, count, rows, int(index.shape(1)), index.data(),
-                     square.data()},
-                    threads);
 }
 
 double multiply_add(int64_t rounds) {
@@ -405,8 +364,6 @@ NB_MODULE(_native, m) {
     bind_sensor(m);
     bind_step(m);
     bind_events(m);
-    m.def("nearest", &nearest, nb::arg("points"), nb::arg("queries").none(), nb::arg("index"), nb::arg("square"),
-          nb::arg("threads"), "Nearest points of queries, or of the points themselves; squared distances.");
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
     m.def("levels", &available_levels, "SIMD levels that run here, best first.");
     m.def("level", [] { return std::string(select_kernels().name); }, "SIMD level in use.");

@@ -12,18 +12,11 @@ namespace {
 
 constexpr size_t kPiece = 16384;  // values of one piece of work; a multiple of every level's lanes
 
-template <class Work>
-void in_pieces(size_t count, int threads, const Work& work) {
-    parallel_for(threads, (count + kPiece - 1) / kPiece, [&](size_t piece) {
-        work(piece * kPiece, std::min(count, (piece + 1) * kPiece));
-    });
-}
-
 // The sums of what `work` returns of each piece, in order.
 template <class Work>
 PairOfSums sum_of_pieces(size_t count, int threads, const Work& work) {
     std::vector<PairOfSums> parts((count + kPiece - 1) / kPiece);
-    in_pieces(count, threads, [&](size_t begin, size_t end) { parts[begin / kPiece] = work(begin, end); });
+    in_pieces(threads, count, kPiece, [&](size_t begin, size_t end) { parts[begin / kPiece] = work(begin, end); });
     PairOfSums total = {};
     for (const PairOfSums& part : parts) total.first += part.first, total.second += part.second;
     return total;
@@ -33,18 +26,18 @@ PairOfSums sum_of_pieces(size_t count, int threads, const Work& work) {
 
 void log_brightness(const LogBrightness& job, size_t count, int threads) {
     const auto kernel = select_kernels().log_brightness;
-    in_pieces(count, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+    in_pieces(threads, count, kPiece, [&](size_t begin, size_t end) { kernel(job, begin, end); });
 }
 
 void power(const Power& job, size_t count, int threads) {
     const auto kernel = select_kernels().power;
-    in_pieces(count, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+    in_pieces(threads, count, kPiece, [&](size_t begin, size_t end) { kernel(job, begin, end); });
 }
 
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count,
               int threads, float* grad) {
     const auto kernel = select_kernels().add_sign;
-    in_pieces(count, threads, [&](size_t begin, size_t end) {
+    in_pieces(threads, count, kPiece, [&](size_t begin, size_t end) {
         kernel(image + begin, reference + begin, by_difference, scale, end - begin, grad + begin);
     });
 }
@@ -73,7 +66,7 @@ void map_difference_backward(const float* map, const float* reference, const Map
     const auto kernel = select_kernels().difference_slope;
     const double* scale = known.scale;
     const float by_sign = float(weight * scale[0]), by_map = float(weight * known.along * scale[0] * scale[0] * scale[0]);
-    in_pieces(count, threads, [&](size_t begin, size_t end) {
+    in_pieces(threads, count, kPiece, [&](size_t begin, size_t end) {
         kernel(map + begin, reference + begin, float(scale[0]), float(scale[1]), by_sign, by_map, end - begin,
                grad + begin);
     });

@@ -12,13 +12,6 @@ namespace {
 
 constexpr size_t kPiece = 1024;  // points of one piece of work; a multiple of every level's lanes
 
-template <class Work>
-void in_pieces(size_t count, int threads, const Work& work) {
-    parallel_for(threads, (count + kPiece - 1) / kPiece, [&](size_t piece) {
-        work(piece * kPiece, std::min(count, (piece + 1) * kPiece));
-    });
-}
-
 // Where a coordinate lies among the bins: beyond [0, 1] on the nearest end, and with what is no number in the
 // first bin as no number.
 struct Bump {
@@ -52,7 +45,7 @@ struct Unit {
 
 void view_directions(const ViewDirections& job, int threads) {
     const auto kernel = select_kernels().view_directions;
-    in_pieces(job.points, threads, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+    in_pieces(threads, job.points, kPiece, [&](size_t begin, size_t end) { kernel(job, begin, end); });
 }
 
 size_t rows_in_view(const InView& job, int64_t* rows) {
@@ -89,7 +82,7 @@ size_t rows_in_view(const InView& job, int64_t* rows) {
 
 void sh_rows(const ShRows& job, int threads) {
     const auto kernel = select_kernels().sh_rows;
-    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+    in_pieces(threads, job.points, kPiece, [&](size_t begin, size_t end) {
         kernel(job, begin, end);
         for (size_t i = begin; i < end; ++i)
             std::copy_n(job.values + i * job.columns, job.columns, job.beside + i * job.stride);
@@ -97,7 +90,7 @@ void sh_rows(const ShRows& job, int threads) {
 }
 
 void one_blob(const OneBlob& job, int threads, float* encoded) {
-    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+    in_pieces(threads, job.points, kPiece, [&](size_t begin, size_t end) {
         std::fill(encoded + begin * 3 * job.bins, encoded + end * 3 * job.bins, 0.f);
         for (size_t i = begin * 3; i < end * 3; ++i) {
             const Bump bump(job.positions[i], job.bins);
@@ -109,7 +102,7 @@ void one_blob(const OneBlob& job, int threads, float* encoded) {
 }
 
 void one_blob_backward(const OneBlob& job, const float* above, int threads, float* grad) {
-    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+    in_pieces(threads, job.points, kPiece, [&](size_t begin, size_t end) {
         for (size_t i = begin * 3; i < end * 3; ++i) {
             const Bump bump(job.positions[i], job.bins);
             const float* by = above + i * job.bins;
@@ -122,7 +115,7 @@ void one_blob_backward(const OneBlob& job, const float* above, int threads, floa
 
 void tree_softmax(const TreeSoftmax& job, int threads) {
     const auto kernel = select_kernels().tree_softmax;
-    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+    in_pieces(threads, job.points, kPiece, [&](size_t begin, size_t end) {
         Buffer<float> scratch(tree_softmax_floats(job.joints, job.logits));
         kernel(job, begin, end, scratch.data());
     });
@@ -130,7 +123,7 @@ void tree_softmax(const TreeSoftmax& job, int threads) {
 
 void change_shape(const ShapeChange& job, int threads, float* moved, float* scales, float* rotations, float* feature) {
     const size_t rest = job.columns - kShapeChanges;
-    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+    in_pieces(threads, job.points, kPiece, [&](size_t begin, size_t end) {
         for (size_t t = 0; t < job.times; ++t)
             for (size_t i = begin; i < end; ++i) {
                 const size_t row = t * job.points + i;
@@ -154,7 +147,7 @@ void change_shape(const ShapeChange& job, int threads, float* moved, float* scal
 void change_shape_backward(const ShapeChange& job, const float* scales, const ShapeGrad (&above)[4], int threads,
                            float* changes, float* means, float* scales_log, float* quaternions) {
     const size_t rest = job.columns - kShapeChanges;
-    in_pieces(job.points, threads, [&](size_t begin, size_t end) {
+    in_pieces(threads, job.points, kPiece, [&](size_t begin, size_t end) {
         for (size_t i = begin; i < end; ++i) {
             const Unit q(job.quaternions + i * 4);
             float mean[3] = {}, scale_log[3] = {}, unit[4] = {};

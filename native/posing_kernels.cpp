@@ -1,9 +1,6 @@
 // Where Gaussians are seen from, compiled once per SIMD level.
 
 #include "kernels.h"
-#if defined(__x86_64__)
-#include <immintrin.h>
-#endif
 
 namespace evsplat {
 namespace EVSPLAT_LEVEL {

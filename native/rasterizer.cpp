@@ -81,32 +81,6 @@ struct TileSorter {
     }
 };
 
-// Slots that one block of Gaussians makes, in memory from the cache.
-struct BlockSlots : SlotList {
-    Buffer<Slot> memory;
-
-    void take(BlockSlots& other) {
-        memory.swap(other.memory);
-        data = memory.data();
-        size = other.size;
-    }
-
-    void start(size_t expected) {
-        memory.reset(expected);
-        data = memory.data();
-        size = 0;
-        capacity = memory.size();
-        grow = [](SlotList& list) {
-            auto& self = static_cast<BlockSlots&>(list);
-            Buffer<Slot> larger(2 * self.capacity);
-            std::memcpy(larger.data(), self.data, self.size * sizeof(Slot));
-            self.memory.swap(larger);
-            self.data = self.memory.data();
-            self.capacity = self.memory.size();
-        };
-    }
-};
-
 // Moving and still entries of a tile, both in order, to one list in order: `merged` starts with the
 // moving ones and has room for all. Equal depths: the moving ones come first.
 void merge(Entry* merged, uint32_t moving, const Projected* projected, const Entry* still, uint32_t count,
@@ -150,14 +124,13 @@ void project_and_bin(const Record& r, const View& view, const Gaussians& g, uint
     d.first_slot.reset(size_t(g.count) + 1);
     d.tile_begin.reset(tiles + 1);
 
-    std::vector<BlockSlots> slots(blocks);
+    std::vector<GrowingList<Slot>> slots(blocks);
     run(threads, blocks, [&](size_t b) {
         const uint32_t begin = uint32_t(b * kBlock), end = std::min(begin + kBlock, g.count);
         Lap lap(r);
-        BlockSlots list;  // on this thread's stack: its size changes with every slot
-        list.start(3 * kBlock);
+        GrowingList<Slot> list;  // on this thread's stack: its size changes with every slot
         r.kernels->project(view, g, begin, end, d.projected.data(), radii, d.first_slot.data(), list);
-        slots[b].take(list);
+        slots[b].swap(list);
         lap.end(kProject);
     });
     std::vector<size_t> base(blocks + 1, 0);

@@ -3,10 +3,8 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
-#include <cstdlib>
 #include <cstring>
 #include <limits>
-#include <new>
 #include <utility>
 
 #include "levels.h"
@@ -49,19 +47,6 @@ class DigitSort {
 
 }  // namespace
 
-Sensor::Events::Events() {
-    grow = [](EventList& list) {
-        const size_t larger = list.capacity ? 2 * list.capacity : 1024;
-        void* moved = std::realloc(list.data, larger * sizeof(RawEvent));
-        if (!moved) throw std::bad_alloc();
-        list.data = static_cast<RawEvent*>(moved), list.capacity = larger;
-    };
-}
-
-Sensor::Events::Events(Events&& other) noexcept : EventList(other) { other.data = nullptr; }
-
-Sensor::Events::~Events() { std::free(data); }
-
 float* Sensor::fill(std::vector<float>& array, const float* values, float otherwise) {
     array.assign(pixels_ + kSensorPad, otherwise);
     if (values) std::copy(values, values + pixels_, array.begin());
@@ -99,7 +84,7 @@ bool Sensor::step(const float* luma, int64_t time_us, int threads) {
     const auto kernel = select_kernels().sensor_step;
     start_us_ = started_ ? time_us_ : time_us;
     run(threads, events_.size(), [&](size_t i) {
-        Events& events = events_[i];
+        GrowingList<RawEvent>& events = events_[i];
         events.size = 0;
         const size_t begin = i * kPiece, end = std::min(pixels_, begin + kPiece);
         kernel({&model_, &state_, luma, uint32_t(begin), uint32_t(end), double(start_us_),
@@ -112,7 +97,7 @@ bool Sensor::step(const float* luma, int64_t time_us, int threads) {
 
 size_t Sensor::count() const {
     size_t total = 0;
-    for (const Events& events : events_) total += events.size;
+    for (const auto& events : events_) total += events.size;
     return total;
 }
 
@@ -122,7 +107,7 @@ void Sensor::take(int64_t* t, uint16_t* x, uint16_t* y, int8_t* p) const {
     while (passes * kDigitBits < 32 && (time_us_ - start_us_) >> (passes * kDigitBits)) ++passes;
     Buffer<RawEvent> from(total), to(passes > 1 ? total : 0);
     size_t at = 0;
-    for (const Events& events : events_) {
+    for (const auto& events : events_) {
         std::copy(events.data, events.data + events.size, from.data() + at);
         at += events.size;
     }

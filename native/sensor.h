@@ -30,12 +30,6 @@ class Sensor {
     void take(int64_t* t, uint16_t* x, uint16_t* y, int8_t* p) const;
 
   private:
-    struct Events : EventList {
-        Events();
-        Events(Events&& other) noexcept;
-        ~Events();
-    };
-
     float* fill(std::vector<float>& array, const float* values, float otherwise = 0.f);
 
     int width_;
@@ -45,7 +39,7 @@ class Sensor {
     std::vector<float> signal_, input_, change_, change_rest_, on_, off_, leak_, hot_, hazard_, hazard_rest_;
     std::vector<uint32_t> draws_;
     std::vector<double> last_us_;
-    std::vector<Events> events_;  // of each piece
+    std::vector<GrowingList<RawEvent>> events_;  // of each piece
     bool started_ = false;
     int64_t start_us_ = 0, time_us_ = 0;
 };

@@ -2,10 +2,6 @@
 
 #include "kernels.h"
 
-#if defined(__x86_64__) || defined(__i386__)
-#include <immintrin.h>
-#endif
-
 namespace evsplat {
 namespace EVSPLAT_LEVEL {
 namespace {
@@ -63,7 +59,7 @@ struct Pixel {
             if (now - last[index] < piece.model->refractory_us) return;
             last[index] = now;
         }
-        EventList& list = *piece.events;
+        List<RawEvent>& list = *piece.events;
         if (list.size == list.capacity) list.grow(list);
         list.data[list.size++] = {uint32_t(at_us), index * 2 + (brighter ? 1 : 0)};
     }
@@ -111,12 +107,6 @@ INLINE F add(F sum, F x, F& rest) {
     return result;
 }
 
-INLINE F load_some(const float* p, uint32_t n, float rest) {
-    float values[W];
-    for (uint32_t l = 0; l < uint32_t(W); ++l) values[l] = l < n ? p[l] : rest;
-    return load(values);
-}
-
 template <bool filtered, bool leaking, bool noisy>
 INLINE void step_piece(const SensorPiece& piece) {
     const SensorModel& model = *piece.model;
@@ -125,8 +115,7 @@ INLINE void step_piece(const SensorPiece& piece) {
     const float turns = kTwoPi * model.cutoff_hz * seconds, dark_noise = model.shot_hz * seconds;
     for (uint32_t i = piece.begin; i < piece.end; i += W) {
         const uint32_t left = piece.end - i, lanes = left < uint32_t(W) ? left : uint32_t(W);
-        const F seen = lanes == uint32_t(W) ? load(piece.luma + i) : load_some(piece.luma + i, lanes, 1.f);
-        const F luma = max(seen, F{});
+        const F luma = max(load_some(piece.luma + i, lanes, 1.f), F{});
         F input;
         if (model.lin_log) {
             const F scaled = luma * 255.f;

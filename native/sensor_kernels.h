@@ -8,17 +8,13 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "list.h"
+
 namespace evsplat {
 
 // One event of a step: microseconds since the step's start; pixel * 2 + (1 if brighter).
 struct RawEvent {
     uint32_t offset_us, pixel_and_sign;
-};
-
-struct EventList {
-    RawEvent* data = nullptr;
-    size_t size = 0, capacity = 0;
-    void (*grow)(EventList&) = nullptr;
 };
 
 // What all pixels share.
@@ -54,7 +50,7 @@ struct SensorPiece {
     uint32_t begin, end;
     double start_us, duration_us;
     bool first;                   // only look: no events
-    EventList* events;
+    List<RawEvent>* events;
 };
 
 constexpr uint32_t kSensorPad = 16;

@@ -1,29 +1,21 @@
-#include "sensor_module.h"
+// Python bindings of the simulated sensor; evsplat/events/simulator.py calls them.
 
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
-
-#include <optional>
-#include <stdexcept>
-
+#include "bindings.h"
 #include "sensor.h"
 
-namespace nb = nanobind;
 using namespace evsplat;
 
 namespace {
 
 using Plane = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-template <class T>
-using Column = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 class PySensor {
   public:
     PySensor(Plane on, Plane off, std::optional<Plane> leak, std::optional<Plane> phase, std::optional<Plane> hot_hz,
              bool lin_log, float eps, float cutoff_hz, float shot_hz, double refractory_us, uint64_t seed)
         : height_(on.shape(0)), width_(on.shape(1)) {
-        if (width_ == 0 || height_ == 0 || width_ > 65536 || height_ > 65536 || width_ * height_ >= size_t(1) << 31)
-            throw std::invalid_argument("evsplat._native: bad size of the sensor");
+        require(width_ > 0 && width_ <= 65536 && height_ > 0 && height_ <= 65536, "the sensor");
+        require(width_ * height_ < size_t(1) << 31, "the sensor");
         const auto plane = [&](const std::optional<Plane>& p) -> const float* {
             if (!p) return nullptr;
             check(*p);
@@ -44,16 +36,14 @@ class PySensor {
 
     void take(Column<int64_t> t, Column<uint16_t> x, Column<uint16_t> y, Column<int8_t> p) const {
         const size_t n = sensor_->count();
-        if (t.size() != n || x.size() != n || y.size() != n || p.size() != n)
-            throw std::invalid_argument("evsplat._native: bad shape of the events");
+        require(t.size() == n && x.size() == n && y.size() == n && p.size() == n, "the events");
         nb::gil_scoped_release release;
         sensor_->take(t.data(), x.data(), y.data(), p.data());
     }
 
   private:
     void check(const Plane& p) const {
-        if (p.shape(0) != height_ || p.shape(1) != width_)
-            throw std::invalid_argument("evsplat._native: bad shape of an array of the sensor");
+        require(p.shape(0) == height_ && p.shape(1) == width_, "an array of the sensor");
     }
 
     size_t height_, width_;
@@ -62,7 +52,7 @@ class PySensor {
 
 }  // namespace
 
-void bind_sensor(nb::module_& m) {
+void evsplat::bind_sensor(nb::module_& m) {
     nb::class_<PySensor>(m, "Sensor", "An event camera: the state of its pixels, moved from picture to picture.")
         .def(nb::init<Plane, Plane, std::optional<Plane>, std::optional<Plane>, std::optional<Plane>, bool, float, float,
                       float, double, uint64_t>(),

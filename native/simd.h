@@ -26,6 +26,17 @@ typedef int32_t I4 __attribute__((vector_size(16), may_alias));
 INLINE F splat(float value) { return value - F{}; }
 INLINE F load(const float* p) { F v; __builtin_memcpy(&v, p, sizeof v); return v; }
 INLINE void store(float* p, F v) { __builtin_memcpy(p, &v, sizeof v); }
+// The same of the first `count` lanes, of all where there are more; the others read `rest`.
+INLINE F load_some(const float* p, size_t count, float rest = 0.f) {
+    if (count >= size_t(W)) return load(p);
+    F v = splat(rest);
+    __builtin_memcpy(&v, p, count * sizeof(float));
+    return v;
+}
+INLINE void store_some(float* p, F v, size_t count) {
+    if (count >= size_t(W)) return store(p, v);
+    __builtin_memcpy(p, &v, count * sizeof(float));
+}
 INLINE void store_ints(int32_t* p, I v) { __builtin_memcpy(p, &v, sizeof v); }
 // To an aligned place that is not read soon: past the cache, so that its line is not fetched first.
 INLINE void stream(float* p, F v) {

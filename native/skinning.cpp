@@ -7,18 +7,13 @@
 #include "thread_pool.h"
 
 namespace evsplat {
-namespace {
 
-constexpr size_t kPoints = 512;  // of a block; fixes the order of sums over points
-constexpr size_t kLanes = 16;
-
-}  // namespace
+static constexpr size_t kPoints = 512;  // of a block; fixes the order of sums over points
+static constexpr size_t kLanes = 16;
 
 void skin(const Skinning& s, int threads, float* moved, float* blended) {
     const auto kernel = select_kernels().skin;
-    parallel_for(threads, (s.points + kPoints - 1) / kPoints, [&](size_t block) {
-        kernel(s, block * kPoints, std::min(s.points, (block + 1) * kPoints), moved, blended);
-    });
+    in_pieces(threads, s.points, kPoints, [&](size_t begin, size_t end) { kernel(s, begin, end, moved, blended); });
 }
 
 void skin_backward(const Skinning& s, const float* blended, SkinningGrads g, int threads) {
@@ -33,13 +28,13 @@ void skin_backward(const Skinning& s, const float* blended, SkinningGrads g, int
     float* total = g.bones;
     Buffer<float> sums(total ? blocks * bones : 0);
     const auto kernel = select_kernels().skin_backward;
-    parallel_for(threads, blocks, [&](size_t block) {
+    in_pieces(threads, s.points, kPoints, [&](size_t begin, size_t end) {
         SkinningGrads mine = g;
         if (total) {
-            mine.bones = sums.data() + block * bones;
+            mine.bones = sums.data() + begin / kPoints * bones;
             std::fill_n(mine.bones, bones, 0.f);
         }
-        kernel(s, mine, blended, block * kPoints, std::min(s.points, (block + 1) * kPoints));
+        kernel(s, mine, blended, begin, end);
     });
     if (!total) return;
     std::fill_n(total, bones, 0.f);

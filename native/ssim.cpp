@@ -14,7 +14,7 @@ SsimSums ssim_planes(size_t planes, int height, int width, const float* image, c
     constexpr int kBand = 128;  // fixes the order of sums
     const size_t plane = size_t(height) * width, bands = (height + kBand - 1) / kBand;
     std::vector<SsimSums> parts(planes * bands);
-    const auto kernel = select_kernels().ssim;
+    const auto kernel = select_kernels().ssim_band;
     parallel_for(threads, parts.size(), [&](size_t i) {
         const size_t p = i / bands;
         const int begin = int(i % bands) * kBand;

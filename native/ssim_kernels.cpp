@@ -6,9 +6,6 @@
 // as the windows of those reach, so that all stays in the cache. Rows in the scratch memory are whole vectors long.
 
 #include "kernels.h"
-#if defined(__x86_64__)
-#include <immintrin.h>
-#endif
 
 namespace evsplat {
 namespace EVSPLAT_LEVEL {

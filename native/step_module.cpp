@@ -1,44 +1,25 @@
-#include "step_module.h"
+// Python bindings of what a training step computes between networks, rasteriser and losses.
 
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/array.h>
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/pair.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
-
-#include <optional>
-#include <stdexcept>
-
+#include "bindings.h"
 #include "isometry.h"
 #include "picture.h"
 #include "posing.h"
 #include "surface_light.h"
 
-namespace nb = nanobind;
 using namespace evsplat;
 
 namespace {
 
-using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
-using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-using Rows = nb::ndarray<const float, nb::device::cpu>;  // (T, N, columns): columns together, rows evenly apart
-using Index = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+using Rows = Strided;  // (T, N, columns): columns together, rows evenly apart
+using Index = Array<const int64_t>;
 using Bits = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-
-void require(bool ok, const char* what) {
-    if (!ok) throw std::invalid_argument(std::string("evsplat._native: bad shape of ") + what);
-}
-
-const float* given(const std::optional<In>& array) { return array ? array->data() : nullptr; }
-float* asked(const std::optional<Out>& array) { return array ? array->data() : nullptr; }
 
 double py_membership(In share, Bits bits, float lowest, std::optional<Out> slope, int threads) {
     const size_t count = share.size(), bytes = (count + 7) / 8;
     require(bits.shape(0) == 2 && bits.shape(1) == bytes, "the masks");
     require(!slope || slope->size() == count, "the slope");
     nb::gil_scoped_release release;
-    return membership({share.data(), bits.data(), bits.data() + bytes, lowest, asked(slope)}, count, threads);
+    return membership({share.data(), bits.data(), bits.data() + bytes, lowest, data_of(slope)}, count, threads);
 }
 
 std::array<double, 4> py_map_difference(In map, In reference, float floor, int threads) {
@@ -68,8 +49,8 @@ IsometryInputs isometry_inputs(const Index& rows, size_t times, size_t points) {
 }
 
 // `arrays`: means, quaternions, scales_log, posed means, posed quaternions, posed scales, transforms.
-template <class Array>
-void check_isometry(const std::vector<Array>& arrays, size_t times, size_t points) {
+template <class T>
+void check_isometry(const std::vector<Array<T>>& arrays, size_t times, size_t points) {
     require(arrays.size() == 7, "the arrays");
     for (int i = 0; i < 7; ++i)
         require(i < 3 ? arrays[i].size() >= points * kIsometryWidth[i]
@@ -108,7 +89,7 @@ void py_view_directions(In positions, std::optional<In> transforms, const std::a
     const size_t points = positions.size() / 3;
     require(positions.size() == points * 3 && directions.size() == positions.size(), "the positions");
     require(!transforms || transforms->size() == points * 16, "the transforms");
-    ViewDirections job = {points, positions.data(), given(transforms), {}, {}, directions.data()};
+    ViewDirections job = {points, positions.data(), data_of(transforms), {}, {}, directions.data()};
     for (int i = 0; i < 3; ++i) job.center[i] = center[i];
     for (int i = 0; i < 9; ++i) job.turn[i] = turn[i];
     nb::gil_scoped_release release;
@@ -116,7 +97,7 @@ void py_view_directions(In positions, std::optional<In> transforms, const std::a
 }
 
 size_t py_rows_in_view(In means, In scales, In k, In pose, int width, int height,
-                       nb::ndarray<int64_t, nb::c_contig, nb::device::cpu> rows) {
+                       Array<int64_t> rows) {
     const size_t points = rows.size();
     require(means.size() == points * 3 && scales.size() == points * 3, "the Gaussians");
     require(k.size() == 9 && pose.size() == 16, "the camera");
@@ -172,7 +153,7 @@ void py_tree_softmax(In given, const std::array<Joints, 4>& tree, std::optional<
     require(result.size() == points * (above ? logits : joints), "the result");
     TreeSoftmax job = {points,       int(joints),   int(logits), order.data(), parents.data(), gate.data(),
                        divides.data(), given.data(), nullptr,    given.data(), nullptr};
-    job.above = ::given(above);
+    job.above = data_of(above);
     (above ? job.grad : job.weights) = result.data();
     nb::gil_scoped_release release;
     tree_softmax(job, threads);
@@ -235,7 +216,7 @@ SurfaceLight light_on(const In& transforms, const In& normals, const In& places,
                      lit->shape(2) == points),
             "the shares of light");
     return {times, points, transforms.data(), normals.data(), places.data(), coefficients.data(),
-            {center[0], center[1], center[2]}, radius, int(count), lamps.data(), intensities.data(), given(lit),
+            {center[0], center[1], center[2]}, radius, int(count), lamps.data(), intensities.data(), data_of(lit),
             lit_times};
 }
 
@@ -255,14 +236,14 @@ void py_surface_light_backward(In transforms, In normals, In places, In coeffici
         light_on(transforms, normals, places, coefficients, center, radius, lamps, intensities, lit);
     require(above.size() == places.size() && sums.size() == light_sums(job.lamps), "the gradients");
     require(!lit_grad || (lit && lit_grad->size() == lit->size()), "the gradient of the shares of light");
-    float* to = lit_grad ? lit_grad->data() : nullptr;
+    float* to = data_of(lit_grad);
     nb::gil_scoped_release release;
     surface_light_backward(job, above.data(), threads, sums.data(), to);
 }
 
 }  // namespace
 
-void bind_step(nb::module_& m) {
+void evsplat::bind_step(nb::module_& m) {
     m.def("membership", &py_membership, nb::arg("share"), nb::arg("bits"), nb::arg("lowest"), nb::arg("slope").none(),
           nb::arg("threads"), "Sum of the logarithms of what pixels surely are, by two bit masks, and its slope.");
     m.def("map_difference", &py_map_difference, nb::arg("map"), nb::arg("reference"), nb::arg("floor"),

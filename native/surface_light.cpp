@@ -8,26 +8,20 @@
 #include "thread_pool.h"
 
 namespace evsplat {
-namespace {
 
-constexpr size_t kPoints = 1024;  // of a piece; fixes the order of sums over points
-
-}  // namespace
+static constexpr size_t kPoints = 1024;  // of a piece; fixes the order of sums over points
 
 void surface_light(const SurfaceLight& job, int threads, float* factors) {
     const auto kernel = select_kernels().surface_light;
-    parallel_for(threads, (job.points + kPoints - 1) / kPoints, [&](size_t piece) {
-        kernel(job, piece * kPoints, std::min(job.points, (piece + 1) * kPoints), factors);
-    });
+    in_pieces(threads, job.points, kPoints, [&](size_t begin, size_t end) { kernel(job, begin, end, factors); });
 }
 
 void surface_light_backward(const SurfaceLight& job, const float* above, int threads, float* sums, float* lit) {
     const auto kernel = select_kernels().surface_light_backward;
     const size_t pieces = (job.points + kPoints - 1) / kPoints, width = light_sums(job.lamps);
     Buffer<float> parts(pieces * width);
-    parallel_for(threads, pieces, [&](size_t piece) {
-        kernel(job, piece * kPoints, std::min(job.points, (piece + 1) * kPoints), above,
-               parts.data() + piece * width, lit);
+    in_pieces(threads, job.points, kPoints, [&](size_t begin, size_t end) {
+        kernel(job, begin, end, above, parts.data() + begin / kPoints * width, lit);
     });
     std::vector<double> totals(width);
     for (size_t piece = 0; piece < pieces; ++piece)

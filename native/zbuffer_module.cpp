@@ -1,32 +1,16 @@
 // Python bindings of the z-buffer renderer; evsplat/staging/renderer.py calls them.
 
-#include "zbuffer_module.h"
-
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/array.h>
-#include <nanobind/stl/vector.h>
-
-#include <optional>
-#include <stdexcept>
-#include <string>
-
+#include "bindings.h"
 #include "thread_pool.h"
 #include "zbuffer.h"
 
-namespace nb = nanobind;
 using namespace evsplat;
 
 namespace {
 
-using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
-using Ints = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
-using Bytes = nb::ndarray<const uint8_t, nb::c_contig, nb::device::cpu>;
-using Image = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-
-// Python has checked the meaning; this guards memory.
-void require(bool ok, const char* what) {
-    if (!ok) throw std::invalid_argument(std::string("evsplat._native: bad shape of ") + what);
-}
+using Floats = In;
+using Ints = Array<const int32_t>;
+using Bytes = Array<const uint8_t>;
 
 void require_below(const Ints& indices, size_t limit, const char* what) {
     for (size_t i = 0; i < indices.size(); ++i) require(indices.data()[i] >= 0 && size_t(indices.data()[i]) < limit, what);
@@ -85,7 +69,7 @@ class Stage {
 
     // One instant per set of bones; one view, or one per instant.
     void draw(Floats k, Floats world_to_camera, Floats bones, Floats vertices, Floats normals, bool shadows, int samples,
-              Image image, int threads) {
+              Out image, int threads) {
         require(bones.ndim() == 4 && bones.shape(1) == person_.joints && bones.shape(2) == 4 && bones.shape(3) == 4, "bones");
         const size_t times = bones.shape(0);
         require(image.ndim() == 4 && image.shape(0) == times && image.shape(3) == 4, "the image");
@@ -141,7 +125,7 @@ class Stage {
 
 }  // namespace
 
-void bind_zbuffer(nb::module_& m) {
+void evsplat::bind_zbuffer(nb::module_& m) {
     using zbuffer::Light;
     nb::class_<Light>(m, "Light", "A lamp, light from all around, and how surfaces answer; metres and texels.")
         .def(nb::init<>())

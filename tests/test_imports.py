@@ -17,7 +17,13 @@ RANK = {name: int(layer) for layer, names in ROWS for name in re.findall("`(.+?)
 SEE_EVERYTHING = set(
     "capture inspection synthesis evaluation benching film export view evsplat".split()
 )
-SEE_EVERYTHING |= {"masks.capture", "restore.capture", "training.run", "training.train"}
+SEE_EVERYTHING |= {
+    "masks.capture",
+    "restore.capture",
+    "posing.find",
+    "training.run",
+    "training.train",
+}
 SEE_TRAINING_ALONE = set("body calibration gaussians models objectives methods".split())
 
 

@@ -9,8 +9,8 @@ The verbs of the command line are functions here, imported on first use:
     ev.render_run(run, slow=8)
 
 ``evsplat render`` is `render_run` here, ``view`` is `view_run`, ``export`` is `export_run`,
-``restore`` is `restore_capture` and ``masks`` is `mask_capture`, because these words are names of
-packages.
+``restore`` is `restore_capture`, ``masks`` is `mask_capture` and ``poses`` is `find_poses`: the
+first words are names of packages.
 """
 
 import os
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from evsplat.importers import import_capture
     from evsplat.inspection import inspect
     from evsplat.masks import mask_capture
+    from evsplat.posing import find_poses
     from evsplat.restore import restore_capture
     from evsplat.staging import stage
     from evsplat.synthesis import synthesize
@@ -53,6 +54,7 @@ __all__ = [
     "demo",
     "evaluate",
     "export_run",
+    "find_poses",
     "import_capture",
     "inspect",
     "load_capture",
@@ -75,6 +77,7 @@ _LAZY = {
     "demo": "evsplat.cli.runs:demo",
     "evaluate": "evsplat.evaluation.run:evaluate_run",
     "export_run": "evsplat.export:export_run",
+    "find_poses": "evsplat.posing:find_poses",
     "import_capture": "evsplat.importers:import_capture",
     "inspect": "evsplat.inspection:inspect",
     "load_capture": "evsplat.capture:load_capture",

@@ -8,12 +8,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from evsplat.errors import BackendError
+
 native: Any = None
 import_error: ImportError | None = None
 try:
     from evsplat import _native as native
 except ImportError as error:
     import_error = error
+
+
+def native_for(user: str) -> Any:
+    """The compiled module, which ``user`` needs; a `BackendError` says so where it is missing."""
+    if native is None:
+        raise BackendError(
+            f"{user} needs evsplat's compiled module, which cannot be loaded ({import_error}); "
+            "install evsplat again."
+        )
+    return native
 
 
 def runs_native(tensor: Tensor) -> bool:

@@ -51,22 +51,23 @@ def new_folder(path: Path | str) -> Iterator[Path]:
     `DataError`, at the start as at the end.
     """
     path = Path(path)
-
-    def check() -> None:
-        if path.exists():
-            raise DataError(f"{path}: already exists; choose another name or remove it first.")
-
-    check()
+    refuse_existing(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
     try:
         yield folder
-        check()
+        refuse_existing(path)
         folder.chmod(0o777 & ~_umask())
         folder.rename(path)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+def refuse_existing(path: Path) -> None:
+    """A `DataError` where something is there already: before long work, or just before writing."""
+    if path.exists():
+        raise DataError(f"{path}: already exists; choose another name or remove it first.")
 
 
 def write_text(path: Path | str, text: str) -> None:

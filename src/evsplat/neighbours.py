@@ -5,8 +5,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from evsplat.compiled import native, runs_native
-
 _ROWS_AT_ONCE = 2_048
 """Distances of so many points to all others are held at a time: 160 MB at 20,000 points."""
 
@@ -24,14 +22,10 @@ def nearest(
         raise ValueError(f"{len(points)} points have no {k} neighbours each")
     if points.device.type != "cpu":
         return _by_all_distances(points.detach(), k, None if queries is None else queries.detach())
-    places = points.detach().contiguous()
-    asked = places if queries is None else queries.detach().contiguous()
-    if runs_native(places) and runs_native(asked):
-        index, square = torch.empty(len(asked), k, dtype=torch.long), torch.empty(len(asked), k)
-        others = None if queries is None else asked
-        native.nearest(places, others, index, square, torch.get_num_threads())
-        return square.sqrt(), index
-    found = cKDTree(places.numpy()).query(asked.numpy(), k=range(1, k + 1 + (queries is None)))
+    places = points.detach().numpy()
+    asked = places if queries is None else queries.detach().numpy()
+    ranks, workers = range(1, k + 1 + (queries is None)), torch.get_num_threads()
+    found = cKDTree(places).query(asked, k=ranks, workers=workers)
     distance, index = (torch.from_numpy(values) for values in found)
     if queries is None:
         # A point comes first among its own neighbours, unless others lie at the same place.

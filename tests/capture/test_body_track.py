@@ -57,8 +57,14 @@ def test_unsorted_joints_and_their_poses_move_together():
     rng = np.random.default_rng(4)
     poses, transl = rng.normal(size=(3, 9, 3)), rng.normal(size=(3, 3))
     times = np.array([0, 40_000, 80_000])
-    file = body_file(times_us=times, poses=poses, transl=transl, **rig)
+    errors = rng.random((3, 9)), rng.random((3, 3))
+    stated = {"source": "markers", "pose_std_rad": errors[0], "transl_std_m": errors[1]}
+    file = body_file(times_us=times, poses=poses, transl=transl, **rig, **stated)
     track = load_body_track(SimpleNamespace(body_file=file))
+    order = load_body(file)[1]
+    assert order != sorted(order)
+    assert np.array_equal(track.errors.joint_rad, errors[0][:, order])
+    assert np.array_equal(track.errors.root_m, errors[1]) and track.errors.source == "markers"
     moved, _ = skin(
         track.body.rest_vertices,
         track.body.weights,

@@ -141,8 +141,13 @@ def test_of_a_held_out_frame_its_own_key_pose_passes(tiny_capture, seed):
         "times_us": times,
         "poses": rng.normal(size=(len(times), 3, 3)).astype(np.float32) * 0.1,
         "transl": np.zeros((len(times), 3), np.float32),
+        "pose_std_rad": rng.random((len(times), 3)),
+        "transl_std_m": rng.random((len(times), 3)),
     }
     np.savez(path / "body.npz", **body)
+    document = json.loads((path / "capture.json").read_text())
+    document["body"]["source"] = "markers"
+    (path / "capture.json").write_text(json.dumps(document))
     capture = seen(path)
     kept = capture.body_file.times_us
     spans = held_out_spans(capture.frames)
@@ -154,7 +159,10 @@ def test_of_a_held_out_frame_its_own_key_pose_passes(tiny_capture, seed):
     assert len(set(inside) - around) > 10
     interpolated = seen(path, held_out_poses="interpolated").body_file
     assert set(times) - set(interpolated.times_us) == set(inside)
-    assert np.array_equal(interpolated.poses, body["poses"][np.isin(times, interpolated.times_us)])
+    kept = np.isin(times, interpolated.times_us)
+    assert np.array_equal(interpolated.poses, body["poses"][kept])
+    assert np.array_equal(interpolated.pose_std_rad, body["pose_std_rad"][kept])
+    assert np.array_equal(interpolated.errors.root_m, body["transl_std_m"][kept])
 
 
 def test_poses_at_test_times_are_interpolated_where_the_policy_says_so(tiny_capture):

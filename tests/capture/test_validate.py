@@ -296,7 +296,16 @@ def test_unknown_key_names_the_nearest(
         (("novel_views", 0, "frame"), "77", "novel_views[0].frame", "'77'", "valid frame"),
         (("novel_views", 0, "frame"), "0008", "novel_views[1].frame", "second view", "one view"),
         (("body", "model"), "star", "body.model", "'star'", "'rig'"),
+        (
+            ("cameras", "main", "transfer"),
+            "gamma",
+            "cameras.main.transfer",
+            "'gamma'",
+            "['power', 'srgb', 'linear']",
+        ),
         (("body", "file"), ..., "body.file", "nothing", "a value"),
+        (("body", "source"), "guess", "body.source", "'guess'", "['exact', 'markers', 'estimated'"),
+        (("body", "source"), [1], "body.source", "[1]", "['exact', 'markers', 'estimated'"),
         (("body",), ..., "body", "nothing", "a value"),
         (("events", "width"), 31, "events.width", "31x24", "32x24 pixels of camera 'main'"),
         (
@@ -495,6 +504,35 @@ def test_fault_of_the_body(
     assert len(matching) == 1 and matching[0].severity == "error"
     check(matching[0], path / "body.npz", field, found, expected)
     assert str(path / "body.npz") in refuses_to_load(path)
+
+
+@pytest.mark.parametrize(
+    ("source", "changes", "field", "found", "expected"),
+    [
+        ("markers", {"pose_std_rad": np.zeros((10, 2))}, "pose_std_rad", "10x2", "10x3"),
+        ("markers", {"transl_std_m": np.zeros((9, 3))}, "transl_std_m", "9x3", "10x3"),
+        ("markers", {"transl_std_m": None}, "transl_std_m", "nothing", "10x3"),
+        ("markers", {"pose_std_rad": -0.1}, "pose_std_rad[0, 0]", "-0.1 (30", "at least 0"),
+        ("markers", {"pose_std_rad": np.nan}, "pose_std_rad[0, 0]", "nan (30", "finite"),
+        ("exact", {"transl_std_m": 0.1}, "transl_std_m[0, 0]", "0.1 (30", "0 of exact poses"),
+        (None, {}, "pose_std_rad", "body.source of capture.json says nothing", "'markers'"),
+    ],
+)
+def test_fault_of_the_errors_of_poses(
+    tiny_capture: Factory,
+    source: str | None,
+    changes: dict,
+    field: str,
+    found: str,
+    expected: str,
+) -> None:
+    path = tiny_capture()
+    edit_json(path, "body", "source", value=source)
+    stated: dict[str, Any] = {"pose_std_rad": np.zeros((10, 3)), "transl_std_m": np.zeros((10, 3))}
+    for key, value in changes.items():
+        stated[key] = np.full((10, 3), value) if isinstance(value, float) else value
+    edit_body(path, **{key: value for key, value in stated.items() if value is not None})
+    check(the_only(path), path / "body.npz", field, found, expected)
 
 
 def test_infinite_translation_names_the_pose(tiny_capture: Factory) -> None:

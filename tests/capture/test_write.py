@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from evsplat.capture import CaptureWriter, load_capture, validate_capture
+from evsplat.capture import CaptureWriter, load_body_track, load_capture, validate_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream
 
@@ -70,7 +70,15 @@ def test_a_capture_written_anew_is_the_same(tiny_capture: Factory, tmp_path: Pat
             writer.add_novel_view(view.camera, view.frame, view.time_us, view.image)
         dense = np.arange(3) * 1_000, np.zeros((3, 3, 3)), np.ones((3, 3))
         writer.set_body(
-            body.model, body.times_us, body.poses, body.transl, rig=body.rig, dense=dense
+            body.model,
+            body.times_us,
+            body.poses,
+            body.transl,
+            rig=body.rig,
+            dense=dense,
+            source="estimated",
+            pose_std_rad=np.arange(36).reshape(12, 3) / 64,
+            transl_std_m=np.arange(36).reshape(12, 3) / 512,
         )
         count = writer.set_events(
             (events.between(a, b) for a, b in zip(edges, edges[1:], strict=False)),
@@ -103,7 +111,13 @@ def test_a_capture_written_anew_is_the_same(tiny_capture: Factory, tmp_path: Pat
         assert np.array_equal(after.novel_image(view), before.novel_image(old_view))
     for name in ("times_us", "poses", "transl", *(body.rig or {})):
         assert np.array_equal(getattr(after.body_file, name), getattr(body, name))
+    errors = load_body_track(after).errors
+    assert errors is not None and errors.source == "estimated" and not errors.typical
+    assert np.array_equal(errors.joint_rad, np.arange(36).reshape(12, 3) / 64)
+    assert np.array_equal(errors.root_m, np.arange(36).reshape(12, 3) / 512)
+    assert load_body_track(before).errors is None
     assert after.dense_body_file is not None and after.dense_body_file.transl.min() == 1
+    assert after.dense_body_file.errors is None
     assert after.events is not None
     all_events, old_events = after.events.between(-250, last), events.between(first, last)
     assert np.array_equal(all_events.t + 250, old_events.t)

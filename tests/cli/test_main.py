@@ -12,7 +12,7 @@ from evsplat.cli import main
 from evsplat.cli.main import _gathered
 from evsplat.shipped import demo_capture
 
-VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "masks")
+VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "masks", "poses")
 VERBS += ("restore", "settings", "train", "evaluate", "report", "render", "view", "export", "bench")
 
 

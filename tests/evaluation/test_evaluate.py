@@ -10,10 +10,12 @@ from PIL import Image
 
 from evsplat.capture import Policy, load_capture
 from evsplat.capture.policy import policy_of
+from evsplat.errors import DataError
 from evsplat.evaluation import evaluate
 from evsplat.evaluation import run as evaluation_run
 from evsplat.evaluation.event_maps import chosen_pairs
 from evsplat.evaluation.protocols import METRICS, PSNR_CEILING_DB, REGIONS
+from evsplat.evaluation.tables import latex, markdown
 from evsplat.methods.trivial import MedianBackground
 from evsplat.similarity.lpips import WEIGHTS_VARIABLE
 
@@ -49,6 +51,44 @@ def test_every_key_of_the_schema_is_there_and_means_are_means(tiny_capture, tmp_
             values = [f["protocols"][protocol][region]["psnr"] for f in metrics["per_frame"]]
             assert regions[region]["psnr"] == pytest.approx(np.mean(values))
     assert set(metrics["novel_views"]["side"]) == {"full", "person_crop", "per_view"}
+
+
+def test_training_frames_are_measured_against_their_own_truth(tiny_capture, tmp_path):
+    capture = load_capture(tiny_capture(frames=20, width=48, height=40))
+    both = {
+        split: evaluate(capture, TruthWithNoise(capture, 0.1), out_dir=tmp_path, split=split)
+        for split in ("test", "train")
+    }
+    trained = both["train"]
+    assert [both[split]["split"] for split in both] == ["test", "train"]
+    names = [frame.name for frame in capture.train_frames]
+    assert [entry["frame"] for entry in trained["per_frame"]] == names
+    # the same noise on other pictures
+    psnr = trained["protocols"]["standard"]["full"]["psnr"]
+    assert psnr == pytest.approx(both["test"]["protocols"]["standard"]["full"]["psnr"], abs=1)
+    # the nearest training frame is the blurry picture itself
+    assert list(trained["trivial"]) == ["median_background"]
+    own = [
+        -10 * np.log10(float((capture.image(name) - capture.sharp(name)).square().mean()))
+        for name in names
+    ]
+    assert trained["blurry_input"]["full"]["psnr"] == pytest.approx(np.mean(own), abs=1e-3)
+    assert trained["novel_views"] == {} and trained["events"] is None
+    assert "events" in trained["reasons"]
+    written = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert {f"train_{name}_render.png" for name in names} <= written
+    assert {f"test_{frame.name}_render.png" for frame in capture.test_frames} <= written
+    text = markdown({**trained, "policy": {}})
+    assert f"Means over {len(names)} training frames" in text and "training saw it" in text
+    assert "Training frames" in latex({**trained, "policy": {}})
+
+
+def test_training_frames_without_truth_are_refused(tiny_capture, tmp_path):
+    capture = load_capture(edit(tiny_capture(), drop("sharp")))
+    said = "capture.json: none of the 7 training frames names a sharp"
+    with pytest.raises(DataError, match=said):
+        evaluate(capture, TruthWithNoise(capture), out_dir=tmp_path / "run", split="train")
+    assert not (tmp_path / "run").exists()
 
 
 def test_missing_weights_are_null_with_the_reason(tiny_capture, tmp_path):
@@ -180,6 +220,18 @@ def test_a_person_out_of_sight_in_one_frame_is_left_out_of_the_mean(tiny_capture
     )
     reason = metrics["reasons"]["protocols.standard.person_mask.psnr"]
     assert reason == "missing in 1 of 3: the person mask is empty"
+
+
+def test_a_person_in_no_test_frame_is_told(tiny_capture, tmp_path, caplog):
+    path = tiny_capture()
+    for frame in load_capture(path).test_frames[1:]:
+        Image.new("L", (32, 24)).save(frame.mask)
+    run(path, tmp_path / "some")
+    assert "the person is in no test frame" not in caplog.text
+    for frame in load_capture(path).test_frames:
+        Image.new("L", (32, 24)).save(frame.mask)
+    run(path, tmp_path / "none")
+    assert f"{path}: the person is in no test frame; check camera and poses." in caplog.text
 
 
 def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):

@@ -20,6 +20,7 @@ from evsplat.evaluation.protocols import METRICS
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import name_of
 from evsplat.files import write_json
 
 from .helpers import TruthWithNoise, drop, edit
@@ -64,7 +65,7 @@ class Page(HTMLParser):
         return sum(name == tag for name, _ in self.elements)
 
 
-def evaluated(path, folder, *, training=True, alone=False, policy=None, change=None):
+def evaluated(path, folder, *, training=True, alone=False, policy=None, change=None, split="test"):
     """An evaluated run of `TruthWithNoise`, as a source for the page.
 
     ``change`` is applied to the metrics before they are written.
@@ -73,7 +74,7 @@ def evaluated(path, folder, *, training=True, alone=False, policy=None, change=N
     if policy is not None and policy.use == "everything":
         capture = capture.with_nothing_held_out()
     reconstruction = TruthWithNoise(capture, 0.02)
-    metrics = evaluate(capture, reconstruction, out_dir=folder, test_frames_only=alone)
+    metrics = evaluate(capture, reconstruction, out_dir=folder, test_frames_only=alone, split=split)
     if policy is not None:
         metrics["policy"] = to_dict(policy)
     if change is not None:
@@ -89,8 +90,8 @@ def evaluated(path, folder, *, training=True, alone=False, policy=None, change=N
         (folder / "log.jsonl").write_text("\n".join(lines) + '\n{"iteration": 9, "lo')
         (folder / "config.yaml").write_text(f"event: {{weight: 0.2, note: '{HOSTILE}'}}\nseed: 3\n")
         write_json(folder / "versions.json", {"torch": "2.13"})
-    write_json(folder / "metrics.json", metrics)
-    return Source.read(folder, capture, reconstruction)
+    write_json(folder / name_of("metrics", split, ".json"), metrics)
+    return Source.read(folder, capture, reconstruction, split)
 
 
 def test_page_is_one_file_without_any_request_and_hostile_names_stay_text(tiny_capture, tmp_path):
@@ -130,6 +131,24 @@ def test_page_shows_every_test_frame_pair_and_view(tiny_capture, tmp_path):
     assert sum(attributes.get("type") == "range" for _, attributes in parsed.elements) == 2 * len(
         source.capture.test_frames
     )
+
+
+def test_page_of_training_frames_says_so(tiny_capture, tmp_path):
+    everything = Policy(use="everything")
+    source = evaluated(tiny_capture(frames=20), tmp_path, split="train", policy=everything)
+    parsed = Page(page(source))
+    text = " ".join(parsed.text)
+    for said in ("20 training frames against", "on training frames", "Training frames", "saw it"):
+        assert said in text
+    for wrong in ("held-out", "Held-out", "Test frames", "no test figures"):
+        assert wrong not in text
+    alts = [attributes["alt"] for tag, attributes in parsed.elements if tag == "img"]
+    assert "our render, frame 0000" in alts
+    with pytest.raises(DataError, match="metrics.json: file not found"):
+        Source.read(tmp_path, source.capture, source.reconstruction)
+    (tmp_path / "metrics_train.json").unlink()
+    with pytest.raises(DataError, match="run `evsplat evaluate .* --split train` first"):
+        Source.read(tmp_path, source.capture, source.reconstruction, "train")
 
 
 def test_embedded_pictures_are_the_pictures(tiny_capture, tmp_path):

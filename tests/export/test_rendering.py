@@ -54,6 +54,9 @@ class _Recording:
         )
         self.is_static_camera = not moving
 
+    def transfer(self, frame: Frame) -> str:
+        return "power"
+
     def camera(self, frame: Frame) -> Camera:
         camera = self.cameras[frame.camera]
         if frame.world_to_camera is None:

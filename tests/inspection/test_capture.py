@@ -27,7 +27,7 @@ def test_summary_states_what_was_recorded(tiny_capture: Factory, tmp_path: Path)
     ):
         assert words in report.summary
     names = sorted(picture.name for picture in report.pictures)
-    assert names == ["body.png", "contact_sheet.png", "events.png", "timeline.png"]
+    assert names == ["body.png", "body_fit.png", "contact_sheet.png", "events.png", "timeline.png"]
     for picture in report.pictures:
         with Image.open(picture) as image:
             assert image.width >= 700 and len(np.unique(np.asarray(image.convert("L")))) > 50

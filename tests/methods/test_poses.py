@@ -1,7 +1,9 @@
-"""Noisy poses in method `evsplat`: told, smoothed, corrected, and held-out pictures unseen."""
+"""Poses that err in method `evsplat`: told, smoothed, corrected, held-out pictures unseen."""
 
+import json
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,14 +23,29 @@ from ..small_model import built, small_config
 SETTINGS = ("lamps=0", "most_renders=3", "event_start=0", "pose.start=0")
 
 
+def with_errors(path: Path, **fields) -> None:
+    """Write fields of body.npz, and ``source`` into capture.json."""
+    source = fields.pop("source", None)
+    with np.load(path / "body.npz") as archive:
+        body = dict(archive)
+    np.savez(path / "body.npz", **body | fields)
+    if source is not None:
+        document = json.loads((path / "capture.json").read_text("utf-8"))
+        document["body"]["source"] = source
+        (path / "capture.json").write_text(json.dumps(document), "utf-8")
+
+
 @pytest.fixture
 def captures(tiny_capture):
-    """The same recording with exact and with noisy key poses."""
+    """The same recording with exact and with noisy key poses, which say so."""
     exact, noisy = tiny_capture("exact", frames=20), tiny_capture("noisy", frames=20)
-    body = dict(np.load(noisy / "body.npz"))
+    poses = load_capture(noisy).body_file.poses
     rng = np.random.default_rng(0)
-    body["poses"] = body["poses"] + np.float32(0.05 * rng.normal(size=body["poses"].shape))
-    np.savez(noisy / "body.npz", **body)
+    poses = poses + np.float32(0.05 * rng.normal(size=poses.shape))
+    std = np.full(poses.shape[:2], 0.05, np.float32)
+    place = np.full((len(poses), 3), 0.01, np.float32)
+    with_errors(noisy, source="estimated", poses=poses, pose_std_rad=std, transl_std_m=place)
+    with_errors(exact, source="exact")
     return load_capture(exact), load_capture(noisy)
 
 
@@ -37,56 +54,63 @@ def composed(capture: Capture, *settings: str):
 
 
 def prepared(capture: TrainingCapture, **settings) -> Poses:
-    return prepare_poses(replace(EvsplatConfig().pose, **settings), capture, announce=True)
+    return prepare_poses(replace(EvsplatConfig().pose, **settings), capture, fit=True)
 
 
-def test_noisy_poses_are_told_and_exact_ones_stay_at_every_key(captures, caplog):
-    exact, noisy = captures
+def test_exact_poses_stay_at_every_key(captures, caplog):
+    exact = seen(captures[0])
     with caplog.at_level(logging.INFO):
-        untouched = prepared(seen(exact))
-    assert "taken as they are, corrected between keys only" in caplog.text
-    assert untouched.spline is not None
+        untouched = prepared(exact)
+    assert "exact: not smoothed, corrected between keys only" in caplog.text
+    assert untouched.correction is not None
     keys = untouched.track.times_us.tolist()
-    assert untouched.spline.weights(keys).abs().max() < 1e-5
-    assert set(untouched.priced_us).isdisjoint(keys)
-    assert prepared(seen(exact), between=False).spline is None
+    torch.nn.init.normal_(untouched.correction.between.rotations)
+    turns, shifts = untouched.correction.residual(keys)
+    assert turns.abs().max() < 1e-5 and shifts.abs().max() < 1e-5
     assert np.array_equal(untouched.track.poses, load_body_track(exact).poses)
-    caplog.clear()
+    assert prepared(exact, between=False).correction is None
+
+
+def test_poses_that_err_are_smoothed_and_corrected_by_what_is_said_of_them(captures, caplog):
+    exact, noisy = (load_body_track(capture).poses for capture in captures)
     with caplog.at_level(logging.INFO):
-        found = prepared(seen(noisy))
+        found = prepared(seen(captures[1]))
+    assert "(source: estimated) are taken as off by some 0.050 rad and 10 mm" in caplog.text
     assert "smoothed in time, corrected in training" in caplog.text
-    truth = load_body_track(exact).poses
-    before = np.abs(load_body_track(noisy).poses - truth).mean()
-    assert np.abs(found.track.poses - truth).mean() < before
-    assert found.spline is not None
-    assert float(found.spline.joint_rad.max()) == pytest.approx(0.05, rel=0.5)
-    off = prepared(seen(noisy), smooth="never", refine="never", between=False)
-    assert off.spline is None
-    assert np.array_equal(off.track.poses, load_body_track(noisy).poses)
+    assert np.abs(found.track.poses - exact).mean() < np.abs(noisy - exact).mean()
+    assert float(found.correction.joint_rad.max()) == pytest.approx(0.05)
+    assert not bool(found.correction.exact)
+    off = prepared(seen(captures[1]), smooth="never", refine="never", between=False)
+    assert off.correction is None
+    assert np.array_equal(off.track.poses, noisy)
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(
-    ("cycles", "jitter", "noisy"),
-    [(0.5, 0.004, True), (5.0, 0.004, False), (2.0, 0.03, True), (0.0, 0.0, False)],
-)
-def test_jitter_counts_against_what_lies_between_the_keys(
-    seed, cycles, jitter, noisy, tiny_capture, caplog
-):
-    """The same jitter is a fit's on a slow motion, and hides nothing in a fast one."""
+@pytest.mark.parametrize("source", ["exact", "markers", "estimated"])
+def test_what_a_capture_says_of_its_poses_counts_whatever_their_curve(seed, source, tiny_capture):
+    """Fast exact motions stay as they are, smooth ones that are estimated are corrected."""
     path, rng = tiny_capture(frames=40), np.random.default_rng(seed)
-    body = dict(np.load(path / "body.npz"))
-    count, *joints = body["poses"].shape
+    count, *joints = load_capture(path).body_file.poses.shape
+    cycles, jitter = (8.0, 0.01) if source == "exact" else (0.5, 0.0)
     phase = 2 * np.pi * (np.linspace(0, cycles, count)[:, None, None] + rng.random(joints))
-    poses = 0.3 * np.sin(phase) * (cycles > 0) + jitter * rng.normal(size=(count, *joints))
-    np.savez(path / "body.npz", **body | {"poses": poses.astype(np.float32)})
-    with caplog.at_level(logging.INFO):
-        found = prepared(seen(path))
-    assert ("are noisy: smoothed in time, corrected in training" in caplog.text) == noisy
-    if noisy:
-        assert found.spline is not None
-        expected = max(0.02, jitter)
-        assert float(found.spline.joint_rad.max()) == pytest.approx(expected, rel=0.3)
+    poses = 0.3 * np.sin(phase) + jitter * rng.normal(size=(count, *joints))
+    with_errors(path, source=source, poses=poses.astype(np.float32))
+    found = prepared(seen(path))
+    assert np.array_equal(found.track.poses, load_body_track(load_capture(path)).poses)
+    assert bool(found.correction.exact) == (source == "exact")
+
+
+def test_what_was_found_out_is_part_of_the_state(captures, tiny_capture):
+    """Of poses that say nothing: built to be loaded, the state decides."""
+    path = tiny_capture("silent", frames=20)
+    given = prepare_poses(EvsplatConfig().pose, seen(path), fit=False).correction
+    torch.nn.init.normal_(given.errors["fast"].rotations)
+    state = given.state_dict()
+    other = prepare_poses(EvsplatConfig().pose, seen(path), fit=False).correction
+    other.load_state_dict(state | {"exact": torch.tensor(False)})
+    assert other.residual([0])[0].abs().max() > 0
+    other.load_state_dict(state | {"exact": torch.tensor(True)})
+    assert other.residual([0])[0].abs().max() < 1e-6
 
 
 INTERPOLATION = ("policy.held_out_events=true", "pose.events_of_held_out=true")
@@ -111,7 +135,11 @@ def test_held_out_frames_move_their_poses_only(captures):
     changed = {
         name for name, value in model.state_dict().items() if not torch.equal(value, before[name])
     }
-    assert changed == {"residual.rotations", "residual.translations"}
+    assert changed == {
+        f"residual.errors.{part}.{what}"
+        for part in ("constant", "slow", "fast")
+        for what in ("rotations", "translations")
+    }
     assert torch.equal(count, trainer.statistics["gaussians"].seen)
 
 
@@ -131,11 +159,11 @@ def test_without_being_asked_held_out_events_teach_nothing(captures, tmp_path):
         return {name: value.clone() for name, value in state.items() if value.is_floating_point()}
 
     ours, theirs = learned(noisy), learned(load_capture(others))
-    assert ours["residual.rotations"].abs().max() > 0
+    assert ours["residual.errors.fast.rotations"].abs().max() > 0
     assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
     # where they are asked for they do teach
     asked = [learned(capture, *INTERPOLATION) for capture in (noisy, load_capture(others))]
-    assert not torch.equal(asked[0]["residual.rotations"], asked[1]["residual.rotations"])
+    assert not torch.equal(*(each["residual.errors.fast.rotations"] for each in asked))
 
 
 def test_events_of_held_out_frames_need_a_policy_that_shows_them(captures):
@@ -154,12 +182,12 @@ def test_errors_expected_of_exact_poses_are_refused(captures, setting):
     name = setting.partition("=")[0]
     with pytest.raises(ConfigError, match=f"{name} is 0.1, and nothing reads it: .* as exact"):
         composed(exact, setting)
-    spline = composed(noisy, setting).model.residual
-    found = spline.joint_rad.max() if name == "pose.std_rad" else spline.root_m
-    assert float(found) == pytest.approx(0.1)
+    correction = composed(noisy, setting).model.residual
+    found = correction.joint_rad if name == "pose.std_rad" else correction.root_m
+    assert float(found.max()) == pytest.approx(0.1)
 
 
-def test_a_spline_is_learned_where_it_is_asked_for(captures):
+def test_a_correction_is_learned_where_it_is_asked_for(captures):
     composition = composed(captures[1])
     assert composition.held_out is None
     assert composition.model.residual is not None

@@ -15,7 +15,7 @@ def bend(model, times: list[int], rng: np.random.Generator) -> None:
     model.track = BodyTrack(model.track.body, np.array(times), poses, places)
     model.residual_start = 0.0
     with torch.no_grad():
-        for values in (model.residual.rotations, model.residual.translations):
+        for values in model.residual.parameters():
             values.copy_(torch.from_numpy(0.8 * rng.normal(size=values.shape)))
 
 

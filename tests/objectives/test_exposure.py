@@ -8,6 +8,8 @@ import torch
 from evsplat.objectives import Exposure, renders_for
 from evsplat.similarity import ssim
 
+POWER = SimpleNamespace(transfer=lambda frame: "power")
+
 
 def frame(start: int = 1_000, end: int = 31_000) -> SimpleNamespace:
     return SimpleNamespace(name="a", exposure_us=(start, end), mid_us=(start + end) // 2)
@@ -41,6 +43,7 @@ def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
     pictures = torch.rand(4, 20, 24, 3, generator=generator, dtype=torch.float64)
     observed = torch.rand(20, 24, 3, generator=generator, dtype=torch.float64)
     step = SimpleNamespace(
+        capture=POWER,
         frame=frame(),
         times_us=(500, 2_000, 16_000, 30_999),
         linear=pictures**2.2,
@@ -69,6 +72,7 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
     linear = (pictures**2.2).requires_grad_()
     observed = torch.rand(16, 16, 3, generator=generator, dtype=torch.float64)
     step = SimpleNamespace(
+        capture=POWER,
         frame=frame(),
         times_us=tuple(times),
         linear=linear,
@@ -86,6 +90,7 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
 def test_a_black_exposure_has_a_finite_gradient():
     pictures = torch.zeros(3, 16, 16, 3, requires_grad=True)
     step = SimpleNamespace(
+        capture=POWER,
         frame=frame(),
         times_us=(2_000, 16_000, 30_000),
         linear=pictures,

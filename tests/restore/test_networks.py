@@ -15,7 +15,7 @@ from evsplat.errors import DataError, WeightsError
 from evsplat.events import EventStream
 from evsplat.restore import RESTORERS, WEIGHT_FILES, restore_capture
 from evsplat.restore.d2net import D2Net, TwoIterations, event_stack
-from evsplat.restore.e2vid import E2VidNetwork, RecurrentUNet
+from evsplat.restore.e2vid import E2Vid, RecurrentUNet
 from evsplat.restore.efnet import TwoStages, event_mask, symmetric_cumulative
 from evsplat.restore.mprnet import ThreeStages
 from evsplat.restore.nafnet import LocalMean, NafUNet
@@ -339,10 +339,10 @@ def test_d2net_sees_neighbours_and_reverses_at_the_ends(tiny_capture) -> None:
         assert torch.equal(middle, event_stack(own, *pictures.shape[-2:]))
 
 
-def test_e2vid_remembers_until_reset_and_takes_many_events_in_parts(tmp_path) -> None:
+def test_e2vid_remembers_until_reset_and_takes_many_events_in_parts(tiny_capture, tmp_path) -> None:
     torch.manual_seed(1)
     torch.save(_e2vid(), tmp_path / "e2vid.tar")
-    network = E2VidNetwork(tmp_path / "e2vid.tar", "cpu")
+    network = E2Vid(seen(tiny_capture()), weights=tmp_path / "e2vid.tar", device="cpu")
     width, height = 30, 22
     events = _stream(0, round(0.35 * width * height * 3), width, height)
     whole = network.step(events, height, width)

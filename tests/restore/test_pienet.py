@@ -31,19 +31,19 @@ def _stream(seed: int, count: int, width: int, height: int) -> EventStream:
 
 
 @needs_package
-def test_every_trained_weight_is_used() -> None:
+def test_every_trained_weight_is_used(tiny_capture) -> None:
     """The package's own loader leaves out 12 of them; its published count is without them."""
-    network = pienet.PieNetwork()
+    network = pienet.PieNet(seen(tiny_capture()))
     state = torch.load(network.weights, "cpu", weights_only=True)
-    loaded = network._model.state_dict()
+    loaded = network.network.state_dict()
     assert set(loaded) == set(state)
     assert all(torch.equal(loaded[key], state[key]) for key in state)
-    assert sum(value.numel() for value in network._model.parameters()) == 171_121
+    assert sum(value.numel() for value in network.network.parameters()) == 171_121
 
 
 @needs_package
-def test_windows_build_on_each_other_until_reset() -> None:
-    network = pienet.PieNetwork()
+def test_windows_build_on_each_other_until_reset(tiny_capture) -> None:
+    network = pienet.PieNet(seen(tiny_capture()))
     windows = [_stream(seed, 4000, 48, 40) for seed in range(3)]
     first = [network.step(window, 40, 48) for window in windows]
     assert all(picture.shape == (40, 48) for picture in first)
@@ -104,10 +104,10 @@ def test_without_the_package_one_sentence_says_how_to_get_it(
 
 
 @needs_package
-def test_another_version_of_the_weights_is_refused(tmp_path, monkeypatch) -> None:
+def test_another_version_of_the_weights_is_refused(tiny_capture, tmp_path, monkeypatch) -> None:
     state = torch.load(pienet.find_weights(), "cpu", weights_only=True)
     state.pop(next(iter(state)))
     torch.save(state, tmp_path / "model.pth")
     monkeypatch.setattr(pienet, "find_weights", lambda: tmp_path / "model.pth")
     with pytest.raises(WeightsError, match="event-pienet==1.1.3"):
-        pienet.PieNetwork()
+        pienet.PieNet(seen(tiny_capture()))

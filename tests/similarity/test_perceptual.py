@@ -122,8 +122,12 @@ def test_lpips_is_the_formula_written_out(tmp_path, name, taps):
 
 @pytest.mark.parametrize("name", ["alex", "vgg"])
 def test_heads_fit_the_networks_and_are_not_negative(name):
-    heads = lpips_heads(name)
-    assert tuple(len(head) for head in heads) == NETWORKS[name].channels
+    heads, shapes = lpips_heads(name), NETWORKS[name].parameter_shapes
+    convolutions = [
+        [shapes[f"{key}.bias"] for key, layer in stage.items() if f"{key}.bias" in shapes]
+        for stage in NETWORKS[name].stages
+    ]
+    assert [head.shape for head in heads] == [stage[-1] for stage in convolutions]
     assert all(bool((head >= 0).all()) for head in heads)
 
 
@@ -194,11 +198,11 @@ def test_distance_is_differentiable():
 @pytest.mark.parametrize("network", [*NETWORKS.values(), ST_NETWORK], ids=lambda n: n.name)
 def test_smallest_side_is_the_smallest_that_leaves_features(network):
     parameters = {key: torch.zeros(shape) for key, shape in network.parameter_shapes.items()}
-    side = network.min_side
-    features = network.features(torch.zeros(1, 3, side, side), parameters)
+    side, network = network.min_side, network.filled(parameters)
+    features = network.features(torch.zeros(1, 3, side, side))
     assert all(min(feature.shape[2:]) >= 1 for feature in features)
     with pytest.raises(RuntimeError):
-        network.features(torch.zeros(1, 3, side - 1, side - 1), parameters)
+        network.features(torch.zeros(1, 3, side - 1, side - 1))
 
 
 @pytest.fixture

@@ -150,13 +150,13 @@ def test_visibility_takes_all_of_one_picture(tmp_path):
 
 
 def test_missing_weights_say_what_and_where(tmp_path, monkeypatch):
-    monkeypatch.delenv(super_slomo.WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.delenv(super_slomo.CHECKPOINT.variable, raising=False)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     with pytest.raises(MissingWeights) as error:
         SuperSloMo("power")
     for words in ("SuperSloMo.ckpt (151 MB)", "avinashpaliwal/Super-SloMo", "hub", "--weights"):
         assert words in str(error.value)
-    monkeypatch.setenv(super_slomo.WEIGHTS_VARIABLE, str(tmp_path / "named.ckpt"))
+    monkeypatch.setenv(super_slomo.CHECKPOINT.variable, str(tmp_path / "named.ckpt"))
     with pytest.raises(MissingWeights, match=r"named\.ckpt"):
         SuperSloMo("power")
 

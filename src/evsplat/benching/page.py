@@ -9,8 +9,8 @@ from evsplat.benching.folder import BenchFolder
 from evsplat.benching.tables import SPREAD
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.evaluation.regions import Box, HumanRegions
-from evsplat.evaluation.report.html import Embedder, document, folded, read_picture, section, spread
 from evsplat.evaluation.tables import LEGEND, Table, html
+from evsplat.pages import Embedder, document, folded, read_picture, section, spread
 from evsplat.pictures import to_bytes
 
 _PIXELS = 60_000_000

@@ -2,6 +2,7 @@
 
 from evsplat.body.body import Body, bounding_box, skin
 from evsplat.body.make import default_body, make_body
+from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.body.retarget import SkeletonMotion, retarget
 from evsplat.body.rotations import (
     axis_angle_to_matrix,
@@ -14,8 +15,11 @@ from evsplat.body.surface import SurfaceSamples
 from evsplat.body.track import BodyTrack, up_axis
 
 __all__ = [
+    "POSE_SOURCES",
     "Body",
     "BodyTrack",
+    "PoseErrors",
+    "PoseSource",
     "SkeletonMotion",
     "SurfaceSamples",
     "axis_angle_to_matrix",

@@ -96,7 +96,7 @@ def retarget(
     upright = rest_from_zero(mover, zero, taker, rest)
     turns = _matched_turns(source, mover, target, taker, joint_map or {})
     into_world = np.asarray(source.world_from_source, np.float64)
-    aligned = _alignments(mover, zero @ upright.T, taker, rest)
+    aligned = alignments(mover, zero @ upright.T, taker, rest)
     parents = target.parents.tolist()
     world = np.empty((len(source.times_us), len(parents), 3, 3))
     for joint, parent in enumerate(parents):
@@ -232,7 +232,7 @@ def _collar(chest: np.ndarray, arm: np.ndarray) -> np.ndarray:
     return chest @ Rotation.from_rotvec(COLLAR_SHARE * fade * raised).as_matrix()
 
 
-def _alignments(mover: Skeleton, zero: np.ndarray, taker: Skeleton, rest: np.ndarray) -> np.ndarray:
+def alignments(mover: Skeleton, zero: np.ndarray, taker: Skeleton, rest: np.ndarray) -> np.ndarray:
     """A of every joint of the target; ``zero`` already stands in the target's axes."""
     aligned = np.tile(np.eye(3), (len(rest), 1, 1))
     for side in ("left", "right"):

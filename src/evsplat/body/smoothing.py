@@ -43,8 +43,10 @@ class MotionNoise:
     against squared errors at the keys; what smooths best."""
 
 
-def motion_noise(track: BodyTrack) -> MotionNoise:
-    """Estimate the noise of a track's key poses.
+def motion_noise(
+    track: BodyTrack, *, most_rad: float = math.inf, most_m: float = math.inf
+) -> MotionNoise:
+    """Estimate the noise of a track's key poses, at most ``most_rad`` and ``most_m`` per axis.
 
     Each joint's quaternions are compared with their smoothing spline, whose stiffness generalised
     cross-validation picks (Craven and Wahba, Smoothing noisy data with spline functions, 1979).
@@ -56,8 +58,7 @@ def motion_noise(track: BodyTrack) -> MotionNoise:
     joints = track.poses.shape[1]
     if len(track.times_us) < FEWEST_KEYS:
         return MotionNoise(0.0, 0.0, np.ones(joints, bool), np.zeros(joints + 1))
-    quaternions = _quaternions(track.poses)
-    moving = np.ptp(quaternions, axis=0).max(-1) > _STILL
+    quaternions, moving = _quaternions(track.poses), moving_joints(track)
     pieces = _pieces(_seconds(track))
     stiffness = np.zeros(joints + 1)
     if not moving.any():
@@ -66,12 +67,17 @@ def motion_noise(track: BodyTrack) -> MotionNoise:
         # A small rotation changes a unit quaternion by half of it, in three of four directions.
         per_component = math.sqrt(3) / 4
         estimates = [_cross_validated(pieces, quaternions[:, j]) for j in np.flatnonzero(moving)]
-        rotation = float(np.median(estimates)) / per_component
+        rotation = min(float(np.median(estimates)) / per_component, most_rad)
         for joint in np.flatnonzero(moving):
             stiffness[joint] = _least_risk(pieces, quaternions[:, joint], rotation * per_component)
-    translation = _cross_validated(pieces, track.transl)
+    translation = min(_cross_validated(pieces, track.transl), most_m)
     stiffness[-1] = _least_risk(pieces, track.transl, translation)
     return MotionNoise(rotation, translation, moving, stiffness)
+
+
+def moving_joints(track: BodyTrack) -> Bool[np.ndarray, " J"]:
+    """Joints that move at all."""
+    return np.ptp(_quaternions(track.poses), axis=0).max(-1) > _STILL
 
 
 def smoothed(track: BodyTrack, noise: MotionNoise) -> BodyTrack:
@@ -84,7 +90,7 @@ def smoothed(track: BodyTrack, noise: MotionNoise) -> BodyTrack:
     )
     stacked = np.stack(rotations, 1)
     poses = Rotation.from_quat(stacked.reshape(-1, 4)).as_rotvec().reshape(track.poses.shape)
-    return BodyTrack(track.body, track.times_us, poses, transl)
+    return BodyTrack(track.body, track.times_us, poses, transl, errors=track.errors)
 
 
 @dataclass(frozen=True)

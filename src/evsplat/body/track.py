@@ -12,6 +12,7 @@ from torch import Tensor
 
 from evsplat.body.body import Body, skin
 from evsplat.body.canonical import find_legs
+from evsplat.body.pose_errors import PoseErrors
 from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.devices import send
 from evsplat.errors import DataError
@@ -33,12 +34,17 @@ class BodyTrack:
         transl: Float[np.ndarray, "P 3"],
         *,
         source: str = "body track",
+        errors: PoseErrors | None = None,
     ) -> None:
         times = np.asarray(times_us, dtype=np.int64)
         poses = np.asarray(poses, dtype=np.float64)
         transl = np.asarray(transl, dtype=np.float64)
         _check(body, times, poses, transl, source)
+        if errors is not None:
+            errors.check(len(times), len(body.parents), source)
         self.body = body
+        self.errors = errors
+        """How far the key poses err; None where nobody says."""
         self.times_us = times
         self.poses, self.transl = poses, transl
         device = body.rest_joints.device

@@ -3,14 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from evsplat.calibration.brightness import (
-    EventSource,
-    Exposure,
-    FramePair,
-    exposure,
-    pair,
-    pair_indices,
-)
+from evsplat.calibration.brightness import EventSource, FramePair, exposure, pair, pair_indices
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
@@ -18,15 +11,12 @@ from evsplat.calibration.thresholds import ThresholdEstimate, estimate_threshold
 __all__ = [
     "ClockEstimate",
     "EventSource",
-    "Exposure",
     "FramePair",
     "NoiseEstimate",
     "NoiseMeter",
     "SensorEstimate",
     "ThresholdEstimate",
-    "estimate_clock",
     "estimate_from_pairs",
-    "estimate_thresholds",
     "noise_of",
     "exposure",
     "pair",

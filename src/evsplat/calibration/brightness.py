@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from evsplat.errors import DataError
-from evsplat.events import EventStream, Span
+from evsplat.events import EventStore, EventStream, Span
 from evsplat.events.maps import event_pixels
 from evsplat.pictures.light import Transfer, decode, luminance
 
@@ -25,12 +24,8 @@ MOST_EVENTS = 10_000
 """About a pair of frames; of more a part is taken."""
 
 
-class EventSource(Protocol):
-    """Events by time: an `EventStream` in memory or an `EventStore` on disk."""
-
-    def between(self, start_us: int, end_us: int) -> EventStream:
-        """Events with ``start_us <= t < end_us``."""
-        ...
+EventSource = EventStream | EventStore
+"""Events by time, in memory or on disk."""
 
 
 @dataclass(frozen=True, eq=False)

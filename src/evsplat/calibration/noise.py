@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int64
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, rank_filter
 
 from evsplat.events import EventStore, EventStream
 
@@ -18,6 +18,7 @@ LEAST_QUIET_SHARE = 0.05
 QUIET_DISTANCE_PX = 3
 """Nothing moves at pixels that are farther than this from any that had a supported event."""
 _BESIDE = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+_AROUND = np.array(((1, 1, 1), (1, 0, 1), (1, 1, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,14 +127,8 @@ def _has_support(chunk: EventStream, width: int, height: int) -> np.ndarray:
 
 
 def _hot_pixels(total: Int64[np.ndarray, "H W"], seconds: float) -> Int64[np.ndarray, "K 2"]:
-    height, width = total.shape
-    padded = np.pad(total, 1, mode="reflect") if min(height, width) > 1 else np.pad(total, 1)
-    around = [
-        padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-        for dy, dx in _BESIDE
-        if (dy, dx) != (0, 0)
-    ]
-    second = np.sort(np.stack(around), axis=0)[-2]
+    border = "mirror" if min(total.shape) > 1 else "constant"
+    second = rank_filter(total, rank=-2, footprint=_AROUND, mode=border)
     hot = (total > HOT_RATE_HZ * seconds) & (total > HOT_RATIO * np.maximum(second, 1))
     y, x = np.nonzero(hot)
     order = np.argsort(-total[y, x], kind="stable")

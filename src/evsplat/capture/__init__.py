@@ -7,7 +7,7 @@ from evsplat.capture.capture import Capture, load_capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.policy import Policy
-from evsplat.capture.sensor_estimate import estimate_sensor
+from evsplat.capture.sensor_estimate import estimate_sensor, warn_of_linear_frames
 from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import validate_capture
 from evsplat.capture.write import CaptureWriter
@@ -23,6 +23,7 @@ __all__ = [
     "Policy",
     "TrainingCapture",
     "estimate_sensor",
+    "warn_of_linear_frames",
     "load_body_track",
     "load_capture",
     "validate_capture",

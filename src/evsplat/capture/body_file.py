@@ -1,12 +1,13 @@
 """The body and its key poses as they stand in ``body.npz``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Int64
+from jaxtyping import Bool, Float, Int, Int64
 
+from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.errors import DataError
 from evsplat.files import why_not_read
 from evsplat.safe_pickle import BROKEN
@@ -35,6 +36,29 @@ class BodyFile:
     weights: Float[np.ndarray, "V J"] | None = None
     betas: Float[np.ndarray, "B"] | None = None
     gender: str | None = None
+    source: PoseSource | None = None
+    """Where the poses come from; None where the capture does not say."""
+    pose_std_rad: Float[np.ndarray, "P J"] | None = None
+    """Standard deviation of each joint's rotation, radians per axis."""
+    transl_std_m: Float[np.ndarray, "P 3"] | None = None
+    """Standard deviation of ``transl``, metres."""
+
+    @property
+    def errors(self) -> PoseErrors | None:
+        """How far the poses err, joints in the file's order; None where the source is unknown."""
+        if self.source is None:
+            return None
+        if self.pose_std_rad is None or self.transl_std_m is None:
+            return PoseErrors.typical_of(self.source, *self.poses.shape[:2])
+        return PoseErrors(self.source, self.pose_std_rad, self.transl_std_m)
+
+    def at_keys(self, kept: Bool[np.ndarray, "P"]) -> "BodyFile":
+        """The same body with those of the key poses."""
+        keyed = ("times_us", "poses", "transl", "pose_std_rad", "transl_std_m")
+        values = {name: getattr(self, name) for name in keyed}
+        return replace(
+            self, **{name: value[kept] for name, value in values.items() if value is not None}
+        )
 
     @property
     def rig(self) -> dict[str, Any] | None:
@@ -66,7 +90,19 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"{path}: not a readable npz ({said}); write it anew.") from error
 
 
-def body_from_arrays(path: Path, arrays: dict[str, np.ndarray], model: str) -> BodyFile:
+def stated_body(path: Path, arrays: dict[str, np.ndarray], source: PoseSource | None) -> BodyFile:
+    """A `BodyFile` outside of a capture, whose poses' ``source`` the user states."""
+    if source is None and "pose_std_rad" in arrays:
+        raise DataError(
+            f"{path}: says how far its poses err (pose_std_rad), expected their source as well; "
+            f"give --pose-source ({', '.join(POSE_SOURCES)})."
+        )
+    return body_from_arrays(path, arrays, "", source)
+
+
+def body_from_arrays(
+    path: Path, arrays: dict[str, np.ndarray], model: str, source: PoseSource | None = None
+) -> BodyFile:
     """A `BodyFile` of well-formed arrays; ``model`` where they name none."""
     names = arrays.get("joint_names")
     gender = arrays.get("gender")
@@ -78,6 +114,9 @@ def body_from_arrays(path: Path, arrays: dict[str, np.ndarray], model: str) -> B
         transl=arrays["transl"],
         joint_names=None if names is None else tuple(str(name) for name in names),
         gender=None if gender is None else str(gender),
+        source=source,
+        pose_std_rad=arrays.get("pose_std_rad"),
+        transl_std_m=arrays.get("transl_std_m"),
         betas=None if "betas" not in arrays else np.ravel(arrays["betas"]),
         **{key: arrays.get(key) for key in RIG_ARRAYS if key != "joint_names"},
     )

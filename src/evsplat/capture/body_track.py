@@ -1,5 +1,7 @@
 """The body of a capture and its pose at any time."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from evsplat.body.body import Body
@@ -31,7 +33,17 @@ def load_body_track(capture: Capture | TrainingCapture, *, dense: bool = False) 
             f"{file.path}: poses has shape {poses.shape}, expected (P, {len(order)}, 3) "
             f"for the joints of the body."
         )
-    return BodyTrack(body, file.times_us, poses[:, order], file.transl, source=str(file.path))
+    errors = file.errors
+    if errors is not None:
+        errors = replace(errors, joint_rad=errors.joint_rad[:, order])
+    return BodyTrack(
+        body,
+        file.times_us,
+        poses[:, order],
+        file.transl,
+        source=str(file.path),
+        errors=errors,
+    )
 
 
 def load_body(file: BodyFile) -> tuple[Body, list[int]]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
 from evsplat.capture.body_file import read_arrays
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import Metadata
@@ -28,6 +29,7 @@ def check_body(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
     _check_model(metadata, arrays, findings)
     check = _Check(metadata.body_file, arrays, findings)
     check.poses(_JOINTS.get(metadata.body_model))
+    check.errors(metadata.body_source)
     if metadata.body_model == "rig":
         check.rig()
     else:
@@ -142,6 +144,33 @@ class _Check:
                 "strictly ascending times",
                 "Sort the poses by time and remove doubles.",
             )
+
+    def errors(self, source: PoseSource | None) -> None:
+        """How far the poses are said to err."""
+        given = [key for key in ("pose_std_rad", "transl_std_m") if key in self.arrays]
+        if not given:
+            return
+        if source is None:
+            self.error(
+                given[0],
+                "an array, while body.source of capture.json says nothing",
+                f"one of {list(POSE_SOURCES)} there",
+                "Say where the poses come from, or leave the array out.",
+            )
+        times = self.arrays.get("times_us")
+        count = None if times is None or times.ndim != 1 else len(times)
+        shapes = {"pose_std_rad": (count, self.joint_count()), "transl_std_m": (count, 3)}
+        for key, shape in shapes.items():
+            array = self.array(key, shape, "f")
+            wrong = None if array is None else (array < 0) | ((array > 0) & (source == "exact"))
+            if array is not None and wrong is not None and wrong.any():
+                index = tuple(int(i) for i in np.argwhere(wrong)[0])
+                self.error(
+                    f"{key}[{', '.join(map(str, index))}]",
+                    f"{array[index]:.4g} ({int(wrong.sum())} such values)",
+                    "0 of exact poses" if source == "exact" else "numbers of at least 0",
+                    "Give standard deviations, or leave both arrays out.",
+                )
 
     def rig(self) -> None:
         joints = self.joint_count()

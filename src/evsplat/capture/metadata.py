@@ -7,8 +7,10 @@ from typing import Any, Literal
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.body.pose_errors import PoseSource
 from evsplat.camera import Camera
 from evsplat.capture.distortion import Distortion
+from evsplat.pictures.light import Transfer
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +72,14 @@ class Metadata:
     name: str
     cameras: dict[str, Camera]
     distortions: dict[str, Distortion]
+    transfers: dict[str, Transfer]
+    """From the values of pictures to light, of cameras for which capture.json says it."""
     frames: tuple[Frame, ...]
     novel_views: tuple[NovelView, ...]
     body_file: Path
     body_model: str
     """Empty where the capture has no body yet."""
+    body_source: PoseSource | None
+    """Where its poses come from; None where the capture does not say."""
     events: EventsEntry | None
     provenance: dict[str, Any]

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
 from evsplat.camera import Camera
 from evsplat.capture.distortion import COEFFICIENT_COUNTS, Distortion
 from evsplat.capture.fields import MISSING, RENAME, Fields, brief, is_whole
@@ -16,6 +17,7 @@ from evsplat.capture.metadata import EventsEntry, Frame, Metadata, NovelView
 from evsplat.errors import DataError
 from evsplat.files import read_json
 from evsplat.names import NAME_RULE, is_name
+from evsplat.pictures.light import TRANSFERS, Transfer
 
 FORMAT = "evsplat-capture"
 VERSION = 1
@@ -69,7 +71,7 @@ class _Parser:
     def parse(self, document: dict[str, Any]) -> Metadata:
         known = ("format", "version", "name", "cameras", "frames", "novel_views", "body", "events")
         top = self.fields("", document, (*known, "provenance"))
-        cameras, distortions = self.cameras(top)
+        cameras, distortions, transfers = self.cameras(top)
         frames = self.frames(top, cameras)
         body = self.body(top)
         provenance = document.get("provenance", {})
@@ -79,10 +81,12 @@ class _Parser:
             name=top.name("name"),
             cameras=cameras,
             distortions=distortions,
+            transfers=transfers,
             frames=frames,
             novel_views=self.novel_views(top, cameras, frames),
             body_file=body_file or self.path / "body.npz",
             body_model=self.body_model(body) if body else "",
+            body_source=self.body_source(body) if body else None,
             events=self.events(document),
             provenance=provenance if isinstance(provenance, dict) else {"text": str(provenance)},
         )
@@ -90,15 +94,18 @@ class _Parser:
     def fields(self, where: str, value: Any, known: tuple[str, ...]) -> Fields:
         return Fields(self.file, where, value, known, self.findings)
 
-    def cameras(self, top: Fields) -> tuple[dict[str, Camera], dict[str, Distortion]]:
+    def cameras(
+        self, top: Fields
+    ) -> tuple[dict[str, Camera], dict[str, Distortion], dict[str, Transfer]]:
         cameras: dict[str, Camera] = {}
         distortions: dict[str, Distortion] = {}
+        transfers: dict[str, Transfer] = {}
         entries = top.get("cameras")
         if not isinstance(entries, dict) or not entries:
             if entries is not None:
                 top.fail("cameras", brief(entries), "at least one named camera", "Add a camera.")
-            return cameras, distortions
-        keys = ("width", "height", "K", "world_to_camera", "distortion")
+            return cameras, distortions, transfers
+        keys = ("width", "height", "K", "world_to_camera", "distortion", "transfer")
         for name, value in entries.items():
             if not is_name(name):
                 top.fail("cameras", brief(name), f"names: {NAME_RULE}", RENAME)
@@ -106,14 +113,16 @@ class _Parser:
             entry = self.fields(f"cameras.{name}", value, keys)
             width, height = self.pixels(entry, "width"), self.pixels(entry, "height")
             K, pose = self.intrinsics(entry), self.rigid(entry, "world_to_camera")
-            coefficients = self.distortion(entry)
+            coefficients, transfer = self.distortion(entry), self.transfer(entry)
             if not entry.valid or K is None or pose is None:
                 continue
             K32 = torch.from_numpy(K.astype(np.float32))
             cameras[name] = Camera(width, height, K32, pose)
             if coefficients and any(coefficients):
                 distortions[name] = Distortion(width, height, K, coefficients)
-        return cameras, distortions
+            if transfer is not None:
+                transfers[name] = transfer
+        return cameras, distortions, transfers
 
     def pixels(self, entry: Fields, key: str) -> int:
         """A side of the camera's pictures."""
@@ -179,6 +188,13 @@ class _Parser:
             )
         entry.valid &= inner.valid
         return tuple(float(c) for c in coefficients) if inner.valid else None
+
+    def transfer(self, entry: Fields) -> Transfer | None:
+        value = entry.get("transfer", None)
+        if value is None or value in TRANSFERS:
+            return value
+        entry.fail("transfer", brief(value), f"one of {list(TRANSFERS)}", "Correct it.")
+        return None
 
     def frames(self, top: Fields, cameras: dict[str, Camera]) -> tuple[Frame, ...]:
         entries = top.entries("frames")
@@ -333,16 +349,24 @@ class _Parser:
                 "body",
                 "null: no body",
                 "a body and its poses",
-                "All methods need them and will refuse this capture.",
+                "All methods need them; 'evsplat poses' finds them.",
             )
             return None
-        return self.fields("body", top.get("body"), ("file", "model")) if top.has("body") else None
+        keys = ("file", "model", "source")
+        return self.fields("body", top.get("body"), keys) if top.has("body") else None
 
     def body_model(self, body: Fields) -> str:
         model = body.text("model")
         if body.valid and model not in BODY_MODELS:
             body.fail("model", repr(model), f"one of {list(BODY_MODELS)}", "Correct it.")
         return model
+
+    def body_source(self, body: Fields) -> PoseSource | None:
+        source = body.get("source", None)
+        if source is None or source in POSE_SOURCES:
+            return source
+        body.fail("source", brief(source), f"one of {list(POSE_SOURCES)}", "Correct it.")
+        return None
 
     def events(self, document: dict[str, Any]) -> EventsEntry | None:
         value = document.get("events")

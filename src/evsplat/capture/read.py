@@ -17,6 +17,7 @@ from evsplat.capture.points import read_points
 from evsplat.errors import DataError
 from evsplat.events import EventStore
 from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_rgb, to_unit_range
+from evsplat.pictures.light import Transfer
 
 IMAGE_CACHE_BYTES = 512 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
@@ -73,6 +74,10 @@ class CaptureReader:
         if frame.world_to_camera is None:
             return camera
         return Camera(camera.width, camera.height, camera.K, frame.world_to_camera)
+
+    def transfer(self, frame: Frame | str) -> Transfer:
+        """From the values of a frame's pictures to light; the power curve where nothing is said."""
+        return self._metadata.transfers.get(self._frame(frame).camera, "power")
 
     def is_distorted(self, camera: str) -> bool:
         """True where the lens of a camera distorts, which reading pictures and events undoes."""
@@ -143,11 +148,14 @@ class CaptureReader:
         """The body and its key poses as stored; a `DataError` where there are none."""
         if not self.has_body:
             raise DataError(
-                f"{self.path / 'capture.json'}: has no body; write body.npz with the poses and "
-                "name it under 'body' (docs/capture-format.md)."
+                f"{self.path / 'capture.json'}: has no body; find the person's poses with: evsplat "
+                f"poses {self.path} --out NEW; or write body.npz and name it under 'body' "
+                "(docs/capture-format.md)."
             )
         path = self._metadata.body_file
-        return body_from_arrays(path, read_arrays(path), self._metadata.body_model)
+        metadata = self._metadata
+        arrays = read_arrays(path)
+        return body_from_arrays(path, arrays, metadata.body_model, metadata.body_source)
 
     @functools.cached_property
     def dense_body_file(self) -> BodyFile | None:

@@ -1,5 +1,7 @@
 """Clock and contrast thresholds of a capture's event sensor, from its frames and events."""
 
+import logging
+
 from evsplat.calibration import (
     MOST_PAIRS,
     SensorEstimate,
@@ -8,7 +10,38 @@ from evsplat.calibration import (
     pair,
     pair_indices,
 )
+from evsplat.capture.capture import Capture
 from evsplat.capture.training_capture import TrainingCapture
+
+logger = logging.getLogger(__name__)
+
+
+LIKELY_LARGEST = 0.6
+"""Sensors' thresholds lie between 0.1 and 0.5; frames that are light and are taken as coded by the
+power curve make them look 2.2 times as large."""
+
+
+def looks_linear(capture: Capture | TrainingCapture, estimate: SensorEstimate | None) -> bool:
+    """True where fitted thresholds are so large that the frames are likely to hold linear light."""
+    if estimate is None or estimate.thresholds is None:
+        return False
+    fitted = estimate.thresholds
+    coded = capture.transfer(capture.frames[0]) != "linear"
+    return coded and (fitted.plus + fitted.minus) / 2 > LIKELY_LARGEST
+
+
+def warn_of_linear_frames(capture: TrainingCapture, estimate: SensorEstimate | None) -> None:
+    """Log that frames look linear where their values are taken as coded."""
+    if looks_linear(capture, estimate):
+        assert estimate is not None and estimate.thresholds is not None
+        fitted = estimate.thresholds
+        logger.warning(
+            "%s: the contrast fitted to frames and events is %.2f / %.2f, expected 0.1 to 0.5: the "
+            'frames look linear; if they are, write "transfer": "linear" into their camera.',
+            capture.path / "capture.json",
+            fitted.plus,
+            fitted.minus,
+        )
 
 
 def estimate_sensor(capture: TrainingCapture) -> SensorEstimate | None:
@@ -29,6 +62,9 @@ def estimate_sensor(capture: TrainingCapture) -> SensorEstimate | None:
     pairs = []
     for both in pair_indices(spans, MOST_PAIRS, stretch=stretch):
         start, end = stretch[both[0]]
-        before, after = (exposure(capture.image(frames[i]), spans[i]) for i in both)
+        before, after = (
+            exposure(capture.image(frames[i]), spans[i], transfer=capture.transfer(frames[i]))
+            for i in both
+        )
         pairs.append(pair(before, after, (max(start, first), min(end, last))))
     return estimate_from_pairs(pairs, capture.events)

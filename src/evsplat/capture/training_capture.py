@@ -20,6 +20,7 @@ from evsplat.capture.policy import Policy
 from evsplat.capture.read import CaptureReader
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS, EventStore, Span
+from evsplat.pictures.light import Transfer
 
 _KEPT_MASKS = 64
 """Estimated masks kept in memory; the least recently used one goes first."""
@@ -107,6 +108,10 @@ class TrainingCapture:
         """The pinhole camera of any frame, held out or not (`Capture.camera`)."""
         return self._source.camera(self._name(frame))
 
+    def transfer(self, frame: Frame | str) -> Transfer:
+        """From the values of a frame's pictures to light (`Capture.transfer`)."""
+        return self._source.transfer(self._name(frame))
+
     @property
     def is_static_camera(self) -> bool:
         """True where all frames come from one camera that stands still."""
@@ -169,9 +174,7 @@ class TrainingCapture:
                 f"{file.path}: every key pose lies in a held-out interval, so that training sees "
                 "none; give poses of the training frames."
             )
-        return replace(
-            file, times_us=file.times_us[kept], poses=file.poses[kept], transl=file.transl[kept]
-        )
+        return file.at_keys(kept)
 
     @property
     def dense_body_file(self) -> BodyFile | None:

@@ -12,6 +12,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evsplat.body.pose_errors import PoseSource
 from evsplat.capture.body_file import RIG_ARRAYS
 from evsplat.capture.parse import FORMAT, VERSION, default_split
 from evsplat.capture.points import write_points
@@ -21,6 +22,7 @@ from evsplat.events import EventStream, write_events
 from evsplat.files import read_json, write_json
 from evsplat.names import checked_name
 from evsplat.pictures.files import image_size, write_image
+from evsplat.pictures.light import Transfer
 
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
@@ -88,10 +90,12 @@ class CaptureWriter:
         world_to_camera: ArrayLike | None = None,
         *,
         distortion: Sequence[float] | None = None,
+        transfer: Transfer | None = None,
     ) -> None:
         """Declare a camera: size in pixels, K (3, 3), pose (4, 4; identity where it moves).
 
-        ``distortion`` holds OpenCV's k1, k2, p1, p2 (k3 (k4, k5, k6)) of the pictures as given.
+        ``distortion`` holds OpenCV's k1, k2, p1, p2 (k3 (k4, k5, k6)) of the pictures as given,
+        ``transfer`` the curve from their values to light; None: the power curve, exponent 2.2.
         """
         checked_name(name, "a camera")
         pose = np.eye(4) if world_to_camera is None else world_to_camera
@@ -104,6 +108,7 @@ class CaptureWriter:
             "K": _numbers(K),
             "world_to_camera": _numbers(pose),
             "distortion": lens,
+            **({} if transfer is None else {"transfer": transfer}),
         }
 
     def add_frame(
@@ -120,10 +125,10 @@ class CaptureWriter:
     ) -> str:
         """Add the next frame and give its split; frames of a camera come in the order of time.
 
-        Pictures are arrays (H, W) or (H, W, 3), sRGB-coded: uint8, uint16 or floats in [0, 1]
-        (stored as 8 bit), or the path of a PNG, JPEG or WebP file that is copied as it is. ``mask``
-        is (H, W), the share of the person; booleans will do. Without ``split``, frames whose index
-        modulo 10 is 7, 8 or 9 are test.
+        Pictures are arrays (H, W) or (H, W, 3), coded as the camera says: uint8, uint16 or floats
+        in [0, 1] (stored as 8 bit), or the path of a PNG, JPEG or WebP file that is copied as it
+        is. ``mask`` is (H, W), the share of the person; booleans will do. Without ``split``, frames
+        whose index modulo 10 is 7, 8 or 9 are test.
         """
         checked_name(name, "a frame")
         index = len(self._frames)
@@ -161,12 +166,16 @@ class CaptureWriter:
         betas: ArrayLike | None = None,
         gender: str | None = None,
         dense: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
+        source: PoseSource | None = None,
+        pose_std_rad: ArrayLike | None = None,
+        transl_std_m: ArrayLike | None = None,
     ) -> None:
         """Give the body and its key poses: times (P,), poses (P, J, 3), root shifts (P, 3).
 
         A "rig" brings ``rig`` with the arrays of docs/capture-format.md, the other models
         ``betas`` (and ``gender``, all but "default"). ``dense`` are times, poses and shifts of the
-        truth between key poses, for evaluation only.
+        truth between key poses, for evaluation only. ``source`` says where the key poses come from;
+        ``pose_std_rad`` (P, J) and ``transl_std_m`` (P, 3), how far they err (`PoseErrors`).
         """
         arrays: dict[str, Any] = {"model": model, **_poses(times_us, poses, transl)}
         if rig is not None:
@@ -175,14 +184,30 @@ class CaptureWriter:
             arrays["betas"] = np.asarray(betas, dtype=np.float64).ravel()
         if gender is not None:
             arrays["gender"] = gender
+        for key, value in (("pose_std_rad", pose_std_rad), ("transl_std_m", transl_std_m)):
+            if value is not None:
+                arrays[key] = np.asarray(value, dtype=np.float32)
         _save_arrays(self._root / "body.npz", arrays)
         self._body = {"file": "body.npz", "model": model}
+        if source is not None:
+            self._body["source"] = source
         if dense is not None:
             _save_arrays(self._root / "body_dense.npz", _poses(*dense))
 
     def leave_out_body(self) -> None:
-        """Say that nobody has posed the person yet; without this a capture needs `set_body`."""
+        """Say that nobody has posed the person yet; without this a capture needs `set_body`.
+
+        What `set_body` was given before is taken back.
+        """
+        for name in ("body.npz", "body_dense.npz"):
+            (self._root / name).unlink(missing_ok=True)
+        self._body = None
         self._without_body = True
+
+    @property
+    def has_body(self) -> bool:
+        """True where `set_body` gave a body."""
+        return self._body is not None
 
     def set_events(
         self,
@@ -321,6 +346,7 @@ def read_camera(
         "K": _matrix(path, entry, "K", 3),
         "world_to_camera": pose,
         "distortion": lens.get("coefficients") if isinstance(lens, dict) else lens,
+        "transfer": entry.get("transfer"),
     }
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.options import ReadOptions, StageSettings, SynthesisSettings
+from evsplat.options import PoseSearch, ReadOptions, StageSettings, SynthesisSettings
 from evsplat.options.declare import (
     FLAT,
     CaptureFolder,
@@ -106,6 +106,10 @@ class Synthesize:
     """Rate at which footage was shot."""
     body: Annotated[Path | None, option("NPZ", default="none")] = None
     """Poses as in body.npz."""
+    pose_source: Annotated[
+        Literal["exact", "markers", "estimated"] | None, option("KIND", default="unknown")
+    ] = None
+    """Where the poses of --body come from."""
     camera: Annotated[Path | None, option("JSON", default="a nominal one")] = None
     """Camera as in capture.json."""
     overwrite: Flag = False
@@ -121,6 +125,7 @@ class Synthesize:
             weights=self.weights,
             source_fps=self.source_fps,
             body=self.body,
+            pose_source=self.pose_source,
             camera=self.camera,
             overwrite=self.overwrite,
         )
@@ -226,6 +231,34 @@ class Masks:
         policy = Policy(use=self.use)
         written = mask_capture(self.capture, out, method=self.method, policy=policy, **options)
         print(f"written: {written}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Poses:
+    """Find the person's poses in a capture; write one with them.
+
+    They are found in its pictures and events, offline (docs/poses.md).
+
+    What is held out is neither looked at nor followed, unless told so.
+    """
+
+    capture: CaptureFolder
+    out: Annotated[Path, option("FOLDER")]
+    """The new capture; poses.html in it shows what was found."""
+    search: Annotated[PoseSearch, FLAT]
+    keypoints: Annotated[Path | None, option("FILE", default="found by the network")] = None
+    """Key points of COCO (17, 133), OpenPose (25) or BlazePose (33)."""
+    threads: Threads = None
+
+    def __call__(self) -> None:
+        import torch
+
+        from evsplat.posing import find_poses
+
+        if self.threads is not None:
+            torch.set_num_threads(self.threads)
+        found = find_poses(self.capture, self.out, self.search, keypoints=self.keypoints)
+        print(found.summary)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -139,10 +139,10 @@ def _opencv() -> Check:
 
 
 def _super_slomo() -> Check:
-    from evsplat.synthesis.super_slomo import find_checkpoint
+    from evsplat.synthesis.super_slomo import CHECKPOINT
 
     try:
-        return Check("Super SloMo", "ok", f"weights {find_checkpoint()}")
+        return Check("Super SloMo", "ok", f"weights {CHECKPOINT.find()}")
     except WeightsError as error:
         return Check("Super SloMo", "optional", str(error))
 

@@ -22,7 +22,7 @@ class _Import:
     """The import of a kind of source."""
 
     source: Annotated[tyro.conf.Positional[Path], option("SOURCE")]
-    """Folder of the data (docs/import.md shows each tree)."""
+    """Folder, video or recording (docs/import.md shows each)."""
     out: Annotated[Path, option("CAPTURE")]
     """Capture to write."""
     smpl: Annotated[Path | None, option("PATH", default="EVSPLAT_BODY_MODELS")] = None

@@ -22,6 +22,7 @@ _VERBS: dict[str, Callable[..., Any]] = {
     "stage": captures.Stage,
     "inspect": captures.Inspect,
     "masks": captures.Masks,
+    "poses": captures.Poses,
     "restore": captures.Restore,
     "settings": runs.Settings,
     "train": runs.Train,

@@ -20,7 +20,7 @@ from evsplat.options.declare import (
     Threads,
     option,
 )
-from evsplat.options.runs import Kind
+from evsplat.options.runs import Kind, Split
 from evsplat.shipped import demo_capture
 
 _REGIONS = ("full", "person_crop", "person_mask")
@@ -111,6 +111,8 @@ class Evaluate:
     """Measure a run on its test frames: metrics.json, tables, pictures, report.html."""
 
     run: RunFolder
+    split: Annotated[Split, option("SPLIT")] = "test"
+    """Frames to measure: test, or train (then metrics_train.json and so on)."""
     lpips_weights: Annotated[Path | None, option("FILE", default="torch hub cache")] = None
     """Backbone weights for LPIPS; without any it stays empty, with the reason."""
     device: Device = "auto"
@@ -119,8 +121,11 @@ class Evaluate:
     def __call__(self) -> None:
         from evsplat.evaluation.run import evaluate_run, write_report
 
-        metrics = evaluate_run(self.run, lpips_weights=self.lpips_weights, device=self.device)
-        _print_summary(metrics, run=self.run, report=write_report(self.run))
+        metrics = evaluate_run(
+            self.run, lpips_weights=self.lpips_weights, device=self.device, split=self.split
+        )
+        report = write_report(self.run, split=self.split)
+        _print_summary(metrics, run=self.run, report=report)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,11 +134,13 @@ class Report:
 
     run: Annotated[Positional[Path], option("RUN")]
     """Run folder with metrics.json (made by 'evsplat evaluate')."""
+    split: Annotated[Split, option("SPLIT")] = "test"
+    """Frames whose figures it shows: test, or train ('evsplat evaluate --split train')."""
 
     def __call__(self) -> None:
         from evsplat.evaluation.run import write_report
 
-        print(f"report: {write_report(self.run)}")
+        print(f"report: {write_report(self.run, split=self.split)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,9 +242,10 @@ def summary_table(metrics: dict[str, Any]) -> str:
 
     The last row is what the camera itself took at those times, which no method sees.
     """
+    from evsplat.evaluation.splits import count_of, words_of
     from evsplat.evaluation.tables import composited, terms
 
-    if metrics["frames"]["test"] == 0:
+    if not count_of(metrics):
         return f"No test figures. {terms(metrics)}"
     rows = {
         metrics["method"]: metrics["protocols"]["standard"],
@@ -247,7 +255,8 @@ def summary_table(metrics: dict[str, Any]) -> str:
     }
     width = max(map(len, rows))
     head = "".join(f"{region.replace('_', ' '):>18}" for region in _REGIONS)
-    lines = [f"PSNR dB / SSIM on the test frames, protocol 'standard'\n{'':{width}}{head}"]
+    frames = words_of(metrics).title.lower()
+    lines = [f"PSNR dB / SSIM on the {frames}, protocol 'standard'\n{'':{width}}{head}"]
     for name, regions in rows.items():
         cells = "".join(f"{_cell(regions[region]):>18}" for region in _REGIONS)
         lines.append(f"{name:{width}}{cells}")

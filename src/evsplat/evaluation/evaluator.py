@@ -1,4 +1,4 @@
-"""One evaluator for all methods: figures, pictures and tables of a reconstruction's test frames."""
+"""One evaluator for all methods: figures and pictures of a reconstruction's test frames."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -31,6 +31,7 @@ from evsplat.evaluation.regions import Absent, HumanRegions
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
 from evsplat.names import file_stem
+from evsplat.options.runs import Split
 from evsplat.pictures import error_map, to_bytes
 from evsplat.pictures.files import save_png
 from evsplat.similarity.lpips import load_lpips
@@ -61,6 +62,7 @@ def evaluate(
     device: torch.device | str = "cpu",
     test_frames_only: bool = False,
     human_only: bool = False,
+    split: Split = "test",
 ) -> dict[str, Any]:
     """Measure ``reconstruction`` on the test frames and novel views of ``capture``.
 
@@ -69,40 +71,48 @@ def evaluate(
     their keys. ``human_only`` says that the reconstruction draws a person on black: it is measured
     once more before the median background ("composited", by protocol), since against a full frame
     the black alone decides.
-    Every figure is a mean over test frames of per-frame values. What cannot be measured is None,
+    ``split="train"`` measures the training frames instead, which needs their sharp truth, and no
+    events; the nearest training frame is then the frame itself and has no row.
+    Every figure is a mean over frames of per-frame values. What cannot be measured is None,
     with the reason under "reasons" (a path of keys). Pictures are handled one by one, so that
     memory does not grow with the length of the recording.
+
+    Raises:
+        DataError: no training frame has a sharp truth and ``split`` is "train".
     """
+    frames = _frames_of(capture, split)
     out_dir = Path(out_dir)
     networks, weights = _load_networks(lpips_weights, device)
     protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
     human_regions = HumanRegions(capture)
-    test = _TestFrames(
+    measured = _MeasuredFrames(
         capture,
         reconstruction,
         protocols,
         networks,
         human_regions,
         out_dir,
+        split=split,
         only=test_frames_only,
         human_only=human_only,
     )
-    for frame in tqdm(
-        capture.test_frames, desc="test frames", unit="frame", leave=False, disable=None
-    ):
-        test.measure(frame)
+    for frame in tqdm(frames, desc=f"{split} frames", unit="frame", leave=False, disable=None):
+        measured.measure(frame)
     result = {
         "capture": capture.name,
         "method": reconstruction.name,
+        "split": split,
         "frames": {"train": len(capture.train_frames), "test": len(capture.test_frames)},
-        **test.results(),
+        **measured.results(),
     }
     reasons: dict[str, str] = result["reasons"]
     if not test_frames_only:
         result["novel_views"] = _novel_views(
-            capture, reconstruction, networks, human_regions, out_dir, reasons
+            capture, reconstruction, networks, human_regions, out_dir, reasons, split
         )
-        events = evaluate_event_maps(capture, reconstruction, out_dir=out_dir)
+        events: dict[str, Any] | Absent = Absent("they are measured with the test frames")
+        if split == "test":
+            events = evaluate_event_maps(capture, reconstruction, out_dir=out_dir)
         result["events"] = None if isinstance(events, Absent) else events
         if isinstance(events, Absent):
             reasons["events"] = events.reason
@@ -111,9 +121,26 @@ def evaluate(
     return result
 
 
+def _frames_of(capture: Capture, split: Split) -> tuple[Frame, ...]:
+    """The frames of a split; a `DataError` where no training frame has a truth.
+
+    Held-out frames without truth have at least pictures to look at.
+    """
+    if split == "test":
+        return capture.test_frames
+    frames = capture.train_frames
+    if all(frame.sharp is None for frame in frames):
+        raise DataError(
+            f"{capture.path / 'capture.json'}: none of the {len(frames)} training "
+            "frames names a sharp picture, expected the truth to measure them against; captures of "
+            "'evsplat stage' and 'evsplat synthesize' have it. Measure the test frames instead."
+        )
+    return frames
+
+
 @dataclass(eq=False)
-class _TestFrames:
-    """All rows and protocols over the test frames."""
+class _MeasuredFrames:
+    """All rows and protocols over the frames of a split."""
 
     capture: Capture
     reconstruction: Reconstruction
@@ -122,6 +149,7 @@ class _TestFrames:
     networks: Networks
     human_regions: HumanRegions
     out_dir: Path
+    split: Split
     only: bool
     """Measure the reconstruction alone, and no other rows."""
     human_only: bool
@@ -136,15 +164,19 @@ class _TestFrames:
                 **{name: _picture_of(kind, self.capture) for name, kind in TRIVIAL.items()},
                 BLURRY_INPUT: self.capture.image,
             }
+            if self.split == "train":
+                del self._others["nearest_frame"]
         rows = ("method", *self._others)
         self._means = {(row, p.name): MetricMeans() for row in rows for p in self.protocols}
         self._against_blurry = MetricMeans()
         self._per_frame: list[dict[str, Any]] = []
+        self._nobody = True
 
     def measure(self, frame: Frame) -> None:
-        """Measure one test frame and write its pictures."""
+        """Measure one frame and write its pictures."""
         ours = _render(self.capture, self.reconstruction, frame)
         mask, human = self.human_regions.in_frame(frame)
+        self._nobody &= isinstance(human, Absent)
         truth = None if frame.sharp is None else self.capture.sharp(frame)
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
@@ -174,6 +206,10 @@ class _TestFrames:
 
     def results(self) -> dict[str, Any]:
         """Means of everything; "trivial" and "blurry_input" are of the protocol standard."""
+        if self._nobody and self._per_frame:
+            logger.warning(
+                "%s: the person is in no test frame; check camera and poses.", self.capture.path
+            )
         reasons: dict[str, str] = {}
 
         def means(frames: MetricMeans, path: str) -> dict[str, Any]:
@@ -197,7 +233,11 @@ class _TestFrames:
             return {**method, **frames}
         return {
             **method,
-            "trivial": {name: row(name, STANDARD, f"trivial.{name}") for name in TRIVIAL},
+            "trivial": {
+                name: row(name, STANDARD, f"trivial.{name}")
+                for name in TRIVIAL
+                if name in self._others
+            },
             BLURRY_INPUT: row(BLURRY_INPUT, STANDARD, BLURRY_INPUT),
             "compat_rows": {
                 p.name: {
@@ -216,7 +256,7 @@ class _TestFrames:
         }
 
     def _save(self, frame: Frame, ours: Tensor, truth: Tensor | None) -> dict[str, str]:
-        stem = file_stem("test", frame.name)
+        stem = file_stem(self.split, frame.name)
         pictures = {"render": to_bytes(ours)}
         if truth is not None:
             pictures["error"] = error_map(ours, truth)
@@ -238,13 +278,17 @@ def _novel_views(
     human_regions: HumanRegions,
     out_dir: Path,
     reasons: dict[str, str],
+    split: Split,
 ) -> dict[str, Any]:
-    """Standard figures of cameras that took no part in the training; empty where there are none."""
+    """Standard figures of cameras that took no part in the training; empty where there are none.
+
+    Beside training frames only views of their times count.
+    """
+    train = {frame.name for frame in capture.train_frames}
+    views = [view for view in capture.novel_views if split == "test" or view.frame in train]
     means_by_camera: dict[str, MetricMeans] = {}
     per_view: dict[str, list[dict[str, Any]]] = {}
-    for view in tqdm(
-        capture.novel_views, desc="novel views", unit="picture", leave=False, disable=None
-    ):
+    for view in tqdm(views, desc="novel views", unit="picture", leave=False, disable=None):
         camera = capture.cameras[view.camera]
         ours: Tensor | None = None
         try:

@@ -86,7 +86,9 @@ def _maps(
     first, second = (
         drawn(reconstruction, capture.camera(frame), frame.mid_us) for frame in (before, after)
     )
-    change = log_brightness_change(first.clamp(0, 1), second.clamp(0, 1)).float()
+    change = log_brightness_change(
+        first.clamp(0, 1), second.clamp(0, 1), transfer=capture.transfer(before)
+    ).float()
     return given, change / _threshold(capture, given, change)
 
 

@@ -8,18 +8,26 @@ from evsplat.config import to_dict
 from evsplat.evaluation.evaluator import evaluate
 from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import name_of
 from evsplat.evaluation.tables import write_tables
 from evsplat.files import write_json, write_text
+from evsplat.options.runs import Split
 from evsplat.render import choose_device
 from evsplat.training.run import load_run
 
 
 def evaluate_run(
-    run_dir: Path | str, *, lpips_weights: Path | str | None = None, device: str = "auto"
+    run_dir: Path | str,
+    *,
+    lpips_weights: Path | str | None = None,
+    device: str = "auto",
+    split: Split = "test",
 ) -> dict[str, Any]:
     """Measure a trained run and write metrics.json, metrics.md, metrics.tex and pictures/.
 
-    ``device`` is where it is drawn and compared, not where it was trained.
+    ``device`` is where it is drawn and compared, not where it was trained. ``split="train"``
+    measures the training frames against their sharp truth; its files are metrics_train.json and so
+    on, beside those of the test frames.
     """
     start = time.monotonic()
     device = choose_device(device)
@@ -31,6 +39,7 @@ def evaluate_run(
         lpips_weights=lpips_weights,
         device=device,
         human_only=run.human_only,
+        split=split,
     )
     metrics = {
         "capture": measured.pop("capture"),
@@ -43,17 +52,18 @@ def evaluate_run(
         "policy": to_dict(run.policy),
         **measured,
     }
-    write_json(Path(run.path) / "metrics.json", metrics)
+    write_json(Path(run.path) / name_of("metrics", split, ".json"), metrics)
     write_tables(Path(run.path), metrics)
     return metrics
 
 
-def write_report(run_dir: Path | str) -> Path:
-    """Write report.html of an evaluated run and return its path.
+def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
+    """Write report.html (report_train.html) of an evaluated run and return its path.
 
     Figures and rendered pictures come from what `evaluate_run` wrote; the clip is drawn anew.
     """
     run = load_run(Path(run_dir))
-    path = Path(run_dir) / "report.html"
-    write_text(path, page(Source.read(Path(run_dir), run.capture, run.reconstruction)))
+    path = Path(run_dir) / name_of("report", split, ".html")
+    source = Source.read(Path(run_dir), run.capture, run.reconstruction, split)
+    write_text(path, page(source))
     return path

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from evsplat.capture.policy import policy_of
+from evsplat.evaluation.splits import count_of, name_of, split_of, words_of
 from evsplat.files import write_text
 
 ROW_TITLES = {
     "on_median_background": "the same person on the median background",
     "median_background": "median background (trivial)",
     "nearest_frame": "nearest training frame (trivial)",
-    "blurry_input": "blurry input itself (no method sees it)",
 }
 REGION_TITLES = {"full": "full frame", "person_crop": "person crop", "person_mask": "person mask"}
 METRIC_TITLES = {
@@ -117,6 +117,7 @@ class Table:
 
 def tables_of(metrics: dict[str, Any]) -> list[Table]:
     """One table per protocol, `standard` first; with other rows where they were measured."""
+    titles = ROW_TITLES | {"blurry_input": words_of(metrics).blurry_input}
     tables = []
     for protocol, ours in metrics["protocols"].items():
         if protocol == "standard":
@@ -127,11 +128,17 @@ def tables_of(metrics: dict[str, Any]) -> list[Table]:
             others = metrics.get("compat_rows", {}).get(protocol, {})
         rows = {metrics["method"]: ours, **others}
         note = f"{metrics['protocol_notes'][protocol]}."
-        tables.append(_table(f"Protocol {protocol}", note, rows, metrics["method"]))
+        tables.append(_table(f"Protocol {protocol}", note, rows, titles, metrics["method"]))
     return tables
 
 
-def _table(title: str, note: str, rows: dict[str, Any], method: str | None = None) -> Table:
+def _table(
+    title: str,
+    note: str,
+    rows: dict[str, Any],
+    titles: dict[str, str],
+    method: str | None = None,
+) -> Table:
     """Rows of region -> metric -> value; columns without any figure are left out."""
     columns = [
         (region, metric)
@@ -145,7 +152,7 @@ def _table(title: str, note: str, rows: dict[str, Any], method: str | None = Non
         values = [row[region][metric] for region, metric in columns]
         figures = (None if v is None else Figure(v, competes=competes) for v in values)
         kind = "aside" if name == "blurry_input" else "ours" if name == method else "other"
-        lines.append(Row(ROW_TITLES.get(name, name), tuple(figures), kind))
+        lines.append(Row(titles.get(name, name), tuple(figures), kind))
     return Table(title, note, tuple(Heading.of(*column) for column in columns), tuple(lines))
 
 
@@ -168,16 +175,19 @@ def missing_networks(metrics: dict[str, Any]) -> list[str]:
 
 
 def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
-    """Write metrics.md and metrics.tex."""
-    count = metrics["frames"]["test"]
+    """Write metrics.md and metrics.tex, or those of training frames (metrics_train.md ...)."""
+    count, words, split = count_of(metrics), words_of(metrics), split_of(metrics)
     tables = tables_of(metrics) if count else []
-    if metrics["novel_views"]:
-        tables.append(_table("Novel views", "Protocol standard.", metrics["novel_views"]))
-    means = f"Means over {count} test frames against the sharp truth. " if count else ""
+    if views := metrics["novel_views"]:
+        tables.append(_table("Novel views", "Protocol standard.", views, {}))
+    frames = words.title.lower()
+    means = f"Means over {count} {frames} against the sharp truth. " if count else ""
     intro = f"{means}{terms(metrics)} {LEGEND.format(second='in italics')}"
     title = f"{metrics['method']} on {metrics['capture']}"
-    write_text(folder / "metrics.md", markdown(title, intro, tables, missing_networks(metrics)))
-    write_text(folder / "metrics.tex", f"% {terms(metrics)}\n{latex(tables)}")
+    page = markdown(title, intro, tables, missing_networks(metrics))
+    write_text(folder / name_of("metrics", split, ".md"), page)
+    page = f"% {words.title}. {terms(metrics)}\n{latex(tables)}"
+    write_text(folder / name_of("metrics", split, ".tex"), page)
 
 
 def markdown(title: str, intro: str, tables: Iterable[Table], notes: Sequence[str] = ()) -> str:

@@ -19,23 +19,12 @@ class EventRecording:
     def __init__(self, path: Path, format: str, source: Source, damage: Damage) -> None:
         self.path = path
         self.format = format
+        self.width, self.height = source.width, source.height
+        """Columns and rows of the sensor; None where neither the file nor the caller says."""
+        self.has_polarity = source.has_polarity
+        """False where the recording says only that something changed; p is 0 then."""
         self._source = source
         self._damage = damage
-
-    @property
-    def width(self) -> int | None:
-        """Columns of the sensor; None where neither the file nor the caller says."""
-        return self._source.width
-
-    @property
-    def height(self) -> int | None:
-        """Rows of the sensor; None where neither the file nor the caller says."""
-        return self._source.height
-
-    @property
-    def has_polarity(self) -> bool:
-        """False where the recording says only that something changed; p is 0 then."""
-        return self._source.has_polarity
 
     @property
     def notes(self) -> list[str]:

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.compiled import import_error, native
+from evsplat.compiled import native_for
 from evsplat.config import AtLeast, Within, check
-from evsplat.errors import BackendError, ConfigError, DataError
+from evsplat.errors import ConfigError, DataError
 from evsplat.events.stream import EventStream
 from evsplat.options.declare import Sensor, given
 from evsplat.pictures.light import luminance
@@ -123,10 +123,6 @@ class SensorSimulator:
     def __init__(
         self, width: int, height: int, settings: SensorSettings | None = None, seed: int = 0
     ) -> None:
-        if native is None:
-            raise BackendError(
-                f"The event simulator is not built ({import_error}); install evsplat with pip."
-            )
         if not (1 <= width <= 65_536 and 1 <= height <= 65_536):
             raise DataError(f"a sensor of {width}x{height} pixels: expected 1 to 65536 each way.")
         self.width = width
@@ -150,7 +146,7 @@ class SensorSimulator:
         hot = uniform[0] < settings.hot_pixel_fraction
         self.hot_hz = (settings.hot_pixel_hz * hot).astype(np.float32)
         leaks, has_hot = bool(settings.leak_hz), bool(self.hot_hz.any())
-        self._sensor = native.Sensor(
+        self._sensor = native_for("The event simulator").Sensor(
             self.contrast_on,
             self.contrast_off,
             # one ON event each time that the drift has covered the pixel's threshold

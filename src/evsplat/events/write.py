@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from shutil import copyfileobj
 from tempfile import TemporaryFile
-from types import TracebackType
 from typing import IO, Any
 
 import h5py
@@ -98,22 +97,8 @@ def write_events(
     return count
 
 
-class Writer(ABC):
-    """Takes sorted pieces one after the other."""
-
-    def __init__(self) -> None:
-        self._open = ExitStack()
-
-    def __enter__(self) -> "Writer":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._open.close()
+class Writer(ExitStack, ABC):
+    """Takes sorted pieces one after the other; closes its files at the end of a ``with``."""
 
     @abstractmethod
     def append(self, piece: EventStream) -> None:
@@ -135,7 +120,7 @@ class Hdf5Writer(Writer):
         self, path: Path, attributes: Mapping[str, object], compression_level: int
     ) -> None:
         super().__init__()
-        self._file = self._open.enter_context(h5py.File(path, "w"))
+        self._file = self.enter_context(h5py.File(path, "w"))
         self._count = self._offset = self._next_ms = 0
         self._index: list[np.ndarray] = []
         packing: dict[str, Any] = {
@@ -181,7 +166,7 @@ class NpzWriter(Writer):
         self._count = 0
         # the header of an array says its length, which is known at the end
         self._columns: dict[str, tuple[IO[bytes], np.dtype]] = {
-            name: (self._open.enter_context(TemporaryFile(dir=path.parent)), np.dtype(kind))
+            name: (self.enter_context(TemporaryFile(dir=path.parent)), np.dtype(kind))
             for name, kind in (("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1"))
         }
 
@@ -211,7 +196,7 @@ class CsvWriter(Writer):
 
     def __init__(self, path: Path, size: Size) -> None:
         super().__init__()
-        self._file = self._open.enter_context(open(path, "w", encoding="ascii", newline="\n"))
+        self._file = self.enter_context(open(path, "w", encoding="ascii", newline="\n"))
         self._names = ["t", "x", "y"] if size is None else ["t", f"x@{size[0]}", f"y@{size[1]}"]
         self._has_polarity: bool | None = None
 
@@ -241,7 +226,7 @@ class Evt2Writer(Writer):
     def __init__(self, path: Path, size: Size, name: Path) -> None:
         super().__init__()
         self._name = name
-        self._file = self._open.enter_context(open(path, "wb"))
+        self._file = self.enter_context(open(path, "wb"))
         self._high = -1
         lines = ["evt 2.0", "format EVT2" + (f";height={size[1]};width={size[0]}" if size else "")]
         lines += [f"geometry {size[0]}x{size[1]}"] if size else []

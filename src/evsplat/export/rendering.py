@@ -67,7 +67,8 @@ def render_run(
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)
     plan = FilmPlan.of(film, loaded.capture, loaded.reconstruction)
-    look = Look(film.show, film.parts, film.transparent)
+    transfer = loaded.capture.transfer(loaded.capture.frames[0])
+    look = Look(film.show, film.parts, film.transparent, transfer)
     trained = loaded.method, loaded.iteration, loaded.train_seconds
     digest = film_digest(plan.frames, look, film, *trained, *plan.poses)
     cache = FrameCache(out.with_name(out.name + ".partial"), digest)

@@ -11,7 +11,7 @@ from evsplat.camera import Camera
 from evsplat.errors import ConfigError
 from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import Shown
-from evsplat.pictures import decode, encode, luminance
+from evsplat.pictures import Transfer, decode, encode, luminance
 from evsplat.pictures.colours import colours
 from evsplat.training.run import GaussianReconstruction
 
@@ -31,6 +31,8 @@ class Look:
     parts: Parts = "all"
     transparent: bool = False
     """RGBA instead of black where nothing is; for ``rgb`` and ``semantic``."""
+    transfer: Transfer = "power"
+    """From the values that are drawn to light; read by ``events``."""
 
     def __post_init__(self) -> None:
         if self.transparent and self.shown not in ("rgb", "semantic"):
@@ -49,7 +51,7 @@ class Look:
         drawn = reconstruction.render(camera, times_us, parts=self.parts)
         rgb, alpha = drawn.rgb.cpu().clamp(0, 1), drawn.alpha.cpu().clamp(0, 1)
         if self.shown == "events":
-            coded = encode(luminance(decode(rgb)))
+            coded = encode(luminance(decode(rgb, self.transfer)))
             return list((coded * 65_535).round().clamp(0, 65_535).numpy().astype(np.uint16))
         if self.shown == "semantic":
             human = drawn.human.cpu().clamp(0, 1)[..., None]

@@ -1,6 +1,7 @@
 """A video file, decoded by FFmpeg (PyAV)."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -74,33 +75,16 @@ class VideoFootage:
             stream.thread_type = "AUTO"
             yield from container.decode(stream)
 
-    def _opened(self) -> "_Opened":
-        return _Opened(self.path)
-
-
-class _Opened:
-    """An open container and its video stream; what FFmpeg cannot read is a `DataError`."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> tuple[Any, Any]:
+    @contextmanager
+    def _opened(self) -> Iterator[tuple[Any, Any]]:
+        """The container and its video stream; what FFmpeg cannot read is a `DataError`."""
         try:
-            self.container = av.open(str(self.path))
+            with av.open(str(self.path)) as container:
+                if not container.streams.video:
+                    raise DataError(f"{self.path}: holds no video stream.")
+                yield container, container.streams.video[0]
         except (av.error.FFmpegError, OSError) as error:
-            raise self._unreadable(error) from error
-        if not self.container.streams.video:
-            self.container.close()
-            raise DataError(f"{self.path}: holds no video stream.")
-        return self.container, self.container.streams.video[0]
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        self.container.close()
-        if isinstance(error, av.error.FFmpegError):
-            raise self._unreadable(error) from error
-
-    def _unreadable(self, error: Exception) -> DataError:
-        return DataError(f"{self.path}: cannot be decoded as video ({error}).")
+            raise DataError(f"{self.path}: cannot be decoded as video ({error}).") from error
 
 
 def _pixels(frame: Any) -> np.ndarray:

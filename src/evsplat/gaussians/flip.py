@@ -62,17 +62,9 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames) 
 
 def carry(values: dict[str, Tensor], rows: Tensor, transforms: Float[Tensor, "M 4 4"]) -> None:
     """Apply rigid-like transforms to centres and rotations of some rows, in place."""
-    values["means"][rows], values["quaternions"][rows] = carried(
-        values["means"][rows], values["quaternions"][rows], transforms
-    )
-
-
-def carried(
-    means: Float[Tensor, "M 3"], quaternions: Float[Tensor, "M 4"], transforms: Tensor
-) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 4"]]:
-    """Centres and rotations after rigid-like transforms (M, 4, 4)."""
     turn = matrix_to_quaternion(transforms[:, :3, :3])
-    return applied(transforms, means), quaternion_multiply(turn, quaternions)
+    values["means"][rows] = applied(transforms, values["means"][rows])
+    values["quaternions"][rows] = quaternion_multiply(turn, values["quaternions"][rows])
 
 
 def to_world(frames: BodyFrames, means: Float[Tensor, "M 3"]) -> Float[Tensor, "M 4 4"]:

@@ -9,12 +9,16 @@ from typing import Any
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
 from evsplat.importers.base import Importer
+from evsplat.importers.davis import Davis
 from evsplat.importers.folder import Folder
 from evsplat.importers.mmhpsd import Mmhpsd
 from evsplat.importers.neuman import Neuman
 from evsplat.importers.people_snapshot import PeopleSnapshot
+from evsplat.importers.recorded import without_body
+from evsplat.importers.video import Video
 from evsplat.importers.zju_mocap import ZjuMocap
 from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
+from evsplat.inspection import warn_of_body
 from evsplat.options.declare import given
 
 __all__ = ["KINDS", "Blur", "Importer", "import_capture", "run_importer"]
@@ -28,6 +32,8 @@ KINDS: dict[str, type[Importer]] = {
     "people-snapshot": PeopleSnapshot,
     "zju-mocap-blur": ZjuMocapBlur,
     "folder": Folder,
+    "video": Video,
+    "davis": Davis,
 }
 
 
@@ -98,6 +104,9 @@ def run_importer(
         CaptureWriter(out, overwrite=overwrite)
     with CaptureWriter(first, overwrite=overwrite) as writer:
         notes = importer.write(source, writer, None if smpl is None else Path(smpl))
+        if importer.no_poses and writer.has_body:
+            notes = [note for note in notes if not note.startswith("body:")]
+            notes.append(without_body(writer))
     for note in notes:
         logger.info("%s", note)
     if blur is not None:
@@ -111,4 +120,5 @@ def run_importer(
             overwrite=overwrite,
             interpolation=blur.interpolation,
         )
+    warn_of_body(out)
     return out

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
 from evsplat.pictures.files import image_size, read_image
+from evsplat.pictures.light import Transfer
 
 GUIDE = "docs/import.md shows the tree"
 SHARP_EXPOSURE_US = 1_000
@@ -23,6 +24,9 @@ _ROTATION_TOLERANCE = 1e-2
 @dataclass(frozen=True, kw_only=True)
 class Importer:
     """Options of one kind of source; `write` turns the source into a capture."""
+
+    no_poses: bool = False
+    """Leave out poses that are there: the capture has no body."""
 
     blur_recipe: ClassVar[str | None] = None
     """Recipe of `evsplat.synthesize` that makes the paper's blurry version of this data set."""
@@ -44,7 +48,15 @@ class SourceCamera:
     world_to_camera: Float[np.ndarray, "4 4"]
     distortion: tuple[float, ...] | None = None
 
-    def add_to(self, writer: CaptureWriter, name: str, picture: Path, shrink: int) -> None:
+    def add_to(
+        self,
+        writer: CaptureWriter,
+        name: str,
+        picture: Path,
+        shrink: int,
+        *,
+        transfer: Transfer | None = None,
+    ) -> None:
         """Declare the camera with the size of one of its pictures, made smaller by ``shrink``."""
         width, height = image_size(picture)
         K = self.K.copy()
@@ -56,6 +68,7 @@ class SourceCamera:
             K,
             self.world_to_camera,
             distortion=self.distortion,
+            transfer=transfer,
         )
 
     def moved(self, world_from_new: Float[np.ndarray, "4 4"]) -> "SourceCamera":

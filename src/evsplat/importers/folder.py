@@ -1,6 +1,6 @@
 """Your own recording: pictures, events, poses of a tool and a camera, put together."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Int64
 from tqdm import tqdm
 
+from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence, read_poses
-from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
-from evsplat.capture.write import CaptureWriter, read_camera
+from evsplat.capture.body_file import BodyFile, read_arrays, stated_body
+from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
-from evsplat.events import open_recording
 from evsplat.footage import Footage, open_footage
 from evsplat.importers.base import (
     GUIDE,
@@ -22,7 +22,9 @@ from evsplat.importers.base import (
     human_mask,
     need,
 )
+from evsplat.importers.recorded import add_recorded_events, recorded_camera, without_body
 from evsplat.importers.smpl import add_body, chosen_poses
+from evsplat.pictures.light import Transfer
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -36,9 +38,16 @@ class Folder(Importer):
     events: Path | None = None
     """Event recording of any known format; by default SOURCE/events.* if there is one."""
     poses: Path | None = None
-    """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE."""
+    """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE, and
+    no body where there are none."""
+    pose_source: PoseSource | None = None
+    """Where the poses come from; by default what the tool is known for."""
     camera: Path | None = None
     """One camera as in capture.json; by default SOURCE/camera.json, else what the poses assume."""
+    focal: float | None = None
+    """Focal length in pixels, instead of a camera; without poses 60 degrees of view are guessed."""
+    transfer: Transfer | None = None
+    """From the values of the pictures to light: power (2.2), srgb, or linear as a DAVIS stores."""
     masks: Path | None = None
     """Masks of the person, named as the pictures; by default SOURCE/masks if there is one."""
     fps: float | None = None
@@ -67,8 +76,10 @@ class Folder(Importer):
         middles = exposures.sum(axis=1) // 2
         path = self._poses(source)
         size = footage.width, footage.height
-        motion = self._motion(path, size, smpl)
-        camera = self._camera(source, footage, motion)
+        motion = None if path is None else self._motion(path, size, smpl)
+        camera, focal, note = self._camera(source, size, motion)
+        if self.transfer is not None:
+            camera["transfer"] = self.transfer
         writer.add_camera("main", *size, **camera)
         seen = _frames_with_poses(motion, middles)
         views = _camera_poses(motion)
@@ -84,10 +95,21 @@ class Folder(Importer):
                 mask=human_mask(masks / f"{timed.name}.png"),
                 world_to_camera=views.get(index),
             )
-        notes = self._add_events(source, writer, size)
+        notes = add_recorded_events(
+            writer,
+            self.events or next(iter(sorted(source.glob("events.*"))), None),
+            size,
+            contrast=self.contrast,
+            clock_offset_us=self.clock_offset_us,
+            repair=self.repair,
+        )
+        notes += [note] if note else []
         if len(seen) < len(middles):
             notes.append(f"{len(middles) - len(seen)} pictures have no pose and were left out")
-        writer.provenance |= {"source": "own recording", "notes": notes, "poses": path.name}
+        writer.provenance |= {"source": "own recording", "focal": focal, "notes": notes}
+        if path is None or motion is None:
+            return [*notes, without_body(writer)]
+        writer.provenance["poses"] = path.name
         if isinstance(motion, PoseSequence):
             kept = sorted(seen)
             times = [int(middles[index]) for index in kept]
@@ -100,6 +122,9 @@ class Folder(Importer):
             rig=motion.rig,
             betas=motion.betas,
             gender=motion.gender,
+            source=motion.source,
+            pose_std_rad=motion.pose_std_rad,
+            transl_std_m=motion.transl_std_m,
         )
         return notes
 
@@ -145,69 +170,56 @@ class Folder(Importer):
         times = footage.times_us + self.start_us
         return np.array([exposure_around(int(time), self.exposure_us) for time in times])
 
-    def _poses(self, source: Path) -> Path:
+    def _poses(self, source: Path) -> Path | None:
+        """The poses; None where there are none, or none are wanted."""
+        if self.no_poses:
+            if self.poses is not None:
+                raise ConfigError(f"--no-poses: contradicts --poses {self.poses}; leave one out.")
+            return None
         if self.poses is not None:
             return need(self.poses, "the poses")
         found = sorted(source.glob("poses.*")) + [
             path for path in (source / "poses", source / "body.npz") if path.exists()
         ]
-        if not found:
-            raise DataError(
-                f"{source}: holds no poses.*, poses/ or body.npz, expected the person's poses; "
-                f"{GUIDE}."
-            )
-        return found[0]
+        return found[0] if found else None
 
     def _motion(
         self, path: Path, size: tuple[int, int], smpl: Path | None
     ) -> "PoseSequence | BodyFile":
         if path.name == "body.npz":
-            return body_from_arrays(path, read_arrays(path), "")
-        return read_poses(path, person=self.person, image_size=size, body_models=smpl)
+            return stated_body(path, read_arrays(path), self.pose_source)
+        sequence = read_poses(path, person=self.person, image_size=size, body_models=smpl)
+        return replace(sequence, pose_source=self.pose_source or sequence.pose_source)
 
     def _camera(
-        self, source: Path, footage: Footage, motion: "PoseSequence | BodyFile"
-    ) -> dict[str, Any]:
-        """K, pose and lens: of the file, else what the tool that made the poses assumed."""
+        self, source: Path, size: tuple[int, int], motion: "PoseSequence | BodyFile | None"
+    ) -> tuple[dict[str, Any], str, str]:
+        """`recorded_camera` of the file, else of what the tool that made the poses assumed."""
         path = self.camera or source / "camera.json"
-        if not path.exists():
-            K = motion.K if isinstance(motion, PoseSequence) else None
-            if K is None or self.camera is not None:
-                raise DataError(
-                    f"{path}: not found, expected the camera (width, height, K, world_to_camera); "
-                    f"{GUIDE}."
-                )
-            return {"K": K}
-        return read_camera(path, footage.width, footage.height)
-
-    def _add_events(self, source: Path, writer: CaptureWriter, size: tuple[int, int]) -> list[str]:
-        path = self.events or next(iter(sorted(source.glob("events.*"))), None)
-        if path is None:
-            return ["events: none; simulate them, or give --events"]
-        recording = open_recording(
-            need(path, "the events"), width=size[0], height=size[1], repair=self.repair
-        )
-        if not recording.has_polarity:
-            return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
-        writer.set_events(
-            recording.chunks(),
-            *size,
-            contrast_threshold=self.contrast,
-            simulated=False,
-            clock_offset_us=self.clock_offset_us,
-        )
-        return list(recording.notes)
+        if self.camera is not None or (path.exists() and self.focal is None):
+            return recorded_camera(path, self.focal, size)
+        K = motion.K if isinstance(motion, PoseSequence) else None
+        if K is not None and self.focal is None:
+            return {"K": K}, "assumed by the pose tool", ""
+        if motion is not None and self.focal is None:
+            raise DataError(
+                f"{path}: not found, expected the camera (width, height, K, world_to_camera); "
+                f"{GUIDE}."
+            )
+        return recorded_camera(None, self.focal, size)
 
 
-def _camera_poses(motion: "PoseSequence | BodyFile") -> dict[int, np.ndarray]:
+def _camera_poses(motion: "PoseSequence | BodyFile | None") -> dict[int, np.ndarray]:
     """Poses of a moving camera by the index of the picture; empty where it stands."""
-    if isinstance(motion, BodyFile) or motion.world_to_camera is None:
+    if not isinstance(motion, PoseSequence) or motion.world_to_camera is None:
         return {}
     return dict(zip(motion.frames.tolist(), motion.world_to_camera, strict=True))
 
 
-def _frames_with_poses(motion: "PoseSequence | BodyFile", middles: np.ndarray) -> set[int]:
-    """Indices of pictures whose moment the poses cover."""
+def _frames_with_poses(motion: "PoseSequence | BodyFile | None", middles: np.ndarray) -> set[int]:
+    """Indices of pictures whose moment the poses cover; all where there are no poses."""
+    if motion is None:
+        return set(range(len(middles)))
     if isinstance(motion, PoseSequence):
         return set(motion.frames.tolist()) & set(range(len(middles)))
     first, last = motion.times_us[0], motion.times_us[-1]

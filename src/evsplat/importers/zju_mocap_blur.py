@@ -63,7 +63,7 @@ class ZjuMocapBlur(Importer):
             np.abs(camera.world_to_camera - cameras[first].world_to_camera).max() > 1e-6
             for camera in cameras.values()
         )
-        cameras[first].add_to(writer, "main", frames[first], self.shrink)
+        cameras[first].add_to(writer, "main", frames[first], self.shrink, transfer="linear")
         exposure_us, sub_frames = _exposure(list(moments), list(moments.values()), unit)
         times = []
         for name in tqdm(moments, desc="pictures", unit="frame", leave=False):
@@ -92,7 +92,8 @@ class ZjuMocapBlur(Importer):
             "sequence": source.resolve().name,
             "shrink": self.shrink,
             "sub_frames_per_picture": sub_frames,
-            "blur": "mean of sub-frames of coded values (not linear light)",
+            "blur": "mean of sub-frames of coded values (not linear light), which therefore count "
+            "as light here (transfer linear)",
         }
         infos = source / "mesh_infos.pkl"
         rest = _rest_joints(tables["mesh_infos"], list(moments), infos)
@@ -218,4 +219,5 @@ def _poses(
         betas=np.zeros(0),
         source=str(path),
         world="calibration",
+        pose_source="markers",
     )

@@ -1,12 +1,25 @@
 """`evsplat inspect`: a capture or an event recording checked, in words and in pictures."""
 
-from evsplat.inspection.capture import InspectReport, body_mask_overlap, inspect_capture
+from evsplat.inspection.belonging import Belonging, judge_body
+from evsplat.inspection.body_check import check_body, fit_sheet, save_fit_sheet
+from evsplat.inspection.capture import (
+    InspectReport,
+    body_mask_overlap,
+    inspect_capture,
+    warn_of_body,
+)
 from evsplat.inspection.recording import inspect, inspect_recording
 
 __all__ = [
+    "Belonging",
     "InspectReport",
     "body_mask_overlap",
+    "check_body",
+    "fit_sheet",
     "inspect",
     "inspect_capture",
     "inspect_recording",
+    "judge_body",
+    "save_fit_sheet",
+    "warn_of_body",
 ]

@@ -1,6 +1,6 @@
 """`evsplat inspect`: check a capture, sum it up in words and draw it."""
 
-from collections.abc import Mapping
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,12 +12,14 @@ from evsplat.body import BodyTrack, silhouette
 from evsplat.calibration import SensorEstimate
 from evsplat.camera import Camera
 from evsplat.capture import estimate_sensor, load_body_track
-from evsplat.capture.capture import Capture
+from evsplat.capture.capture import Capture, load_capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
 from evsplat.capture.validate import check_capture
-from evsplat.files import atomic_path
+from evsplat.errors import DataError
+from evsplat.inspection.belonging import judge_body
+from evsplat.inspection.body_check import FIT_SHEET, body_findings, check_body, fit_sheet
 from evsplat.inspection.drawing import (
     DETAIL_PX,
     EVENT_WINDOW_US,
@@ -25,12 +27,15 @@ from evsplat.inspection.drawing import (
     draw_outline,
     event_tile,
     fit,
+    save_drawings,
     sheet,
     short_number,
     to_picture,
 )
 from evsplat.inspection.plots import draw_timeline
-from evsplat.inspection.sensor import clock_findings, sensor_lines
+from evsplat.inspection.sensor import clock_findings, contrast_findings, sensor_lines
+
+logger = logging.getLogger(__name__)
 
 CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
 SHOWN_FINDINGS = 12
@@ -56,8 +61,8 @@ class InspectReport:
 def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     """Validate the capture fully and, where it has no errors, draw it into ``out_dir``.
 
-    Writes contact_sheet.png, events.png, body.png and timeline.png, as far as there is something
-    to draw.
+    Writes contact_sheet.png, events.png, body.png, body_fit.png and timeline.png, as far as there
+    is something to draw.
     """
     path, out_dir = Path(path), Path(out_dir)
     metadata, found = check_capture(path, deep=True)
@@ -65,31 +70,41 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     if metadata is None or not report.usable:
         return replace(report, summary=f"{path}\n{_findings_text(report.findings)}")
     capture = Capture(metadata)
-    estimate = estimate_sensor(capture.for_training(Policy(use="everything")))
-    findings = (*found, *clock_findings(capture, estimate))
+    seen = capture.for_training(Policy(use="everything"))
+    estimate = estimate_sensor(seen)
+    findings = (
+        *found,
+        *clock_findings(capture, estimate),
+        *contrast_findings(capture, estimate),
+    )
     track = load_body_track(capture) if capture.has_body else None
+    fitting = None if track is None else judge_body(seen, track)
     drawings = {"contact_sheet": _contact_sheet(capture)}
     if track is not None:
         drawings["body"] = _body_sheet(capture, track)
+    if fitting is not None:
+        findings = (*findings, *body_findings(seen, fitting))
+        drawings[FIT_SHEET] = fit_sheet(seen, fitting)
     if capture.events is not None and len(capture.events):
         drawings["events"] = _events_sheet(capture)
     drawings["timeline"] = draw_timeline(capture)
     pictures = save_drawings(drawings, out_dir)
-    summary = (
-        f"{_summary(capture, track, estimate)}\n{_findings_text(findings)}\npictures   {out_dir}: "
-    )
+    summary = _summary(capture, track, estimate)
+    if fitting is not None:
+        summary += f"\nbelongs    {fitting.sentence}"
+    summary += f"\n{_findings_text(findings)}\npictures   {out_dir}: "
     summary += ", ".join(picture.name for picture in pictures)
     return replace(report, findings=findings, summary=summary, pictures=pictures)
 
 
-def save_drawings(drawings: Mapping[str, Image.Image], out_dir: Path) -> tuple[Path, ...]:
-    """Write each drawing as NAME.png; gives the files."""
-    pictures = []
-    for name, drawing in drawings.items():
-        pictures.append(out_dir / f"{name}.png")
-        with atomic_path(pictures[-1]) as temporary:
-            drawing.save(temporary)
-    return tuple(pictures)
+def warn_of_body(path: Path) -> None:
+    """Log a warning where a new capture's body does not belong to it, as training will see it."""
+    seen = load_capture(path).for_training(Policy())
+    try:
+        if seen.has_body:
+            check_body(seen, refuse=False)
+    except DataError as error:  # such as an SMPL file that training will have to find
+        logger.info("The body is not compared with the recording: %s", error)
 
 
 def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, ...]) -> list[float]:
@@ -117,7 +132,8 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
     lines = [
         f"{capture.name}   {capture.path}",
         f"frames     {len(frames)}: {len(capture.train_frames)} train, {len(capture.test_frames)} "
-        f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera",
+        f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera"
+        f"{_transfer_text(capture)}",
         f"time       {(end - start) / 1e6:.3f} s{rate}, exposure {exposure / 1000:.4g} ms",
         f"events     {_events_text(capture)}",
         *(sensor_lines(estimate, capture.clock_offset_us) if capture.events is not None else []),
@@ -138,6 +154,12 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
     if "text" in capture.provenance:
         lines.append(f"made       {capture.provenance['text']}")
     return "\n".join(lines)
+
+
+def _transfer_text(capture: Capture) -> str:
+    """The curve from values to light, where capture.json says it."""
+    stated = {capture.metadata.transfers.get(frame.camera) for frame in capture.frames} - {None}
+    return f"; values: {', '.join(sorted(str(one) for one in stated))}" if stated else ""
 
 
 def _events_text(capture: Capture) -> str:

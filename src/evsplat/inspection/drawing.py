@@ -1,7 +1,8 @@
 """Sheets of labelled tiles, outlines, lines and colours, drawn with Pillow."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from evsplat.calibration import EventSource
 from evsplat.events import count_map
+from evsplat.files import atomic_path
 from evsplat.pictures import to_bytes
 
 PAPER, INK, FAINT = (255, 255, 255), (38, 43, 51), (128, 136, 148)
@@ -44,6 +46,16 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def split_colour(split: str) -> tuple[int, int, int]:
     """One colour for train, another for test; "" is neither."""
     return {"train": TRAIN, "test": TEST}.get(split, FAINT)
+
+
+def save_drawings(drawings: Mapping[str, Image.Image], out_dir: Path) -> tuple[Path, ...]:
+    """Write each drawing as NAME.png; gives the files."""
+    pictures = []
+    for name, drawing in drawings.items():
+        pictures.append(out_dir / f"{name}.png")
+        with atomic_path(pictures[-1]) as temporary:
+            drawing.save(temporary)
+    return tuple(pictures)
 
 
 def to_picture(image: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Image.Image:
@@ -104,12 +116,12 @@ def event_tile(
     """Events of `EVENT_WINDOW_US` about a time over the greyed picture, counted in the label."""
     height, width = image.shape[:2]
     stream = events.between(middle_us - EVENT_WINDOW_US // 2, middle_us + EVENT_WINDOW_US // 2)
-    mixed = _events_over(image, count_map(stream, height, width))
+    mixed = events_over(image, count_map(stream, height, width))
     picture = to_picture(mixed, fit(width, height, DETAIL_PX))
     return Tile(picture, f"{label}   {len(stream):,} events", split)
 
 
-def _events_over(
+def events_over(
     image: Float[Tensor, "H W 3"], counts: Float[Tensor, "H W"]
 ) -> Float[Tensor, "H W 3"]:
     """Signed event counts over the greyed picture: red where brighter, blue where darker."""

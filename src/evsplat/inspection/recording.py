@@ -20,8 +20,14 @@ from evsplat.calibration import (
 )
 from evsplat.errors import DataError
 from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
-from evsplat.inspection.capture import InspectReport, inspect_capture, save_drawings
-from evsplat.inspection.drawing import EVENT_WINDOW_US, event_tile, sheet, short_number
+from evsplat.inspection.capture import InspectReport, inspect_capture
+from evsplat.inspection.drawing import (
+    EVENT_WINDOW_US,
+    event_tile,
+    save_drawings,
+    sheet,
+    short_number,
+)
 from evsplat.inspection.plots import draw_curve
 from evsplat.inspection.sensor import sensor_lines
 

@@ -1,8 +1,9 @@
-"""Words for an event sensor's clock and thresholds, and the warning about the clock."""
+"""Words for an event sensor's clock and thresholds, and the warnings about them."""
 
 from evsplat.calibration import ClockEstimate, SensorEstimate
 from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding, Findings
+from evsplat.capture.sensor_estimate import looks_linear
 
 
 def sensor_lines(estimate: SensorEstimate | None, clock_offset_us: int) -> list[str]:
@@ -47,5 +48,23 @@ def clock_findings(capture: Capture, estimate: SensorEstimate | None) -> list[Fi
         f"{capture.clock_offset_us}, with which events {_lag_text(estimate.clock)}",
         "events and frames on one clock",
         f"Try {_aligning_us(estimate.clock, capture.clock_offset_us)}.",
+    )
+    return findings.items
+
+
+def contrast_findings(capture: Capture, estimate: SensorEstimate | None) -> list[Finding]:
+    """A warning where the fitted thresholds say that coded frames hold linear light."""
+    if not looks_linear(capture, estimate):
+        return []
+    assert estimate is not None and estimate.thresholds is not None
+    fitted, camera = estimate.thresholds, capture.frames[0].camera
+    findings = Findings()
+    findings.warning(
+        capture.path / "capture.json",
+        f"cameras.{camera}.transfer",
+        f"{capture.transfer(capture.frames[0])!r}, with which an event stands for a change of "
+        f"{fitted.plus:.2f} / {fitted.minus:.2f}: the frames look linear",
+        "thresholds of 0.1 to 0.5",
+        'Write "linear" if the camera stores light as it measures it, as a DAVIS does.',
     )
     return findings.items

@@ -20,7 +20,7 @@ from torch import Tensor
 from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.masks.silhouette import track_silhouette
-from evsplat.pictures import decode
+from evsplat.pictures import Transfer, decode
 
 THRESHOLD = 0.08
 """Least difference to the background, in coded values: fewer are shading of the scene."""
@@ -71,7 +71,12 @@ class BackgroundDifference:
     ) -> Iterator[tuple[Frame, Float[Tensor, "H W"]]]:
         """Each frame in order with a mask whose edge is half a pixel soft."""
         for frame in frames:
-            differs = difference(capture.image(frame), self._background, self._threshold)
+            differs = difference(
+                capture.image(frame),
+                self._background,
+                self._threshold,
+                capture.transfer(frame),
+            )
             if self._track is None:
                 person = clean(differs, None)
             else:
@@ -90,12 +95,15 @@ class BackgroundDifference:
 
 
 def difference(
-    image: Float[Tensor, "H W 3"], background: Float[Tensor, "H W 3"], threshold: float
+    image: Float[Tensor, "H W 3"],
+    background: Float[Tensor, "H W 3"],
+    threshold: float,
+    transfer: Transfer = "power",
 ) -> Bool[np.ndarray, "H W"]:
     """Pixels that differ from the background by more than a shadow on it would."""
     differs = (image - background).abs().amax(-1) > threshold
     # A little light keeps the ratio of dark pixels, which is mostly noise, near one.
-    ratio = (decode(image) + 0.002) / (decode(background) + 0.002)
+    ratio = (decode(image, transfer) + 0.002) / (decode(background, transfer) + 0.002)
     mean = ratio.mean(-1)
     hue = (ratio / mean[..., None] - 1).abs().amax(-1)
     shadow = (mean > _SHADOW_DARKEST) & (mean < _SHADOW_BRIGHTEST) & (hue < _SHADOW_HUE)

@@ -88,18 +88,13 @@ class RobustVideoMatting:
 
 def find_weights(weights: Path | str | None = None) -> Path:
     """The TorchScript file: as given, from the environment variable, or in torch's cache."""
-    for place in (weights, os.environ.get(WEIGHTS_VARIABLE)):
-        if place:
-            path = Path(place).expanduser()
-            found = [path] if path.is_file() else [path / FILE, path / OTHER_FILE]
-            for file in found:
-                if file.is_file():
-                    return file
-            raise WeightsError(f"{path}: no such file, and no folder with {FILE}. {_advice()}")
-    cached = hub_folder()
-    for file in (cached / FILE, cached / OTHER_FILE):
+    named = weights or os.environ.get(WEIGHTS_VARIABLE)
+    path = Path(named or hub_folder()).expanduser()
+    for file in (path, path / FILE, path / OTHER_FILE):
         if file.is_file():
             return file
+    if named:
+        raise WeightsError(f"{path}: no such file, and no folder with {FILE}. {_advice()}")
     raise MissingWeights(f"RobustVideoMatting: no network. {_advice()}")
 
 

@@ -97,6 +97,8 @@ EVSPLAT = {
     "exposure.px_per_render": "renamed to px_per_render",
     "exposure.most_renders": "renamed to most_renders",
     "exposure": "its settings are px_per_render and most_renders",
+    "pose.noisy_rad": "gone, the shape of a curve does not tell exact poses from wrong ones; "
+    "body.source of capture.json does (docs/capture-format.md)",
     "windows.pixel_thresholds": "gone, no run showed a gain (docs/method.md)",
     "windows.begun_us": "renamed to event_ramp_us",
     "windows.clock": "renamed to clock",

@@ -14,7 +14,13 @@ import torch
 
 from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate
-from evsplat.capture import Frame, Policy, TrainingCapture, estimate_sensor
+from evsplat.capture import (
+    Frame,
+    Policy,
+    TrainingCapture,
+    estimate_sensor,
+    warn_of_linear_frames,
+)
 from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
@@ -71,6 +77,9 @@ CONSTANT_SHARE = 0.3
 """Share of the training before learning rates begin to fall."""
 SCENE_NETWORK_RATE = 1e-3
 """Learning rate of the network of a random cube's colours."""
+ERRORS_RATE = 0.3
+"""Learning rate of the poses' errors as a share of that of the motion between exact key poses:
+three splines add up to them, and all move at once."""
 CLIP = 0.1
 """Largest gradient norm of the networks together."""
 
@@ -179,7 +188,6 @@ class EvsplatConfig:
         smooth="auto",
         refine="auto",
         between=True,
-        noisy_rad=0.006,
         start=1_500,
         prior=1e-3,
         std_rad=None,
@@ -216,7 +224,7 @@ def build(
     refuse_masks(config.policy, "evsplat")
     fit = purpose == "train"
     generator = start_of_randomness(seed)
-    poses = prepare_poses(config.pose, capture, announce=fit)
+    poses = prepare_poses(config.pose, capture, fit=fit)
     times_us = [frame.mid_us for frame in capture.train_frames]
     model = DiscModel(
         poses.track,
@@ -230,7 +238,7 @@ def build(
         lamps=config.lamps,
         self_shadow=config.self_shadow,
         scene_network=config.scene.kind == "random_cube",
-        residual=poses.spline,
+        residual=poses.correction,
         residual_start=config.pose.start,
     ).to(device)
     if fit and config.scene.kind == "median_backdrop":
@@ -248,8 +256,8 @@ def build(
         Exposure(capture, cache(renders), generator),
         RenderedSemantics(bounds),
     ]
-    if poses.spline is not None:
-        objectives.append(PosePrior(poses.priced_us))
+    if poses.correction is not None:
+        objectives.append(PosePrior())
     windows = None
     if config.event_weight != 0.0 and capture.events is None:
         logger.warning(
@@ -306,10 +314,12 @@ def _learning(rates: DiscRates, model: DiscModel) -> Learning:
         means_final=rates.final,
         constant=CONSTANT_SHARE,
     )
+    residual = model.residual
     parts = (
         (model.deformation, rates.non_rigid, True),
         (model.scene_colour, SCENE_NETWORK_RATE, True),
-        (model.residual, rates.pose, False),
+        (residual and residual.between, rates.pose, False),
+        (residual and residual.errors, ERRORS_RATE * rates.pose, False),
         (model.shading, rates.shading, False),
         (model.shadow, rates.shadow, False),
         (model.lamps, rates.shadow, False),
@@ -362,6 +372,7 @@ def _windows(
         estimate = None
         if capture.contrast_threshold is None or config.clock != "never":
             estimate = estimate_sensor(capture)
+            warn_of_linear_frames(capture, estimate)
         known = _thresholds(capture, estimate)
         late_us = _late_us(config, estimate)
         if not capture.events.has_polarity:

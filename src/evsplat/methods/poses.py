@@ -1,29 +1,26 @@
-"""Noisy body poses: how noisy they are, what is smoothed, and what training may correct."""
+"""Errors of given body poses: whether there are any, what is smoothed, what training corrects."""
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
-from evsplat.body import BodyTrack
-from evsplat.body.smoothing import MotionNoise, SplineError, motion_noise, smoothed, spline_error
+from evsplat.body import BodyTrack, PoseSource
+from evsplat.body.smoothing import motion_noise, moving_joints, smoothed, spline_error
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError
-from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, NotNegative, Weight
-from evsplat.models.pose_spline import PoseSpline
+from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, Weight
+from evsplat.models.pose_correction import SHARES, PoseCorrection
 
 logger = logging.getLogger(__name__)
 
 When = Literal["auto", "always", "never"]
-"""``auto``: where the key poses are noisy, see `PoseSettings.noisy_rad`."""
-EXACT_RAD = 1e-3
-"""Poses that jitter by less are taken as exact, whatever the motion."""
-LEAST_STD_RAD, LEAST_STD_M = 0.02, 0.01
-"""Expected errors of noisy poses, however little they jitter: what was fitted to pictures errs by
-more, and that changes slowly."""
+"""``auto``: by what the capture says of its poses, see `PoseSettings`."""
+UNKNOWN = (0.05, 0.02)
+"""Errors expected of joints (radians) and of the root's place (metres), per axis, of poses whose
+source is unknown, and of those that are said to be exact where they are to be corrected."""
 
 _NOT_ALWAYS = ReadIf("pose.refine", "auto or never", lambda refine: refine != "always")
 _REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "never")
@@ -34,23 +31,23 @@ class PoseSettings:
     """Errors of the given poses."""
 
     smooth: When
-    """Take out of the given key poses what looks like noise."""
+    """Take out of the given key poses what looks like noise, up to the share of the expected errors
+    that is new in every pose. ``auto``: where the capture says how far its poses err."""
     refine: When
-    """Learn a residual of the poses, a cubic B-spline in time, from pictures and events."""
+    """Learn the errors of the poses from pictures and events. ``auto``: where the capture says that
+    they err, and where it doesn't say, if pictures are explained better by others."""
     between: Annotated[bool, _NOT_ALWAYS]
-    """Where poses are taken as exact, learn how the person moves between them: such a residual that
-    is zero at every key pose."""
-    noisy_rad: NotNegative
-    """Jitter of key poses, radians per axis, from which poses count as noisy. With less they do if
-    its variance is half or more of what a spline through the poses misses between them."""
+    """Where poses are taken as exact, learn how the person moves between them: a residual that is
+    zero at every key pose."""
     start: Nominal
     """Nominal iteration from which the residual is learned."""
     prior: Weight
     """Weight of the residual's mean square in units of the errors expected."""
     std_rad: Annotated[float, Above(0), _REFINED] | None
-    """Error expected of a joint, radians per axis; null = the jitter, at least 0.02."""
+    """Error expected of a joint, radians per axis; null = as the capture says, or by the source of
+    its poses."""
     std_m: Annotated[float, Above(0), _REFINED] | None
-    """Error expected of the root's place, metres per axis; null = its jitter, at least 0.01."""
+    """Error expected of the root's place, metres per axis; null = the same."""
     events_of_held_out: Annotated[bool, WITH_EVENTS, WITH_WINDOWS]
     """Let events around held-out frames correct the poses there; needs
     ``policy.held_out_events``. The pictures of those frames stay unseen and nothing else is learned
@@ -62,65 +59,91 @@ class Poses:
     """Motion of a model."""
 
     track: BodyTrack
-    spline: PoseSpline | None = None
+    correction: PoseCorrection | None = None
     """None where nothing is to be learned of poses."""
-    priced_us: Sequence[int] = ()
-    """Times at which the residual costs."""
 
 
-def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, announce: bool) -> Poses:
-    """Track of a capture by the settings, and the residual to learn; said at level INFO on wish."""
+def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) -> Poses:
+    """Track of a capture by the settings, and the residual to learn.
+
+    ``fit``: find out what the capture does not say; otherwise a state that is loaded says it.
+    """
     track = load_body_track(capture)
-    noise, expected = motion_noise(track), spline_error(track)
-    surer = _surer_than_between(noise, expected)
-    noisy = noise.rotation_rad >= (config.noisy_rad if surer else EXACT_RAD)
-    smooth, refine = (
-        noisy if when == "auto" else when == "always" for when in (config.smooth, config.refine)
+    source = None if track.errors is None else track.errors.source
+    exact = {"always": False, "never": True}.get(config.refine)
+    if exact is None and source is not None:
+        exact = source == "exact"
+    joint_rad, root_m = _expected(config, track)
+    told = track.errors is not None and not track.errors.typical and source != "exact"
+    smooth = config.smooth == "always" or (config.smooth == "auto" and told)
+    if smooth:
+        new = SHARES["fast"] ** 0.5
+        noise = motion_noise(
+            track, most_rad=new * float(joint_rad.max()), most_m=new * float(root_m.max())
+        )
+        track = smoothed(track, noise)
+    decided = exact if exact is not None else not fit or motion_noise(track).rotation_rad < 0.006
+    if exact is not False and decided and fit:
+        _refuse_unread(config, capture)
+    if fit:
+        _announce(config, source, joint_rad, root_m, exact=decided, smooth=smooth)
+    between = spline_error(track) if config.between and exact is not False else None
+    if exact and between is None:
+        return Poses(track)
+    frames_us = [frame.mid_us for frame in capture.train_frames]
+    correction = PoseCorrection(
+        track, frames_us, joint_rad=joint_rad, root_m=root_m, between=between, exact=decided
     )
-    for name in ("std_rad", "std_m") if not refine else ():
+    return Poses(track, correction)
+
+
+def _expected(config: PoseSettings, track: BodyTrack) -> tuple[np.ndarray, np.ndarray]:
+    """Errors expected of the key poses: joints (P, J), radians, and root (P, 3), metres."""
+    errors = track.errors
+    if errors is None or errors.source == "exact":
+        keys, joints = track.poses.shape[:2]
+        joint_rad, root_m = np.full((keys, joints), UNKNOWN[0]), np.full((keys, 3), UNKNOWN[1])
+    else:
+        joint_rad, root_m = errors.joint_rad.copy(), errors.root_m.copy()
+    if config.std_rad is not None:
+        joint_rad[:] = config.std_rad
+    if config.std_m is not None:
+        root_m[:] = config.std_m
+    joint_rad[:, ~moving_joints(track)] = 0
+    return joint_rad, root_m
+
+
+def _announce(
+    config: PoseSettings,
+    source: PoseSource | None,
+    joint_rad: np.ndarray,
+    root_m: np.ndarray,
+    *,
+    exact: bool,
+    smooth: bool,
+) -> None:
+    """Say what is held of the poses, and what is done about it."""
+    taken = "exact"
+    if not exact:
+        moving = joint_rad[joint_rad > 0]
+        radians, metres = (np.median(each) if each.size else 0.0 for each in (moving, root_m))
+        taken = f"off by some {radians:.3f} rad and {1000 * metres:.0f} mm per axis"
+    done = "corrected in training"
+    if exact:
+        done = "corrected between keys only" if config.between else "not corrected"
+    logger.info(
+        "given poses (source: %s) are taken as %s: %s, %s",
+        source or "not said",
+        taken,
+        "smoothed in time" if smooth else "not smoothed",
+        done,
+    )
+
+
+def _refuse_unread(config: PoseSettings, capture: TrainingCapture) -> None:
+    for name in ("std_rad", "std_m"):
         if (value := getattr(config, name)) is not None:
             raise ConfigError(
                 f"pose.{name} is {value}, and nothing reads it: the poses of {capture.path} are "
                 "taken as exact; pass --set pose.refine=always as well, or leave it out."
             )
-    between = config.between and not refine and surer
-    logger.log(
-        logging.INFO if announce else logging.DEBUG,
-        "given poses jitter by %.4f rad per axis and are %s: %s, %s",
-        noise.rotation_rad,
-        "noisy" if noisy else "taken as exact",
-        "smoothed in time" if smooth else "taken as they are",
-        "corrected in training"
-        if refine
-        else "corrected between keys only"
-        if between
-        else "not corrected",
-    )
-    if smooth:
-        track = smoothed(track, noise)
-    times = track.times_us
-    if between:
-        middles = (times[1:] + times[:-1]) // 2
-        return Poses(track, PoseSpline.between_keys(track, expected), middles.tolist())
-    if not refine:
-        return Poses(track)
-    spline = PoseSpline.of(
-        track,
-        noise,
-        [frame.mid_us for frame in capture.train_frames],
-        knot_frames=1.0,
-        joint_rad=config.std_rad or max(noise.rotation_rad, LEAST_STD_RAD),
-        root_m=config.std_m or max(noise.translation_m, LEAST_STD_M),
-        stiff=smooth,
-    )
-    return Poses(track, spline, times.tolist())
-
-
-def _surer_than_between(noise: MotionNoise, expected: SplineError) -> bool:
-    """Whether key poses err by less than half of the variance of what lies between them.
-
-    Where they do not, either is as likely an error of fitting, and a residual that is held at the
-    keys would bend to make up for them.
-    """
-    between = np.square(expected.rotation_rad[noise.moving])
-    return len(between) > 0 and 2 * noise.rotation_rad**2 < float(between.mean())

@@ -40,7 +40,7 @@ class Step(Generic[ModelType]):
 
     @property
     def rgb(self) -> tuple[Float[Tensor, "H W 3"], ...]:
-        """Rendered pictures, sRGB."""
+        """Rendered pictures, coded as the recorded ones are."""
         return self.drawing.rgb
 
     @property
@@ -55,9 +55,9 @@ class Step(Generic[ModelType]):
 
     @cached_property
     def linear(self) -> Float[Tensor, "T H W 3"]:
-        """The pictures in linear light, planar in memory."""
+        """The pictures in linear light, planar in memory; by the curve of the frame's camera."""
         planes = torch.stack([picture.movedim(-1, 0) for picture in self.rgb])
-        return decode(planes).movedim(1, -1)
+        return decode(planes, self.capture.transfer(self.frame)).movedim(1, -1)
 
     def index(self, time_us: int) -> int:
         """Place of a time among the pictures."""

@@ -137,7 +137,10 @@ class EventChange(Objective):
         if weight == 0.0:
             return {}
         change = log_brightness_change(
-            step.rgb[step.index(before)], step.rgb[step.index(after)], eps=self.eps
+            step.rgb[step.index(before)],
+            step.rgb[step.index(after)],
+            eps=self.eps,
+            transfer=step.capture.transfer(step.frame),
         )
         events = step.data.get(("events", before, after), partial(self._map, before, after))
         if not self.events.has_polarity:

@@ -75,6 +75,7 @@ class Exposure(Objective):
         # Times of other objectives lie outside. A shutter adds light up before it is coded.
         mean = step.linear[first:last].mean(0)
         l1, similarity = l1_and_ssim(
-            encode(mean.clamp_min(DARKEST_LINEAR)), step.observed(step.frame)
+            encode(mean.clamp_min(DARKEST_LINEAR), step.capture.transfer(step.frame)),
+            step.observed(step.frame),
         )
         return {"l1": l1, "dssim": 1 - similarity}

@@ -4,7 +4,13 @@ A field's annotation gives type, range and placeholder, its docstring the help t
 loads torch, so that ``--help`` is quick.
 """
 
-from evsplat.options.captures import RECIPES, ReadOptions, StageSettings, SynthesisSettings
+from evsplat.options.captures import (
+    RECIPES,
+    PoseSearch,
+    ReadOptions,
+    StageSettings,
+    SynthesisSettings,
+)
 from evsplat.options.runs import BenchOptions, ExportOptions, Film, TrainOptions
 
 __all__ = [
@@ -12,6 +18,7 @@ __all__ = [
     "BenchOptions",
     "ExportOptions",
     "Film",
+    "PoseSearch",
     "ReadOptions",
     "StageSettings",
     "SynthesisSettings",

@@ -1,12 +1,13 @@
 """Options of the verbs that make captures and read event recordings."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
 
 from evsplat.config import Above, AtLeast, Within
 from evsplat.errors import ConfigError
-from evsplat.options.declare import Flag, Sensor, Transfer, check_options, option
+from evsplat.options.declare import Flag, Sensor, Transfer, Use, check_options, option
 
 
 @dataclass(frozen=True)
@@ -179,3 +180,35 @@ class StageSettings:
     def size(self) -> tuple[int, int]:
         """Width and height of the pictures, pixels."""
         return self.width, self.height or self.width
+
+
+@dataclass(frozen=True)
+class PoseSearch:
+    """Body poses to be found in a capture."""
+
+    body: Annotated[Literal["default", "smpl"], option("MODEL")] = "default"
+    """default (ships with evsplat) or smpl (your licensed file)."""
+    height_m: Annotated[
+        float | None, Within(0.5, 2.5), option("M", default="an adult's", name="height")
+    ] = None
+    """Stature of the person, metres: it alone tells how far away they are."""
+    focal: Annotated[str | None, option("auto|PX", default="the capture's")] = None
+    """Focal length in pixels, or auto: the one that fits best."""
+    use: Use = "training"
+    """everything: held-out frames are looked at too."""
+    held_out_events: Flag = False
+    """Follow the person through held-out times by their events."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.focal not in (None, "auto") and self.focal_px is None:
+            raise ConfigError(f"--focal {self.focal}: expected auto or pixels above 0.")
+
+    @property
+    def focal_px(self) -> float | None:
+        """The focal length given in pixels; None where it is not."""
+        try:
+            focal = float(self.focal or "")
+        except ValueError:
+            return None
+        return focal if 0 < focal < math.inf else None

@@ -47,6 +47,8 @@ class TrainOptions:
     """GPU memory for recorded pictures and event maps."""
     seed: Annotated[int | None, option("S", default="0")] = None
     """Seed of every random number."""
+    any_body: Flag = False
+    """Train even with a body that follows nothing that moves in the recording."""
     use: Annotated[Use | None, option("{training,everything}", default="training")] = None
     """everything trains on all that was recorded and holds nothing out for test figures."""
 
@@ -137,6 +139,7 @@ class Film:
         return "-".join(words) + ending
 
 
+Split = Literal["test", "train"]
 UpAxis = Literal["y", "z"]
 FileKind = Literal["ply", "spz", "splat", "gltf"]
 Kind = Literal["ply", "spz", "splat", "gltf", "html", "avatar"]

@@ -1,6 +1,6 @@
 """Coded values of pictures, linear light, luminance and its logarithm, which events report."""
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ Transfer = Literal["power", "srgb", "linear"]
 """``power``: exponent 2.2 (paper eq. 8); ``srgb``: the exact piecewise curve of IEC 61966-2-1;
 ``linear``: the values are light as they stand."""
 
+TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
 GAMMA = 2.2
 REC709 = (0.2126, 0.7152, 0.0722)
 DARKEST = 1.0 / 255.0
@@ -53,11 +54,13 @@ def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
 
 
 def log_brightness(
-    rgb_srgb: Float[Tensor, "*shape 3"], *, eps: float = 1e-5
+    rgb_srgb: Float[Tensor, "*shape 3"], *, eps: float = 1e-5, transfer: Transfer = "power"
 ) -> Float[Tensor, "*shape"]:
     """Natural logarithm of the luminance of sRGB-coded pictures in [0, 1] (A11)."""
-    result: Tensor = _PowerLogBrightness.apply(rgb_srgb, eps)
-    return result
+    if transfer == "power":
+        result: Tensor = _PowerLogBrightness.apply(rgb_srgb, eps)
+        return result
+    return torch.log(luminance(decode(rgb_srgb.clamp_min(DARKEST), transfer)) + eps)
 
 
 def log_brightness_change(
@@ -65,9 +68,11 @@ def log_brightness_change(
     after_srgb: Float[Tensor, "*shape 3"],
     *,
     eps: float = 1e-5,
+    transfer: Transfer = "power",
 ) -> Float[Tensor, "*shape"]:
     """``log Y(after) - log Y(before)``, the left side of the event model (paper eq. 8)."""
-    return log_brightness(after_srgb, eps=eps) - log_brightness(before_srgb, eps=eps)
+    after = log_brightness(after_srgb, eps=eps, transfer=transfer)
+    return after - log_brightness(before_srgb, eps=eps, transfer=transfer)
 
 
 class _NativePower(torch.autograd.Function):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.restore.d2net import D2Net
-from evsplat.restore.e2vid import FILE, E2Vid
+from evsplat.restore.e2vid import E2Vid
 from evsplat.restore.edi import Edi
 from evsplat.restore.efnet import EfNet
 from evsplat.restore.mprnet import MprNet
@@ -51,6 +51,6 @@ WEIGHT_FILES: dict[str, WeightFile] = {
     MprNet.name: MprNet.file,
     EfNet.name: EfNet.file,
     D2Net.name: D2Net.file,
-    E2Vid.name: FILE,
+    E2Vid.name: E2Vid.file,
 }
 """Files that users bring for the restorers whose weights come with no package."""

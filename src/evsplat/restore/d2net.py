@@ -43,7 +43,6 @@ class D2Net(NetworkRestorer):
         variable="EVSPLAT_D2NET",
     )
     multiple = 4
-    needs_events = True
 
     def load(self, path: Path) -> nn.Module:
         """The network with events."""

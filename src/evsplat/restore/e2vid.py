@@ -6,9 +6,9 @@ evsplat. Its size is read from the checkpoint, which states it.
 """
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -16,22 +16,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import TrainingCapture
-from evsplat.devices import network_device
 from evsplat.errors import WeightsError
 from evsplat.events import EventStream
 from evsplat.events.maps import voxel_grid
 from evsplat.restore.intensity import FromEvents
 from evsplat.restore.network import enough_memory
-from evsplat.weights import WeightFile, fill, read_state, sha256_of
+from evsplat.weights import WeightFile, fill, read_state
 
-FILE = WeightFile(
-    network="E2VID",
-    name="E2VID_lightweight.pth.tar",
-    size="about 43 MB",
-    source="from rpg.ifi.uzh.ch/data/E2VID/models (its README: github.com/uzh-rpg/rpg_e2vid)",
-    variable="EVSPLAT_E2VID",
-)
 EVENTS_PER_PIXEL = 0.35
 """About how many events its authors give the network at a time."""
 
@@ -42,88 +33,75 @@ class E2Vid(FromEvents):
     """Brightness from events by E2VID, colour from the blurry frame."""
 
     name = "e2vid"
+    file: ClassVar = WeightFile(
+        network="E2VID",
+        name="E2VID_lightweight.pth.tar",
+        size="about 43 MB",
+        source="from rpg.ifi.uzh.ch/data/E2VID/models (its README: github.com/uzh-rpg/rpg_e2vid)",
+        variable="EVSPLAT_E2VID",
+    )
+    _states: Sequence[State | None] = ()
 
-    def __init__(
-        self, capture: TrainingCapture, *, weights: Path | str | None = None, device: str = "auto"
-    ) -> None:
-        """Raises `WeightsError` without its weights, `DataError` as its base."""
-        super().__init__(capture, E2VidNetwork(weights, device))
-
-
-class E2VidNetwork:
-    """The network and what it remembers (`IntensityNetwork`)."""
-
-    def __init__(self, weights: Path | str | None = None, device: str = "auto") -> None:
-        """``weights``: the file; else looked for as `WeightFile.find` says."""
-        self.weights = FILE.find(weights)
-        self.device = network_device(device)
-        self._model = load(self.weights).to(self.device)
-        self._states: list[State | None] = []
+    def load(self, path: Path) -> "RecurrentUNet":
+        """The network in the shape that the checkpoint states under 'model'."""
+        state = read_state(path)
+        stated = state.get("model") or state.get("config", {}).get("model")
+        if not isinstance(stated, Mapping) or not isinstance(state.get("state_dict"), Mapping):
+            raise WeightsError(
+                f"{path}: holds no 'model' and 'state_dict', expected {self.file.name}; fetch it "
+                "again."
+            )
+        known = {"skip_type": "sum", "recurrent_block_type": "convlstm"}
+        for key, value in known.items():
+            if stated.get(key, value) != value:
+                raise WeightsError(
+                    f"{path}: model.{key}: expected {value!r} as in {self.file.name}, found "
+                    f"{stated[key]!r}."
+                )
+        network = RecurrentUNet(
+            bins=int(stated["num_bins"]),
+            levels=int(stated.get("num_encoders", 4)),
+            channels=int(stated.get("base_num_channels", 32)),
+            residuals=int(stated.get("num_residual_blocks", 2)),
+            normalised=stated.get("norm") == "BN",
+            interpolated=bool(stated.get("use_upsample_conv", True)),
+        )
+        tensors = {
+            key.removeprefix("unetrecurrent."): value for key, value in state["state_dict"].items()
+        }
+        fill(network, tensors, path, what=self.file.name, part="unetrecurrent.")
+        return network
 
     def reset(self) -> None:
         """Forget all windows so far."""
-        self._states = []
+        self._states = ()
 
     @torch.inference_mode()
     def step(self, events: EventStream, height: int, width: int) -> Float[Tensor, "H W"]:
         """Intensity in [0, 1] at the end of a window, which is taken in equal parts."""
         count = max(1, round(len(events) / (EVENTS_PER_PIXEL * height * width)))
         edges = np.linspace(0, len(events), count + 1).round().astype(int)
-        columns = (events.t, events.x, events.y, events.p)
-        multiple = 2 ** len(self._model.encoders)
+        multiple = 2 ** len(self.network.encoders)
         # evenly on both sides, the odd pixel first
         down, right = -height % multiple, -width % multiple
         top, left = (down + 1) // 2, (right + 1) // 2
         picture = torch.empty(0)
-        with enough_memory(E2Vid.name, height, width, self.device):
+        with enough_memory(self.name, height, width, self.device):
             for first, last in zip(edges, edges[1:], strict=False):
-                part = EventStream(*(column[first:last] for column in columns))
-                grid = voxel_grid(part, height, width, self._model.bins, scaling="standard")
+                part = events.take(slice(first, last))
+                grid = voxel_grid(part, height, width, self.network.bins, scaling="standard")
                 padded = F.pad(
                     grid[None].to(self.device),
                     (left, right - left, top, down - top),
                     mode="reflect",
                 )
-                made, self._states = self._model(padded, self._states)
+                made, self._states = self.network(padded, self._states)
                 picture = made[0, 0, top : top + height, left : left + width]
         return picture
 
     def provenance(self) -> dict[str, Any]:
         """The weights and how events were grouped."""
-        return {
-            "weights": self.weights.name,
-            "sha256": sha256_of(self.weights),
-            "events_per_pixel": EVENTS_PER_PIXEL,
-        }
-
-
-def load(path: Path) -> "RecurrentUNet":
-    """The network in the shape that the checkpoint states under 'model'."""
-    state = read_state(path)
-    stated = state.get("model") or state.get("config", {}).get("model")
-    if not isinstance(stated, Mapping) or not isinstance(state.get("state_dict"), Mapping):
-        raise WeightsError(
-            f"{path}: holds no 'model' and 'state_dict', expected {FILE.name}; fetch it again."
-        )
-    known = {"skip_type": "sum", "recurrent_block_type": "convlstm"}
-    for key, value in known.items():
-        if stated.get(key, value) != value:
-            raise WeightsError(
-                f"{path}: model.{key}: expected {value!r} as in {FILE.name}, found {stated[key]!r}."
-            )
-    network = RecurrentUNet(
-        bins=int(stated["num_bins"]),
-        levels=int(stated.get("num_encoders", 4)),
-        channels=int(stated.get("base_num_channels", 32)),
-        residuals=int(stated.get("num_residual_blocks", 2)),
-        normalised=stated.get("norm") == "BN",
-        interpolated=bool(stated.get("use_upsample_conv", True)),
-    )
-    tensors = {
-        key.removeprefix("unetrecurrent."): value for key, value in state["state_dict"].items()
-    }
-    fill(network, tensors, path, what=FILE.name, part="unetrecurrent.")
-    return network
+        return {**super().provenance(), "events_per_pixel": EVENTS_PER_PIXEL}
 
 
 class RecurrentUNet(nn.Module):
@@ -156,7 +134,7 @@ class RecurrentUNet(nn.Module):
         self.pred = Convolution(channels, 1, 1, normalised=normalised, rectified=False)
 
     def forward(
-        self, grid: Float[Tensor, "1 B H W"], states: list[State | None]
+        self, grid: Float[Tensor, "1 B H W"], states: Sequence[State | None]
     ) -> tuple[Float[Tensor, "1 1 H W"], list[State | None]]:
         """The picture in [0, 1] and the memories after it; sides multiples of 2 per level."""
         head = x = self.head(grid)

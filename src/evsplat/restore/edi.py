@@ -6,7 +6,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Frame, TrainingCapture, estimate_sensor
+from evsplat.capture import Frame, TrainingCapture, estimate_sensor, warn_of_linear_frames
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import deblur
 from evsplat.pictures import Transfer
@@ -23,9 +23,10 @@ class Edi:
         capture: TrainingCapture,
         *,
         contrast_threshold: tuple[float, float] | None = None,
-        transfer: Transfer = "power",
+        transfer: Transfer | None = None,
     ) -> None:
         """``contrast_threshold``: C+ and C-; without them the capture's, or else estimated ones.
+        ``transfer``: the curve from values to light, by default the capture's own.
 
         Raises:
             DataError: The capture has no events or no polarity, or no thresholds and none can be
@@ -33,7 +34,7 @@ class Edi:
             ConfigError: A threshold is not above 0.
         """
         require_signed_events(capture, "the event double integral (edi)")
-        self._transfer: Transfer = transfer
+        self._transfer: Transfer = transfer or capture.transfer(capture.frames[0])
         if contrast_threshold is not None and min(contrast_threshold) <= 0:
             raise ConfigError(
                 f"contrast threshold {contrast_threshold}: expected two numbers above 0, C+ and C-."
@@ -74,6 +75,7 @@ class Edi:
 
 def _estimated(capture: TrainingCapture) -> tuple[float, float]:
     estimate = estimate_sensor(capture)
+    warn_of_linear_frames(capture, estimate)
     if estimate is None or estimate.thresholds is None:
         raise DataError(
             f"{capture.path}: its contrast thresholds are unknown and cannot be estimated from its "

@@ -41,7 +41,6 @@ class EfNet(NetworkRestorer):
         variable="EVSPLAT_EFNET",
     )
     multiple = 4
-    needs_events = True
 
     def load(self, path: Path) -> nn.Module:
         """The network with 64 channels."""

@@ -5,9 +5,9 @@ contrast and unknown where nothing has moved yet. A static camera sees no events
 the frames of a capture keep their own pixels there, and elsewhere their colour.
 """
 
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.events import EventStream
 from evsplat.events.maps import polarity_counts
 from evsplat.pictures.light import REC709
-from evsplat.restore.network import require_signed_events
+from evsplat.restore.network import Pretrained
 
 MATCHED_OVER = 0.02
 """Standard deviation, over the picture's shorter side, of the weights of brightness matching."""
@@ -26,39 +26,21 @@ _LEAST_VARIANCE = 1e-5
 _OFFSET = 0.02
 
 
-class IntensityNetwork(Protocol):
-    """Gives a grey picture per window of events, keeping what earlier windows have shown."""
-
-    device: torch.device
-    weights: Path
-
-    def reset(self) -> None:
-        """Forget all windows so far."""
-        ...
-
-    def step(self, events: EventStream, height: int, width: int) -> Float[Tensor, "H W"]:
-        """Intensity at the end of a window, in no known unit."""
-        ...
-
-    def provenance(self) -> dict[str, Any]:
-        """Weights and settings, as JSON values."""
-        ...
-
-
-class FromEvents:
+class FromEvents(Pretrained):
     """Each frame at mid-exposure, its brightness from events and its colour from the blurry frame.
 
     The events between the mid-exposures of neighbouring frames are one window; the first begins
-    one such interval early, as far as there are events. Where events may not be read the network
-    forgets what it saw, and begins anew behind the gap.
+    one such interval early, as far as there are events. The network keeps what earlier windows have
+    shown; where events may not be read it forgets that, and begins anew behind the gap.
     """
 
-    name: str
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget all windows so far."""
 
-    def __init__(self, capture: TrainingCapture, network: IntensityNetwork) -> None:
-        """Raises `DataError` where the capture has no events, or they have no polarity."""
-        require_signed_events(capture, self.name)
-        self._network = network
+    @abstractmethod
+    def step(self, events: EventStream, height: int, width: int) -> Float[Tensor, "H W"]:
+        """Intensity at the end of a window, in no known unit."""
 
     def restore(
         self, capture: TrainingCapture, frames: Sequence[Frame]
@@ -71,12 +53,12 @@ class FromEvents:
         stretch, before = None, 0
         for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us):
             if stretch != (stretch := capture.events.readable_around(frame.mid_us)):
-                self._network.reset()
+                self.reset()
                 before = max(frame.mid_us - interval, stretch[0])
             camera = capture.camera(frame)
             height, width = camera.height, camera.width
             window = capture.events.between(before, frame.mid_us)
-            intensity = self._network.step(window, height, width).cpu()
+            intensity = self.step(window, height, width).cpu()
             before = frame.mid_us
             if frame.name in asked:
                 moved = polarity_counts(capture.events.between(*frame.exposure_us), height, width)
@@ -85,7 +67,7 @@ class FromEvents:
     def provenance(self) -> dict[str, Any]:
         """The network's, and how its pictures became frames."""
         return {
-            **self._network.provenance(),
+            **super().provenance(),
             "colour": "of the blurry frame, brightness from events where the exposure saw any",
             "brightness_matched_over": MATCHED_OVER,
         }

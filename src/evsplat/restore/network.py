@@ -1,4 +1,4 @@
-"""Base of restorers that run a pretrained network on each frame, in tiles where it is large."""
+"""Bases of restorers with a pretrained network, one that runs it on each frame, in tiles."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -23,14 +23,12 @@ OVERLAP_PX = 64
 _CPU_SIGNS = ("can't allocate memory", "not enough memory")
 
 
-class NetworkRestorer(ABC):
-    """Sharp pictures by a network that takes some inputs of each frame and gives its picture."""
+class Pretrained(ABC):
+    """A restorer with a pretrained network."""
 
     name: str
     file: ClassVar[WeightFile]
-    multiple: ClassVar[int]
-    """The network wants sides that are a multiple of this."""
-    needs_events: ClassVar[bool]
+    needs_events: ClassVar[bool] = True
 
     def __init__(
         self, capture: TrainingCapture, *, weights: Path | str | None = None, device: str = "auto"
@@ -43,13 +41,28 @@ class NetworkRestorer(ABC):
         """
         if self.needs_events:
             require_signed_events(capture, self.name)
-        self.weights = self.file.find(weights)
+        self.weights = self.find(weights)
         self.device = network_device(device)
         self.network = self.load(self.weights).to(self.device)
 
+    def find(self, weights: Path | str | None) -> Path:
+        """The weight file."""
+        return self.file.find(weights)
+
     @abstractmethod
-    def load(self, path: Path) -> nn.Module:
+    def load(self, path: Path) -> Any:
         """The network with the weights of ``path``."""
+
+    def provenance(self) -> dict[str, Any]:
+        """The weights."""
+        return {"weights": self.weights.name, "sha256": sha256_of(self.weights)}
+
+
+class NetworkRestorer(Pretrained):
+    """Sharp pictures by a network that takes some inputs of each frame and gives its picture."""
+
+    multiple: ClassVar[int]
+    """The network wants sides that are a multiple of this."""
 
     @abstractmethod
     def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
@@ -68,12 +81,7 @@ class NetworkRestorer(ABC):
 
     def provenance(self) -> dict[str, Any]:
         """The weights and how large pictures were cut."""
-        return {
-            "weights": self.weights.name,
-            "sha256": sha256_of(self.weights),
-            "tile_px": SIDE_PX,
-            "overlap_px": OVERLAP_PX,
-        }
+        return {**super().provenance(), "tile_px": SIDE_PX, "overlap_px": OVERLAP_PX}
 
 
 class SupervisedAttention(nn.Module):

@@ -16,12 +16,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.capture import TrainingCapture
-from evsplat.devices import network_device
 from evsplat.errors import DataError, WeightsError
 from evsplat.events import EventStream
 from evsplat.events.maps import voxel_grid
 from evsplat.restore.intensity import FromEvents
-from evsplat.weights import MissingWeights, read_state, sha256_of
+from evsplat.weights import MissingWeights, read_state
 
 PACKAGE = "pie_net"
 DISTRIBUTION = "event-pienet"
@@ -32,27 +31,38 @@ _LEAST_SIDE = 20
 
 
 class PieNet(FromEvents):
-    """Brightness from events by PIE-Net, colour from the blurry frame."""
+    """Brightness from events by the full PIE-Net, colour from the blurry frame."""
 
     name = "pienet"
 
     def __init__(self, capture: TrainingCapture, *, device: str = "auto") -> None:
-        """Raises `MissingWeights` where the package is not installed, `DataError` as its base."""
-        super().__init__(capture, PieNetwork(device))
+        """Raises `WeightsError` where the package is not installed, or another one than 1.1.3."""
+        super().__init__(capture, device=device)
 
+    def find(self, weights: Path | str | None) -> Path:
+        """The weight file in the installed package."""
+        return find_weights()
 
-class PieNetwork:
-    """The full network of the package (`IntensityNetwork`); takes 5-bin voxel grids as they are."""
-
-    def __init__(self, device: str = "auto") -> None:
-        """Raises `WeightsError` where the package is another one than 1.1.3 or alike."""
-        self.weights = find_weights()
-        self.device = network_device(device)
-        self._model = _load(self.weights).to(self.device)
+    def load(self, path: Path) -> nn.Module:
+        """The network as it was trained; takes 5-bin voxel grids as they are."""
+        state = read_state(path)
+        try:
+            definition = importlib.import_module(f"{PACKAGE}.model")
+            params = {**definition.CONFIG_PIENET, "n_rep_dn": [1, 1, 1]}
+            network: nn.Module = definition.PIENet()
+            network.model = definition.SingleEncoderEffUNet_v3(BINS, 1, 3, params)
+            network.load_state_dict(state)
+        except (ImportError, AttributeError, TypeError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise WeightsError(
+                f"{path}: not the network of {DISTRIBUTION} 1.1.3 ({reason}); get it with: "
+                f"{INSTALL}==1.1.3."
+            ) from error
+        return network.eval()
 
     def reset(self) -> None:
         """Forget all windows so far."""
-        self._model.reset_states()
+        self.network.reset_states()
 
     @torch.inference_mode()
     def step(self, events: EventStream, height: int, width: int) -> Float[Tensor, "H W"]:
@@ -63,16 +73,12 @@ class PieNetwork:
                 f"{_LEAST_SIDE} pixels each way; use --with edi."
             )
         grid = voxel_grid(events, height, width, BINS).to(self.device)
-        picture: Tensor = self._model(grid[None])["image"][0, 0]
+        picture: Tensor = self.network(grid[None])["image"][0, 0]
         return picture
 
     def provenance(self) -> dict[str, Any]:
         """Package and weights."""
-        return {
-            "package": f"{DISTRIBUTION} {version(DISTRIBUTION)}",
-            "weights": self.weights.name,
-            "sha256": sha256_of(self.weights),
-        }
+        return {"package": f"{DISTRIBUTION} {version(DISTRIBUTION)}", **super().provenance()}
 
 
 def find_weights() -> Path:
@@ -87,21 +93,3 @@ def find_weights() -> Path:
     if not path.is_file():
         raise WeightsError(f"{path}: file not found; get it again with: {INSTALL}.")
     return path
-
-
-def _load(path: Path) -> Any:
-    state = read_state(path)
-    try:
-        definition = importlib.import_module(f"{PACKAGE}.model")
-        blocks = [1, 1, 1]
-        params = {**definition.CONFIG_PIENET, "n_rep_dn": blocks}
-        network: nn.Module = definition.PIENet()
-        network.model = definition.SingleEncoderEffUNet_v3(BINS, 1, 3, params)
-        network.load_state_dict(state)
-    except (ImportError, AttributeError, TypeError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise WeightsError(
-            f"{path}: not the network of {DISTRIBUTION} 1.1.3 ({reason}); get it with: "
-            f"{INSTALL}==1.1.3."
-        ) from error
-    return network.eval()

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from evsplat.errors import WeightsError
-from evsplat.similarity.perceptual import Conv, Layer, MaxPool, Network, PerceptualMetric, Relu
+from evsplat.similarity.perceptual import Network, PerceptualMetric, numbered
 from evsplat.weights import MissingWeights, home_as_tilde, hub_folder, read_state, sha256_of
 
 LpipsName = Literal["alex", "vgg"]
@@ -21,34 +21,31 @@ WEIGHTS_VARIABLE = "EVSPLAT_LPIPS_WEIGHTS"
 
 
 def _alexnet() -> Network:
-    pool = MaxPool(3, 2)
-    return Network(
-        "LPIPS AlexNet",
-        (
-            (Conv("features.0", (64, 3, 11, 11), stride=4, padding=2), Relu()),
-            (pool, Conv("features.3", (192, 64, 5, 5), padding=2), Relu()),
-            (pool, Conv("features.6", (384, 192, 3, 3)), Relu()),
-            (Conv("features.8", (256, 384, 3, 3)), Relu()),
-            (Conv("features.10", (256, 256, 3, 3)), Relu()),
-        ),
-        min_side=31,
+    conv, act, pool = nn.Conv2d, nn.ReLU(), nn.MaxPool2d(3, 2)
+    stages = (
+        (conv(3, 64, 11, 4, 2), act),
+        (pool, conv(64, 192, 5, 1, 2), act),
+        (pool, conv(192, 384, 3, 1, 1), act),
+        (conv(384, 256, 3, 1, 1), act),
+        (conv(256, 256, 3, 1, 1), act),
     )
+    return Network("LPIPS AlexNet", numbered(stages, "features.{place}"), min_side=31)
 
 
 def _vgg16() -> Network:
-    stages: list[tuple[Layer, ...]] = []
-    index, channels = 0, 3
+    stages: list[list[nn.Module]] = []
+    channels = 3
     for width, convolutions in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-        layers: list[Layer] = [MaxPool(2, 2)] if stages else []
+        layers: list[nn.Module] = [nn.MaxPool2d(2, 2)] if stages else []
         for _ in range(convolutions):
-            layers += [Conv(f"features.{index}", (width, channels, 3, 3)), Relu()]
-            index, channels = index + 2, width
-        stages.append(tuple(layers))
-        index += 1  # the pooling layer has a place in torchvision's numbering
-    return Network("LPIPS VGG16", tuple(stages), min_side=16)
+            layers += [nn.Conv2d(channels, width, 3, 1, 1), nn.ReLU()]
+            channels = width
+        stages.append(layers)
+    return Network("LPIPS VGG16", numbered(stages, "features.{place}"), min_side=16)
 
 
-NETWORKS: dict[LpipsName, Network] = {"alex": _alexnet(), "vgg": _vgg16()}
+with torch.device("meta"):
+    NETWORKS: dict[LpipsName, Network] = {"alex": _alexnet(), "vgg": _vgg16()}
 HUB_FILES: dict[LpipsName, str] = {
     "alex": "alexnet-owt-7be5be79.pth",
     "vgg": "vgg16-397923af.pth",

@@ -1,11 +1,13 @@
 """Distance of two images in the features of a convolutional network (Zhang et al. 2018)."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import copy
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evsplat.devices import send
@@ -15,39 +17,21 @@ _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
 
-@dataclass(frozen=True)
-class Conv:
-    """Convolution with the weight and bias stored under ``key``."""
+class Blur(nn.Module):
+    """Depthwise 3×3 filter: reflect-padded by 2, stride 2."""
 
-    key: str
-    shape: tuple[int, int, int, int]
-    """Shape of the weight: channels out, channels in, height, width."""
-    stride: int = 1
-    padding: int = 1
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.filt = nn.Parameter(torch.empty(channels, 1, 3, 3))
 
-
-@dataclass(frozen=True)
-class MaxPool:
-    """Largest value of each window."""
-
-    size: int
-    stride: int
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
+        """Features at half the resolution."""
+        padded = F.pad(x, (2, 2, 2, 2), mode="reflect")
+        return F.conv2d(padded, self.filt, stride=2, groups=len(self.filt))
 
 
-@dataclass(frozen=True)
-class Blur:
-    """Depthwise 3×3 filter stored under ``key`` + ".filt": reflect-padded by 2, stride 2."""
-
-    key: str
-    channels: int
-
-
-@dataclass(frozen=True)
-class Relu:
-    """Negative values become zero."""
-
-
-Layer = Conv | MaxPool | Blur | Relu
+Stage = Mapping[str, nn.Module]
+"""Layers in their order, by the names that the weight file has for them."""
 
 
 @dataclass(frozen=True)
@@ -55,57 +39,53 @@ class Network:
     """A feature network: the output of each stage takes part in the distance."""
 
     name: str
-    stages: tuple[tuple[Layer, ...], ...]
+    stages: Sequence[Stage]
+    """Layers without values (on the meta device), or with them: see `filled`."""
     min_side: int
     """Shortest image side, in pixels, that leaves something to compare after the last stage."""
 
     @property
-    def channels(self) -> tuple[int, ...]:
-        """Channels of the output of each stage."""
-        return tuple(
-            next(layer.shape[0] for layer in reversed(stage) if isinstance(layer, Conv))
-            for stage in self.stages
-        )
+    def layers(self) -> dict[str, nn.Module]:
+        """All layers, by the names that the weight file has for them."""
+        return {key: layer for stage in self.stages for key, layer in stage.items()}
 
     @property
     def parameter_shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of all parameters, as they are called in the weight file."""
-        shapes: dict[str, tuple[int, ...]] = {}
-        for stage in self.stages:
-            for layer in stage:
-                if isinstance(layer, Conv):
-                    shapes[f"{layer.key}.weight"] = layer.shape
-                    shapes[f"{layer.key}.bias"] = layer.shape[:1]
-                elif isinstance(layer, Blur):
-                    shapes[f"{layer.key}.filt"] = (layer.channels, 1, 3, 3)
-        return shapes
+        return {
+            f"{key}.{name}": tuple(value.shape)
+            for key, layer in self.layers.items()
+            for name, value in layer.state_dict().items()
+        }
 
-    def features(
-        self, x: Float[Tensor, "B 3 H W"], parameters: Mapping[str, Tensor]
-    ) -> list[Float[Tensor, "B C h w"]]:
+    def filled(self, parameters: Mapping[str, Tensor]) -> "Network":
+        """The network with values for its parameters, for inference."""
+        network = replace(self, stages=copy.deepcopy(self.stages))
+        for key, layer in network.layers.items():
+            own = {name: parameters[f"{key}.{name}"].detach() for name in layer.state_dict()}
+            layer.load_state_dict(own, assign=True)
+            layer.requires_grad_(False)
+        return network
+
+    def features(self, x: Float[Tensor, "B 3 H W"]) -> list[Float[Tensor, "B C h w"]]:
         """Output of every stage; ``x`` is in [-1, 1]."""
         shift, scale = send(torch.tensor([_SHIFT, _SCALE], dtype=x.dtype), x.device)
         x = (x - shift.view(3, 1, 1)) / scale.view(3, 1, 1)
         outputs = []
         for stage in self.stages:
-            for layer in stage:
-                x = _apply(layer, x, parameters)
+            for layer in stage.values():
+                x = layer(x)
             outputs.append(x)
         return outputs
 
 
-def _apply(layer: Layer, x: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-    match layer:
-        case Conv(key, _, stride, padding):
-            weight, bias = parameters[f"{key}.weight"], parameters[f"{key}.bias"]
-            return F.conv2d(x, weight, bias, stride, padding)
-        case MaxPool(size, stride):
-            return F.max_pool2d(x, size, stride)
-        case Blur(key, channels):
-            padded = F.pad(x, (2, 2, 2, 2), mode="reflect")
-            return F.conv2d(padded, parameters[f"{key}.filt"], stride=2, groups=channels)
-        case Relu():
-            return F.relu(x)
+def numbered(stages: Iterable[Iterable[nn.Module]], name: str) -> list[Stage]:
+    """Layers by their names, which count stages from 1 and places of layers through all stages."""
+    places = itertools.count()
+    return [
+        {name.format(stage=stage, place=next(places)): layer for layer in layers}
+        for stage, layers in enumerate(stages, 1)
+    ]
 
 
 Features = Sequence[Float[Tensor, "C h w"]]
@@ -124,11 +104,10 @@ class PerceptualMetric:
         sha256: str,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.network = network
+        self.device = torch.device(device)
+        self.network = network.filled({k: v.to(self.device) for k, v in parameters.items()})
         self.sha256 = sha256
         """Checksum of the file that the network's weights came from."""
-        self.device = torch.device(device)
-        self._parameters = {k: v.detach().to(self.device) for k, v in parameters.items()}
         self._heads = [head.detach().to(self.device) for head in heads]
 
     def features(self, image: Float[Tensor, "H W 3"]) -> Features:
@@ -142,7 +121,7 @@ class PerceptualMetric:
         # 1e-10 outside the root, as in the reference code: it keeps all-zero vectors zero.
         return [
             (f / (f.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))[0]
-            for f in self.network.features(x, self._parameters)
+            for f in self.network.features(x)
         ]
 
     def compare(self, first: Features, second: Features) -> Float[Tensor, ""]:

@@ -8,34 +8,31 @@ import importlib.util
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from evsplat.errors import WeightsError
-from evsplat.similarity.perceptual import Blur, Conv, MaxPool, Network, PerceptualMetric, Relu
+from evsplat.similarity.perceptual import Blur, Network, PerceptualMetric, numbered
 from evsplat.weights import MissingWeights, read_state, sha256_of
 
 PACKAGE = "stlpips_pytorch"
 
-_POOL = MaxPool(3, 1)
-NETWORK = Network(
-    "ST-LPIPS AlexNet",
-    (
-        (
-            Conv("net.slice1.0", (64, 3, 11, 11), padding=2),
-            Blur("net.slice1.1", 64),
-            Relu(),
-        ),
-        (
-            _POOL,
-            Blur("net.slice2.4", 64),
-            Conv("net.slice2.5", (192, 64, 5, 5), padding=2),
-            Relu(),
-        ),
-        (_POOL, Blur("net.slice3.8", 192), Conv("net.slice3.9", (384, 192, 3, 3)), Relu()),
-        (Conv("net.slice4.11", (256, 384, 3, 3)), Relu()),
-        (Conv("net.slice5.13", (256, 256, 3, 3)), Relu()),
-    ),
-    min_side=21,
-)
+_CHANNELS = (64, 192, 384, 256, 256)
+
+
+def _alexnet() -> Network:
+    conv, act, pool = nn.Conv2d, nn.ReLU(), nn.MaxPool2d(3, 1)
+    stages = (
+        (conv(3, 64, 11, 1, 2), Blur(64), act),
+        (pool, Blur(64), conv(64, 192, 5, 1, 2), act),
+        (pool, Blur(192), conv(192, 384, 3, 1, 1), act),
+        (conv(384, 256, 3, 1, 1), act),
+        (conv(256, 256, 3, 1, 1), act),
+    )
+    return Network("ST-LPIPS AlexNet", numbered(stages, "net.slice{stage}.{place}"), min_side=21)
+
+
+with torch.device("meta"):
+    NETWORK = _alexnet()
 
 
 def load_st_lpips(*, device: torch.device | str = "cpu") -> PerceptualMetric:
@@ -51,7 +48,7 @@ def load_st_lpips(*, device: torch.device | str = "cpu") -> PerceptualMetric:
     if not path.is_file():
         raise WeightsError(f"{path}: file not found; expected stlpips-pytorch 0.0.2.")
     state = read_state(path)
-    heads = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(NETWORK.channels)}
+    heads = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(_CHANNELS)}
     for key, shape in {**NETWORK.parameter_shapes, **heads}.items():
         found = tuple(state[key].shape) if key in state else "nothing"
         if found != shape:

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from evsplat.body import axis_angle_to_matrix
 from evsplat.camera import Camera
@@ -73,15 +74,9 @@ class CameraPath:
 
     def _orbit(self, second: float) -> np.ndarray:
         """An even arc round the vertical through the target, symmetric about the tripod's place."""
-        angle = np.radians(self.orbit_deg) * (second / self.duration_s - 0.5)
-        offset = np.subtract(MAIN, TARGET)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        turned = (
-            cosine * offset[0] - sine * offset[1],
-            sine * offset[0] + cosine * offset[1],
-            offset[2],
-        )
-        return look_at(np.add(TARGET, turned), TARGET)
+        degrees = self.orbit_deg * (second / self.duration_s - 0.5)
+        turn = Rotation.from_euler("z", degrees, degrees=True)
+        return look_at(TARGET + turn.apply(np.subtract(MAIN, TARGET)), TARGET)
 
     def _sway(self, seconds: np.ndarray) -> np.ndarray:
         """Small rigid motions of the camera in its own axes, (T, 4, 4)."""

@@ -12,9 +12,9 @@ from jaxtyping import Float32
 from tqdm import tqdm
 
 import evsplat
-from evsplat.body import BodyTrack
+from evsplat.body import BodyTrack, PoseSource
 from evsplat.body.motion import load_motion
-from evsplat.body.pose_noise import poses_off_by
+from evsplat.body.pose_noise import noise_errors, poses_off_by
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.capture import Camera, CaptureWriter
 from evsplat.capture.parse import default_split
@@ -41,6 +41,7 @@ from evsplat.staging.motion import (
     height_m,
     key_poses,
     place_motion,
+    warn_of_hiding,
     warn_of_leaving,
 )
 from evsplat.staging.renderer import StageRenderer
@@ -55,6 +56,13 @@ POSE_ERRORS: dict[PoseNoise, float] = {
 """Mean error of wrists and ankles as a share of the body's height. A pose network run on frames of
 a synthetic 512-pixel kick missed them by 1 to 2 % of the height, blurry frames being twice as bad;
 0.3 % (5 mm) is what markers reach."""
+POSE_SOURCE: dict[PoseNoise, PoseSource] = {
+    "none": "exact",
+    "mocap": "markers",
+    "estimated": "estimated",
+    "estimated-blurry": "estimated",
+}
+"""Where poses with such errors come from in a recording."""
 MOST_FRAMES = 100
 """Frames filmed of a long motion where no number is asked for."""
 _CHUNK_BYTES = 64 << 20
@@ -174,7 +182,7 @@ class _Film:
         """The bare body, its key poses (with noise where asked for) and the truth in between."""
         body, settings = self.track.body, self.settings
         x, y, z = self.camera.world_to_camera[2, :3].tolist()
-        poses, transl, error_m = poses_off_by(
+        poses, transl, error_m, noise = poses_off_by(
             body,
             *key_poses(self.track, self.mids_us),
             self.mids_us,
@@ -182,6 +190,8 @@ class _Film:
             seed=settings.seed,
             view=(x, y, z),
         )
+        source = POSE_SOURCE[settings.pose_noise]
+        errors = noise_errors(body, noise, len(poses), source, view=(x, y, z))
         writer.provenance["pose_error_wrists_ankles_m"] = error_m
         dense = np.concatenate([np.concatenate((t.exposure, t.after)) for t in self.times])
         writer.set_body(
@@ -198,12 +208,16 @@ class _Film:
                 "weights": body.weights.numpy(),
             },
             dense=(dense, *key_poses(self.track, dense)),
+            source=source,
+            pose_std_rad=errors.joint_rad,
+            transl_std_m=errors.root_m,
         )
 
     def shoot(self, writer: CaptureWriter, progress: bool) -> Iterator[EventStream]:
         """Write the pictures frame by frame and give the events of each."""
         settings = self.settings
         sensor = SensorSimulator(*settings.size, PRESETS[settings.events], settings.seed)
+        area = 0.0
         bar = tqdm(self.times, desc="filming", unit="frame", disable=not progress)
         for index, times in enumerate(bar):
             blurry = np.zeros((*reversed(settings.size), 3))
@@ -214,6 +228,7 @@ class _Film:
                 events.append(sensor.step(luminance(torch.from_numpy(picture)), time))
             name = f"{index:04d}"
             sharp, mask = self._draw_at(times.mid_us)
+            area += float(mask.mean()) / len(self.times)
             writer.add_frame(
                 name,
                 "main",
@@ -231,6 +246,7 @@ class _Film:
                     seen, _ = self._draw_at(times.mid_us, view)
                     writer.add_novel_view(camera, name, times.mid_us, _coded(seen))
             yield EventStream.joined(events)
+        warn_of_hiding(area)
 
     def _draw(self, times_us: np.ndarray) -> Iterator[tuple[int, Float32[np.ndarray, "H W 3"]]]:
         """Time and linear picture of the recording camera, drawn in batches."""

@@ -16,6 +16,7 @@ from evsplat.staging.character import Character
 
 logger = logging.getLogger(__name__)
 
+_LEAST_AREA = 1e-3
 _FLOOR_TIMES = 60
 _FLOOR_PERCENTILE = 10
 """Share of the time in which feet may sink in: a jump's landing must not lift all the rest."""
@@ -89,6 +90,16 @@ def warn_of_leaving(
             "The person leaves the picture in %d of %d frames; --in-place holds them to the spot.",
             cut,
             len(cameras),
+        )
+
+
+def warn_of_hiding(area: float) -> None:
+    """Log where the person's mean share of the pictures is next to nothing."""
+    if area < _LEAST_AREA:
+        logger.warning(
+            "The person fills %.2g %% of the pictures in the mean, and so is hidden, out of view "
+            "or far away; move or turn them, or the camera.",
+            100 * area,
         )
 
 

@@ -4,11 +4,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
 
-from evsplat import compiled
 from evsplat.body import Body
 from evsplat.body.skeleton import find_skeleton
 from evsplat.camera import Camera
-from evsplat.errors import BackendError
+from evsplat.compiled import native_for
 from evsplat.staging.character import Character
 from evsplat.staging.room import Lighting, Room
 
@@ -35,11 +34,6 @@ class StageRenderer:
         *,
         threads: int | None = None,
     ) -> None:
-        if compiled.native is None:
-            raise BackendError(
-                f"the compiled module is missing ({compiled.import_error}), which draws synthetic "
-                "captures; reinstall evsplat with a C++ compiler at hand."
-            )
         self.character = character
         self.threads = threads or torch.get_num_threads()
         lamp = tuple(float(value) for value in room.lamp)
@@ -49,7 +43,7 @@ class StageRenderer:
         bones, weights = _sparse(character.weights)
         self._vertices = _floats(character.vertices)[None]
         self._normals = _floats(character.normals)[None]
-        self._stage = compiled.native.Stage(
+        self._stage = native_for("Drawing synthetic captures").Stage(
             corners=_floats(room.corners),
             normals=_floats(room.normals),
             uv=_floats(room.uv),

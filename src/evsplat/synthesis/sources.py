@@ -1,21 +1,24 @@
 """Sharp pictures and what they bring along into the new capture: footage, or a sharp capture."""
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int64
 
+from evsplat.body import PoseSource
 from evsplat.capture import BodyFile, Capture, CaptureWriter, Frame, load_capture
-from evsplat.capture.body_file import RIG_ARRAYS, body_from_arrays, read_arrays
+from evsplat.capture.body_file import RIG_ARRAYS, read_arrays, stated_body
 from evsplat.capture.write import read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture
 from evsplat.pictures.files import read_image
+from evsplat.pictures.light import Transfer
 
 logger = logging.getLogger(__name__)
 
@@ -29,36 +32,46 @@ class RecordedEvents:
     simulated: bool
 
 
-class Source(Protocol):
+class Source(ABC):
     """Sharp pictures with what belongs to them."""
 
     footage: Footage
     camera: str
     """Name of the camera that took them."""
 
+    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """Facts about the source for the provenance."""
-        ...
 
-    def declare(self, writer: CaptureWriter) -> None:
-        """Add the cameras."""
-        ...
+    @property
+    @abstractmethod
+    def transfer(self) -> Transfer | None:
+        """From values to light, as the camera states it."""
+
+    @abstractmethod
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
+        """Add the cameras, with that curve from values to light."""
 
     def extras(self, index: int) -> dict[str, Any]:
         """Options of `CaptureWriter.add_frame` that go with the source picture of that index."""
-        ...
+        return {}
 
     def split(self, index: int) -> Literal["train", "test"]:
         """The source's own split; `ConfigError` where it has none."""
-        ...
+        raise self._has_no("split")
 
     def events(self) -> RecordedEvents:
         """The source's own events; `ConfigError` where it has none."""
-        ...
+        raise self._has_no("events")
 
+    @abstractmethod
     def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
         """Add the body and the rest; ``frames`` are names and mid-exposures of those made."""
-        ...
+
+    def _has_no(self, what: str) -> ConfigError:
+        return ConfigError(
+            f"--{what} source: {self.footage.path} is no capture and has no {what} of its own."
+        )
 
 
 def set_body(
@@ -69,24 +82,27 @@ def set_body(
 ) -> None:
     """Key poses are those at mid-exposures; all there are, or the denser truth, go beside them."""
     nearest = np.abs(body.times_us[None] - middles_us[:, None]).argmin(axis=1)
-    keys = np.unique(nearest)
+    kept = body.at_keys(np.isin(np.arange(len(body.times_us)), nearest))
     truth = dense or body
     writer.set_body(
         body.model,
-        body.times_us[keys],
-        body.poses[keys],
-        body.transl[keys],
+        kept.times_us,
+        kept.poses,
+        kept.transl,
         rig=body.rig,
         betas=body.betas,
         gender=body.gender,
         dense=(truth.times_us, truth.poses, truth.transl),
+        source=kept.source,
+        pose_std_rad=kept.pose_std_rad,
+        transl_std_m=kept.transl_std_m,
     )
 
 
 _PIECE_US = 100_000
 
 
-class CaptureSource:
+class CaptureSource(Source):
     """Camera, poses, masks, other views and first points go on to the new capture (`Source`).
 
     The sharp pictures are the frames' ``sharp`` where all have one, else their ``image``.
@@ -101,7 +117,12 @@ class CaptureSource:
         """See `Source`."""
         return {"capture": self._capture.name, "provenance": self._capture.provenance}
 
-    def declare(self, writer: CaptureWriter) -> None:
+    @property
+    def transfer(self) -> Transfer | None:
+        """See `Source`."""
+        return self._capture.metadata.transfers.get(self.camera)
+
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
         """See `Source`; lenses stay, pictures are handled as they were recorded."""
         for name, camera in self._capture.cameras.items():
             lens = self._capture.metadata.distortions.get(name)
@@ -112,6 +133,7 @@ class CaptureSource:
                 camera.K,
                 camera.world_to_camera,
                 distortion=None if lens is None else lens.coefficients,
+                transfer=transfer,
             )
 
     def extras(self, index: int) -> dict[str, Any]:
@@ -137,7 +159,10 @@ class CaptureSource:
         """See `Source`."""
         capture = self._capture
         middles = np.array(list(frames.values()))
-        set_body(writer, capture.body_file, capture.dense_body_file, middles)
+        if capture.has_body:
+            set_body(writer, capture.body_file, capture.dense_body_file, middles)
+        else:
+            writer.leave_out_body()
         for view in capture.novel_views:
             if view.frame in frames:
                 writer.add_novel_view(view.camera, view.frame, view.time_us, view.image)
@@ -195,7 +220,7 @@ _NOMINAL_FOV_DEG = 60.0
 _CAMERA_KEYS = ("width", "height", "K", "world_to_camera")
 
 
-class FootageSource:
+class FootageSource(Source):
     """Footage with a camera and body poses, if the user has them (`Source`).
 
     ``body`` is an npz like body.npz of a capture, on the footage's clock; ``camera`` a JSON file
@@ -204,14 +229,20 @@ class FootageSource:
 
     camera = "main"
 
-    def __init__(self, footage: Footage, body: Path | None, camera: Path | None) -> None:
+    def __init__(
+        self,
+        footage: Footage,
+        body: Path | None,
+        camera: Path | None,
+        pose_source: PoseSource | None = None,
+    ) -> None:
         if body is not None and camera is None:
             raise ConfigError(
                 f"{body}: poses mean nothing without the camera that saw them; give its "
                 "description with --camera."
             )
         self.footage: Footage = footage
-        self._body = None if body is None else _read_body(body)
+        self._body = None if body is None else _read_body(body, pose_source)
         self._camera = None
         if camera is not None:
             self._camera = read_camera(camera, footage.width, footage.height, _CAMERA_KEYS)
@@ -220,11 +251,16 @@ class FootageSource:
         """See `Source`."""
         return {"footage": self.footage.path.name, "camera_known": self._camera is not None}
 
-    def declare(self, writer: CaptureWriter) -> None:
+    @property
+    def transfer(self) -> Transfer | None:
+        """See `Source`."""
+        return None if self._camera is None else self._camera["transfer"]
+
+    def declare(self, writer: CaptureWriter, transfer: Transfer) -> None:
         """See `Source`."""
         width, height = self.footage.width, self.footage.height
         if self._camera is not None:
-            writer.add_camera(self.camera, width, height, **self._camera)
+            writer.add_camera(self.camera, width, height, **{**self._camera, "transfer": transfer})
             return
         logger.warning(
             "No camera is given: one with %g degrees of view is written. Correct it in "
@@ -233,35 +269,21 @@ class FootageSource:
         )
         focal = max(width, height) / 2 / np.tan(np.radians(_NOMINAL_FOV_DEG) / 2)
         K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
-        writer.add_camera(self.camera, width, height, K)
-
-    def extras(self, index: int) -> dict[str, Any]:
-        """See `Source`."""
-        return {}
-
-    def split(self, index: int) -> Literal["train", "test"]:
-        """See `Source`."""
-        self._has_no("split")
-
-    def events(self) -> RecordedEvents:
-        """See `Source`."""
-        self._has_no("events")
+        writer.add_camera(self.camera, width, height, K, transfer=transfer)
 
     def complete(self, writer: CaptureWriter, frames: Mapping[str, int]) -> None:
         """See `Source`."""
         if self._body is None:
-            logger.warning("No body poses are given; 'evsplat train' will need them.")
+            logger.warning(
+                "No body poses are given; 'evsplat train' will need them, 'evsplat poses' finds "
+                "them."
+            )
             writer.leave_out_body()
             return
         set_body(writer, self._body, None, np.array(list(frames.values())))
 
-    def _has_no(self, what: str) -> NoReturn:
-        raise ConfigError(
-            f"--{what} source: {self.footage.path} is no capture and has no {what} of its own."
-        )
 
-
-def _read_body(path: Path) -> BodyFile:
+def _read_body(path: Path, source: PoseSource | None) -> BodyFile:
     arrays = read_arrays(path)
     needed: tuple[str, ...] = ("model", "times_us", "poses", "transl")
     if "model" in arrays and str(arrays["model"]) == "rig":
@@ -281,4 +303,4 @@ def _read_body(path: Path) -> BodyFile:
             )
     if count == 0:
         raise DataError(f"{path}: times_us is empty, expected at least one pose.")
-    return body_from_arrays(path, arrays, "")
+    return stated_body(path, arrays, source)

@@ -6,7 +6,6 @@ parameters are those of ``SuperSloMo.ckpt`` of github.com/avinashpaliwal/Super-S
 trained on Adobe240fps. Weights are never downloaded and never shipped.
 """
 
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,18 +19,16 @@ from torch.nn import functional as F
 from evsplat.errors import WeightsError
 from evsplat.pictures.light import Transfer, decode
 from evsplat.synthesis.interpolate import Picture
-from evsplat.weights import (
-    MissingWeights,
-    fill,
-    home_as_tilde,
-    hub_folder,
-    read_state,
-    sha256_of,
-)
+from evsplat.weights import WeightFile, fill, read_state, sha256_of
 
-WEIGHTS_VARIABLE = "EVSPLAT_SUPER_SLOMO"
-"""Environment variable with the path of the checkpoint."""
-FILE_NAME = "SuperSloMo.ckpt"
+CHECKPOINT = WeightFile(
+    network="Super SloMo",
+    name="SuperSloMo.ckpt",
+    size="151 MB",
+    source="by the link in the README of github.com/avinashpaliwal/Super-SloMo (--interpolation "
+    "flow needs no weights)",
+    variable="EVSPLAT_SUPER_SLOMO",
+)
 _NETWORKS = {"state_dictFC": (6, 4), "state_dictAT": (20, 5)}
 # The checkpoint was trained on pictures with these channel means taken off.
 _MEAN_RGB = (0.429, 0.431, 0.397)
@@ -98,7 +95,7 @@ class SuperSloMo:
 
     def __init__(self, transfer: Transfer, weights: Path | str | None = None) -> None:
         self._transfer: Transfer = transfer
-        path = find_checkpoint(weights)
+        path = CHECKPOINT.find(weights)
         state = read_state(path)
         self.sha256 = sha256_of(path)
         self._flow, self._refine = (
@@ -172,29 +169,13 @@ def _as_input(coded: Float[np.ndarray, "H W C"]) -> Float[Tensor, "1 3 H2 W2"]:
     return F.pad(picture[None], padding, mode="replicate")
 
 
-def find_checkpoint(weights: Path | str | None = None) -> Path:
-    """The checkpoint at ``weights``, the environment variable's place or torch's hub folder.
-
-    Raises `MissingWeights` where it is not.
-    """
-    named = weights or os.environ.get(WEIGHTS_VARIABLE)
-    path = Path(named or hub_folder() / FILE_NAME).expanduser()
-    if path.is_file():
-        return path
-    raise MissingWeights(
-        f"{home_as_tilde(path)}: file not found. Super SloMo needs {FILE_NAME} (151 MB): get it by "
-        "the link in the README of github.com/avinashpaliwal/Super-SloMo and put it there, or give "
-        f"its place with --weights or {WEIGHTS_VARIABLE}; --interpolation flow needs no weights."
-    )
-
-
 def _network(path: Path, state: dict[str, Any], key: str, inputs: int, outputs: int) -> UNet:
     if not isinstance(state.get(key), dict):
         raise WeightsError(
-            f"{path}: holds no {key!r}, expected {FILE_NAME} with {' and '.join(_NETWORKS)}; fetch "
-            "it again."
+            f"{path}: holds no {key!r}, expected {CHECKPOINT.name} with "
+            f"{' and '.join(_NETWORKS)}; fetch it again."
         )
-    what = f"{FILE_NAME} of colour pictures"
+    what = f"{CHECKPOINT.name} of colour pictures"
     network = UNet(inputs, outputs)
     fill(network, state[key], path, what=what, part=f"{key}.")
     return network

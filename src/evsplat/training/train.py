@@ -19,6 +19,7 @@ from evsplat.capture import Capture, load_capture
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
 from evsplat.errors import ConfigError, DataError
+from evsplat.inspection import check_body, save_fit_sheet
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, Purpose, method_config
 from evsplat.methods.settings import Weight
 from evsplat.options import TrainOptions
@@ -85,7 +86,8 @@ def train(
     Raises:
         Stopped: Ctrl-C; the step is finished and saved.
         ConfigError: An option or a setting is unknown or out of range, or ``out`` is not empty.
-        DataError: The capture, or the run to go on with, is not what it should be.
+        DataError: The capture, or the run to go on with, is not what it should be; or the body is
+            that of another recording, and ``any_body`` is not set.
     """
     options = given(TrainOptions, options, changes)
     device = choose_device(options.device)
@@ -97,6 +99,9 @@ def train(
     started = time.perf_counter()
     seen = seen_by_training(capture, start.settings)
     purpose: Purpose = "train" if start.checkpoint is None else "resume"
+    fitting = None
+    if purpose == "train" and seen.has_body:
+        fitting = check_body(seen, refuse=not options.any_body)
     composition = TRAINABLE[start.method].build(
         start.settings, seen, start.seed, device=device, purpose=purpose
     )
@@ -121,6 +126,8 @@ def train(
         folder.path.mkdir(parents=True, exist_ok=True)
         save_yaml(folder.config, start.settings, method=start.method)
         write_facts(folder, capture, start.method, device, start.seed)
+        if fitting is not None and fitting.verdict != "belongs":
+            logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
         logger.info("%s", schedule_table(start.settings, composition.weights))
         logger.info("%s", seen.terms.sentence)
     if on_start is not None:

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from scipy.interpolate import BSpline
 
 from evsplat.body import skin
 from evsplat.capture import load_capture
-from evsplat.models.pose_spline import PoseSpline
+from evsplat.models.pose_correction import PoseCorrection
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
@@ -34,7 +33,8 @@ def activate(model) -> None:
             model.shading.coefficients.normal_(std=0.03)
             model.shading.intensities.uniform_(0.2, 1.0)
         if model.residual is not None:
-            model.residual.rotations.normal_(std=0.1)
+            for values in model.residual.parameters():
+                values.normal_(std=0.1)
 
 
 def fields(splats) -> dict[str, torch.Tensor]:
@@ -234,25 +234,22 @@ def test_half_of_the_training_steps_see_noise_on_the_pose(tiny_capture):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_pose_residuals_of_a_spline_turn_joints_about_their_own_axes(tiny_capture, seed):
+def test_pose_residuals_turn_joints_about_their_own_axes(tiny_capture, seed):
     model, capture, _, _ = model_of(tiny_capture())
-    rng, knot_us = np.random.default_rng(seed), [70_000.0, 40_000.0, 110_000.0][seed]
+    rng, track = np.random.default_rng(seed), model.track
+    keys, joints = track.poses.shape[:2]
     frames = [frame.mid_us for frame in capture.train_frames]
-    units = torch.tensor(rng.uniform(0.3, 0.9, len(model.track.body.parents)))
-    span = (frames[0], frames[-1])
-    spline = PoseSpline(span, knot_us, frames, joint_rad=units, root_m=0.2)
-    model.residual = spline
+    model.residual = PoseCorrection(
+        track,
+        frames,
+        joint_rad=np.tile(rng.uniform(0.3, 0.9, joints), (keys, 1)),
+        root_m=np.full((keys, 3), 0.2),
+        between=None,
+        exact=False,
+    )
     bend(model, frames, rng)
-    knots = 1e-6 * (frames[0] + knot_us * np.arange(-3, spline.count + 1))
     times = rng.integers(frames[0], frames[-1] + 1, size=12).tolist()
-    found = []
-    for points, unit in (
-        (spline.rotations, units.double().numpy()[:, None]),
-        (spline.translations, spline.root_m),
-    ):
-        curve = BSpline(knots, points.detach().double().numpy(), 3)
-        mean = curve(1e-6 * np.array(frames)).mean(0)
-        found.append(unit * (curve(1e-6 * np.array(times)) - mean))
+    found = [value.detach().double().numpy() for value in model.residual.residual(times)]
     assert_posed(model, times, *found)
 
 

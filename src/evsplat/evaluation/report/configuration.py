@@ -4,9 +4,9 @@ from html import escape
 from typing import Any
 
 from evsplat.config import to_dict
-from evsplat.evaluation.report.html import folded, section
 from evsplat.evaluation.report.source import Source
 from evsplat.methods import TRAINABLE, method_config
+from evsplat.pages import folded, section
 
 _HARDWARE = ("device", "gpu", "cpu", "cpu_cores", "threads", "memory_gb", "machine")
 

@@ -1,11 +1,12 @@
 """The figures: large cards, one table per protocol, and what could not be measured."""
 
+from collections.abc import Mapping
 from html import escape
 from typing import Any
 
 from evsplat.capture.policy import policy_of
-from evsplat.evaluation.report.html import folded, section
 from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import count_of, split_of, words_of
 from evsplat.evaluation.tables import (
     REGION_TITLES,
     Table,
@@ -14,6 +15,7 @@ from evsplat.evaluation.tables import (
     tables_of,
     terms,
 )
+from evsplat.pages import folded, section
 
 _REFERENCES = {"trivial": "the best trivial row", "camera": "the camera’s own blurry picture"}
 
@@ -34,9 +36,9 @@ def figures(source: Source) -> str:
         if against is not None
         else ""
     )
-    count = metrics["frames"]["test"]
+    count, frames = count_of(metrics), words_of(metrics).frames
     measured = (
-        f"Means over {count} held-out frames against the sharp picture at mid-exposure."
+        f"Means over {count} {frames} against the sharp picture at mid-exposure."
         if first.headings
         else f"{count} frames were held out, and none has a sharp picture to be compared with."
     )
@@ -50,6 +52,8 @@ def figures(source: Source) -> str:
 def no_test_figures(metrics: dict[str, Any]) -> str | None:
     """The reason for no test figures, as HTML that continues a sentence; None where there are."""
     policy = policy_of(metrics)
+    if split_of(metrics) == "train":
+        return None
     if policy is not None and policy.use == "everything":
         return (
             "trained on every frame and every event (<code>--use everything</code>): nothing was "
@@ -105,3 +109,13 @@ def _with_note(table: Table) -> str:
         return ""
     corner = table.title[0].lower() + table.title[1:]
     return f'{html(table, corner)}<p class="note">{escape(table.note)}</p>'
+
+
+def frame_figures(figures: Mapping[str, Mapping[str, float | None]]) -> str:
+    """PSNR per region as text that continues a line; empty where nothing is known."""
+    parts = [
+        f"{title} {value:.2f} dB"
+        for region, title in REGION_TITLES.items()
+        if region in figures and (value := figures[region]["psnr"]) is not None
+    ]
+    return " · " + " · ".join(parts) if parts else ""

@@ -1,4 +1,4 @@
-"""Test frames: their pictures, whole and around the person, and their figures over time."""
+"""Measured frames: their pictures, whole and around the person, and figures over time."""
 
 from dataclasses import dataclass
 from html import escape
@@ -11,20 +11,20 @@ from evsplat.capture import Frame, Policy, load_body_track
 from evsplat.capture.policy import policy_of
 from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.charts import Series, line_chart
-from evsplat.evaluation.report.figures import no_test_figures
-from evsplat.evaluation.report.html import (
+from evsplat.evaluation.report.figures import frame_figures, no_test_figures
+from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import split_of, words_of
+from evsplat.objectives import motion_px
+from evsplat.pages import (
     Embedder,
     compare,
     figure,
     folded,
-    frame_figures,
     legend,
     more,
     section,
     spread,
 )
-from evsplat.evaluation.report.source import Source
-from evsplat.objectives import motion_px
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import ERROR_FULL_SCALE, css_gradient
 
@@ -34,6 +34,9 @@ _FRAMES_OPEN = 4
 """Test frames shown at once, evenly spread; the others are folded."""
 _MOST_PIXELS = 24_000_000
 """Pixels of all pictures of test frames on a page; of a longer recording fewer frames are shown."""
+_TRAINING_TERMS = (
+    "Training saw the blurry pictures and the events of these times; the sharp truth it never sees."
+)
 _INPUT, _RENDER = "blurry input", "our render"
 _REGIONS = {"person_crop": "person crop", "full": "full frame"}
 _MOST_FRAMES = 400
@@ -44,10 +47,11 @@ Pictures = dict[str, UInt8[np.ndarray, "H W 3"]]
 
 
 def test_frames(source: Source) -> str:
-    """The section with all test frames."""
+    """The section with all frames that were measured."""
+    words = words_of(source.metrics)
     why = no_test_figures(source.metrics)
     if why is not None:
-        return section("Test frames", "", f'<p class="note">{why[0].upper()}{why[1:]}</p>')
+        return section(words.title, "", f'<p class="note">{why[0].upper()}{why[1:]}</p>')
     entries = source.metrics["per_frame"]
     # Per frame four pictures and crops of about a third of their area.
     camera = source.capture.camera(entries[0]["frame"])
@@ -62,11 +66,13 @@ def test_frames(source: Source) -> str:
         css_gradient(signed=False), "0", f"{ERROR_FULL_SCALE} levels of 255 and more", "error"
     )
     return section(
-        "Test frames",
-        _held_out_terms(policy_of(source.metrics)),
+        words.title,
+        _TRAINING_TERMS
+        if split_of(source.metrics) == "train"
+        else _held_out_terms(policy_of(source.metrics)),
         (scale if any("error" in one.pictures for one in chosen) else "")
         + "".join(_test_frame(one, embed) for one in shown)
-        + folded(more(len(others), len(entries) - len(shown), "test frames"), folds),
+        + folded(more(len(others), len(entries) - len(shown), words.title.lower()), folds),
     )
 
 
@@ -200,8 +206,9 @@ def frame_by_frame(source: Source) -> str:
     intro = (
         "How far the body moves while the shutter is open."
         if region is None
-        else "Held-out frames. The faster the person, the more of a frame is smeared: a picture of "
-        "the camera falls with the speed, a reconstruction should not."
+        else f"{words_of(source.metrics).frames.capitalize()}. The faster the person, the more of "
+        "a frame is smeared: a picture of the camera falls with the speed, a reconstruction should "
+        "not."
     )
     return section("Frame by frame", intro, f'<div class="charts">{charts}</div>')
 

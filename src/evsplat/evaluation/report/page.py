@@ -7,21 +7,27 @@ from typing import Any
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
 from evsplat.evaluation.report.configuration import configuration, duration, made_with
-from evsplat.evaluation.report.figures import distance, figures, no_test_figures, references
+from evsplat.evaluation.report.figures import (
+    distance,
+    figures,
+    frame_figures,
+    no_test_figures,
+    references,
+)
 from evsplat.evaluation.report.frames import frame_by_frame, test_frames
-from evsplat.evaluation.report.html import (
+from evsplat.evaluation.report.source import Source
+from evsplat.evaluation.splits import words_of
+from evsplat.pages import (
     Embedder,
     data_uri,
     document,
     figure,
     folded,
-    frame_figures,
     legend,
     more,
     section,
     spread,
 )
-from evsplat.evaluation.report.source import Source
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import css_gradient
 
@@ -32,10 +38,11 @@ _PAIRS_MOST = 24
 _NOVEL_SHOWN = 4
 """Novel views shown per camera, evenly spread over time."""
 _HEADLINE = {
-    "full": "on held-out frames",
+    "full": None,
     "person_crop": "on the person’s crop",
     "person_mask": "on the person’s mask",
 }
+"""Where a figure was reached; of the full frame the split says it."""
 _REFERENCES = {
     "trivial": ("the best picture that needs no method", "the best without a method"),
     "camera": ("the camera’s own blurry picture", "the camera’s own"),
@@ -101,7 +108,8 @@ def _summary(metrics: dict[str, Any]) -> str:
             f"{distance(value, theirs, 1)} {_REFERENCES[name][min(len(parts), 1)]}"
             for name, theirs in references(metrics, region).items()
         )
-        parts.append(f"<b>{value:.2f}&nbsp;dB</b> {where}" + (f" ({against})" if against else ""))
+        place = where or words_of(metrics).headline
+        parts.append(f"<b>{value:.2f}&nbsp;dB</b> {place}" + (f" ({against})" if against else ""))
     if not parts:
         return f"{method}: no sharp ground truth to compare with, so the pictures must speak."
     return f"{method} reaches {', '.join(parts)}."

@@ -11,9 +11,11 @@ from jaxtyping import UInt8
 from evsplat.capture import Capture
 from evsplat.config import load_yaml
 from evsplat.errors import DataError
-from evsplat.evaluation.report.html import read_picture
+from evsplat.evaluation.splits import name_of
 from evsplat.files import parse_json, read_json, read_text
 from evsplat.methods.reconstruction import Reconstruction
+from evsplat.options.runs import Split
+from evsplat.pages import read_picture
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,19 @@ class Source:
     versions: dict[str, Any]
 
     @classmethod
-    def read(cls, folder: Path, capture: Capture, reconstruction: Reconstruction) -> "Source":
-        """Read the files of an evaluated run; only metrics.json must be there."""
-        metrics_file = folder / "metrics.json"
+    def read(
+        cls,
+        folder: Path,
+        capture: Capture,
+        reconstruction: Reconstruction,
+        split: Split = "test",
+    ) -> "Source":
+        """Read the files of an evaluated run; only the split's metrics.json must be there."""
+        metrics_file = folder / name_of("metrics", split, ".json")
         if not metrics_file.is_file():
+            option = "" if split == "test" else f" --split {split}"
             raise DataError(
-                f"{metrics_file}: file not found; run `evsplat evaluate {folder}` first."
+                f"{metrics_file}: file not found; run `evsplat evaluate {folder}{option}` first."
             )
         config, versions = folder / "config.yaml", folder / "versions.json"
         return cls(

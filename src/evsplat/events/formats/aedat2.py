@@ -7,15 +7,13 @@ https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-2
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
+from evsplat.events.formats.base import ByteReader, RawEvents, Source
 from evsplat.options import ReadOptions
 
-MAGIC = b"#!AER-DAT2.0"
 _CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f]")
 _MAX_LINE_BYTES = 1 << 16
 _MAX_HEADER_BYTES = 16 << 20
@@ -55,11 +53,9 @@ _CHIPS = {
 class Aedat2(Source):
     """An AEDAT2 file; polarity events alone are read."""
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        self._path = path
-        self._damage = damage
-        self.notes = []
-        header = self._read_header()
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
+        header = self._comments()
         name = re.search(r"AEChip: *([\w.]+)", header)
         chip_name = name[1].split(".")[-1] if name else ""
         known = (chip for key, chip in _CHIPS.items() if chip_name.lower().startswith(key))
@@ -67,7 +63,7 @@ class Aedat2(Source):
         if chip is None:
             if options.width is None or options.height is None:
                 raise DataError(
-                    f"{path}: recorded by chip {chip_name or '(not named)'}, expected one of "
+                    f"{self.path}: recorded by chip {chip_name or '(not named)'}, expected one of "
                     f"{', '.join(_CHIPS)}; for another DAVIS give width and height."
                 )
             chip = _davis(options.width, options.height)
@@ -78,9 +74,8 @@ class Aedat2(Source):
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte at a time."""
         chip = self._chip
-        with ByteReader(self._path) as reader:
-            reader.skip_to(self._start)
-            for pairs in reader.records(_PAIR, _READ_EVENTS, self._damage):
+        with ByteReader(self.path, self._start) as reader:
+            for pairs in reader.records(_PAIR, _READ_EVENTS, self.damage):
                 address = pairs["address"].astype(np.uint32)
                 keep = (address & chip.not_polarity) == 0
                 address = address[keep]
@@ -93,10 +88,10 @@ class Aedat2(Source):
                     (address & chip.polarity) == chip.brighter,
                 )
 
-    def _read_header(self) -> str:
+    def _comments(self) -> str:
         """The lines that begin with #, decoded; remembers where they end."""
         lines: list[bytes] = []
-        with ByteReader(self._path) as reader:
+        with ByteReader(self.path) as reader:
             while True:
                 self._start = reader.offset
                 line = reader.read_line(_MAX_LINE_BYTES)
@@ -109,4 +104,4 @@ class Aedat2(Source):
                     self._start = reader.offset
                     return b"".join(lines).decode("latin-1")
                 if self._start > _MAX_HEADER_BYTES:
-                    raise DataError(f"{self._path}: its header does not end.")
+                    raise DataError(f"{self.path}: its header does not end.")

@@ -16,7 +16,6 @@ import numpy as np
 from evsplat.errors import DataError
 from evsplat.events.formats.base import (
     ByteReader,
-    Damage,
     RawEvents,
     RecordedFrame,
     Source,
@@ -46,19 +45,17 @@ _Streams = dict[int, tuple[str, int | None, int | None]]
 class Aedat4(Source):
     """An AEDAT4 file; its first event stream and its first frame stream are read."""
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        self.path = path
-        self.notes: list[str] = []
-        self._damage = damage
-        compression, table_position, description = self._read_header()
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
+        compression, table_position, description = self._preamble()
         # the table of packets at the end is not needed; 0 or -1 where there is none
         self._end = table_position if table_position > 0 else None
-        self._decompress = _decompressor(path, compression)
+        self._decompress = _decompressor(self.path, compression)
         streams = self._streams(description)
         self._events = self._choose(streams, "EVTS")
         self._frames = self._choose(streams, "FRME")
         if self._events is None:
-            raise DataError(f"{path}: holds no event stream (found {_names(streams)}).")
+            raise DataError(f"{self.path}: holds no event stream (found {_names(streams)}).")
         self.width, self.height = streams[self._events][1:]
 
     def blocks(self) -> Iterator[RawEvents]:
@@ -84,7 +81,7 @@ class Aedat4(Source):
                 continue
             yield frame
 
-    def _read_header(self) -> tuple[int, int, bytes]:
+    def _preamble(self) -> tuple[int, int, bytes]:
         """Compression, where the packets end, and the XML description of the streams."""
         with ByteReader(self.path) as reader:
             if reader.read(len(MAGIC)) != MAGIC:
@@ -125,8 +122,7 @@ class Aedat4(Source):
 
     def _packets(self, stream: int | None, identifier: bytes) -> Iterator[tuple[int, bytes]]:
         """Offset and decompressed, size-prefixed buffer of each packet of a stream."""
-        with ByteReader(self.path) as reader:
-            reader.skip_to(self._first_packet)
+        with ByteReader(self.path, self._first_packet) as reader:
             while self._end is None or reader.offset < self._end:
                 offset = reader.offset
                 head = reader.read(8)
@@ -138,7 +134,7 @@ class Aedat4(Source):
                 if not wanted:
                     reader.skip_to(offset + 8 + max(size, 0))
                 if len(head) < 8 or size < 0 or reader.offset < offset + 8 + size:
-                    self._damage.found(
+                    self.damage.found(
                         f"ends in the middle of a packet, or is damaged, at byte {offset}",
                         repaired_by="keeps the packets before the cut",
                     )
@@ -157,7 +153,7 @@ class Aedat4(Source):
                 yield offset, data
 
     def _broken(self, offset: int, reason: str) -> None:
-        self._damage.found(
+        self.damage.found(
             f"the packet at byte {offset} is damaged ({reason})",
             repaired_by="leaves out damaged packets",
         )

@@ -5,16 +5,16 @@ import os
 import re
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
 
 from evsplat.errors import DataError
+from evsplat.options import ReadOptions
 from evsplat.safe_pickle import BROKEN
 
 BLOCK_EVENTS = 1 << 18
@@ -45,23 +45,6 @@ class RecordedFrame:
     """Start and end of the exposure on the clock of the events."""
 
 
-class Source(ABC):
-    """An opened recording of one format: its header is read, its events are read on demand."""
-
-    width: int | None = None
-    height: int | None = None
-    has_polarity: bool = True
-    notes: list[str]
-
-    @abstractmethod
-    def blocks(self) -> Iterator[RawEvents]:
-        """Events from the first to the last, in order of the file."""
-
-    def frames(self) -> Iterator[RecordedFrame]:
-        """Pictures recorded beside the events; none in most formats."""
-        return iter(())
-
-
 @dataclass
 class Damage:
     """Faults of a recording: an error by default, a counted repair where asked for."""
@@ -81,14 +64,42 @@ class Damage:
         return [f"repaired: {what} ({count:,})" for what, count in self.counts.items()]
 
 
-class ByteReader:
+class Source(ABC):
+    """An opened recording of one format: its header is read, its events are read on demand."""
+
+    width: int | None = None
+    height: int | None = None
+    has_polarity: bool = True
+
+    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
+        self.path = path
+        self.damage = damage
+        self.notes: list[str] = []
+        self.read_header(options)
+
+    @abstractmethod
+    def read_header(self, options: ReadOptions) -> None:
+        """Read all but the events."""
+
+    @abstractmethod
+    def blocks(self) -> Iterator[RawEvents]:
+        """Events from the first to the last, in order of the file."""
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Pictures recorded beside the events; none in most formats."""
+        return iter(())
+
+
+class ByteReader(ExitStack):
     """Sequential bytes of a file, gunzipped where it is a gzip file, with the offset in mind."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, start: int = 0) -> None:
+        """The first byte to be read is that at ``start``."""
+        super().__init__()
         self.path = path
         self.offset = 0
         try:
-            self._file = open(path, "rb", buffering=_BUFFER_BYTES)  # noqa: SIM115 - see __exit__
+            self._file = self.enter_context(open(path, "rb", buffering=_BUFFER_BYTES))
         except FileNotFoundError:
             raise DataError(f"{path}: file not found.") from None
         except OSError as error:
@@ -97,28 +108,15 @@ class ByteReader:
         self.zipped = self._file.read(2) == b"\x1f\x8b"
         self._file.seek(0)
         self._stream = gzip.GzipFile(fileobj=self._file) if self.zipped else self._file
-
-    def __enter__(self) -> "ByteReader":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._file.close()
+        self.skip_to(start)
 
     def read(self, count: int) -> bytes:
         """``count`` bytes, fewer only at the end of the file."""
-        try:
-            data = self._stream.read(count)
-        except (OSError, EOFError, zlib.error) as error:
-            raise DataError(
-                f"{self.path}: cannot be read after byte {self.offset} ({error}); copy it again."
-            ) from None
-        self.offset += len(data)
-        return data
+        return self._taken(self._stream.read, count)
+
+    def read_line(self, limit: int) -> bytes:
+        """Bytes up to and with the next newline, at most ``limit``."""
+        return self._taken(self._stream.readline, limit)
 
     def skip_to(self, offset: int) -> None:
         """Go on to ``offset`` or the end of the file."""
@@ -126,17 +124,6 @@ class ByteReader:
             self.offset = self._file.seek(min(offset, self._size))
         while self.offset < offset and self.read(min(offset - self.offset, 1 << 20)):
             pass
-
-    def read_line(self, limit: int) -> bytes:
-        """Bytes up to and with the next newline, at most ``limit``."""
-        try:
-            line = self._stream.readline(limit)
-        except (OSError, EOFError, zlib.error) as error:
-            raise DataError(
-                f"{self.path}: cannot be read after byte {self.offset} ({error}); copy it again."
-            ) from None
-        self.offset += len(line)
-        return line
 
     def records(self, kind: np.dtype, most: int, damage: Damage) -> Iterator[np.ndarray]:
         """Events of a fixed size to the end of the file, at most ``most`` at a time."""
@@ -148,6 +135,16 @@ class ByteReader:
                     f"ends in the middle of an event at byte {self.offset}",
                     repaired_by="keeps the events before the cut",
                 )
+
+    def _taken(self, read: Callable[[int], bytes], most: int) -> bytes:
+        try:
+            data = read(most)
+        except (OSError, EOFError, zlib.error) as error:
+            raise DataError(
+                f"{self.path}: cannot be read after byte {self.offset} ({error}); copy it again."
+            ) from None
+        self.offset += len(data)
+        return data
 
 
 @contextmanager

@@ -4,14 +4,12 @@ https://github.com/neuromorphic-paris/event_stream, with the bytes that its vers
 """
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
+from evsplat.events.formats.base import ByteReader, RawEvents, Source
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
 
-MAGIC = b"Event Stream"
 _KINDS = {1: "es_dvs", 2: "es_atis"}
 _NAMES = {0: "generic", 4: "colour"}
 _HEADER_BYTES = 20
@@ -20,33 +18,31 @@ _HEADER_BYTES = 20
 class EventStreamFile(Source):
     """An .es file; of ATIS the change detections, not the exposure measurements."""
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        self._path = path
-        self._damage = damage
-        self.notes = []
-        with ByteReader(path) as reader:
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
+        with ByteReader(self.path) as reader:
             header = reader.read(_HEADER_BYTES)
         if len(header) < _HEADER_BYTES or header[12] != 2:
-            raise DataError(f"{path}: expected version 2 of Event Stream.")
+            raise DataError(f"{self.path}: expected version 2 of Event Stream.")
         kind = header[15]
         if kind not in _KINDS:
             raise DataError(
-                f"{path}: holds {_NAMES.get(kind, f'type {kind}')} events, expected DVS or ATIS."
+                f"{self.path}: holds {_NAMES.get(kind, f'type {kind}')} events, expected DVS or "
+                "ATIS."
             )
         self._kind = _KINDS[kind]
         self.width = int.from_bytes(header[16:18], "little")
         self.height = int.from_bytes(header[18:20], "little")
         if not self.width or not self.height:
-            raise DataError(f"{path}: its header gives {self.width} x {self.height} pixels.")
+            raise DataError(f"{self.path}: its header gives {self.width} x {self.height} pixels.")
         if self._kind == "es_atis":
             self.notes.append("of ATIS events only the changes are read, not the exposures")
 
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte at a time."""
-        decoder = WordDecoder(self._kind, self._damage)
+        decoder = WordDecoder(self._kind, self.damage)
         assert self.height is not None
-        with ByteReader(self._path) as reader:
-            reader.skip_to(_HEADER_BYTES)
+        with ByteReader(self.path, _HEADER_BYTES) as reader:
             for events in decoder.blocks(reader):
                 # rows count from the bottom; beyond the sensor is for the checks to find
                 yield events._replace(y=self.height - 1 - events.y.astype("i4"))

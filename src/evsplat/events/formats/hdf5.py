@@ -15,7 +15,6 @@ import numpy as np
 from evsplat.errors import DataError
 from evsplat.events.formats.base import (
     BLOCK_EVENTS,
-    Damage,
     RawEvents,
     Source,
     broken_as_data_error,
@@ -23,7 +22,6 @@ from evsplat.events.formats.base import (
 from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
 from evsplat.options import ReadOptions
 
-MAGIC = b"\x89HDF\r\n\x1a\n"
 _PLACES = ("events", "CD/events", "/")
 _ECF = 36559
 # Filters that HDF5 and h5py bring with them: deflate, shuffle, checksum, scale-offset, lzf
@@ -50,17 +48,16 @@ class _Column:
 class Hdf5(Source):
     """Events of an HDF5 file, read slice by slice."""
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        self._path = path
-        self.notes = []
-        with _opened(path) as file:
-            self._columns = _find_columns(path, file, options)
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
+        with _opened(self.path) as file:
+            self._columns = _find_columns(self.path, file, options)
             self._count = self._check_columns(file)
             self._offset_us = int(file["t_offset"][()]) if "t_offset" in file else 0
             if abs(self._offset_us) > 1 << 60:
-                raise DataError(f"{path}: t_offset is {self._offset_us} us, which is no time.")
+                raise DataError(f"{self.path}: t_offset is {self._offset_us} us, which is no time.")
             self.width, self.height = _size(file)
-            head = Table(path, self._slice(file, 0), options.time_unit)
+            head = Table(self.path, self._slice(file, 0), options.time_unit)
             self._unit = head.unit
             self.has_polarity = head.has_polarity or self._any_polarity(file)
         self.notes = [note for note in head.notes if note != NO_POLARITY]
@@ -69,9 +66,9 @@ class Hdf5(Source):
 
     def blocks(self) -> Iterator[RawEvents]:
         """Slices of the columns."""
-        with _opened(self._path) as file:
+        with _opened(self.path) as file:
             for first in range(0, self._count, BLOCK_EVENTS):
-                table = Table(self._path, self._slice(file, first), self._unit)
+                table = Table(self.path, self._slice(file, first), self._unit)
                 events = table.events(slice(None), first)
                 yield events._replace(t=events.t + self._offset_us) if self._offset_us else events
 
@@ -100,15 +97,15 @@ class Hdf5(Source):
         counts = {}
         for key, column in self._columns.items():
             dataset = file[column.dataset]
-            _check_filters(self._path, dataset)
+            _check_filters(self.path, dataset)
             counts[key] = len(dataset)
         if len(set(counts.values())) != 1:
             text = ", ".join(f"{key}: {count:,}" for key, count in counts.items())
-            raise DataError(f"{self._path}: its components differ in length ({text}).")
+            raise DataError(f"{self.path}: its components differ in length ({text}).")
         stored = file[self._columns["t"].dataset].id.get_storage_size()
         if counts["t"] > _MAX_EVENTS_PER_BYTE * (stored + 1):
             raise DataError(
-                f"{self._path}: announces {counts['t']:,} events but holds {stored:,} bytes of "
+                f"{self.path}: announces {counts['t']:,} events but holds {stored:,} bytes of "
                 "times; copy the file again."
             )
         return counts["t"]

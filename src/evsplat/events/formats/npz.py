@@ -10,7 +10,6 @@ import numpy as np
 from evsplat.errors import DataError
 from evsplat.events.formats.base import (
     BLOCK_EVENTS,
-    Damage,
     RawEvents,
     Source,
     broken_as_data_error,
@@ -27,11 +26,11 @@ _SIZE_KEYS = (("width", "height"), ("sensor_width", "sensor_height"))
 class Npz(Source):
     """Arrays of a NumPy file; all of them are in memory while it is open."""
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        self._path = path
-        arrays = _load(path)
-        named = _components(path, arrays, options)
-        self._table = Table(path, named, options.time_unit)
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
+        arrays = _load(self.path)
+        named = _components(self.path, arrays, options)
+        self._table = Table(self.path, named, options.time_unit)
         self.has_polarity = self._table.has_polarity
         self.notes = self._table.notes
         for wide, high in _SIZE_KEYS:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
+from evsplat.events.formats.base import ByteReader, RawEvents, Source
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
 
@@ -70,11 +70,9 @@ class _Header:
 class Raw(Source):
     """A RAW file; triggers and monitoring words are passed over."""
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        self._path = path
-        self._damage = damage
-        self.notes = []
-        with ByteReader(path) as reader:
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
+        with ByteReader(self.path) as reader:
             header = _Header(reader)
         self._start = header.end
         self.width, self.height = header.width, header.height
@@ -83,16 +81,15 @@ class Raw(Source):
         kind = _FORMAT_NAMES.get(format_name.upper()) or _EVT_VERSIONS.get(version)
         if kind is None:
             raise DataError(
-                f"{path}: its header names neither EVT 2, 2.1 nor 3 (format {format_name!r}, evt "
-                f"{version!r})."
+                f"{self.path}: its header names neither EVT 2, 2.1 nor 3 (format {format_name!r}, "
+                f"evt {version!r})."
             )
         self._kind = self._layout_of_evt21(details) if kind == "evt21" else kind
 
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte of words at a time."""
-        decoder = WordDecoder(self._kind, self._damage)
-        with ByteReader(self._path) as reader:
-            reader.skip_to(self._start)
+        decoder = WordDecoder(self._kind, self.damage)
+        with ByteReader(self.path, self._start) as reader:
             yield from decoder.blocks(reader)
         note = "events before the first time are left out, as they have none"
         if decoder.untimed and not any(note in known for known in self.notes):
@@ -104,8 +101,7 @@ class Raw(Source):
             return "evt21_swapped"
         if "endianness=little" in details:
             return "evt21"
-        with ByteReader(self._path) as reader:
-            reader.skip_to(self._start)
+        with ByteReader(self.path, self._start) as reader:
             sample = reader.read(_SAMPLE_BYTES)
         halves = np.frombuffer(sample[: len(sample) // 8 * 8], dtype="<u4").reshape(-1, 2)
         if not len(halves):
@@ -113,7 +109,7 @@ class Raw(Source):
         scores = [_plausibility(halves[:, half], halves[:, 1 - half]) for half in (1, 0)]
         if scores[0] == scores[1]:
             raise DataError(
-                f"{self._path}: its EVT 2.1 words are of neither known layout; is it damaged?"
+                f"{self.path}: its EVT 2.1 words are of neither known layout; is it damaged?"
             )
         return "evt21" if scores[0] > scores[1] else "evt21_swapped"
 
@@ -130,28 +126,24 @@ def _plausibility(heads: np.ndarray, rests: np.ndarray) -> tuple[bool, int]:
 class Dat(Source):
     """A DAT file of change-detection events: 32 bits of time, 14 of x, 14 of y, 4 of polarity."""
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        self._path = path
-        self._damage = damage
-        self.notes = []
-        with ByteReader(path) as reader:
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
+        with ByteReader(self.path) as reader:
             header = _Header(reader)
-        with ByteReader(path) as reader:
-            reader.skip_to(header.end)
+        with ByteReader(self.path, header.end) as reader:
             kind = reader.read(2)
             self._start = reader.offset
         if len(kind) < 2 or kind[0] not in _DAT_EVENT_TYPES or kind[1] != _DAT_EVENT.itemsize:
             raise DataError(
-                f"{path}: after its header come bytes {kind.hex(' ') or 'none'}, expected an event "
-                "type of 0 or 12 and a size of 8."
+                f"{self.path}: after its header come bytes {kind.hex(' ') or 'none'}, expected an "
+                "event type of 0 or 12 and a size of 8."
             )
         self.width, self.height = header.width, header.height
 
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte at a time."""
-        with ByteReader(self._path) as reader:
-            reader.skip_to(self._start)
-            for events in reader.records(_DAT_EVENT, _DAT_READ_EVENTS, self._damage):
+        with ByteReader(self.path, self._start) as reader:
+            for events in reader.records(_DAT_EVENT, _DAT_READ_EVENTS, self.damage):
                 pixel = events["pixel"]
                 yield RawEvents(
                     events["t"].astype(np.int64),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import Damage, RawEvents, Source, peek
+from evsplat.events.formats.base import RawEvents, Source, peek
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
 
@@ -37,16 +37,14 @@ class RosBag(Source):
     Times of EventArray are those of ROS, times of EventPacket those of the sensor.
     """
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        self._path = path
-        self._damage = damage
-        self.notes = []
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
         types = _ARRAY_TYPES + _PACKET_TYPES
-        with _opened(path) as bag:
+        with _opened(self.path) as bag:
             topics = {c.topic: c.msgtype for c in bag.connections if c.msgtype in types}
             if not topics:
                 found = ", ".join(sorted({c.msgtype for c in bag.connections})) or "none"
-                raise DataError(f"{path}: holds no event messages (types there: {found}).")
+                raise DataError(f"{self.path}: holds no event messages (types there: {found}).")
             self._topic = sorted(topics)[0]
             self._type = topics[self._topic]
             if len(topics) > 1:
@@ -57,8 +55,8 @@ class RosBag(Source):
 
     def blocks(self) -> Iterator[RawEvents]:
         """One message at a time."""
-        decoder = WordDecoder(_ENCODING, self._damage)
-        with _opened(self._path) as bag:
+        decoder = WordDecoder(_ENCODING, self.damage)
+        with _opened(self.path) as bag:
             for number, message in self._messages(bag):
                 if message.encoding:
                     yield from self._packet(decoder, message, number)
@@ -70,7 +68,7 @@ class RosBag(Source):
     ) -> Iterator[RawEvents]:
         if message.encoding != _ENCODING:
             raise DataError(
-                f"{self._path}: message {number} of {self._topic} is encoded as "
+                f"{self.path}: message {number} of {self._topic} is encoded as "
                 f"{message.encoding!r}, expected {_ENCODING!r}."
             )
         start = 0
@@ -86,7 +84,7 @@ class RosBag(Source):
             try:
                 yield number, _read_message(data, is_ros1, self._type in _PACKET_TYPES)
             except (struct.error, ValueError) as error:
-                self._damage.found(
+                self.damage.found(
                     f"message {number} of {self._topic} is damaged ({error})",
                     repaired_by="leaves out damaged messages",
                 )

@@ -1,13 +1,12 @@
 """Text tables (.txt, .csv, gzipped too) with named, positional or recognisable columns."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
-from evsplat import compiled
-from evsplat.errors import BackendError, DataError
-from evsplat.events.formats.base import ByteReader, Damage, RawEvents, Source
+from evsplat.compiled import native_for
+from evsplat.errors import DataError
+from evsplat.events.formats.base import ByteReader, RawEvents, Source
 from evsplat.events.formats.table import (
     NO_POLARITY,
     guess_time_unit,
@@ -39,16 +38,10 @@ _ERRORS = (
 class Text(Source):
     """A text file with one event per line."""
 
-    def __init__(self, path: Path, options: ReadOptions, damage: Damage) -> None:
-        if compiled.native is None:
-            raise BackendError(
-                f"{path}: reading text needs evsplat's compiled module, which cannot be loaded "
-                f"({compiled.import_error}); install evsplat again."
-            )
-        self._path = path
-        self._damage = damage
-        self.notes = []
-        self._file = file = inspect_text(path)
+    def read_header(self, options: ReadOptions) -> None:
+        """See `Source`."""
+        self._native = native_for(f"{self.path}: reading text")
+        self._file = file = inspect_text(self.path)
         self.width, self.height = file.width, file.height
         self._mmhpsd = options.columns == ("mmhpsd",)
         columns = self._find_columns(options)
@@ -64,7 +57,7 @@ class Text(Source):
         """A few megabytes of text at a time."""
         first = 0
         for t, x, y, p in self._parsed():
-            p = to_polarity(p, str(self._path), first)
+            p = to_polarity(p, str(self.path), first)
             if self._mmhpsd:
                 x, y = _MMHPSD_SIZE[0] - 1 - x, _MMHPSD_SIZE[1] - 1 - y
             yield RawEvents(t, x, y, p)
@@ -77,7 +70,7 @@ class Text(Source):
             named = match_names(file.names)
             if not {"t", "x", "y"} <= set(named):
                 raise DataError(
-                    f"{self._path}: its columns are named {', '.join(file.names)}; say which are "
+                    f"{self.path}: its columns are named {', '.join(file.names)}; say which are "
                     "t, x, y and p with columns."
                 )
             component = {name: key for key, name in named.items()}
@@ -91,10 +84,10 @@ class Text(Source):
         if self._mmhpsd:
             given = _MMHPSD_COLUMNS
         if given is None:
-            given = tuple(table_order(self._path, file.sample, options))
+            given = tuple(table_order(self.path, file.sample, options))
         if not isinstance(given, tuple) or len(given) != file.fields:
             raise DataError(
-                f"{self._path}: has {file.fields} columns and columns names {len(given)}; give one "
+                f"{self.path}: has {file.fields} columns and columns names {len(given)}; give one "
                 "name per column, '-' to pass over one."
             )
         columns = [name for name in given if name != _PASSED_OVER]
@@ -102,7 +95,7 @@ class Text(Source):
             columns
         ):
             raise DataError(
-                f"{self._path}: columns is {','.join(given)}, expected t, x, y and perhaps p, each "
+                f"{self.path}: columns is {','.join(given)}, expected t, x, y and perhaps p, each "
                 "once, and '-' for what to pass over."
             )
         return ["" if name == _PASSED_OVER else name for name in given]
@@ -122,8 +115,7 @@ class Text(Source):
 
     def _parsed(self) -> Iterator[np.ndarray]:
         """Components (4, N) int64, times in microseconds, of a few megabytes of text at a time."""
-        with ByteReader(self._path) as reader:
-            reader.skip_to(self._file.first_byte)
+        with ByteReader(self.path, self._file.first_byte) as reader:
             rest, first, last = b"", 0, False
             while not last:
                 data = reader.read(_READ_BYTES)
@@ -132,7 +124,7 @@ class Text(Source):
                 start = reader.offset - len(text)
                 if not last and b"\n" not in data and len(text) > MAX_LINE_BYTES:
                     raise DataError(
-                        f"{self._path}: the line at byte {start} is longer than "
+                        f"{self.path}: the line at byte {start} is longer than "
                         f"{MAX_LINE_BYTES} bytes; not a line of numbers."
                     )
                 columns, taken = self._parse(text, start, first, last)
@@ -146,7 +138,7 @@ class Text(Source):
         columns = np.empty((len(_COMPONENTS), len(text) // _MIN_LINE_BYTES + 2), dtype=np.int64)
         if "p" not in [_COMPONENTS[role] for role in self._roles if role >= 0]:
             columns[3] = 0
-        rows, taken, error, field = compiled.native.parse_events(
+        rows, taken, error, field = self._native.parse_events(
             np.frombuffer(text, dtype=np.uint8),
             last,
             self._roles,
@@ -162,7 +154,7 @@ class Text(Source):
             )
             at_end = text.find(b"\n", taken) < 0 and last
             if not at_end:
-                raise DataError(f"{self._path}: {what}.")
-            self._damage.found(what, repaired_by="leaves out a last line that was cut")
+                raise DataError(f"{self.path}: {what}.")
+            self.damage.found(what, repaired_by="leaves out a last line that was cut")
             taken = len(text)
         return columns[:, :rows], taken

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from evsplat import compiled
-from evsplat.errors import BackendError
+from evsplat.compiled import native_for
 from evsplat.events.formats.base import BLOCK_EVENTS, ByteReader, Damage, RawEvents
 
 _READ_BYTES = 1 << 20
@@ -22,11 +21,7 @@ class WordDecoder:
     """
 
     def __init__(self, kind: str, damage: Damage) -> None:
-        if compiled.native is None:
-            raise BackendError(
-                f"{damage.path}: reading {kind} needs evsplat's compiled module, which cannot be "
-                f"loaded ({compiled.import_error}); install evsplat again."
-            )
+        self._native = native_for(f"{damage.path}: reading {kind}")
         self._kind = kind
         self._damage = damage
         self._state = np.zeros(_STATE_FIELDS, dtype=np.int64)
@@ -47,7 +42,7 @@ class WordDecoder:
         x, y = np.empty(capacity, dtype=np.uint16), np.empty(capacity, dtype=np.uint16)
         p = np.empty(capacity, dtype=np.int8)
         view = np.frombuffer(data, dtype=np.uint8)
-        taken, count = compiled.native.decode_events(self._kind, view, self._state, t, x, y, p)
+        taken, count = self._native.decode_events(self._kind, view, self._state, t, x, y, p)
         unknown = int(self._state[_UNKNOWN])
         if unknown:
             self._damage.found(

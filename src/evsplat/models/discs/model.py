@@ -23,7 +23,7 @@ from evsplat.models.layers import Layers, SceneShadow, human_splats, scene_splat
 from evsplat.models.model import PosedModel, RowCache
 from evsplat.models.networks.colour import SceneColour, scene_rgb
 from evsplat.models.networks.non_rigid import PoseDeformation, draw_pose_noise
-from evsplat.models.pose_spline import PoseSpline
+from evsplat.models.pose_correction import PoseCorrection
 from evsplat.render import rows_in_view
 
 NORMAL_SAMPLES = 20_000
@@ -47,7 +47,7 @@ class _View:
 class DiscModel(PosedModel):
     """Discs of person and scene, the light on them, and the body track."""
 
-    residual: PoseSpline | None
+    residual: PoseCorrection | None
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class DiscModel(PosedModel):
         lamps: int,
         self_shadow: bool,
         scene_network: bool = False,
-        residual: PoseSpline | None = None,
+        residual: PoseCorrection | None = None,
         residual_start: float = 0.0,
     ) -> None:
         """Start at ``gaussians``, whose colours are their own.

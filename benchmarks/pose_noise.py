@@ -1,7 +1,7 @@
 """What noise of the given poses costs method `evsplat`, and what it gets back.
 
-    python benchmarks/poses.py CAPTURE [--noise-rad 0.03] [--iterations N] [--set KEY=VALUE ...]
-        [--only ROW ...] [--out FOLDER]
+    python benchmarks/pose_noise.py CAPTURE [--noise-rad 0.03] [--iterations N]
+        [--set KEY=VALUE ...] [--only ROW ...] [--out FOLDER]
 
 Adds independent noise to every joint of every key pose and trains on exact poses, on noisy ones as
 they are, and with what `pose.*` does about them. Printed per row, for training and for held-out
@@ -30,8 +30,8 @@ ROWS: dict[str, tuple[bool, tuple[str, ...]]] = {
     "noisy": (True, AS_GIVEN),
     "smoothed": (True, ("pose.smooth=always", "pose.refine=never")),
     "refined": (True, ("pose.smooth=never", "pose.refine=always")),
-    "both": (True, ()),
-    "both_held_out_events": (
+    "default": (True, ()),
+    "default_held_out_events": (
         True,
         ("policy.held_out_events=true", "pose.events_of_held_out=true"),
     ),
@@ -40,7 +40,7 @@ ROWS: dict[str, tuple[bool, tuple[str, ...]]] = {
 
 
 def write_noisy(source: Capture, path: Path, noise_rad: float, seed: int) -> None:
-    """The capture with key poses that are each off by Gaussian noise, radians per axis."""
+    """The capture with key poses off by Gaussian noise each, radians per axis, which say so."""
     with derived_capture(source, path) as making:
         file = making.folder / source.body_file.path.name
         with np.load(file) as archive:
@@ -49,6 +49,9 @@ def write_noisy(source: Capture, path: Path, noise_rad: float, seed: int) -> Non
         noise = noise_rad * np.random.default_rng(seed).normal(size=(len(exact), 3))
         turned = (exact * Rotation.from_rotvec(noise)).as_rotvec()
         body["poses"] = turned.reshape(body["poses"].shape).astype(np.float32)
+        body["pose_std_rad"] = np.full(body["poses"].shape[:2], noise_rad, np.float32)
+        body["transl_std_m"] = np.full((len(body["poses"]), 3), 1e-3, np.float32)
+        making.document["body"]["source"] = "estimated"
         file.unlink()  # it may be a hard link, and what it is linked to must stay
         np.savez(file, **body)
 
@@ -77,7 +80,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int)
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
     parser.add_argument("--only", nargs="*", default=list(ROWS), choices=list(ROWS))
-    parser.add_argument("--out", type=Path, default=Path("bench/poses"))
+    parser.add_argument("--out", type=Path, default=Path("bench/pose_noise"))
     options = parser.parse_args()
     noisy = options.out / "noisy_capture"
     if not noisy.exists():

@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import resources
@@ -14,7 +14,6 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from evsplat.errors import DataError
-from evsplat.evaluation.tables import REGION_TITLES
 
 Item = TypeVar("Item")
 
@@ -82,16 +81,6 @@ def spread(items: Sequence[Item], count: int) -> list[Item]:
     if len(items) <= count:
         return list(items)
     return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
-
-
-def frame_figures(figures: Mapping[str, Mapping[str, float | None]]) -> str:
-    """PSNR per region as text that continues a line; empty where nothing is known."""
-    parts = [
-        f"{title} {value:.2f} dB"
-        for region, title in REGION_TITLES.items()
-        if region in figures and (value := figures[region]["psnr"]) is not None
-    ]
-    return " · " + " · ".join(parts) if parts else ""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,194 @@
+"""Errors of found body poses against the truth, by stage: landmarks, fit, refinement.
+
+    python benchmarks/find_poses.py CAPTURE … [--held-out-events] [--keypoints-px 2] [--threads 1]
+
+Per capture and stage the mean distance of 14 joints in pixels (through the frame's camera), in
+millimetres about the pelvis (MPJPE), and after a similarity per frame (PA-MPJPE), at the times of
+training and of held-out frames apart; the share of the given poses' overlap with the masks that
+the found ones reach; seconds. The stature is taken from the truth, the pose prior leaves the
+capture's motion out. With ``--keypoints-px`` a row follows that is fitted to the true joints, off
+by that many pixels of noise per axis, in place of landmarks. The last line is all of it as JSON.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from evsplat.body import BodyTrack
+from evsplat.body.skeleton import find_skeleton
+from evsplat.capture import Capture, Policy, load_body_track, load_capture
+from evsplat.errors import DataError
+from evsplat.inspection.capture import body_mask_overlap
+from evsplat.landmarks import (
+    COCO_17,
+    LandmarkNetwork,
+    Landmarks,
+    find_landmarks,
+    sharp_pictures,
+)
+from evsplat.posing.find import key_times
+from evsplat.posing.fit import FitSettings, fit_landmarks
+from evsplat.posing.prior import pose_prior
+
+PARTS = [f"{s}_{p}" for p in ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
+         for s in ("left", "right")]  # fmt: skip
+LANDMARKS = [f"{s}_{p}" for p in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+             for s in ("left", "right")]  # fmt: skip
+"""Landmarks named after the joints of `PARTS`."""
+
+
+def main() -> None:
+    """Measure the captures that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("captures", nargs="+", type=Path)
+    parser.add_argument("--held-out-events", action="store_true")
+    parser.add_argument("--keypoints-px", type=float)
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    policy = Policy(held_out_events=options.held_out_events)
+    results = []
+    for path in options.captures:
+        results += measure(load_capture(path), policy, options.keypoints_px)
+    print(json.dumps({"policy": policy.sentence, "rows": results}))
+
+
+def measure(capture: Capture, policy: Policy, keypoints_px: float | None) -> list[dict]:
+    """A row per stage."""
+    seen = capture.for_training(policy)
+    truth = load_body_track(capture, dense=capture.dense_body_file is not None)
+    extent = truth.body.rest_vertices.amax(0) - truth.body.rest_vertices.amin(0)
+    settings = FitSettings(height_m=float(extent.max()))
+    motion = str(capture.provenance.get("motion", ""))
+    try:
+        prior = pose_prior(without=(motion,))
+    except DataError:
+        prior = pose_prior()
+    start = time.perf_counter()
+    landmarks = find_landmarks(
+        seen, sharp_pictures(seen), network=LandmarkNetwork(), progress=False
+    )
+    found_s = time.perf_counter() - start
+    rows = [
+        {"stage": "landmarks", "seconds": found_s, **landmark_errors(capture, truth, landmarks)}
+    ]
+    sets = {"fit": landmarks}
+    if keypoints_px is not None:
+        sets["fit to true joints"] = true_keypoints(capture, truth, landmarks, keypoints_px)
+    for stage, points in sets.items():
+        start = time.perf_counter()
+        cameras = [capture.camera(nearest(capture, t)) for t in points.times_us.tolist()]
+        span = capture.frames[0].exposure_us[0], max(f.exposure_us[1] for f in capture.frames)
+        fitted = fit_landmarks(points, cameras, span, settings=settings, prior=prior)
+        track = fitted.track(key_times(seen))
+        seconds = time.perf_counter() - start
+        rows.append({"stage": stage, "seconds": seconds, **pose_errors(capture, truth, track)})
+    for row in rows:
+        row["capture"] = capture.name
+        shown = {k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}
+        print("  ".join(f"{key} {value}" for key, value in shown.items()), flush=True)
+    return rows
+
+
+def pose_errors(capture: Capture, truth: BodyTrack, track: BodyTrack) -> dict:
+    """Errors at mid-exposures, training and held-out apart, and overlap with the masks."""
+    values: dict = {}
+    for split, frames in (("train", capture.train_frames), ("test", capture.test_frames)):
+        if not frames:
+            continue
+        times = [frame.mid_us for frame in frames]
+        true, found = (joints(one, times) for one in (truth, track))
+        cameras = [capture.camera(frame) for frame in frames]
+        off = [
+            c.project(a)[0] - c.project(b)[0] for c, a, b in zip(cameras, true, found, strict=True)
+        ]
+        values[f"{split}_px"] = float(torch.stack(off).norm(dim=-1).mean())
+        a, b = true.double().numpy(), found.double().numpy()
+        centred = [one - one[:, 6:8].mean(1, keepdims=True) for one in (a, b)]
+        values[f"{split}_mpjpe"] = 1000 * float(
+            np.linalg.norm(centred[0] - centred[1], axis=-1).mean()
+        )
+        aligned = np.stack([similar(one, to) for one, to in zip(b, a, strict=True)])
+        values[f"{split}_pa"] = 1000 * float(np.linalg.norm(aligned - a, axis=-1).mean())
+        given = body_mask_overlap(capture, truth, frames)
+        if given:
+            own = body_mask_overlap(capture, track, frames)
+            values[f"{split}_iou"] = float(np.mean(own))
+            values[f"{split}_iou_share"] = float(np.mean(own) / np.mean(given))
+    if track.errors is not None:
+        values["sure"] = calibration(truth, track)
+    return values
+
+
+def calibration(truth: BodyTrack, track: BodyTrack) -> float:
+    """Root mean square of limb errors over the standard deviations told: 1 where they are right.
+
+    Only for tracks of the same joints.
+    """
+    if truth.body.joint_names != track.body.joint_names or track.errors is None:
+        return float("nan")
+    true, _ = truth.at(track.times_us)
+    own, _ = track.at(track.times_us)
+    trace = (true.mT @ own).diagonal(dim1=-2, dim2=-1).sum(-1)
+    angle = ((trace - 1) / 2).clamp(-1, 1).arccos().numpy()
+    skeleton = find_skeleton(truth.body.parents.tolist(), truth.body.joint_names)
+    limbs = [skeleton.limbs[part] for part in PARTS if "hand" not in part]
+    told = track.errors.joint_rad[:, limbs]
+    return float(np.sqrt(np.mean(angle[:, limbs] ** 2 / 3) / np.mean(told**2)))
+
+
+def landmark_errors(capture: Capture, truth: BodyTrack, landmarks: Landmarks) -> dict:
+    """Mean distance of twelve landmarks from the joints that they are named after."""
+    true = joints(truth, landmarks.times_us.tolist())[:, :12]
+    own = torch.from_numpy(landmarks.places[:, [landmarks.index(n) for n in LANDMARKS]])
+    frames = [nearest(capture, int(time)) for time in landmarks.times_us]
+    pixels = [capture.camera(f).project(place)[0] for f, place in zip(frames, true, strict=True)]
+    off = (torch.stack(pixels).double() - own).norm(dim=-1).mean(1)
+    held = torch.tensor([frame.split != "train" for frame in frames])
+    values = {"pictures": len(frames), "train_px": float(off[~held].mean())}
+    return values | ({"test_px": float(off[held].mean())} if held.any() else {})
+
+
+def true_keypoints(
+    capture: Capture, truth: BodyTrack, landmarks: Landmarks, noise_px: float
+) -> Landmarks:
+    """The joints' true places at the same times as COCO's key points, the face not seen."""
+    true = joints(truth, landmarks.times_us.tolist())[:, :12]
+    frames = [nearest(capture, int(time)) for time in landmarks.times_us]
+    pixels = [capture.camera(f).project(place)[0] for f, place in zip(frames, true, strict=True)]
+    places = np.zeros((len(frames), len(COCO_17), 2))
+    seen = np.zeros(places.shape[:2])
+    index = [COCO_17.index(name) for name in LANDMARKS]
+    noise = noise_px * np.random.default_rng(0).normal(size=(len(frames), 12, 2))
+    places[:, index] = torch.stack(pixels).numpy() + noise
+    seen[:, index] = 1
+    sigma = np.full(seen.shape, noise_px)
+    return Landmarks(landmarks.times_us, places, sigma, seen, None, COCO_17)
+
+
+def joints(track: BodyTrack, times_us: list[int]) -> torch.Tensor:
+    """The 14 joints in the world: those of `PARTS`, neck and head."""
+    skeleton = find_skeleton(track.body.parents.tolist(), track.body.joint_names)
+    index = [skeleton.limbs[part] for part in PARTS] + [skeleton.neck[0], skeleton.neck[-1]]
+    return track.body.joint_transforms(*track.at(times_us))[..., :3, 3][:, index]
+
+
+def similar(points: np.ndarray, to: np.ndarray) -> np.ndarray:
+    """The points moved, turned and scaled to lie as near as they can (Umeyama 1991)."""
+    a, b = points - points.mean(0), to - to.mean(0)
+    u, s, v = np.linalg.svd(a.T @ b)
+    sign = np.array([1, 1, np.sign(np.linalg.det(u @ v))])
+    return (s * sign).sum() / (a**2).sum() * a @ (u * sign @ v) + to.mean(0)
+
+
+def nearest(capture: Capture, time_us: int):
+    """The frame whose mid-exposure is nearest."""
+    return min(capture.frames, key=lambda frame: abs(frame.mid_us - time_us))
+
+
+if __name__ == "__main__":
+    main()

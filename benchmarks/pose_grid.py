@@ -1,0 +1,112 @@
+"""The default treatment of given poses against forced settings, on captures drawn at random.
+
+    python benchmarks/pose_grid.py [--captures 24] [--seed 0] [--iterations 400] [--out FOLDER]
+        [--characters NAME ...] [--only ROW ...]
+
+Each capture is staged (128 px) with a character, motion, frame rate, exposure, sensor and level of
+pose errors drawn at random, and trained by each row. Printed: PSNR of the person's pixels in
+held-out frames, dB, and how far the default stays behind the best of its own forced settings and
+behind `paper`. What exists is not made again, so a grid can be stopped and gone on with. The last
+line is one JSON object.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import evsplat as ev
+from evsplat.staging.assets import characters, motions
+
+FORCED = {
+    "never": ("pose.smooth=never", "pose.refine=never"),
+    "refine": ("pose.smooth=never", "pose.refine=always"),
+    "both": ("pose.smooth=always", "pose.refine=always"),
+}
+ROWS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "default": ("evsplat", ()),
+    **{name: ("evsplat", settings) for name, settings in FORCED.items()},
+    "paper": ("paper", ()),
+}
+NOISE = ("none", "mocap", "estimated", "estimated-blurry")
+CLOSE_DB = 0.2
+"""Behind the best of the forced settings by no more than this counts as close."""
+
+
+def draw(rng: np.random.Generator, people: list[str]) -> dict[str, Any]:
+    """Settings of one staged capture."""
+    fps = float(rng.choice([12.5, 15, 20, 25]))
+    return {
+        "character": str(rng.choice(people)),
+        "motion": str(rng.choice(motions())),
+        "fps": fps,
+        "exposure_ms": float(rng.uniform(0.3, 0.9) * min(1000 / fps, 80)),
+        "yaw_deg": float(rng.uniform(0, 360)),
+        "events": str(rng.choice(["clean", "davis346", "dvxplorer", "evk4"])),
+        "pose_noise": str(rng.choice(NOISE)),
+        "seed": int(rng.integers(1 << 30)),
+    }
+
+
+def trained(capture: Path, run: Path, row: str, iterations: int) -> float:
+    """PSNR of the person's pixels in held-out frames, dB, of a run that is made if it is not."""
+    method, settings = ROWS[row]
+    if not (run / "metrics.json").exists():
+        if run.exists():
+            ev.train(capture, out=run, resume=True)
+        else:
+            ev.train(capture, method=method, out=run, iterations=iterations, overrides=settings)
+        ev.evaluate(run)
+    found = json.loads((run / "metrics.json").read_text("utf-8"))
+    return float(found["protocols"]["standard"]["person_mask"]["psnr"])
+
+
+def main() -> None:
+    """Stage and train what is left, and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--captures", type=int, default=24)
+    parser.add_argument("--frames", type=int, default=32)
+    parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--characters", nargs="*", default=list(characters()))
+    parser.add_argument("--only", nargs="*", default=list(ROWS), choices=list(ROWS))
+    parser.add_argument("--out", type=Path, default=Path("bench/pose_grid"))
+    options = parser.parse_args()
+    rng = np.random.default_rng(options.seed)
+    behind: dict[str, list[float]] = {"best_forced": [], "paper": [], "never_of_exact": []}
+    print(f"{'capture':44}" + "".join(f"{row:>9}" for row in options.only))
+    for number in range(options.captures):
+        settings = draw(rng, options.characters)
+        capture = options.out / f"capture_{options.seed}_{number:02d}"
+        if not capture.exists():
+            ev.stage(capture, width=128, frames=options.frames, progress=False, **settings)
+        found = {
+            row: trained(
+                capture, options.out / "runs" / f"{capture.name}-{row}", row, options.iterations
+            )
+            for row in options.only
+        }
+        said = " ".join(str(settings[key]) for key in ("character", "motion", "fps", "pose_noise"))
+        print(f"{said:44}" + "".join(f"{value:9.2f}" for value in found.values()), flush=True)
+        if FORCED.keys() | {"default"} <= found.keys():
+            best = max(found[row] for row in FORCED)
+            behind["best_forced"].append(best - found["default"])
+            if settings["pose_noise"] == "none":
+                behind["never_of_exact"].append(found["never"] - found["default"])
+        if {"paper", "default"} <= found.keys():
+            behind["paper"].append(found["paper"] - found["default"])
+    figures: dict[str, float] = {"captures": options.captures}
+    for name, values in behind.items():
+        if values:
+            figures[f"behind_{name}_most_db"] = round(max(values), 3)
+            figures[f"behind_{name}_mean_db"] = round(float(np.mean(values)), 3)
+    if behind["best_forced"]:
+        close = np.mean(np.array(behind["best_forced"]) <= CLOSE_DB)
+        figures["close_to_best_forced_ratio"] = round(float(close), 3)
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()

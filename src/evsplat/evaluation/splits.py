@@ -1,0 +1,55 @@
+"""Frames that are measured: those held out, or those that training saw; their names and words."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from evsplat.options.runs import Split
+
+
+@dataclass(frozen=True)
+class SplitWords:
+    """How tables and pages speak of the frames of a split."""
+
+    frames: str
+    title: str
+    headline: str
+    """Where a figure of the full frame was reached."""
+    blurry_input: str
+    """Title of the row of the camera's own pictures."""
+
+
+WORDS: dict[Split, SplitWords] = {
+    "test": SplitWords(
+        "held-out frames",
+        "Test frames",
+        "on held-out frames",
+        "blurry input itself (no method sees it)",
+    ),
+    "train": SplitWords(
+        "training frames",
+        "Training frames",
+        "on training frames",
+        "blurry input itself (training saw it)",
+    ),
+}
+
+
+def split_of(metrics: dict[str, Any]) -> Split:
+    """The split that figures are of; those without a word on it are of test frames."""
+    return "train" if metrics.get("split") == "train" else "test"
+
+
+def words_of(metrics: dict[str, Any]) -> SplitWords:
+    """The words for the frames that were measured."""
+    return WORDS[split_of(metrics)]
+
+
+def count_of(metrics: dict[str, Any]) -> int:
+    """The number of frames that were measured."""
+    count: int = metrics["frames"][split_of(metrics)]
+    return count
+
+
+def name_of(stem: str, split: Split, suffix: str) -> str:
+    """Name of a file about one split: metrics.json of test frames, else metrics_train.json."""
+    return f"{stem}{suffix}" if split == "test" else f"{stem}_{split}{suffix}"

@@ -1,0 +1,74 @@
+"""Parts of importers of your own recordings: camera, events, and the lack of poses."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evsplat.capture.write import CaptureWriter, read_camera
+from evsplat.errors import ConfigError
+from evsplat.events import open_recording
+from evsplat.importers.base import check_positive, need
+
+GUESSED_FOV_DEG = 60.0
+"""Angle of view across the longer side where nothing tells the focal length: a phone held upright
+has about 65 degrees, a DAVIS346 with its usual 6 mm lens 61."""
+
+
+def recorded_camera(
+    file: Path | None, focal_px: float | None, size: tuple[int, int]
+) -> tuple[dict[str, Any], str, str]:
+    """Arguments of `CaptureWriter.add_camera`, where the focal length comes from, and a note.
+
+    The origin is "calibrated" (by ``file``), "given" or "guessed"; it goes to the provenance.
+    """
+    width, height = size
+    if file is not None:
+        if focal_px is not None:
+            raise ConfigError(f"--focal: {file} holds the camera; give one of the two.")
+        return read_camera(need(file, "the camera"), width, height), "calibrated", ""
+    if focal_px is not None:
+        check_positive(focal=focal_px)
+        origin, note = "given", ""
+    else:
+        focal_px = max(width, height) / 2 / float(np.tan(np.radians(GUESSED_FOV_DEG) / 2))
+        origin, note = (
+            "guessed",
+            f"camera: its focal length is guessed, {focal_px:.0f} px ({GUESSED_FOV_DEG:g} degrees "
+            "of view); give --focal PX or --camera FILE",
+        )
+    K = [[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]]
+    return {"K": K}, origin, note
+
+
+def add_recorded_events(
+    writer: CaptureWriter,
+    path: Path | None,
+    size: tuple[int, int],
+    *,
+    contrast: tuple[float, float] | None,
+    clock_offset_us: int,
+    repair: bool,
+) -> list[str]:
+    """Write the events of a recording of any format; gives notes for the user."""
+    if path is None:
+        return ["events: none; simulate them, or give --events"]
+    recording = open_recording(
+        need(path, "the events"), width=size[0], height=size[1], repair=repair
+    )
+    if not recording.has_polarity:
+        return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
+    writer.set_events(
+        recording.chunks(),
+        *size,
+        contrast_threshold=contrast,
+        simulated=False,
+        clock_offset_us=clock_offset_us,
+    )
+    return list(recording.notes)
+
+
+def without_body(writer: CaptureWriter) -> str:
+    """Leave the body out and give the note that says how to come by one."""
+    writer.leave_out_body()
+    return f"body: none; find the person's poses with: evsplat poses {writer.path} --out NEW"

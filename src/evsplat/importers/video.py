@@ -1,0 +1,69 @@
+"""A plain video, with the events recorded beside it where there are any."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from evsplat.capture.write import CaptureWriter
+from evsplat.errors import ConfigError
+from evsplat.footage import open_footage
+from evsplat.importers.base import Importer, check_positive, exposure_around
+from evsplat.importers.recorded import add_recorded_events, recorded_camera, without_body
+from evsplat.pictures.light import Transfer
+
+
+@dataclass(frozen=True, kw_only=True)
+class Video(Importer):
+    """A video of your own, without poses: pictures, an event file if there is one, a camera."""
+
+    events: Path | None = None
+    """Event recording of any known format, in the pixels of the video."""
+    exposure_us: float | None = None
+    """Exposure time, microseconds; it has to be known."""
+    fps: float | None = None
+    """Rate at which it was shot, where the file does not say (slow motion)."""
+    camera: Path | None = None
+    """One camera as in capture.json."""
+    focal: float | None = None
+    """Focal length in pixels, instead of --camera; without both 60 degrees of view are guessed."""
+    transfer: Transfer | None = None
+    """From the values of the pictures to light: power (2.2), srgb or linear."""
+    start_us: int = 0
+    """Middle of the first exposure."""
+    clock_offset_us: int = 0
+    """Added to the events' times to get the clock of the pictures."""
+    contrast: tuple[float, float] | None = None
+    """Contrast thresholds of the sensor, brighter and darker, where they are known."""
+    repair: bool = False
+    """Read on where the event recording is damaged."""
+
+    def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
+        """Read the video; see `Importer.write`."""
+        footage = open_footage(source, self.fps)
+        if self.exposure_us is None:
+            raise ConfigError(
+                f"{source}: how long the shutter was open is not known, and blur is made of it; "
+                "give --exposure-us."
+            )
+        check_positive(exposure_us=self.exposure_us)
+        size = footage.width, footage.height
+        camera, focal, note = recorded_camera(self.camera, self.focal, size)
+        if self.transfer is not None:
+            camera["transfer"] = self.transfer
+        writer.add_camera("main", *size, **camera)
+        for timed in tqdm(footage, "pictures", len(footage.times_us), leave=False):
+            middle = timed.time_us + self.start_us
+            exposure = exposure_around(middle, self.exposure_us)
+            writer.add_frame(timed.name, "main", timed.pixels, exposure)
+        notes = add_recorded_events(
+            writer,
+            self.events,
+            size,
+            contrast=self.contrast,
+            clock_offset_us=self.clock_offset_us,
+            repair=self.repair,
+        )
+        notes += [note] if note else []
+        writer.provenance |= {"source": f"video {source.name}", "focal": focal, "notes": notes}
+        return [*notes, without_body(writer)]

@@ -1,0 +1,120 @@
+"""Warnings about a body that does not belong to its recording; its outline over what moves."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from evsplat.body import BodyTrack, silhouette
+from evsplat.camera import Camera
+from evsplat.capture import Frame, TrainingCapture, load_body_track
+from evsplat.capture.finding import Finding, Findings
+from evsplat.errors import DataError
+from evsplat.events import count_map
+from evsplat.inspection.belonging import Belonging, judge_body
+from evsplat.inspection.drawing import (
+    DETAIL_PX,
+    Tile,
+    draw_outline,
+    events_over,
+    fit,
+    save_drawings,
+    sheet,
+    to_picture,
+)
+from evsplat.inspection.movement import event_window
+
+logger = logging.getLogger(__name__)
+
+_TILES = 8
+_GIVEN, _BEST = (60, 255, 120), (255, 225, 80)
+FIT_SHEET = "body_fit"
+"""Name of the picture."""
+
+
+def check_body(capture: TrainingCapture, *, refuse: bool) -> Belonging:
+    """Judge the body that a training is given; a right one is said nothing of.
+
+    Raises:
+        DataError: with ``refuse``, a body that follows nothing of what moves, or is out of view.
+    """
+    found = judge_body(capture)
+    if found.verdict == "another" and refuse:
+        raise DataError(
+            f"{capture.body_file.path}: {found.sentence}; give the body of this recording (evsplat "
+            f"inspect {capture.path} draws it), or pass --any-body to train on this one."
+        )
+    if found.verdict != "belongs":
+        logger.warning("%s: %s.", capture.body_file.path, found.sentence)
+    if found.in_no_held_out_frame:
+        logger.warning("%s: the person is in no test frame; check camera and poses.", capture.path)
+    return found
+
+
+def body_findings(capture: TrainingCapture, found: Belonging) -> list[Finding]:
+    """A warning where the body does not belong to the recording, or cannot be judged."""
+    findings = Findings()
+    if found.verdict != "belongs":
+        findings.warning(
+            capture.body_file.path,
+            "",
+            found.sentence,
+            "a body whose outline lies on what moves",
+            f"Look at {FIT_SHEET}.png; correct poses, their times, or the camera.",
+        )
+    return findings.items
+
+
+def save_fit_sheet(capture: TrainingCapture, found: Belonging, folder: Path) -> Path:
+    """Write `fit_sheet` into a folder; gives the file."""
+    return save_drawings({FIT_SHEET: fit_sheet(capture, found)}, folder)[0]
+
+
+def fit_sheet(capture: TrainingCapture, found: Belonging) -> Image.Image:
+    """The body's outline over events about mid-exposure, or over pictures where there are none.
+
+    Green where it is; yellow where it would fit best, if that is elsewhere.
+    """
+    track = load_body_track(capture)
+    chosen = np.linspace(0, len(found.frames) - 1, min(_TILES, len(found.frames))).round()
+    tiles = []
+    for frame in (found.frames[int(i)] for i in np.unique(chosen)):
+        camera = capture.camera(frame)
+        size = fit(camera.width, camera.height, DETAIL_PX)
+        picture = to_picture(_moving(capture, frame), size)
+        if found.verdict == "off":
+            _outline(picture, track, frame.mid_us + found.delay_us, camera, found.shift_px, _BEST)
+        _outline(picture, track, frame.mid_us, camera, (0.0, 0.0), _GIVEN)
+        tiles.append(Tile(picture, f"{frame.name}   {frame.mid_us / 1e6:.3f} s", frame.split))
+    said = "posed body (green) over what moves"
+    if found.verdict == "off":
+        said = f"posed body (green), {found.place} what moves; where it would fit best (yellow)"
+    return sheet(f"{capture.name}: fit of the body", said, tiles, columns=4)
+
+
+def _moving(capture: TrainingCapture, frame: Frame) -> Float[Tensor, "H W 3"]:
+    image = capture.image(frame)
+    if capture.events is None:
+        return image
+    return events_over(image, count_map(event_window(capture.events, frame), *image.shape[:2]))
+
+
+def _outline(
+    picture: Image.Image,
+    track: BodyTrack,
+    time_us: int,
+    camera: Camera,
+    shift_px: tuple[float, float],
+    colour: tuple[int, int, int],
+) -> None:
+    """Draw the body at a time, moved right and down, on a picture of any size."""
+    factors = torch.tensor([picture.width / camera.width, picture.height / camera.height, 1.0])
+    K = camera.K.clone()
+    K[:2, 2] += torch.tensor(shift_px)
+    drawn = Camera(picture.width, picture.height, K * factors[:, None], camera.world_to_camera)
+    body = silhouette(track.vertices(time_us), track.body.faces, drawn).numpy()
+    draw_outline(picture, body, colour)

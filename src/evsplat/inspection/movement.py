@@ -1,0 +1,92 @@
+"""What moves in a recording, in coarse maps: events, and differences to the background."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float32
+
+from evsplat.capture import Frame, TrainingCapture
+from evsplat.errors import DataError
+from evsplat.events import EventStore, EventStream, polarity_counts
+from evsplat.inspection.figure import Coarse
+
+MOST_FRAMES = 32
+EVENT_REACH_US = 10_000
+"""Events so long before and after mid-exposure count: longer, and fast limbs smear."""
+CHANGED = 0.15
+"""Difference to the background, in coded values, that counts in full."""
+_FEWEST_FOR_BACKGROUND = 3
+
+
+def looked_at(capture: TrainingCapture) -> tuple[Frame, ...]:
+    """At most `MOST_FRAMES` training frames of one camera, evenly spread."""
+    if not capture.train_frames:
+        raise DataError(
+            f"{capture.path / 'capture.json'}: has no frame of split 'train', expected at least "
+            "one; change the split, or train with --use everything."
+        )
+    name = capture.train_frames[0].camera
+    return spread([frame for frame in capture.train_frames if frame.camera == name])
+
+
+def spread(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """At most `MOST_FRAMES` of the frames, evenly spread."""
+    chosen = np.linspace(0, len(frames) - 1, min(MOST_FRAMES, len(frames))).round()
+    return tuple(frames[int(i)] for i in np.unique(chosen))
+
+
+def stands(frames: Sequence[Frame]) -> bool:
+    """True where the camera of the frames does not move."""
+    return all(frame.world_to_camera is None for frame in frames)
+
+
+def movement(
+    capture: TrainingCapture, frames: Sequence[Frame], coarse: Coarse
+) -> Mapping[str, Float32[np.ndarray, "K h w"]]:
+    """What moves about the mid-exposure of each frame, per map pixel, 0 or more.
+
+    "events": how many there are; "frames": difference to the median of the frames, 1 at most. What
+    the capture lacks is left out, as are differences where the camera moves, and what is the
+    same everywhere.
+    """
+    found = {}
+    if stands(frames):
+        found["frames"] = _differences(capture, frames, coarse)
+    # events are of the first frame's camera
+    if capture.events is not None and frames[0].camera == capture.frames[0].camera:
+        found["events"] = _event_counts(capture, frames, coarse)
+    return {name: maps for name, maps in found.items() if np.ptp(maps, axis=(1, 2)).any()}
+
+
+def event_window(events: EventStore, frame: Frame) -> EventStream:
+    """Events within `EVENT_REACH_US` of mid-exposure, as far as they may be read."""
+    start, end = events.readable_around(frame.mid_us)
+    first, last = frame.mid_us - EVENT_REACH_US, frame.mid_us + EVENT_REACH_US
+    return events.between(max(start, first), min(end, last))
+
+
+def _differences(
+    capture: TrainingCapture, frames: Sequence[Frame], coarse: Coarse
+) -> Float32[np.ndarray, "K h w"]:
+    if len(frames) < _FEWEST_FOR_BACKGROUND:
+        return np.zeros((len(frames), coarse.height, coarse.width), np.float32)
+    small = []
+    for frame in frames:
+        channels = capture.image(frame).unbind(-1)
+        small.append(np.stack([coarse.shrunk(channel) for channel in channels]))
+    pictures = np.stack(small)
+    differences = np.abs(pictures - np.median(pictures, axis=0)).max(axis=1)
+    return np.minimum(differences / CHANGED, 1).astype(np.float32)
+
+
+def _event_counts(
+    capture: TrainingCapture, frames: Sequence[Frame], coarse: Coarse
+) -> Float32[np.ndarray, "K h w"]:
+    events, maps = capture.events, []
+    assert events is not None
+    for frame in frames:
+        camera = capture.camera(frame)
+        stream = event_window(events, frame)
+        counts = polarity_counts(stream, camera.height, camera.width).sum(0)
+        maps.append(coarse.shrunk(counts) * coarse.pixel**2)
+    return np.stack(maps)

@@ -1,0 +1,89 @@
+"""The shift and delay at which silhouettes fit best what moves."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+
+from evsplat.inspection.matching import Correlations, normalised, own_time_order
+
+REACH_PX = 24
+"""Shifts of so many map pixels each way are tried: 30 % of the body's height."""
+DELAYS = tuple(step / 2 for step in range(-8, 9))
+"""Delays that are tried, in frames."""
+NOW = DELAYS.index(0.0)
+
+
+@dataclass(frozen=True)
+class BestPlace:
+    """The place where silhouettes fit best, and how well."""
+
+    delay: int = NOW
+    """Index in `DELAYS`."""
+    down: int = 0
+    right: int = 0
+    """Shift in map pixels."""
+    given_score: float = 0.0
+    """Correlation without shift and delay."""
+    score: float = 0.0
+    order: float | None = None
+    """`own_time_order` there."""
+    parting: float = 0.0
+    """`Belonging.parting`."""
+
+    @classmethod
+    def of(
+        cls,
+        found: Mapping[str, Float32[np.ndarray, "K h w"]],
+        silhouettes: Callable[[str, Int[np.ndarray, "K"]], Float32[np.ndarray, "K H W"]],
+        far: Bool[np.ndarray, "K K"],
+        row: Int[np.ndarray, "K D"],
+    ) -> "BestPlace":
+        """Of kinds of movement, which count alike, and what ``silhouettes`` gives for rows."""
+        if not found:
+            return cls()
+        half = (len(row) + 1) // 2
+        halves = (slice(half), slice(half, None))
+        # counts of events have a long tail, which a root shortens
+        maps = {k: normalised(np.sqrt(m) if k == "events" else m) for k, m in found.items()}
+        searched = [
+            Correlations.of(m, partial(silhouettes, kind), row, REACH_PX, halves)
+            for kind, m in maps.items()
+        ]
+        overall = np.mean([one.overall for one in searched], axis=0)
+        grouped = np.mean([one.grouped for one in searched], axis=0)
+        place = np.unravel_index(overall.argmax(), overall.shape)
+        delay, down, right = int(place[0]), int(place[1]) - REACH_PX, int(place[2]) - REACH_PX
+        highest = np.maximum(grouped.max((1, 2, 3)), 1e-9)
+        orders = [
+            own_time_order(
+                m, in_picture(silhouettes(kind, row[:, delay]), m.shape[1:], down, right), far
+            )
+            for kind, m in maps.items()
+        ]
+        told = [order for order in orders if order is not None]
+        return cls(
+            delay,
+            down,
+            right,
+            given_score=float(overall[NOW, REACH_PX, REACH_PX]),
+            score=float(overall[place]),
+            order=float(np.mean(told)) if told else None,
+            parting=float((1 - grouped[:, *place] / highest).max()),
+        )
+
+
+def drawn(
+    kind: str, posed: Bool[np.ndarray, "K H W"], edges: Bool[np.ndarray, "K H W"]
+) -> Float32[np.ndarray, "K H W"]:
+    """Where a body is expected to show: pictures change inside; events come most at the outline."""
+    inside = posed.astype(np.float32)
+    return inside if kind == "frames" else 0.5 * inside + edges
+
+
+def in_picture(posed: np.ndarray, size: tuple[int, ...], down: int, right: int) -> np.ndarray:
+    """The picture's part of wider silhouettes that are moved ``down`` and ``right``."""
+    top, left = REACH_PX - down, REACH_PX - right
+    return posed[:, top : top + size[0], left : left + size[1]]

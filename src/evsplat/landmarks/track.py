@@ -1,0 +1,182 @@
+"""Landmarks of a capture's person at all times: searched for, tracked, searched for again."""
+
+import logging
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from evsplat.capture import TrainingCapture
+from evsplat.errors import DataError
+from evsplat.landmarks.detect import LEAST_FLAG, Found, Region, find_in
+from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
+from evsplat.landmarks.motion import Motion
+from evsplat.landmarks.network import LandmarkNetwork
+from evsplat.landmarks.pictures import SharpPicture
+from evsplat.landmarks.refusals import (
+    refuse_half_out_of_view,
+    refuse_moving_camera,
+    refuse_nobody,
+    refuse_two_people,
+)
+
+logger = logging.getLogger(__name__)
+
+SURE = 0.9
+"""The person is tracked on from pictures with at least this flag, and searched for below it."""
+_TURNS = (0.0, np.pi / 2, -np.pi / 2, np.pi)
+"""Uprights of a search: cartwheels and handstands are found by the last three."""
+_CLEAR = 0.008
+"""Beyond this doubt other uprights are tried."""
+_BOX_MARGIN = 1.25
+_SETTLED = 0.08
+"""A region is read again where the next one is off by more than this share of its side."""
+_BASE_SIGMA = 0.008
+"""Error of a clearly seen point over the side of its region."""
+
+
+def find_landmarks(
+    capture: TrainingCapture,
+    pictures: Sequence[SharpPicture],
+    *,
+    network: LandmarkNetwork,
+    progress: bool = True,
+) -> Landmarks:
+    """The person's 33 landmarks in each picture (of `sharp_pictures`), in order of time.
+
+    Raises:
+        DataError: nobody is found in most pictures, there are two people, most of the person is
+            out of view, or the camera moves.
+    """
+    refuse_moving_camera(capture, None)
+    if not pictures:
+        raise DataError(f"{capture.path}: has no picture in which to look for the person.")
+    pictures = sorted(pictures, key=lambda picture: picture.time_us)
+    motion = Motion(capture)
+    tracker = _Tracker(network, motion)
+    found = [
+        tracker.find(picture)
+        for picture in tqdm(pictures, "landmarks", unit="picture", disable=not progress)
+    ]
+    tracker.look_back(pictures, found)
+    flags = np.array([person.flag for person in found])
+    refuse_nobody(capture, pictures, flags)
+    places = np.stack([person.places for person in found])
+    refuse_moving_camera(capture, (pictures, places))
+    refuse_half_out_of_view(capture, pictures, places)
+    refuse_two_people(capture, motion, pictures, found, tracker.search)
+    doubtful = int((flags < SURE).sum())
+    if doubtful:
+        logger.warning(
+            "%s: the person is hardly recognised in %d of %d pictures.",
+            capture.path,
+            doubtful,
+            len(flags),
+        )
+    return Landmarks(
+        np.array([picture.time_us for picture in pictures], dtype=np.int64),
+        places,
+        np.stack([_sigma(*both) for both in zip(pictures, found, strict=True)]),
+        np.stack([_seen(person) for person in found]),
+        np.stack([person.world for person in found]),
+        BLAZEPOSE_33,
+    )
+
+
+class _Tracker:
+    """Finds the person in one picture after the other."""
+
+    def __init__(self, network: LandmarkNetwork, motion: Motion) -> None:
+        self._network, self._motion = network, motion
+        self._last: Region | None = None
+
+    def find(self, picture: SharpPicture) -> Found:
+        """From the last region, turned otherwise where that is doubtful, or by a search."""
+        best = None if self._last is None else self.settle(picture.image, self._last)
+        if best is not None and best.flag >= LEAST_FLAG and not _is_clear(best):
+            around = Region(best.region.centre, best.region.side)
+            best = min(best, self.search(picture.image, [around]), key=_badness)
+        if best is None or best.flag < SURE:
+            starts = starts_of(self._motion, picture)
+            searched = self.search(picture.image, list(starts))
+            best = searched if best is None else min(best, searched, key=_badness)
+        self._last = best.region if best.flag >= SURE else None
+        return best
+
+    def look_back(self, pictures: Sequence[SharpPicture], found: list[Found]) -> None:
+        """Read doubtful pictures again in the regions of clear ones after them."""
+        for index in range(len(found) - 2, -1, -1):
+            following = found[index + 1]
+            if _is_clear(following) and not _is_clear(found[index]):
+                again = self.settle(pictures[index].image, following.region)
+                found[index] = min(found[index], again, key=_badness)
+
+    def search(self, image: Float[Tensor, "H W 3"], starts: Sequence[Region]) -> Found:
+        """The clearest person in any of the starts, upright, turned or upside down."""
+        best: Found | None = None
+        for start in starts:
+            for turn in _TURNS:
+                found = self.settle(image, start.turned(turn))
+                best = found if best is None else min(best, found, key=_badness)
+                if _is_clear(best):
+                    return best
+        assert best is not None
+        return best
+
+    def settle(self, image: Float[Tensor, "H W 3"], region: Region, rounds: int = 3) -> Found:
+        """Read a region, and again the one that follows from it until they are the same."""
+        best: Found | None = None
+        for _ in range(rounds):
+            found = find_in(self._network, image, region)
+            if best is not None and found.flag < min(best.flag, SURE):
+                break
+            best = found
+            if found.flag < 0.1 or _alike(region, found.region):
+                break
+            region = found.region
+        assert best is not None
+        return best
+
+
+def _is_clear(found: Found) -> bool:
+    return found.flag >= SURE and found.doubt <= _CLEAR
+
+
+def _badness(found: Found) -> float:
+    """Lower is better: belief that there is a person counts first, then agreement of the copies."""
+    return found.doubt + max(0.0, SURE - found.flag)
+
+
+def starts_of(motion: Motion, picture: SharpPicture) -> Iterator[Region]:
+    """Regions to begin a search in: what moves, then the whole picture, then its centre square."""
+    height, width = picture.image.shape[:2]
+    for box in motion.boxes(picture.time_us)[:2]:
+        yield Region(box.centre, _BOX_MARGIN * box.side)
+    centre = np.array([width, height]) / 2
+    yield Region(centre, float(max(height, width)))
+    if height != width:
+        yield Region(centre, float(min(height, width)))
+
+
+def _alike(one: Region, other: Region) -> bool:
+    moved = np.abs(one.centre - other.centre).max() / one.side
+    turned = abs((one.angle - other.angle + np.pi) % (2 * np.pi) - np.pi)
+    grown = abs(np.log(other.side / one.side))
+    return bool(max(moved, turned, grown) < _SETTLED)
+
+
+def _sigma(picture: SharpPicture, found: Found) -> Float[np.ndarray, "33"]:
+    """Expected error per axis, pixels: what clear points have, and the copies' disagreement."""
+    doubt = 1 if found.flag >= SURE else 2
+    base = _BASE_SIGMA * found.region.side
+    sigma: np.ndarray = picture.sigma * doubt * np.hypot(base, found.spread)
+    return sigma
+
+
+def _seen(found: Found) -> Float[np.ndarray, "33"]:
+    """The network's belief, less where its copies disagree: it believes in hidden arms as well."""
+    disagreement = found.spread / (_BASE_SIGMA * found.region.side)
+    seen: np.ndarray = found.flag * found.visible / (1 + (disagreement / 2) ** 2)
+    return seen

@@ -1,0 +1,189 @@
+"""Learned errors of given poses: what holds throughout, what drifts, what is new in every key."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from evsplat.body import BodyTrack
+from evsplat.body.smoothing import SplineError
+from evsplat.devices import send
+from evsplat.models.pose_spline import PoseSpline
+
+SHARES = {"constant": 0.3, "slow": 0.5, "fast": 0.2}
+"""Parts of an error's variance. Whoever fits poses to pictures errs by a habit per joint, by what
+wanders with pose and view, and a little anew in every picture."""
+SLOW_US = 200_000
+"""Least time between knots of the slow part: no less than two key poses, either."""
+
+
+class PoseCorrection(nn.Module):
+    """Residual of a track's poses: axis-angle vectors of the joints, shifts of the root.
+
+    Three splines add up to the errors at the keys, each in units of its share of the errors that
+    are expected there: ``constant``, which corrects held-out times as well as any; ``slow``, whose
+    knots reach over a few frames, so that what is learned at training times is carried into gaps;
+    ``fast``, with a knot per key. The latter two have mean zero over the training frames. A fourth,
+    ``between``, is zero at every key: how the person moves from one to the next, which the track's
+    own spline cannot know.
+
+    ``exact`` says which count: of poses that are exact only ``between``, else the other three. It
+    is part of the state, as it may have been found from pictures.
+    """
+
+    exact: Tensor
+    key_us: Tensor
+    joint_rad: Tensor
+    root_m: Tensor
+    between_rad: Tensor
+
+    def __init__(
+        self,
+        track: BodyTrack,
+        frame_times_us: Sequence[int],
+        *,
+        joint_rad: Float[np.ndarray, "P J"],
+        root_m: Float[np.ndarray, "P 3"],
+        between: SplineError | None,
+        exact: bool,
+    ) -> None:
+        """``joint_rad`` and ``root_m``: errors expected at the keys, per axis, radians and metres.
+
+        ``between``: error expected of the track's spline between its keys; None: not learned.
+        """
+        super().__init__()
+        times = track.times_us
+        span, joints = (int(times[0]), int(times[-1])), track.poses.shape[1]
+        gap = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+        knots = {"constant": float("inf"), "slow": max(SLOW_US, 2 * gap), "fast": gap}
+        self.errors = nn.ModuleDict(
+            {
+                name: PoseSpline(
+                    span, knot_us, joints, centred_us=() if name == "constant" else frame_times_us
+                )
+                for name, knot_us in knots.items()
+            }
+        )
+        self.between, self.between_m = None, 0.0
+        if between is not None:
+            self.between = PoseSpline(span, gap / 2, joints, held_us=times.tolist())
+            self.between_m = between.translation_m
+        buffers = {
+            "key_us": torch.from_numpy(times).double(),
+            "joint_rad": torch.as_tensor(joint_rad).float(),
+            "root_m": torch.as_tensor(root_m).float(),
+            "between_rad": torch.zeros(joints)
+            if between is None
+            else torch.from_numpy(between.rotation_rad),
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, value, persistent=False)
+        self.register_buffer("exact", torch.tensor(exact))
+
+    def residual(
+        self, times_us: Sequence[int] | Tensor
+    ) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T 3"]]:
+        """Axis-angle vectors, radians, and shifts of the root, metres."""
+        times = send(torch.as_tensor(times_us, dtype=torch.float64), self.key_us.device)
+        turns = self.joint_rad.new_zeros(len(times), self.joint_rad.shape[1], 3)
+        shifts = self.root_m.new_zeros(len(times), 3)
+        if not bool(self.exact):
+            for name, spline in self._errors():
+                some_turns, some_shifts = spline.values(times)
+                turns = turns + SHARES[name] ** 0.5 * some_turns
+                shifts = shifts + SHARES[name] ** 0.5 * some_shifts
+            joint_rad, root_m = self._expected(times)
+            return turns * joint_rad[..., None], shifts * root_m
+        if self.between is not None:
+            turns, shifts = self.between.values(times)
+        return turns * self.between_rad[:, None], shifts * self.between_m
+
+    def price(self) -> Float[Tensor, ""]:
+        """Squares in units of what is expected, averaged over moving joints, root, axes and keys.
+
+        A part with fewer knots than keys costs the less: each knot is one unknown.
+        """
+        keys, price = self.key_us, self.joint_rad.new_zeros(())
+        if not bool(self.exact):
+            moving = (self.joint_rad > 0).any(0)
+            parts = dict(self._errors())
+            for spline in parts.values():
+                share = spline.count / parts["fast"].count
+                price = price + share * self._price(spline, keys, moving)
+        elif self.between is not None:
+            middles = ((keys[1:] + keys[:-1]) / 2).floor()
+            price = self._price(self.between, middles, self.between_rad > 0)
+        return price
+
+    def unlikeliness(self) -> Float[Tensor, ""]:
+        """Sum of squares of the errors' unknowns, each in units of its standard deviation.
+
+        Twice the negative logarithm of how likely they are before anything was seen.
+        """
+        moving = (self.joint_rad > 0).any(0)[:, None]
+        squares = [
+            (spline.rotations * moving).square().sum() + spline.translations.square().sum()
+            for _, spline in self._errors()
+        ]
+        return torch.stack(squares).sum()
+
+    @staticmethod
+    def _price(spline: PoseSpline, times_us: Tensor, moving: Tensor) -> Tensor:
+        turns, shifts = spline.values(times_us)
+        joints = (turns * moving[:, None]).square().mean((0, 2)).sum()
+        return (joints + shifts.square().mean()) / (moving.sum() + 1)
+
+    def _expected(self, times_us: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors expected at times, linear between the keys."""
+        if len(self.key_us) == 1:
+            return self.joint_rad, self.root_m
+        upper = torch.searchsorted(self.key_us, times_us).clamp(1, len(self.key_us) - 1)
+        early, late = self.key_us[upper - 1], self.key_us[upper]
+        part = ((times_us - early) / (late - early)).clamp(0, 1).float()[:, None]
+        return tuple(  # type: ignore[return-value]
+            torch.lerp(sizes[upper - 1], sizes[upper], part)
+            for sizes in (self.joint_rad, self.root_m)
+        )
+
+    def _errors(self) -> Iterator[tuple[str, PoseSpline]]:
+        for name, spline in self.errors.items():
+            assert isinstance(spline, PoseSpline)
+            yield name, spline
+
+    def start_at(
+        self,
+        times_us: Sequence[int],
+        turns: Float[Tensor, "T J 3"],
+        shifts: Float[Tensor, "T 3"],
+        *,
+        misfit: float = 0.05,
+    ) -> None:
+        """Set the errors to the likeliest that give these residuals at ``times_us``.
+
+        Ridge regression: each unknown has variance one by its share, and what is given errs by
+        ``misfit`` in units of what is expected.
+        """
+        times = torch.as_tensor(times_us, dtype=torch.float64)
+        joint_rad, root_m = self._expected(times)
+        goal_turns = torch.where(joint_rad[..., None] > 0, turns / joint_rad[..., None], 0.0)
+        parts = list(self._errors())
+        design = torch.cat(
+            [SHARES[name] ** 0.5 * spline.weights(times) for name, spline in parts], 1
+        ).double()
+        goal = torch.cat((goal_turns.flatten(1), shifts / root_m), 1).double()
+        normal = design.T @ design + misfit**2 * torch.eye(design.shape[1], dtype=torch.float64)
+        found = torch.linalg.solve(normal, design.T @ goal).float()
+        with torch.no_grad():
+            for (_, spline), values in zip(
+                parts, found.split([spline.count for _, spline in parts]), strict=True
+            ):
+                spline.rotations.copy_(values[:, :-3].view_as(spline.rotations))
+                spline.translations.copy_(values[:, -3:])
+
+    def forget(self) -> None:
+        """Set all residuals to zero."""
+        with torch.no_grad():
+            for value in self.parameters():
+                value.zero_()

@@ -1,0 +1,250 @@
+"""`evsplat poses`: from a capture without body poses to one with them."""
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+import evsplat
+from evsplat.body import BodyTrack
+from evsplat.body.smpl import smpl_body
+from evsplat.camera import Camera
+from evsplat.capture import Policy, TrainingCapture, load_capture
+from evsplat.capture.derive import Derivation, derived_capture
+from evsplat.config import to_dict
+from evsplat.files import refuse_existing, write_text
+from evsplat.landmarks import (
+    LandmarkNetwork,
+    Landmarks,
+    SharpPicture,
+    find_landmarks,
+    read_keypoints,
+    sharp_pictures,
+)
+from evsplat.options import PoseSearch
+from evsplat.options.declare import given
+from evsplat.posing.fit import PoseFit, fit_focal, fit_landmarks
+from evsplat.posing.page import poses_page
+from evsplat.posing.problem import FitSettings
+from evsplat.posing.rig import Rig, default_rig, make_rig
+
+logger = logging.getLogger(__name__)
+
+_FOCALS = np.geomspace(0.6, 2.4, 7)
+"""Focal lengths that `--focal auto` begins with, in widths of the picture."""
+_BETAS = 10
+_QUARTERS = (0.25, 0.5, 0.75)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPoses:
+    """Poses found in a capture, and the way to them."""
+
+    path: Path
+    """The capture with them."""
+    track: BodyTrack
+    """Key poses at all frames and at the quarters between, with their errors."""
+    fitted: PoseFit
+    """The motion behind them."""
+    landmarks: Landmarks
+    seconds: dict[str, float]
+    """By stage: pictures, landmarks, fit."""
+    summary: str
+    """Some lines of text."""
+
+
+@dataclass
+class _Stages:
+    """Progress bar and stop watch of the stages."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, bar: Any, name: str) -> Iterator[None]:
+        bar.set_postfix_str(name)
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - start
+        bar.update()
+
+
+def find_poses(
+    path: Path | str,
+    out: Path | str,
+    search: PoseSearch | None = None,
+    *,
+    keypoints: Path | str | None = None,
+    policy: Policy | None = None,
+    **changes: Any,
+) -> FoundPoses:
+    """Find the person's poses in a capture and write a new one with them, whole or not at all.
+
+    Landmarks on sharpened pictures (`evsplat.landmarks`; or the key points of a file), and a motion
+    fitted to them (`fit_landmarks`). Of the capture is
+    seen what its policy shows: by default no picture, mask or event of a held-out interval. Poses
+    that the capture has are ignored; its true poses between keys, of another body, are left out of
+    the new one. ``changes`` are options of `PoseSearch`. ``poses.html`` in the new capture shows
+    what was found.
+
+    Raises:
+        ConfigError: An option is out of range.
+        DataError: ``out`` exists, or no person, or too little of one, is found.
+        WeightsError: The body model or the network's weights are missing.
+    """
+    search = given(PoseSearch, search, changes)
+    out = Path(out)
+    refuse_existing(out)
+    rig = _rig(search.body)
+    capture = load_capture(path)
+    policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
+    seen = capture.for_training(policy)
+    stages = _Stages()
+    with tqdm(total=3, desc="poses", unit="stage") as bar:
+        with stages(bar, "pictures"):
+            pictures = sharp_pictures(seen)
+        with stages(bar, "landmarks"):
+            landmarks = _landmarks(seen, pictures, keypoints)
+        with stages(bar, "fit"):
+            fitted, focal_px = _fit(seen, landmarks, rig, search)
+        track = fitted.track(key_times(seen))
+    made = {
+        "from": "key points of a file" if keypoints else "landmarks of BlazePose",
+        **to_dict(search),
+        "pictures": len(landmarks.times_us),
+        "in_doubt": [doubt.part for doubt in fitted.doubts],
+        "evsplat": evsplat.__version__,
+        "policy": to_dict(seen.policy),
+    }
+    with derived_capture(capture, out) as making:
+        _write_body(making, track, fitted)
+        if focal_px is not None:
+            _set_focal(making, seen, focal_px)
+            made["focal_px"] = round(focal_px, 2)
+        making.document["provenance"] = {**capture.provenance, "poses": made}
+        page = poses_page(capture.name, seen, pictures, landmarks, track, fitted, made)
+        write_text(making.folder / "poses.html", page)
+    return FoundPoses(
+        out,
+        track,
+        fitted,
+        landmarks,
+        stages.seconds,
+        _summary(out, track, landmarks, stages.seconds),
+    )
+
+
+def _landmarks(
+    capture: TrainingCapture, pictures: Sequence[SharpPicture], keypoints: Path | str | None
+) -> Landmarks:
+    """Of the network; or those of a file, which has a row for each frame, at training frames."""
+    if keypoints is None:
+        return find_landmarks(capture, pictures, network=LandmarkNetwork(), progress=False)
+    frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
+    points = read_keypoints(keypoints, [frame.mid_us for frame in frames])
+    # Those of held-out frames were found in pictures that are not to be seen.
+    shown = np.array([frame.split == "train" for frame in frames])
+    return replace(
+        points,
+        times_us=points.times_us[shown],
+        places=points.places[shown],
+        sigma_px=points.sigma_px[shown],
+        seen=points.seen[shown],
+    )
+
+
+def key_times(capture: TrainingCapture) -> list[int]:
+    """Times of key poses: each mid-exposure, the quarters between, and where the recording ends."""
+    mids = np.unique([frame.mid_us for frame in capture.frames])
+    between = [mids[:-1] + share * np.diff(mids) for share in _QUARTERS]
+    times = np.concatenate([mids, *between, _span(capture)]).round().astype(np.int64)
+    return np.unique(times).tolist()
+
+
+def _span(capture: TrainingCapture) -> tuple[int, int]:
+    exposures = [frame.exposure_us for frame in capture.frames]
+    return min(start for start, _ in exposures), max(end for _, end in exposures)
+
+
+def _rig(model: str) -> Rig:
+    if model == "default":
+        return default_rig()
+    return make_rig(lambda betas: smpl_body("smpl", betas), "smpl", _BETAS)
+
+
+def _fit(
+    capture: TrainingCapture, landmarks: Landmarks, rig: Rig, search: PoseSearch
+) -> tuple[PoseFit, float | None]:
+    """The motion, and the focal length where it is not the capture's."""
+    cameras = _cameras(capture, landmarks.times_us.tolist())
+    focal_px = search.focal_px
+    width = cameras[0].width
+    if search.focal == "auto":
+        focal_px = width * 1.2
+    if focal_px is not None:
+        cameras = [with_focal(camera, focal_px) for camera in cameras]
+    settings = FitSettings(height_m=search.height_m)
+    fitted = fit_landmarks(landmarks, cameras, _span(capture), rig=rig, settings=settings)
+    if search.focal == "auto":
+        coarse, _ = fit_focal(fitted, [width * share for share in _FOCALS])
+        step = float(_FOCALS[1] / _FOCALS[0]) ** 0.4
+        focal_px, fitted = fit_focal(fitted, [coarse / step, coarse, coarse * step])
+    return fitted, focal_px
+
+
+def with_focal(camera: Camera, focal_px: float) -> Camera:
+    """The camera with another focal length, pixels being square."""
+    K = camera.K.clone()
+    K[0, 0] = K[1, 1] = focal_px
+    return replace(camera, K=K)
+
+
+def _cameras(capture: TrainingCapture, times_us: Sequence[int]) -> list[Camera]:
+    """The camera of the frame nearest to each time."""
+    mids = np.array([frame.mid_us for frame in capture.frames])
+    nearest = [int(np.abs(mids - time).argmin()) for time in times_us]
+    return [capture.camera(capture.frames[index]) for index in nearest]
+
+
+def _write_body(making: Derivation, track: BodyTrack, fitted: PoseFit) -> None:
+    assert track.errors is not None
+    old = making.document.get("body")
+    for name in {"body.npz", "body_dense.npz", *([old["file"]] if old else [])}:
+        # It may be a hard link, and what it is linked to must stay.
+        (making.folder / name).unlink(missing_ok=True)
+    gender = {"gender": "neutral"} if fitted.rig.model == "smpl" else {}
+    np.savez_compressed(
+        making.folder / "body.npz",
+        allow_pickle=False,
+        model=fitted.rig.model,
+        times_us=track.times_us,
+        poses=track.poses.astype(np.float32),
+        transl=track.transl.astype(np.float32),
+        betas=fitted.betas.astype(np.float32),
+        pose_std_rad=np.asarray(track.errors.joint_rad, np.float32),
+        transl_std_m=np.asarray(track.errors.root_m, np.float32),
+        **gender,
+    )
+    model = fitted.rig.model
+    making.document["body"] = {"file": "body.npz", "model": model, "source": "estimated"}
+
+
+def _set_focal(making: Derivation, capture: TrainingCapture, focal_px: float) -> None:
+    for name in {frame.camera for frame in capture.frames}:
+        K = making.document["cameras"][name]["K"]
+        K[0][0] = K[1][1] = focal_px
+
+
+def _summary(out: Path, track: BodyTrack, landmarks: Landmarks, seconds: dict[str, float]) -> str:
+    assert track.errors is not None
+    stages = ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items())
+    return (
+        f"written: {out} ({len(track.times_us)} key poses from {len(landmarks.times_us)} pictures; "
+        f"{stages})\nlook at it: {out / 'poses.html'}\n"
+        f"then: evsplat train {out}"
+    )

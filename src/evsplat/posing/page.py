@@ -1,0 +1,151 @@
+"""poses.html: what was found, over the sharpened pictures, and how sure it is."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+
+from evsplat.body import BodyTrack, silhouette
+from evsplat.camera import Camera
+from evsplat.capture import TrainingCapture
+from evsplat.inspection.drawing import DETAIL_PX, draw_outline, fit, to_picture
+from evsplat.landmarks import Landmarks, SharpPicture
+from evsplat.pages import Embedder, document, figure, folded, section, spread
+from evsplat.posing.fit import PoseFit
+from evsplat.posing.rig import LIMBS, Rig
+
+_OPEN, _MOST = 8, 48
+"""Pictures shown at once, and in all."""
+_DOUBTFUL_PX = 3.0
+"""Pictures whose landmarks lie this many of their standard deviations off are told."""
+_OUTLINE, _LANDMARK, _UNSEEN = (60, 255, 120), (255, 220, 60), (255, 90, 60)
+_NOT_SEEN = 0.5
+_BONES = (
+    *(("left_shoulder", "right_shoulder"), ("left_hip", "right_hip")),
+    *((f"{s}_{a}", f"{s}_{b}") for s in ("left", "right") for a, b in (
+        ("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"),
+        ("shoulder", "hip"))),
+)  # fmt: skip
+
+
+def poses_page(
+    name: str,
+    capture: TrainingCapture,
+    pictures: Sequence[SharpPicture],
+    landmarks: Landmarks,
+    track: BodyTrack,
+    fitted: PoseFit,
+    made: Mapping[str, Any],
+) -> str:
+    """The page as HTML, one file with its pictures inside."""
+    cameras = {frame.name: capture.camera(frame) for frame in capture.frames}
+    by_time = {picture.time_us: picture for picture in pictures}
+    off = dict(zip(landmarks.times_us.tolist(), misfit(fitted), strict=True))
+    shown = [index for index, time in enumerate(landmarks.times_us) if int(time) in by_time]
+    embed = Embedder(lossless=False)
+
+    def tile(index: int) -> str:
+        picture = by_time[int(landmarks.times_us[index])]
+        drawn = _drawn(picture, cameras[picture.frame.name], track, landmarks, index)
+        label = f"{picture.frame.name}, {picture.time_us / 1e6:.3f} s, {off[picture.time_us]:.1f} σ"
+        return figure(embed.image(np.asarray(drawn), label), label)
+
+    chosen = spread(shown, _MOST)
+    first = spread(chosen, _OPEN)
+    rest = [index for index in chosen if index not in first]
+    worst = sorted((i for i in shown if off[int(landmarks.times_us[i])] > _DOUBTFUL_PX),
+                   key=lambda i: -off[int(landmarks.times_us[i])])[:_OPEN]  # fmt: skip
+    grid = lambda indices: f'<div class="tiles">{"".join(map(tile, indices))}</div>'  # noqa: E731
+    body = (
+        f"<header><p class='kicker'>evsplat poses</p><h1>{escape(name)}</h1>"
+        f"<p class='lead'>{len(track.times_us)} key poses from landmarks in "
+        f"{len(landmarks.times_us)} pictures.</p></header><main>"
+        + section(
+            "Over the pictures",
+            "Outline of the posed body (green) over the sharpened pictures; landmarks that are "
+            "seen (yellow) and guessed (red). σ: how far landmarks lie from the pose, in their "
+            "standard deviations.",
+            grid(first) + folded(f"{len(rest)} more pictures", grid(rest) if rest else ""),
+        )
+        + section("How sure", _SURE, _limb_table(track, fitted.rig))
+        + section("In doubt", _DOUBT, _doubts(fitted) + (grid(worst) if worst else ""))
+        + section("Made with", "", f"<p class='note'>{escape(str(dict(made)))}</p>")
+        + "</main>"
+    )
+    return document(f"{name}: poses", body, style=_STYLE)
+
+
+_SURE = (
+    "Standard deviations as the fit expects them, degrees per axis (limbs: of their least sure "
+    "joint) and centimetres; the mean over time, and the greatest."
+)
+_DOUBT = (
+    "Limbs that may as well point the other way in depth, and the pictures whose landmarks lie "
+    "farthest from the pose."
+)
+_STYLE = (
+    ".tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(250px,1fr));gap:12px}"
+    ".tiles img{width:100%;height:auto;border-radius:6px}"
+)
+
+
+def misfit(fitted: PoseFit) -> list[float]:
+    """Root mean square of each picture's landmarks' distances, in standard deviations."""
+    evidence, problem = fitted.problem.evidence, fitted.problem
+    posed = problem.posed(fitted.state)
+    off = evidence.views.project(evidence.points.of(posed))[0] - evidence.places
+    square = (off / evidence.sigma_px[..., None]).square().mean(-1)
+    total = (evidence.weight * square).sum(-1) / evidence.weight.sum(-1).clamp_min(1e-9)
+    return total.sqrt().tolist()
+
+
+def _drawn(
+    picture: SharpPicture, camera: Camera, track: BodyTrack, landmarks: Landmarks, index: int
+) -> Image.Image:
+    size = fit(camera.width, camera.height, DETAIL_PX)
+    scale = size[0] / camera.width
+    factors = torch.tensor([scale, size[1] / camera.height, 1.0])
+    large = Camera(*size, camera.K * factors[:, None], camera.world_to_camera)
+    image = to_picture(picture.image, size)
+    mask = silhouette(track.vertices(picture.time_us), track.body.faces, large)
+    draw_outline(image, mask.numpy(), _OUTLINE)
+    draw = ImageDraw.Draw(image)
+    places, seen = landmarks.places[index] * scale, landmarks.seen[index]
+    for start, end in _BONES:
+        a, b = landmarks.index(start), landmarks.index(end)
+        if a is not None and b is not None and min(seen[a], seen[b]) > 0:
+            draw.line([tuple(places[a]), tuple(places[b])], fill=_LANDMARK, width=1)
+    for place, sure in zip(places, seen, strict=True):
+        if sure > 0:
+            colour = _LANDMARK if sure > _NOT_SEEN else _UNSEEN
+            draw.ellipse([*(place - 2), *(place + 2)], fill=colour)
+    return image
+
+
+def _limb_table(track: BodyTrack, rig: Rig) -> str:
+    assert track.errors is not None
+    degrees, place = np.degrees(track.errors.joint_rad), track.errors.root_m
+    rows = []
+    for limb, parts in {"trunk": ("root",), **LIMBS}.items():
+        worst = degrees[:, [rig.joint(part) for part in parts]].max(1)
+        rows.append((limb.replace("_", " "), f"{worst.mean():.0f}°", f"{worst.max():.0f}°"))
+    along = np.sqrt((place**2).sum(1)) * 100
+    rows.append(("place", f"{along.mean():.1f} cm", f"{along.max():.1f} cm"))
+    cells = "".join(
+        f"<tr><td>{limb}</td><td>{mean}</td><td>{most}</td></tr>" for limb, mean, most in rows
+    )
+    return f"<table><tr><th></th><th>mean</th><th>most</th></tr>{cells}</table>"
+
+
+def _doubts(fitted: PoseFit) -> str:
+    if not fitted.doubts:
+        return "<p>No limb's depth is in doubt.</p>"
+    rows = "".join(
+        f"<li>{doubt.part.replace('_', ' ')}, {doubt.start_us / 1e6:.3f} to "
+        f"{doubt.end_us / 1e6:.3f} s: odds {np.exp(doubt.odds_log):.1f} to 1</li>"
+        for doubt in fitted.doubts
+    )
+    return f"<ul>{rows}</ul>"

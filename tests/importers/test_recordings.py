@@ -1,0 +1,176 @@
+"""Recordings without poses: a video, a DAVIS file, and poses that shall not be taken."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
+from evsplat.errors import ConfigError, DataError, EvsplatError
+from evsplat.events import EventStream, write_events
+from evsplat.importers import import_capture
+from evsplat.pictures.video import write_video
+
+from ..events.formats.encoders import aedat4
+from . import trees
+
+WIDTH, HEIGHT, COUNT = 48, 32, 12
+PERIOD_US, EXPOSURE_US = 40_000, 25_000
+EPOCH_US = 1_700_000_000_000_000
+"""AEDAT4 counts from 1970."""
+
+
+def moving_bar() -> list[np.ndarray]:
+    pictures = [np.full((HEIGHT, WIDTH), 60, np.uint8) for _ in range(COUNT)]
+    for index, picture in enumerate(pictures):
+        picture[:, 2 * index : 2 * index + 6] = 200
+    return pictures
+
+
+def some_events(first_us: int) -> EventStream:
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(0, COUNT * PERIOD_US, 900)) + first_us
+    t[0] = first_us
+    x, y = rng.integers(0, WIDTH, 900), rng.integers(0, HEIGHT, 900)
+    p = rng.choice([-1, 1], 900)
+    return EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
+
+
+def run(kind: str, source: Path, out: Path, **options) -> Capture:
+    """Import, and find nothing wrong but what is said to be missing."""
+    import_capture(kind, source, out, **options)
+    findings = [f for f in validate_capture(out) if f.field not in ("body", "events", "frames")]
+    assert findings == []
+    capture = load_capture(out)
+    with pytest.raises(DataError, match="has no body; find the person's poses with: evsplat poses"):
+        load_body_track(capture)
+    assert json.loads((out / "capture.json").read_text())["body"] is None
+    assert not list(out.glob("body*.npz"))
+    return capture
+
+
+@pytest.fixture
+def davis(tmp_path: Path) -> Path:
+    starts = [EPOCH_US + 3_000 + index * PERIOD_US for index in range(COUNT)]
+    frames = [
+        (picture, start, start + EXPOSURE_US)
+        for picture, start in zip(moving_bar(), starts, strict=True)
+    ]
+    path = tmp_path / "dance.aedat4"
+    path.write_bytes(aedat4(some_events(EPOCH_US), WIDTH, HEIGHT, frames))
+    return path
+
+
+def test_a_davis_recording_is_a_capture_whose_frames_are_light(davis: Path, tmp_path: Path) -> None:
+    capture = run("davis", davis, tmp_path / "out", contrast=(0.3, 0.25))
+    assert [f.exposure_us for f in capture.frames] == [
+        (3_000 + i * PERIOD_US, 3_000 + i * PERIOD_US + EXPOSURE_US) for i in range(COUNT)
+    ]
+    for frame, picture in zip(capture.frames, moving_bar(), strict=True):
+        assert np.array_equal((capture.image(frame)[..., 0] * 255).round(), picture)
+        assert capture.transfer(frame) == "linear"
+    assert capture.events is not None and len(capture.events) == 900
+    events, given = capture.events.between(0, 1 << 40), some_events(0)
+    assert np.array_equal(events.t, given.t) and np.array_equal(events.x, given.x)
+    assert np.array_equal(events.p, given.p)
+    assert capture.contrast_threshold == (0.3, 0.25) and not capture.events_simulated
+    assert capture.provenance["focal"] == "guessed" and capture.provenance["started_us"] == EPOCH_US
+    # 60 degrees across the longer side
+    camera = capture.camera(capture.frames[0])
+    assert np.degrees(2 * np.arctan(WIDTH / 2 / camera.K[0, 0].item())) == pytest.approx(60)
+    assert any("focal length is guessed" in note for note in capture.provenance["notes"])
+
+
+def test_a_part_of_a_davis_recording_begins_with_its_first_frame(
+    davis: Path, tmp_path: Path
+) -> None:
+    capture = run("davis", davis, tmp_path / "out", frames=(4, 9), focal=55.0, transfer="power")
+    assert [frame.name for frame in capture.frames] == [f"{i:06d}" for i in range(4, 9)]
+    assert capture.frames[0].exposure_us == (0, EXPOSURE_US)
+    begin, end = 3_000 + 4 * PERIOD_US, 3_000 + 8 * PERIOD_US + EXPOSURE_US
+    assert capture.events is not None
+    assert len(capture.events) == len(some_events(0).between(begin, end))
+    assert capture.cameras["main"].K[0, 0] == 55 and capture.provenance["focal"] == "given"
+    assert capture.transfer("000004") == "power"
+
+
+def test_a_video_with_events_beside_it(tmp_path: Path) -> None:
+    clip = tmp_path / "clip.mp4"
+    write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)
+    write_events(tmp_path / "events.h5", some_events(500))
+    camera = {"width": WIDTH, "height": HEIGHT, "K": [[50, 0, 24], [0, 50, 16], [0, 0, 1]]}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    capture = run(
+        "video",
+        clip,
+        tmp_path / "out",
+        events=tmp_path / "events.h5",
+        exposure_us=20_000.0,
+        start_us=10_000,
+        clock_offset_us=-500,
+        camera=tmp_path / "camera.json",
+        transfer="srgb",
+    )
+    assert [f.exposure_us for f in capture.frames] == [
+        (i * PERIOD_US, i * PERIOD_US + 20_000) for i in range(COUNT)
+    ]
+    seen = capture.image(capture.frames[3])[..., 0].numpy() * 255
+    assert np.abs(seen - moving_bar()[3]).mean() < 9
+    assert capture.events is not None and capture.events.time_range_us[0] == 0
+    assert capture.provenance["focal"] == "calibrated"
+    assert capture.transfer(capture.frames[0]) == "srgb"
+
+
+def test_poses_of_a_data_set_can_be_left_out(tmp_path: Path) -> None:
+    source = trees.write_zju_raw(tmp_path / "CoreView_377")
+    capture = run("zju-mocap", source, tmp_path / "out", no_poses=True)
+    assert len(capture.frames) == trees.FRAMES and not capture.has_body
+
+
+def aedat_without_frames(path: Path) -> dict:
+    path.write_bytes(aedat4(some_events(EPOCH_US), WIDTH, HEIGHT))
+    return {}
+
+
+def aedat_of_two_sizes(path: Path) -> dict:
+    frame = np.zeros((HEIGHT // 2, WIDTH), np.uint8), EPOCH_US, EPOCH_US + 10
+    path.write_bytes(aedat4(some_events(EPOCH_US), WIDTH, HEIGHT, [frame]))
+    return {}
+
+
+def aedat_without_exposure(path: Path) -> dict:
+    frame = np.zeros((HEIGHT, WIDTH), np.uint8), EPOCH_US, EPOCH_US
+    path.write_bytes(aedat4(some_events(EPOCH_US), WIDTH, HEIGHT, [frame]))
+    return {}
+
+
+def clip_of_one(path: Path) -> dict:
+    write_video(path, [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 2, fps=25)
+    return {}
+
+
+def clip_with_two_cameras(path: Path) -> dict:
+    clip_of_one(path)
+    return {"exposure_us": 1e4, "focal": 40.0, "camera": path}
+
+
+FAULTS = {
+    "no frames": ("davis", aedat_without_frames, DataError, "no frames beside .*import video"),
+    "two sizes": ("davis", aedat_of_two_sizes, DataError, "have 48x16 pixels and its ev.* 48x32"),
+    "no length": ("davis", aedat_without_exposure, DataError, "frame 0 is exposed from"),
+    "no exposure": ("video", clip_of_one, ConfigError, "how long the shutter was open is not"),
+    "two cameras": ("video", clip_with_two_cameras, ConfigError, "--focal: .* holds the camera"),
+    "no clip": ("video", lambda path: {}, DataError, "clip.*: no such video file"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_missing_is_one_sentence(tmp_path: Path, fault: str) -> None:
+    kind, make, error, message = FAULTS[fault]
+    source = tmp_path / ("clip.mp4" if kind == "video" else "clip.aedat4")
+    options = make(source)
+    with pytest.raises(EvsplatError, match=message) as caught:
+        import_capture(kind, source, tmp_path / "out", **options)
+    assert isinstance(caught.value, error) and "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()

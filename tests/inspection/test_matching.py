@@ -1,0 +1,74 @@
+"""`Correlations` and `own_time_order` against closed forms."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from evsplat.inspection.matching import Correlations, normalised, own_time_order
+
+REACH = 5
+
+
+def squares(places: list[tuple[int, int]], size: int = 24) -> np.ndarray:
+    """Silhouettes of 4 x 4 pixels at (row, column)."""
+    maps = np.zeros((len(places), size, size), bool)
+    for k, (row, column) in enumerate(places):
+        maps[k, row : row + 4, column : column + 4] = True
+    return maps
+
+
+def drawing(posed: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Silhouettes by their rows, as `Correlations` takes them."""
+    return lambda rows: posed[rows].astype(np.float32)
+
+
+def whole(maps: np.ndarray, posed: np.ndarray) -> np.ndarray:
+    """Correlation over all shifts with silhouettes of the same times."""
+    row = np.arange(len(maps))[:, None]
+    wide = np.pad(posed, ((0, 0), (REACH, REACH), (REACH, REACH)))
+    groups = (slice(None),)
+    return Correlations.of(normalised(maps), drawing(wide), row, REACH, groups).overall[0]
+
+
+def test_a_silhouette_that_is_moved_back_onto_the_map_correlates_fully() -> None:
+    posed = squares([(8, 9), (3, 12), (11, 6)])
+    found = whole(np.roll(posed, (3, -2), (1, 2)).astype(np.float32), posed)
+    assert np.unravel_index(found.argmax(), found.shape) == (REACH + 3, REACH - 2)
+    assert found.max() == pytest.approx(1, abs=1e-5)
+
+
+def test_correlation_is_that_of_numpy_at_every_shift() -> None:
+    rng = np.random.default_rng(0)
+    maps, posed = rng.random((1, 24, 24)), squares([(9, 8)])
+    found = whole(maps, posed)
+    for down, right in ((0, 0), (4, -5), (-3, 2)):
+        moved = np.roll(posed[0], (down, right), (0, 1))
+        expected = np.corrcoef(maps.ravel(), moved.ravel())[0, 1]
+        assert found[REACH + down, REACH + right] == pytest.approx(expected, abs=1e-5)
+
+
+def test_groups_have_places_of_their_own() -> None:
+    posed = squares([(8, 8), (9, 9)])
+    maps = np.stack([np.roll(posed[0], 2, 0), np.roll(posed[1], -3, 1)]).astype(np.float32)
+    wide = np.pad(posed, ((0, 0), (REACH, REACH), (REACH, REACH)))
+    groups = (slice(0, 1), slice(1, 2))
+    found = Correlations.of(normalised(maps), drawing(wide), np.arange(2)[:, None], REACH, groups)
+    places = [np.unravel_index(group[0].argmax(), group[0].shape) for group in found.grouped]
+    assert places == [(REACH + 2, REACH), (REACH, REACH - 3)]
+    assert found.grouped.max((1, 2, 3)) == pytest.approx(1, abs=1e-5)
+
+
+def test_order_is_one_for_the_own_times_and_a_half_by_chance() -> None:
+    rng = np.random.default_rng(1)
+    posed = squares([tuple(rng.integers(0, 20, 2)) for _ in range(16)])
+    far = ~np.eye(16, dtype=bool)
+    noisy = posed + rng.normal(size=posed.shape)
+    assert own_time_order(noisy, posed, far) > 0.95
+    chance = [own_time_order(rng.normal(size=posed.shape), posed, far) for _ in range(20)]
+    assert np.mean(chance) == pytest.approx(0.5, abs=0.05)
+
+
+def test_order_of_a_body_that_stands_still_is_not_told() -> None:
+    posed = squares([(4, 4)] * 8)
+    assert own_time_order(posed.astype(float), posed, ~np.eye(8, dtype=bool)) is None

@@ -1,0 +1,166 @@
+"""Learned errors of poses: known ones found again and carried on, prices, what counts when."""
+
+import numpy as np
+import pytest
+import torch
+
+from evsplat.body import BodyTrack, axis_angle_to_matrix, default_body
+from evsplat.body.smoothing import spline_error
+from evsplat.models.pose_correction import SHARES, PoseCorrection
+
+STEP_US = 80_000
+KEYS = 16
+
+
+def dance(seed: int) -> BodyTrack:
+    rng = np.random.default_rng(seed)
+    body = default_body()
+    times = np.arange(KEYS) * STEP_US
+    poses = 0.4 * np.sin(times[:, None, None] * 3e-6 + rng.uniform(0, 6, (len(body.parents), 3)))
+    return BodyTrack(body, times, poses, 0.1 * rng.normal(size=(KEYS, 3)).cumsum(0))
+
+
+def correction(
+    track: BodyTrack, *, joint_rad=0.03, root_m=0.01, frames=slice(None), exact=False
+) -> PoseCorrection:
+    keys, joints = track.poses.shape[:2]
+    return PoseCorrection(
+        track,
+        track.times_us[frames].tolist(),
+        joint_rad=np.broadcast_to(joint_rad, (keys, joints)).copy(),
+        root_m=np.broadcast_to(root_m, (keys, 3)).copy(),
+        between=spline_error(track),
+        exact=exact,
+    )
+
+
+def fill(module: torch.nn.Module, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for value in module.parameters():
+            value.normal_(generator=generator)
+
+
+def joints_of(body, rotations, transl):
+    return body.joint_transforms(rotations, transl)[..., :3, 3]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_gradients_are_those_of_finite_differences(seed):
+    track = dance(seed)
+    learned = correction(track, joint_rad=0.3, root_m=0.1)
+    fill(learned, seed)
+    drawn = [90_000, 500_000]
+    base, _ = track.at(drawn)
+    look = torch.randn(2, len(track.body.parents), 3)
+
+    def value():
+        turns, shifts = learned.residual(drawn)
+        return ((base @ axis_angle_to_matrix(turns)).sum(-1) * look).sum() + shifts.sum()
+
+    gradients = torch.autograd.grad(value(), list(learned.errors.parameters()))
+    for parameter, gradient in zip(learned.errors.parameters(), gradients, strict=True):
+        direction = torch.randn_like(parameter)
+        with torch.no_grad():
+            parameter += 1e-2 * direction
+            ahead = value()
+            parameter -= 2e-2 * direction
+            behind = value()
+            parameter += 1e-2 * direction
+        numeric = float(ahead - behind) / 2e-2
+        assert float((gradient * direction).sum()) == pytest.approx(numeric, rel=5e-3, abs=5e-3)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_sizes_are_those_expected_at_each_key_and_linear_between(seed):
+    rng, track = np.random.default_rng(seed), dance(seed)
+    joints = track.poses.shape[1]
+    joint_rad, root_m = rng.uniform(0, 0.1, (KEYS, joints)), rng.uniform(0.001, 0.1, (KEYS, 3))
+    joint_rad[:, 3] = 0
+    sized, plain = (
+        correction(track, joint_rad=rad, root_m=m) for rad, m in ((joint_rad, root_m), (1.0, 1.0))
+    )
+    for each in (sized, plain):
+        fill(each, seed)
+    times = [5 * STEP_US, int(6.25 * STEP_US), -10]
+    turns, shifts = (value.detach().numpy() for value in sized.residual(times))
+    unit_turns, unit_shifts = (value.detach().numpy() for value in plain.residual(times))
+    at = [joint_rad[5], 0.75 * joint_rad[6] + 0.25 * joint_rad[7], joint_rad[0]]
+    assert np.allclose(turns, unit_turns * np.array(at)[..., None], atol=1e-5)
+    at = [root_m[5], 0.75 * root_m[6] + 0.25 * root_m[7], root_m[0]]
+    assert np.allclose(shifts, unit_shifts * np.array(at), atol=1e-5)
+    assert not turns[:, 3].any()
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_what_counts_is_said_by_the_state(exact):
+    track = dance(0)
+    learned = correction(track, exact=exact)
+    fill(learned, 1)
+    keys = track.times_us.tolist()
+    turns, shifts = learned.residual(keys)
+    assert (float(turns.detach().abs().max()) < 1e-5) == exact
+    assert float(learned.residual([3 * STEP_US // 2])[0].detach().abs().max()) > 1e-4
+    other = correction(track, exact=not exact)
+    other.load_state_dict(learned.state_dict())
+    again = other.residual(keys)
+    assert torch.equal(again[0], turns) and torch.equal(again[1], shifts)
+    learned.forget()
+    assert not learned.residual([3 * STEP_US // 2])[0].any() and bool(learned.exact) == exact
+
+
+def test_prices_are_squares_per_unknown():
+    """Control points that are all 2 make a spline that is 2, and nothing where its mean is out."""
+    track = dance(0)
+    learned = correction(track)
+    with torch.no_grad():
+        for spline in learned.errors.values():
+            spline.rotations.fill_(2.0)
+            spline.translations.fill_(2.0)
+    expected = 4.0 * 1 / learned.errors["fast"].count
+    assert float(learned.price().detach()) == pytest.approx(expected, rel=1e-4)
+    still = correction(track, joint_rad=np.arange(len(track.body.parents)) % 2 * 0.1)
+    with torch.no_grad():
+        still.errors["constant"].rotations[:, ::2] = 5.0  # joints that are not expected to err
+    assert float(still.price().detach()) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_holds_throughout_and_what_drifts_reaches_held_out_times(seed):
+    """Runs of three frames without pictures get most of errors that change slowly."""
+    rng, track = np.random.default_rng(seed), dance(seed)
+    unseen = np.arange(KEYS) % 8 > 4
+    seconds = track.times_us * 1e-6
+    shape = (1, *track.poses.shape[1:])
+    wrong = 0.05 * rng.normal(size=shape) + 0.05 * np.sin(
+        2 * np.pi * (0.4 * seconds[:, None, None] + rng.uniform(size=shape))
+    )
+    learned = correction(track, joint_rad=0.1, frames=~unseen)
+    goal, zero = torch.from_numpy(wrong).float(), torch.zeros(KEYS, 3)
+    learned.start_at(track.times_us[~unseen].tolist(), goal[~unseen], zero[~unseen])
+    found = learned.residual(track.times_us.tolist())[0].detach()
+
+    def rms(value, times):
+        return float(value[torch.from_numpy(times)].square().mean().sqrt())
+
+    assert rms(found - goal, ~unseen) < 0.1 * rms(goal, ~unseen)
+    assert rms(found - goal, unseen) < 0.5 * rms(goal, unseen)
+
+
+def test_the_start_is_the_likeliest_of_given_residuals():
+    """Ridge regression as numpy solves it, with the same unknowns and variances."""
+    track = dance(3)
+    learned = correction(track, joint_rad=0.2, root_m=0.05)
+    rng = np.random.default_rng(3)
+    times = track.times_us.tolist()
+    turns = torch.from_numpy(rng.normal(size=track.poses.shape)).float()
+    shifts = torch.from_numpy(rng.normal(size=(KEYS, 3))).float()
+    learned.start_at(times, turns, shifts, misfit=0.3)
+    parts = {name: spline.weights(times).double() for name, spline in learned.errors.items()}
+    design = torch.cat([SHARES[name] ** 0.5 * part for name, part in parts.items()], 1).numpy()
+    covariance = design @ design.T
+    gain = covariance @ np.linalg.inv(covariance + 0.09 * np.eye(KEYS))
+    found = learned.residual(times)
+    expected = np.einsum("st,tjc->sjc", gain, turns.double().numpy())
+    assert np.allclose(found[0].detach(), expected, atol=1e-4)
+    assert np.allclose(found[1].detach(), gain @ shifts.double().numpy(), atol=1e-4)

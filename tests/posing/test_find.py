@@ -1,0 +1,114 @@
+"""`find_poses` on a tiny capture with key points of a file, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.posing.moving import CAMERA, landmarks
+
+from evsplat.capture import load_body_track, load_capture
+from evsplat.errors import ConfigError, DataError
+from evsplat.options import PoseSearch
+from evsplat.posing import find, find_poses
+
+FRAMES = 10
+
+
+@pytest.fixture
+def unposed(tiny_capture, tmp_path):
+    """A capture with ``"body": null`` whose camera films the motion of `moving`, and its points."""
+    path = tiny_capture(frames=FRAMES)
+    document = json.loads((path / "capture.json").read_text())
+    document["body"] = None
+    camera = document["cameras"]["main"]
+    camera["K"] = [[37.5, 0, 16], [0, 37.5, 16], [0, 0, 1]]
+    camera["world_to_camera"] = CAMERA.world_to_camera.tolist()
+    (path / "capture.json").write_text(json.dumps(document))
+    (path / "body.npz").unlink()
+    points = tmp_path / "points.npy"
+    marks = landmarks(FRAMES)
+    np.save(points, np.concatenate((marks.places / 8, marks.seen[..., None]), -1))
+    return path, points
+
+
+def test_a_capture_without_poses_gets_some(unposed, tmp_path):
+    path, points = unposed
+    before = (path / "capture.json").read_bytes()
+    found = find_poses(path, tmp_path / "new", keypoints=points, height_m=1.8)
+    new = load_capture(tmp_path / "new")
+    track = load_body_track(new)
+    mids = [frame.mid_us for frame in new.frames]
+    assert set(mids) <= set(track.times_us.tolist())
+    assert len(track.times_us) >= 4 * len(mids) - 3
+    assert track.errors is not None
+    assert track.errors.source == "estimated"
+    assert (track.errors.joint_rad.max(1) > 0).all()
+    for own, stored in zip(found.track.at(mids), track.at(mids), strict=True):
+        np.testing.assert_allclose(own, stored, atol=1e-4)
+    made = new.provenance["poses"]
+    assert made["pictures"] == len(new.train_frames)
+    page = (tmp_path / "new" / "poses.html").read_text()
+    assert "http" not in page.replace("http-equiv", "")
+    assert "In doubt" in page
+    assert (path / "capture.json").read_bytes() == before
+
+
+def test_pictures_and_key_points_of_held_out_frames_change_nothing(unposed, tmp_path):
+    path, points = unposed
+    first = find_poses(path, tmp_path / "first", keypoints=points)
+    values = np.load(points)
+    values[7:, :, :2] += 20
+    np.save(points, values)
+    frames = load_capture(path).frames
+    for frame in frames[7:]:
+        frame.image.write_bytes(frames[0].image.read_bytes())
+    second = find_poses(path, tmp_path / "second", keypoints=points)
+    np.testing.assert_array_equal(first.track.poses, second.track.poses)
+
+
+def test_a_given_focal_length_is_written(unposed, tmp_path):
+    path, points = unposed
+    find_poses(path, tmp_path / "new", keypoints=points, focal="45")
+    new = load_capture(tmp_path / "new")
+    assert new.camera(new.frames[0]).K[0, 0] == 45
+    assert load_capture(path).camera(new.frames[0]).K[0, 0] == 37.5
+
+
+def test_poses_that_were_there_are_ignored_and_stay(tiny_capture, unposed, tmp_path):
+    path, points = unposed
+    posed = tiny_capture("posed", frames=FRAMES)
+    document = json.loads((path / "capture.json").read_text())
+    document["body"] = {"file": "body.npz", "model": "rig"}
+    (posed / "capture.json").write_text(json.dumps(document))
+    before = (posed / "body.npz").read_bytes()
+    find_poses(posed, tmp_path / "new", keypoints=points)
+    assert (posed / "body.npz").read_bytes() == before
+    assert load_capture(tmp_path / "new").body_file.model == "default"
+
+
+def test_ctrl_c_leaves_nothing(unposed, tmp_path, monkeypatch):
+    path, points = unposed
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(find, "poses_page", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        find_poses(path, tmp_path / "new", keypoints=points)
+    assert [file.name for file in tmp_path.iterdir() if "new" in file.name] == []
+
+
+def test_what_cannot_be_is_refused_before_work_begins(unposed, tmp_path):
+    path, points = unposed
+    with pytest.raises(DataError, match="already exists"):
+        find_poses(path, path, keypoints=points)
+    with pytest.raises(ConfigError, match="--focal wide: expected auto or pixels"):
+        PoseSearch(focal="wide")
+    with pytest.raises(ConfigError, match="--height 17"):
+        PoseSearch(height_m=17)
+
+
+def test_training_on_a_capture_without_poses_offers_to_find_them(unposed):
+    path, _ = unposed
+    with pytest.raises(DataError, match=f"evsplat poses {path} --out NEW"):
+        load_body_track(load_capture(path))

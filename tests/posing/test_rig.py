@@ -1,0 +1,80 @@
+"""Rigs of other bodies move as the body that ships would."""
+
+import numpy as np
+import pytest
+import torch
+
+from evsplat.body import default_body, make_body
+from evsplat.body.rotations import axis_angle_to_matrix
+from evsplat.body.smpl_skeleton import NAMES, PARENTS, approximate_rest_joints
+from evsplat.errors import DataError
+from evsplat.landmarks import BLAZEPOSE_33, COCO_17, OPENPOSE_25
+from evsplat.posing.prior import ROWS, mirrored, pose_prior
+from evsplat.posing.rig import attach, default_rig, make_rig
+
+
+def _stick_figure(betas: np.ndarray):
+    """SMPL's skeleton with a triangle at each joint as its mesh."""
+    joints = approximate_rest_joints() * (1 + 0.1 * betas[0])
+    corners = joints[:, None] + 0.02 * np.eye(3)
+    faces = np.arange(3 * len(joints)).reshape(-1, 3)
+    weights = np.repeat(np.eye(len(joints)), 3, 0)
+    return make_body(corners.reshape(-1, 3), faces, weights, np.array(PARENTS), joints, NAMES)[0]
+
+
+def test_the_body_that_ships_keeps_its_own_frames():
+    frames = default_rig().frames
+    torch.testing.assert_close(frames, torch.eye(3, dtype=torch.float64).expand_as(frames))
+
+
+def test_bones_of_another_body_point_where_those_of_the_shipped_one_do():
+    generator = torch.Generator().manual_seed(0)
+    rows = 0.5 * torch.randn(2, len(ROWS), 3, generator=generator, dtype=torch.float64)
+    root = axis_angle_to_matrix(torch.randn(2, 3, generator=generator, dtype=torch.float64))
+    directions = []
+    for rig in (default_rig(), make_rig(_stick_figure, "smpl", 1)):
+        poses = torch.from_numpy(rig.poses(root, rows))
+        body = rig.body(np.zeros(len(rig.growth)))
+        places = body.joint_transforms(axis_angle_to_matrix(poses), torch.zeros(2, 3).double())
+        limbs = [
+            places[:, rig.joint(f"{side}_{end}"), :3, 3]
+            - places[:, rig.joint(f"{side}_{part}"), :3, 3]
+            for part, end in (("upper_arm", "forearm"), ("forearm", "hand"),
+                              ("thigh", "shin"), ("shin", "foot"))
+            for side in ("left", "right")
+        ]  # fmt: skip
+        directions.append(torch.nn.functional.normalize(torch.stack(limbs), dim=-1))
+    torch.testing.assert_close(*directions, rtol=0, atol=1e-5)
+
+
+def test_stature_follows_the_coefficients():
+    rig = default_rig()
+    betas = np.array([1.0, -0.5, 0, 0, 0, 0, 0, 0, 0, 0])
+    vertices = default_body(betas).rest_vertices[:, 2].double()
+    expected = float(vertices.max() - vertices.min())
+    assert rig.stature + float(rig.growth @ torch.from_numpy(betas)) == pytest.approx(
+        expected, abs=2e-3
+    )
+
+
+@pytest.mark.parametrize(("names", "least"), [(BLAZEPOSE_33, 33), (COCO_17, 17), (OPENPOSE_25, 23)])
+def test_all_usual_sets_of_key_points_sit_on_the_rig(names, least):
+    assert len(attach(default_rig(), names).index) >= least
+
+
+def test_unknown_key_points_are_one_sentence():
+    with pytest.raises(DataError, match="expected at least 8"):
+        attach(default_rig(), [f"point_{i}" for i in range(17)])
+
+
+def test_mirroring_twice_changes_nothing():
+    rows = np.random.default_rng(0).normal(size=(3, len(ROWS), 3))
+    np.testing.assert_array_equal(mirrored(mirrored(rows)), rows)
+
+
+def test_a_motion_can_be_left_out_of_the_prior():
+    whole, without = pose_prior(), pose_prior(without=("dance_b",))
+    assert not torch.equal(whole.mean, without.mean)
+    assert torch.linalg.eigvalsh(without.precision).min() > 0
+    with pytest.raises(DataError, match="no motion is named 'waltz'"):
+        pose_prior(without=("waltz",))
