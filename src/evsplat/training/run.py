@@ -25,6 +25,7 @@ from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_conf
 from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
+from evsplat.models.layers import Layers
 from evsplat.models.model import Model
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
@@ -114,8 +115,7 @@ class GaussianReconstruction:
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
         with torch.no_grad():
-            camera = camera.to(self.model.device)
-            layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+            camera, layers = self._posed(camera, times_us)
             if parts == "all":
                 drawing = draw(
                     layers, camera, backdrop=self.backdrop, shadow_step_px=self.shadow_step_px
@@ -139,10 +139,13 @@ class GaussianReconstruction:
     ) -> Float[Tensor, "T H W"]:
         """Mean of z in the camera over what a pixel shows, metres; 0 where it shows nothing."""
         with torch.no_grad():
-            camera = camera.to(self.model.device)
-            layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+            camera, layers = self._posed(camera, times_us)
             depth = draw_depth(layers, camera, parts=parts).cpu()
         return depth.expand(len(times_us), *depth.shape[1:])
+
+    def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
+        camera = camera.to(self.model.device)
+        return camera, self.model.at(list(times_us), camera.center(), hard_semantics=True)
 
     @property
     def track(self) -> BodyTrack:
@@ -167,8 +170,7 @@ class GaussianReconstruction:
         Channels are R, G, B (sRGB) and the semantic attribute (1 = person). Colours that depend on
         the direction are those seen from ``camera``.
         """
-        center = camera.to(self.model.device).center()
-        layers = self.model.at(list(times_us), center, hard_semantics=True)
+        _, layers = self._posed(camera, times_us)
         if parts == "all":
             return [layers.human, shadowed_scene(layers)]
         return [layers.human if parts == "human" else layers.scene]
