@@ -3,14 +3,11 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32, Int, Shaped
 
 from evsplat.inspection.matching import Correlations, normalised, own_time_order
-
-Maps = TypeVar("Maps", bound=np.ndarray)
 
 REACH_PX = 24
 """Shifts of so many map pixels each way are tried: 30 % of the body's height."""
@@ -86,7 +83,9 @@ def drawn(
     return inside if kind == "frames" else 0.5 * inside + edges
 
 
-def in_picture(posed: Maps, size: tuple[int, ...], down: int, right: int) -> Maps:
+def in_picture(
+    posed: Shaped[np.ndarray, "K H W"], size: tuple[int, ...], down: int, right: int
+) -> Shaped[np.ndarray, "K h w"]:
     """The picture's part of wider silhouettes that are moved ``down`` and ``right``."""
     top, left = REACH_PX - down, REACH_PX - right
     return posed[:, top : top + size[0], left : left + size[1]]
