@@ -242,7 +242,7 @@ def test_a_person_in_no_test_frame_is_told(tiny_capture, tmp_path, caplog):
     for frame in load_capture(path).test_frames:
         Image.new("L", (32, 24)).save(frame.mask)
     run(path, tmp_path / "none")
-    assert f"{path}: the person is in no test frame; check camera and poses." in caplog.text
+    assert f"{path}: the person is in no test frame, so the figures" in caplog.text
 
 
 def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
