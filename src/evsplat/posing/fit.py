@@ -171,7 +171,7 @@ def _first_trunk(
             f"landmarks: shoulders and hips are seen in {len(found)} of {len(seen)} pictures, "
             f"expected at least {_FEWEST}; a motion cannot be fitted to so few."
         )
-    views = Views.of([cameras[index] for index in found])
+    views = Views.of([cameras[index] for index in found.tolist()])
     places = torch.from_numpy(np.asarray(landmarks.places, np.float64)[found])
     world = landmarks.world
     space = None if world is None else torch.from_numpy(np.asarray(world, np.float64)[found])
