@@ -8,6 +8,7 @@ from evsplat.body.pose_noise import (
     NOISE_PRESETS,
     PoseNoise,
     joint_angles,
+    noise_errors,
     noisy_poses,
     poses_off_by,
 )
@@ -120,11 +121,40 @@ def test_errors_can_be_scaled_to_a_distance(body, millimetres):
     ends = wrists_and_ankles(body)
     seen = []
     for seed in (1, 2):
-        *moved, error = poses_off_by(body, poses, still, times, millimetres / 1000, seed=seed)
+        *moved, error, noise = poses_off_by(
+            body, poses, still, times, millimetres / 1000, seed=seed
+        )
         off = np.linalg.norm(joints(body, *moved) - joints(body, poses, still), axis=-1)[:, ends]
         assert 1000 * off.mean() == pytest.approx(millimetres, rel=0.02)
         assert error == pytest.approx(off.mean(), rel=1e-6)
+        assert noise.joint_rad / noise.depth_m == pytest.approx(0.0116 / 0.012)
         seen.append(moved[0])
     assert not np.allclose(seen[0], seen[1])
     untouched = poses_off_by(body, poses, still, times, 0.0, seed=1)
     assert untouched[0] is poses and untouched[2] == 0
+    errors = noise_errors(body, untouched[3], 38, "exact")
+    assert errors.joint_rad.max() == errors.root_m.max() == 0
+
+
+def test_stated_errors_are_those_that_were_drawn(body):
+    """Root mean squares over many seeds of one pose, in a view that looks askew."""
+    noise = NOISE_PRESETS["one_percent"]
+    poses, still, view = bent_poses(body, 4), np.zeros((4, 3)), (0.6, 0.0, 0.8)
+    times = np.arange(4) * 10_000_000  # far enough apart to be independent
+    turns, shifts = [], []
+    for seed in range(150):
+        moved, transl = noisy_poses(body, poses, still, times, noise, seed=seed, view=view)
+        pairs = (
+            Rotation.from_rotvec(poses.reshape(-1, 3)),
+            Rotation.from_rotvec(moved.reshape(-1, 3)),
+        )
+        turns.append((pairs[0].inv() * pairs[1]).as_rotvec().reshape(poses.shape))
+        shifts.append(transl)
+    stated = noise_errors(body, noise, 4, "estimated", view=view)
+    drawn = np.sqrt(np.mean(np.square(turns), axis=(0, 1, 3)))
+    # 1,800 numbers know a standard deviation to 2 %, 600 to 3 %
+    assert drawn == pytest.approx(stated.joint_rad[0], rel=0.08, abs=1e-9)
+    assert np.sqrt(np.mean(np.square(shifts), axis=(0, 1))) == pytest.approx(
+        stated.root_m[0], rel=0.1
+    )
+    assert stated.joint_rad.shape == (4, 31) and stated.source == "estimated"

@@ -36,7 +36,10 @@ def run(kind: str, source: Path, out: Path, **options) -> Capture:
     import_capture(kind, source, out, **options)
     findings = [f for f in validate_capture(out) if f.field != "events"]
     assert [f for f in findings if f.severity == "error"] == []
-    return load_capture(out)
+    capture = load_capture(out)
+    one_camera = kind in ("neuman", "people-snapshot")
+    assert capture.body_file.source == ("estimated" if one_camera else "markers")
+    return capture
 
 
 def track_of(capture: Capture, models: Path | None) -> BodyTrack:

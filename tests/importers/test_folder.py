@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,6 +77,7 @@ def test_parts_are_found_and_put_together(recording: Path, tmp_path: Path, monke
         assert frame.exposure_us == (start, start + EXPOSURE_US)
         assert capture.mask(frame) is not None
     assert worst_miss(capture) < 0.01
+    assert capture.body_file.source is None
     assert capture.events is not None and len(capture.events) == 400
     assert not capture.events_simulated and capture.contrast_threshold is None
     rows = np.loadtxt(recording / "events.csv", delimiter=",", skiprows=1)
@@ -99,9 +101,10 @@ def test_exposures_of_a_list_and_pictures_without_a_pose(
         betas=person.betas,
         gender="neutral",
     )
-    import_capture("folder", recording, tmp_path / "out", smpl=models)
+    import_capture("folder", recording, tmp_path / "out", smpl=models, pose_source="estimated")
     monkeypatch.setenv(ENVIRONMENT, str(models))
     capture = load_capture(tmp_path / "out")
+    assert capture.body_file.source == "estimated"
     assert [frame.exposure_us[0] for frame in capture.frames] == starts[:4].tolist()
     assert worst_miss(capture) < 0.01
     assert any("2 pictures have no pose" in note for note in capture.provenance["notes"])
@@ -112,11 +115,15 @@ def test_a_rig_of_ones_own(recording: Path, tmp_path: Path, tiny_capture: Callab
     tiny = load_capture(tiny_capture(frames=COUNT))
     (recording / "poses.npz").unlink()
     target = recording / "body.npz"
-    target.write_bytes((tiny.path / "body.npz").read_bytes())
-    import_capture(
-        "folder", recording, tmp_path / "out", fps=25.0, exposure_us=3e4, start_us=15_000
-    )
+    errors = {"pose_std_rad": np.full((COUNT, 3), 0.25), "transl_std_m": np.full((COUNT, 3), 0.5)}
+    np.savez(target, **np.load(tiny.path / "body.npz"), **errors)
+    options: dict[str, Any] = {"fps": 25.0, "exposure_us": 3e4, "start_us": 15_000}
+    with pytest.raises(DataError, match="body.npz: says how far its poses err .*--pose-source"):
+        import_capture("folder", recording, tmp_path / "out", **options)
+    import_capture("folder", recording, tmp_path / "out", pose_source="markers", **options)
     body = load_capture(tmp_path / "out").body_file
+    assert body.errors is not None and body.errors.source == "markers"
+    assert (body.errors.joint_rad == 0.25).all() and (body.errors.root_m == 0.5).all()
     assert body.model == "rig" and np.array_equal(body.poses, tiny.body_file.poses)
     assert np.array_equal(body.rest_vertices, tiny.body_file.rest_vertices)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from evsplat.body import silhouette
 from evsplat.body.motion import load_motion
@@ -24,6 +25,7 @@ from evsplat.staging.cloth import Cloth
 from evsplat.staging.motion import (
     cut_motion,
     dressed_vertices,
+    key_poses,
     place_motion,
 )
 from evsplat.staging.renderer import StageRenderer
@@ -68,6 +70,30 @@ def test_capture_is_valid_and_complete(made):
     assert capture.provenance["settings"]["motion"] == "kick"
     for frame in capture.frames:
         assert capture.mask(frame) is not None and capture.sharp(frame).std() > 0.05
+    exact = load_body_track(capture).errors
+    assert exact.source == "exact" and exact.joint_rad.max() == exact.root_m.max() == 0
+
+
+@pytest.mark.parametrize(
+    ("pose_noise", "source"),
+    [("mocap", "markers"), ("estimated", "estimated"), ("estimated-blurry", "estimated")],
+)
+def test_poses_say_how_far_they_err(tmp_path, pose_noise, source):
+    settings = replace(FAST, width=16, height=16, frames=8, pose_noise=pose_noise)
+    capture = load_capture(stage(tmp_path / "a", settings, threads=1, progress=False))
+    given, truth = load_body_track(capture), true_track(capture)
+    errors = given.errors
+    assert errors.source == source and not errors.typical
+    exact = key_poses(truth, given.times_us)
+    turns = Rotation.from_rotvec(exact[0].reshape(-1, 3)).inv() * Rotation.from_rotvec(
+        given.poses.reshape(-1, 3)
+    )
+    off = turns.as_rotvec().reshape(given.poses.shape)
+    still = errors.joint_rad[0] == 0
+    assert np.abs(off[:, still]).max() < 1e-3
+    in_units = off[:, ~still] / errors.joint_rad[:, ~still, None]
+    # 17 joints, two or three errors that differ in 0.16 s each
+    assert np.sqrt(np.mean(in_units**2)) == pytest.approx(1, rel=0.25)
 
 
 def test_blurry_picture_is_the_mean_of_sharp_ones_in_linear_light(made):

@@ -1,5 +1,6 @@
 """`synthesize` from end to end: captures of footage whose blur and events can be computed."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -147,10 +148,12 @@ def test_body_poses_are_those_at_mid_exposure_and_all_go_to_the_dense_file(tmp_p
         source_fps=FPS,
         fps=200,
         duty=0.8,
+        pose_source="exact",
         **posed,
         **FAST,
     )
     capture = load_capture(out)
+    assert capture.body_file.source == "exact"
     given = np.load(posed["body"])
     middles = [frame.mid_us for frame in capture.frames]
     assert np.diff(middles).tolist() == [5000] * (len(middles) - 1)
@@ -162,6 +165,14 @@ def test_body_poses_are_those_at_mid_exposure_and_all_go_to_the_dense_file(tmp_p
 
 def test_capture_of_a_data_set_keeps_what_belongs_to_its_frames(tiny_capture: Factory, tmp_path):
     source_path = tiny_capture(frames=24, seed=2)
+    errors = {
+        "pose_std_rad": np.random.default_rng(0).random((24, 3)),
+        "transl_std_m": np.ones((24, 3)),
+    }
+    np.savez(source_path / "body.npz", **np.load(source_path / "body.npz"), **errors)
+    document = json.loads((source_path / "capture.json").read_text())
+    document["body"]["source"] = "markers"
+    (source_path / "capture.json").write_text(json.dumps(document))
     (source_path / "points.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
         "property float z\nend_header\n1 2 3\n"
@@ -191,6 +202,9 @@ def test_capture_of_a_data_set_keeps_what_belongs_to_its_frames(tiny_capture: Fa
         )
         assert np.array_equal(made.novel_image(view), source.novel_image(before))
     assert np.array_equal(made.body_file.times_us, source.body_file.times_us[1:-1])
+    assert made.body_file.source == "markers"
+    kept = errors["pose_std_rad"][1:-1].astype(np.float32)
+    assert np.array_equal(made.body_file.pose_std_rad, kept)
     assert np.array_equal(made.dense_body_file.poses, source.body_file.poses)
     assert made.initial_points()[0].tolist() == [[1, 2, 3]]
     recorded = made.provenance["synthesis"]

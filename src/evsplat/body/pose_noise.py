@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from evsplat.body.body import Body
+from evsplat.body.pose_errors import PoseErrors, PoseSource
 from evsplat.body.rotations import axis_angle_to_matrix, nearest_axis_angle
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import ConfigError
@@ -101,13 +102,14 @@ def poses_off_by(
     *,
     seed: int,
     view: tuple[float, float, float] = (0.0, 0.0, 1.0),
-) -> tuple[Float[np.ndarray, "T J 3"], Float[np.ndarray, "T 3"], float]:
-    """Noisy poses whose wrists and ankles are off by ``mean_m`` in the mean, and what that became.
+) -> tuple[Float[np.ndarray, "T J 3"], Float[np.ndarray, "T 3"], float, PoseNoise]:
+    """Noisy poses whose wrists and ankles are off by ``mean_m`` in the mean.
 
-    As `noisy_poses`, with the presets' proportions.
+    As `noisy_poses`, with the presets' proportions; gives the mean that was reached and the noise
+    as well.
     """
     if mean_m == 0:
-        return poses, transl, 0.0
+        return poses, transl, 0.0, PoseNoise(0.0, 0.0, 0.0, 0.0)
     one, size = NOISE_PRESETS["one_percent"], 1.0
     truth = _extremities(body, poses, transl)
     for _ in range(_ROUNDS):
@@ -121,7 +123,22 @@ def poses_off_by(
         found = noisy_poses(body, poses, transl, times_us, noise, seed=seed, view=view)
         error = float(np.linalg.norm(_extremities(body, *found) - truth, axis=-1).mean())
         size *= mean_m / error
-    return *found, error
+    return *found, error, noise
+
+
+def noise_errors(
+    body: Body,
+    noise: PoseNoise,
+    poses: int,
+    source: PoseSource,
+    *,
+    view: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> PoseErrors:
+    """Errors of that many `noisy_poses` as a capture states them: what they were drawn with."""
+    along = np.square(np.asarray(view, np.float64) / np.linalg.norm(view))
+    root_m = np.sqrt(noise.root_m**2 * (1 - along) + noise.depth_m**2 * along)
+    joint_rad = np.tile(joint_angles(body, noise), (poses, 1))
+    return PoseErrors(source, joint_rad, np.tile(root_m, (poses, 1)))
 
 
 def joint_angles(body: Body, noise: PoseNoise) -> Float[np.ndarray, "J"]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
-from evsplat.body.pose_errors import PoseErrors, PoseSource
+from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.errors import DataError
 from evsplat.files import why_not_read
 from evsplat.safe_pickle import BROKEN
@@ -88,6 +88,16 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except BROKEN as error:
         said = " ".join(str(error).split()) or type(error).__name__
         raise DataError(f"{path}: not a readable npz ({said}); write it anew.") from error
+
+
+def stated_body(path: Path, arrays: dict[str, np.ndarray], source: PoseSource | None) -> BodyFile:
+    """A `BodyFile` outside of a capture, whose poses' ``source`` the user states."""
+    if source is None and "pose_std_rad" in arrays:
+        raise DataError(
+            f"{path}: says how far its poses err (pose_std_rad), expected their source as well; "
+            f"give --pose-source ({', '.join(POSE_SOURCES)})."
+        )
+    return body_from_arrays(path, arrays, "", source)
 
 
 def body_from_arrays(

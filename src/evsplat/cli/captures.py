@@ -106,6 +106,10 @@ class Synthesize:
     """Rate at which footage was shot."""
     body: Annotated[Path | None, option("NPZ", default="none")] = None
     """Poses as in body.npz."""
+    pose_source: Annotated[
+        Literal["exact", "markers", "estimated"] | None, option("KIND", default="unknown")
+    ] = None
+    """Where the poses of --body come from."""
     camera: Annotated[Path | None, option("JSON", default="a nominal one")] = None
     """Camera as in capture.json."""
     overwrite: Flag = False
@@ -121,6 +125,7 @@ class Synthesize:
             weights=self.weights,
             source_fps=self.source_fps,
             body=self.body,
+            pose_source=self.pose_source,
             camera=self.camera,
             overwrite=self.overwrite,
         )

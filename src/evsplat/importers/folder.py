@@ -1,6 +1,6 @@
 """Your own recording: pictures, events, poses of a tool and a camera, put together."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Int64
 from tqdm import tqdm
 
+from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence, read_poses
-from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
+from evsplat.capture.body_file import BodyFile, read_arrays, stated_body
 from evsplat.capture.write import CaptureWriter, read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import open_recording
@@ -37,6 +38,8 @@ class Folder(Importer):
     """Event recording of any known format; by default SOURCE/events.* if there is one."""
     poses: Path | None = None
     """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE."""
+    pose_source: PoseSource | None = None
+    """Where the poses come from; by default what the tool is known for."""
     camera: Path | None = None
     """One camera as in capture.json; by default SOURCE/camera.json, else what the poses assume."""
     masks: Path | None = None
@@ -100,6 +103,9 @@ class Folder(Importer):
             rig=motion.rig,
             betas=motion.betas,
             gender=motion.gender,
+            source=motion.source,
+            pose_std_rad=motion.pose_std_rad,
+            transl_std_m=motion.transl_std_m,
         )
         return notes
 
@@ -162,8 +168,9 @@ class Folder(Importer):
         self, path: Path, size: tuple[int, int], smpl: Path | None
     ) -> "PoseSequence | BodyFile":
         if path.name == "body.npz":
-            return body_from_arrays(path, read_arrays(path), "")
-        return read_poses(path, person=self.person, image_size=size, body_models=smpl)
+            return stated_body(path, read_arrays(path), self.pose_source)
+        sequence = read_poses(path, person=self.person, image_size=size, body_models=smpl)
+        return replace(sequence, pose_source=self.pose_source or sequence.pose_source)
 
     def _camera(
         self, source: Path, footage: Footage, motion: "PoseSequence | BodyFile"

@@ -188,6 +188,7 @@ def _read_npz_poses(paths: list[Path], frames: list[int]) -> PoseSequence:
         betas=np.array(shapes),
         source=str(paths[0].parent),
         world="camera",
+        pose_source="markers",
     )
 
 

@@ -131,6 +131,7 @@ def _read_poses(
         betas=numbers(arrays, "betas", (None, 10), where, flat=True),
         source=where,
         world="calibration",
+        pose_source="estimated",
     )
     return sequence, scale
 

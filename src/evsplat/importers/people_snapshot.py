@@ -139,6 +139,7 @@ def _read_poses(path: Path, consensus: Path, gender: str) -> PoseSequence:
         gender=gender,
         source=str(path),
         world="calibration",
+        pose_source="estimated",
     )
 
 

@@ -55,6 +55,7 @@ def add_body(
             sequence.transl,
             betas=betas,
             gender=sequence.gender,
+            source=sequence.pose_source,
         )
         return [
             f"body: {sequence.model.upper()} ({sequence.gender}); the capture does not hold the "
@@ -68,7 +69,7 @@ def add_body(
     body = default_body(shape)
     poses, transl = retarget(motion, body, root_scale=1.0)
     transl = transl + _limb_offset(motion, body, poses, transl)
-    writer.set_body("default", times_us, poses, transl, betas=shape)
+    writer.set_body("default", times_us, poses, transl, betas=shape, source=sequence.pose_source)
     size = "at the subject's own size" if known else "at an average size, the data does not tell it"
     return [
         f"body: no {sequence.model.upper()} file (--smpl), so the free body moves instead, {size}; "

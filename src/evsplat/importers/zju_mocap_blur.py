@@ -218,4 +218,5 @@ def _poses(
         betas=np.zeros(0),
         source=str(path),
         world="calibration",
+        pose_source="markers",
     )

@@ -12,9 +12,9 @@ from jaxtyping import Float32
 from tqdm import tqdm
 
 import evsplat
-from evsplat.body import BodyTrack
+from evsplat.body import BodyTrack, PoseSource
 from evsplat.body.motion import load_motion
-from evsplat.body.pose_noise import poses_off_by
+from evsplat.body.pose_noise import noise_errors, poses_off_by
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.capture import Camera, CaptureWriter
 from evsplat.capture.parse import default_split
@@ -55,6 +55,13 @@ POSE_ERRORS: dict[PoseNoise, float] = {
 """Mean error of wrists and ankles as a share of the body's height. A pose network run on frames of
 a synthetic 512-pixel kick missed them by 1 to 2 % of the height, blurry frames being twice as bad;
 0.3 % (5 mm) is what markers reach."""
+POSE_SOURCE: dict[PoseNoise, PoseSource] = {
+    "none": "exact",
+    "mocap": "markers",
+    "estimated": "estimated",
+    "estimated-blurry": "estimated",
+}
+"""Where poses with such errors come from in a recording."""
 MOST_FRAMES = 100
 """Frames filmed of a long motion where no number is asked for."""
 _CHUNK_BYTES = 64 << 20
@@ -174,7 +181,7 @@ class _Film:
         """The bare body, its key poses (with noise where asked for) and the truth in between."""
         body, settings = self.track.body, self.settings
         x, y, z = self.camera.world_to_camera[2, :3].tolist()
-        poses, transl, error_m = poses_off_by(
+        poses, transl, error_m, noise = poses_off_by(
             body,
             *key_poses(self.track, self.mids_us),
             self.mids_us,
@@ -182,6 +189,8 @@ class _Film:
             seed=settings.seed,
             view=(x, y, z),
         )
+        source = POSE_SOURCE[settings.pose_noise]
+        errors = noise_errors(body, noise, len(poses), source, view=(x, y, z))
         writer.provenance["pose_error_wrists_ankles_m"] = error_m
         dense = np.concatenate([np.concatenate((t.exposure, t.after)) for t in self.times])
         writer.set_body(
@@ -198,6 +207,9 @@ class _Film:
                 "weights": body.weights.numpy(),
             },
             dense=(dense, *key_poses(self.track, dense)),
+            source=source,
+            pose_std_rad=errors.joint_rad,
+            transl_std_m=errors.root_m,
         )
 
     def shoot(self, writer: CaptureWriter, progress: bool) -> Iterator[EventStream]:

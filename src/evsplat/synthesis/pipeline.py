@@ -13,6 +13,7 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import evsplat
+from evsplat.body import PoseSource
 from evsplat.capture import CaptureWriter
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import SensorSettings, sensor_settings, simulate_events
@@ -32,6 +33,7 @@ def synthesize(
     *,
     source_fps: float | None = None,
     body: Path | str | None = None,
+    pose_source: PoseSource | None = None,
     camera: Path | str | None = None,
     weights: Path | str | None = None,
     overwrite: bool = False,
@@ -50,6 +52,7 @@ def synthesize(
         settings: How frames and events are made.
         source_fps: Rate at which footage was shot; needed for a folder of pictures.
         body: body.npz on the clock of the footage (a capture has its own).
+        pose_source: Where the poses of ``body`` come from.
         camera: JSON file with one camera as in capture.json (a capture has its own).
         weights: Super SloMo's checkpoint.
         overwrite: Replace a capture at ``out``.
@@ -66,7 +69,7 @@ def synthesize(
     """
     settings = given(SynthesisSettings, settings, changes)
     source, out = Path(source), Path(out)
-    opened = _open(source, source_fps, body, camera)
+    opened = _open(source, source_fps, body, pose_source, camera)
     interpolator = _interpolator(settings, weights)
     plan = plan_exposures(opened.footage.times_us, settings)
     recorded = opened.events() if settings.events == "source" else None
@@ -171,7 +174,11 @@ class _Making:
 
 
 def _open(
-    source: Path, source_fps: float | None, body: Path | str | None, camera: Path | str | None
+    source: Path,
+    source_fps: float | None,
+    body: Path | str | None,
+    pose_source: PoseSource | None,
+    camera: Path | str | None,
 ) -> Source:
     if not (source / "capture.json").exists():
         footage = open_footage(source, source_fps)
@@ -179,8 +186,10 @@ def _open(
             footage,
             None if body is None else Path(body),
             None if camera is None else Path(camera),
+            pose_source,
         )
-    for name, value in (("source-fps", source_fps), ("body", body), ("camera", camera)):
+    own = {"source-fps": source_fps, "body": body, "pose-source": pose_source, "camera": camera}
+    for name, value in own.items():
         if value is not None:
             raise ConfigError(f"--{name}: {source} is a capture and has its own; leave it out.")
     return CaptureSource(source)

@@ -9,8 +9,9 @@ from typing import Any, Literal, NoReturn, Protocol
 import numpy as np
 from jaxtyping import Int64
 
+from evsplat.body import PoseSource
 from evsplat.capture import BodyFile, Capture, CaptureWriter, Frame, load_capture
-from evsplat.capture.body_file import RIG_ARRAYS, body_from_arrays, read_arrays
+from evsplat.capture.body_file import RIG_ARRAYS, read_arrays, stated_body
 from evsplat.capture.write import read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
@@ -69,17 +70,20 @@ def set_body(
 ) -> None:
     """Key poses are those at mid-exposures; all there are, or the denser truth, go beside them."""
     nearest = np.abs(body.times_us[None] - middles_us[:, None]).argmin(axis=1)
-    keys = np.unique(nearest)
+    kept = body.at_keys(np.isin(np.arange(len(body.times_us)), nearest))
     truth = dense or body
     writer.set_body(
         body.model,
-        body.times_us[keys],
-        body.poses[keys],
-        body.transl[keys],
+        kept.times_us,
+        kept.poses,
+        kept.transl,
         rig=body.rig,
         betas=body.betas,
         gender=body.gender,
         dense=(truth.times_us, truth.poses, truth.transl),
+        source=kept.source,
+        pose_std_rad=kept.pose_std_rad,
+        transl_std_m=kept.transl_std_m,
     )
 
 
@@ -204,14 +208,20 @@ class FootageSource:
 
     camera = "main"
 
-    def __init__(self, footage: Footage, body: Path | None, camera: Path | None) -> None:
+    def __init__(
+        self,
+        footage: Footage,
+        body: Path | None,
+        camera: Path | None,
+        pose_source: PoseSource | None = None,
+    ) -> None:
         if body is not None and camera is None:
             raise ConfigError(
                 f"{body}: poses mean nothing without the camera that saw them; give its "
                 "description with --camera."
             )
         self.footage: Footage = footage
-        self._body = None if body is None else _read_body(body)
+        self._body = None if body is None else _read_body(body, pose_source)
         self._camera = None
         if camera is not None:
             self._camera = read_camera(camera, footage.width, footage.height, _CAMERA_KEYS)
@@ -261,7 +271,7 @@ class FootageSource:
         )
 
 
-def _read_body(path: Path) -> BodyFile:
+def _read_body(path: Path, source: PoseSource | None) -> BodyFile:
     arrays = read_arrays(path)
     needed: tuple[str, ...] = ("model", "times_us", "poses", "transl")
     if "model" in arrays and str(arrays["model"]) == "rig":
@@ -281,4 +291,4 @@ def _read_body(path: Path) -> BodyFile:
             )
     if count == 0:
         raise DataError(f"{path}: times_us is empty, expected at least one pose.")
-    return body_from_arrays(path, arrays, "")
+    return stated_body(path, arrays, source)

@@ -44,6 +44,8 @@ def read_amass(documents: list[Document], request: Request) -> PoseSequence:
         gender=gender.decode("latin1") if isinstance(gender, bytes) else str(gender),
         source=where,
         world="z up",
+        # others write such files of what they estimated, without this rate
+        pose_source=None if rate is None else "markers",
         person=choose_person({"0": count}, request.person, where),
         fps=None if rate is None else float(numbers(content, rate, (1,), where, flat=True)[0]),
     )
@@ -72,6 +74,7 @@ def read_arah(documents: list[Document], request: Request) -> PoseSequence:
         betas=np.array(betas),
         source=str(request.path),
         world="calibration",
+        pose_source="markers",
         person=person,
     )
 
@@ -106,6 +109,7 @@ def read_mmhpsd(documents: list[Document], request: Request) -> PoseSequence:
         betas=betas,
         source=where,
         world="camera",
+        pose_source="markers",
         person=person,
         K=_MMHPSD_K,
     )

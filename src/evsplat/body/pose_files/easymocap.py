@@ -71,6 +71,7 @@ def read(documents: list[Document], request: Request) -> PoseSequence:
         betas=shape,
         source=where,
         world="calibration",
+        pose_source="markers",
         person=person,
         notes=(hands,) if len(values) in (78, 87) else (),
     )

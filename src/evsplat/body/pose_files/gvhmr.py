@@ -44,6 +44,7 @@ def read(documents: list[Document], request: Request) -> PoseSequence:
         betas=betas,
         source=where,
         world="y up" if request.world else "camera",
+        pose_source="estimated",
         person=person,
         K=intrinsics,
         world_to_camera=cameras,

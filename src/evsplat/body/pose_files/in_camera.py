@@ -60,6 +60,7 @@ def read_wham(documents: list[Document], request: Request) -> PoseSequence:
         betas=numbers(entry, "betas", (count, 10), where, flat=True),
         source=str(documents[0].path),
         world="camera",
+        pose_source="estimated",
         person=person,
         K=None if size is None else pinhole(float(np.hypot(*size)), *size),
     )
@@ -105,6 +106,7 @@ def read_phalp(documents: list[Document], request: Request) -> PoseSequence:
         betas=np.array(betas),
         source=where,
         world="camera",
+        pose_source="estimated",
         person=person,
         K=pinhole(_PHALP_FOCAL * max(height, width), width, height),
     )
@@ -151,6 +153,7 @@ def read_romp(documents: list[Document], request: Request) -> PoseSequence:
         betas=np.array([shape[:10] for shape in shapes]),
         source=where,
         world="camera",
+        pose_source="estimated",
         person=person,
         K=None if size is None else pinhole(_ROMP_FOCAL * max(size), *size),
         notes=(_BEV_NOTE,) if len(shapes[0]) == 11 else (),

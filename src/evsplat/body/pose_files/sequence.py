@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from evsplat.body.pose_errors import PoseSource
 from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.smpl_skeleton import JOINTS
 from evsplat.errors import DataError
@@ -33,6 +34,8 @@ class PoseSequence:
     world: str
     """Axes of root orientation and translation: "camera" (OpenCV), "y up" and "z up" (a static
     world of the tool's) or "calibration" (the world of the data set's cameras)."""
+    pose_source: PoseSource | None = None
+    """Where such poses come from; None where the format does not tell."""
     person: str = ""
     """The tool's name of the person."""
     fps: float | None = None

@@ -50,6 +50,7 @@ def read(documents: list[Document], request: Request) -> PoseSequence:
         betas=betas,
         source=where,
         world="y down" if request.world else "camera",
+        pose_source="estimated",
         person=person,
         K=intrinsics,
         world_to_camera=world_to_camera,

@@ -1,0 +1,277 @@
+"""Analysis by synthesis: a motion corrected so that discs on the body explain the pictures.
+
+No Gaussians are trained. The person is drawn as one-coloured discs on the surface of the body, and
+what is unknown of motion and look is moved downhill until the drawings are like the sharp pictures.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.body import Body, BodyTrack, PoseErrors
+from evsplat.body.pose_noise import PoseNoise, joint_angles
+from evsplat.capture import TrainingCapture
+from evsplat.errors import DataError
+from evsplat.posing.correction import Correction
+from evsplat.posing.surface_discs import SurfaceDiscs
+from evsplat.posing.targets import Targets, find_targets
+
+DISCS = 5_000
+COARSE_PX = 64
+"""Least side of the pictures that are compared first."""
+UNKNOWN_RAD, UNKNOWN_M = 0.05, 0.02
+"""Errors expected of limb joints and of the root's place, per axis, where nobody says."""
+LEAST_GAIN = 0.12
+"""Share by which pictures kept aside must be explained better, for certain, for a motion to count
+as better. What discs cannot show of a person changes true motions, to a gain below it."""
+_MISFIT = 0.06
+"""Difference of coded colours from which on more of it counts little."""
+_PIXEL_SHARE = 0.05
+"""Independent values that a pixel's three colours count for: neighbours err alike."""
+_STEPS = (120, 160)
+_LOOK_STEPS = 30
+"""Steps in which the look alone is learned, at the start and where two motions are compared."""
+_RATES = {"motion": 0.05, "colours": 0.03, "offsets": 0.1, "light": 0.01}
+_PARTS = 3
+"""Every so many-th picture is drawn in a step."""
+_PROBES = 4
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One part of the descent."""
+
+    pixels: int
+    """Width of the pictures compared."""
+    before: float
+    after: float
+    """Mean misfit of the pictures at its start and end, in units of one squared deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A corrected motion, and whether it is better than the given one."""
+
+    track: BodyTrack
+    """The corrected motion with its errors; `better` says whether to use it."""
+    gain: float
+    """Share by which it explains pictures better that neither motion was fitted to."""
+    gain_error: float
+    """Standard error of the gain over the frames."""
+    stages: tuple[Stage, ...]
+    seconds: float
+
+    @property
+    def better(self) -> bool:
+        """True where the gain exceeds `LEAST_GAIN` by two standard errors."""
+        return self.gain - 2 * self.gain_error > LEAST_GAIN
+
+
+def refine(
+    track: BodyTrack,
+    capture: TrainingCapture,
+    *,
+    steps: tuple[int, int] = _STEPS,
+    discs: int = DISCS,
+    seed: int = 0,
+) -> Refined:
+    """Correct a motion by the sharp pictures of a capture.
+
+    Pictures in the middle of exposures are kept aside for the `gain`. Where the policy shows events
+    of held-out frames, pictures carried there by events count as well. ``steps``: of the coarse
+    and of the fine part.
+
+    Raises:
+        DataError: the camera moves, or the posed body is in no picture.
+    """
+    began = time.monotonic()
+    targets = find_targets(track, capture)
+    joint_rad, root_m = expected_errors(track)
+    correction = Correction(track, joint_rad, root_m)
+    look = SurfaceDiscs(track.body, discs, torch.Generator().manual_seed(seed))
+    aside = _middles(targets)
+    fitted = sorted(set(range(len(targets.times_us))) - set(aside)) or aside
+    descent = _Descent(correction, look, targets.rows(fitted))
+    coarse = max(1, min(targets.camera.width, targets.camera.height) // COARSE_PX)
+    stages: list[Stage] = []
+    for shrink, count in zip(dict.fromkeys((coarse, 1)), steps, strict=False):
+        stages.append(descent.run(shrink, count, first=not stages))
+    errors = descent.errors()
+    gain, gain_error = _gain(descent, targets.rows(aside))
+    return Refined(
+        correction.corrected(errors), gain, gain_error, tuple(stages), time.monotonic() - began
+    )
+
+
+def expected_errors(track: BodyTrack) -> tuple[Float[np.ndarray, "J"], Float[np.ndarray, "3"]]:
+    """What joints (radians) and root (metres) are expected to err by, per axis, root mean square.
+
+    Where the track does not say, limbs by more than the trunk.
+    """
+    errors = track.errors
+    if errors is not None and not errors.typical and errors.joint_rad.any():
+        size = np.sqrt(np.square(errors.joint_rad).mean(0))
+        return size, np.sqrt(np.square(errors.root_m).mean(0))
+    return _anatomical(track.body), np.full(3, UNKNOWN_M)
+
+
+def _anatomical(body: Body) -> Float[np.ndarray, "J"]:
+    noise = PoseNoise(UNKNOWN_RAD, UNKNOWN_RAD / 2, UNKNOWN_M, UNKNOWN_M)
+    try:
+        return joint_angles(body, noise)
+    except DataError:  # a skeleton without names
+        return np.full(len(body.parents), UNKNOWN_RAD)
+
+
+class _Descent:
+    """Motion and look, moved downhill together."""
+
+    def __init__(self, correction: Correction, look: SurfaceDiscs, targets: Targets) -> None:
+        self.correction, self.look, self.targets = correction, look, targets
+
+    def run(self, shrink: int, steps: int, *, first: bool) -> Stage:
+        """Adam on pictures smaller by a factor."""
+        targets = self.targets.smaller(shrink) if shrink > 1 else self.targets
+        if first:
+            with torch.no_grad():
+                rotations, transl = self.correction.at(targets.times_us)
+            self.look.colour_from(rotations, transl, targets.camera, targets.image)
+            self.learn_look(targets, shrink, _LOOK_STEPS)
+        before = self.misfit(targets)
+        motion = [self.correction.turns, self.correction.shifts]
+        groups = [*self._look_groups(), {"params": motion, "rate": _RATES["motion"]}]
+        self._descend(groups, targets, shrink, steps)
+        return Stage(targets.camera.width, before, self.misfit(targets))
+
+    def learn_look(self, targets: Targets, shrink: int, steps: int) -> None:
+        """Leave the motion as it is."""
+        self._descend(self._look_groups(), targets, shrink, steps)
+
+    def _look_groups(self) -> list[dict[str, Any]]:
+        look = self.look
+        return [
+            {"params": [look.colours], "rate": _RATES["colours"]},
+            {"params": [look.offsets, look.inset], "rate": _RATES["offsets"]},
+            {"params": [look.light], "rate": _RATES["light"]},
+        ]
+
+    def _descend(
+        self, groups: list[dict[str, Any]], targets: Targets, shrink: int, steps: int
+    ) -> None:
+        adam = torch.optim.Adam([{**g, "lr": g["rate"]} for g in groups], betas=(0.9, 0.98))
+        count = len(targets.times_us)
+        parts = [targets.rows(range(part, count, _PARTS)) for part in range(min(_PARTS, count))]
+        for step in range(steps):
+            for group in adam.param_groups:
+                group["lr"] = group["rate"] * min(1.0, 2 * (1 - step / steps) + 0.02)
+            part = parts[step % len(parts)]
+            loss = self._data(part) * (shrink**2 * count / len(part.times_us))
+            loss = loss + self.correction.price() + self.look.price()
+            adam.zero_grad()
+            loss.backward()
+            adam.step()
+            with torch.no_grad():
+                self.look.colours.clamp_(0, 1)
+
+    def _data(self, targets: Targets) -> Float[Tensor, ""]:
+        """Minus the logarithm of the likelihood: Cauchy-distributed differences."""
+        return _PIXEL_SHARE * self._differences(targets).sum()
+
+    def _differences(self, targets: Targets) -> Float[Tensor, "P"]:
+        rotations, transl = self.correction.at(targets.times_us)
+        drawn = self.look.draw(rotations, transl, targets.camera, targets.behind)
+        square = (drawn - targets.image).square().sum(-1) / _MISFIT**2
+        return (torch.log1p(square / 2) * targets.weight).sum((1, 2))
+
+    @torch.no_grad()
+    def misfits(self, targets: Targets) -> Float[Tensor, "P"]:
+        """Mean per picture."""
+        return self._differences(targets) / targets.weight.sum((1, 2)).clamp_min(1e-6)
+
+    def misfit(self, targets: Targets) -> float:
+        """Mean over all pictures."""
+        return float(self.misfits(targets).mean())
+
+    def errors(self) -> PoseErrors:
+        """What is still unknown of the motion, by the curvature at the end (Laplace).
+
+        The diagonal of the curvature from differences of gradients along random signs
+        (Bekas et al., An estimator for the diagonal of a matrix, 2007).
+        """
+        correction = self.correction
+        generator = torch.Generator().manual_seed(0)
+        params = [correction.turns, correction.shifts]
+        total = [torch.zeros_like(p) for p in params]
+        for _ in range(_PROBES):
+            signs = [torch.randint(0, 2, p.shape, generator=generator) * 2.0 - 1 for p in params]
+            up, down = (self._gradient(params, signs, size) for size in (0.05, -0.05))
+            for one, a, b, sign in zip(total, up, down, signs, strict=True):
+                one += sign * (a - b) / (0.1 * _PROBES)
+        # What pictures say of a coordinate goes with its share of the variance.
+        shares = correction.mixing.square().mean(0)
+        rates = [one.mean(0).clamp_min(0) / shares.mean() for one in total]
+        times = correction.track.times_us.tolist()
+        weights = correction.weights(times).square()
+        known = [1 / (1 + torch.einsum("m,...->m...", shares, rate)) for rate in rates]
+        joint = (
+            torch.einsum("tm,mjc->tjc", weights, known[0]).mean(-1).sqrt() * correction.joint_rad
+        )
+        root = (weights @ known[1]).sqrt() * correction.root_m
+        joint_rad = np.zeros((len(times), len(correction.track.body.parents)))
+        joint_rad[:, correction.joints.numpy()] = joint.detach().numpy()
+        return PoseErrors("estimated", joint_rad, root.detach().double().numpy())
+
+    def _gradient(
+        self, params: Sequence[Tensor], signs: Sequence[Tensor], size: float
+    ) -> list[Tensor]:
+        with torch.no_grad():
+            for param, sign in zip(params, signs, strict=True):
+                param += size * sign
+        found = torch.autograd.grad(self._data(self.targets), params)
+        with torch.no_grad():
+            for param, sign in zip(params, signs, strict=True):
+                param -= size * sign
+        return list(found)
+
+
+def _middles(targets: Targets) -> list[int]:
+    """Pictures of training frames that are nearest to the middle of each one's exposure."""
+    best: dict[str, tuple[int, int]] = {}
+    for number, (at, frame) in enumerate(zip(targets.times_us, targets.frames, strict=True)):
+        if frame.split == "train":
+            best[frame.name] = min(
+                best.get(frame.name, (1 << 62, 0)), (abs(at - frame.mid_us), number)
+            )
+    return [number for _, number in best.values()]
+
+
+def _gain(descent: _Descent, aside: Targets) -> tuple[float, float]:
+    """How much better the corrected motion explains pictures kept aside, and the standard error.
+
+    Both motions get their look learned for as many steps from where the corrected one's was.
+    """
+    params = [descent.correction.turns, descent.correction.shifts]
+    found = [param.detach().clone() for param in params]
+    state = {name: value.clone() for name, value in descent.look.state_dict().items()}
+    misfits = []
+    for factor in (1.0, 0.0):
+        with torch.no_grad():
+            for param, value in zip(params, found, strict=True):
+                param.copy_(factor * value)
+        descent.look.load_state_dict(state)
+        descent.learn_look(descent.targets, 1, _LOOK_STEPS)
+        misfits.append(descent.misfits(aside))
+    with torch.no_grad():
+        for param, value in zip(params, found, strict=True):
+            param.copy_(value)
+    descent.look.load_state_dict(state)
+    better = (misfits[1] / misfits[0]).log()
+    spread = float(better.std()) if len(better) > 1 else math.inf
+    return 1 - math.exp(-float(better.mean())), spread / math.sqrt(len(better))

@@ -1,0 +1,122 @@
+"""A body as flat discs on its surface, drawn in one colour each under a smooth light."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from evsplat.body import Body
+from evsplat.body.body import skin
+from evsplat.body.surface import SurfaceSamples
+from evsplat.camera import Camera
+from evsplat.render import Splats, render
+
+_OVERSAMPLED = 5
+"""Surface points drawn per disc; the discs lie at those farthest from each other."""
+_WIDTH = 0.5
+"""Standard deviation of a disc over the side of the square that is its share of the surface."""
+_FLATNESS = 0.1
+_OPACITY = 0.95
+_OFFSET_M = 0.01
+"""How far clothes and hair typically lie from the bare body."""
+
+
+class SurfaceDiscs(nn.Module):
+    """N discs of the canonical body, with what is learned of the person's look.
+
+    Each has a colour and an offset along its normal, for clothes and hair; all share a light:
+    shares that the spherical harmonics of the normal in the world add to the colours.
+    """
+
+    quaternions: Tensor
+    scales: Tensor
+
+    def __init__(self, body: Body, count: int, generator: torch.Generator) -> None:
+        """Discs spread evenly over the surface, grey."""
+        super().__init__()
+        self.body = body
+        drawn = body.sample_surface(_OVERSAMPLED * count, generator)
+        rows = _far_apart(drawn.points, count)
+        self.samples = SurfaceSamples(drawn.points[rows], drawn.normals[rows], drawn.weights[rows])
+        a, b, c = body.canonical_vertices()[body.faces].unbind(1)
+        area = float(torch.linalg.cross(b - a, c - a).norm(dim=-1).sum()) / 2
+        width = _WIDTH * (area / count) ** 0.5
+        scales = torch.tensor([width, width, _FLATNESS * width]).repeat(count, 1)
+        self.register_buffer("quaternions", _turned_to(self.samples.normals))
+        self.register_buffer("scales", scales)
+        self.colours = nn.Parameter(torch.full((count, 3), 0.5))
+        # A disc at an outline reaches beyond it by about its width.
+        self.inset = nn.Parameter(torch.tensor(-width / _OFFSET_M))
+        self.offsets = nn.Parameter(torch.zeros(count))
+        self.light = nn.Parameter(torch.zeros(8))
+
+    def splats(self, rotations: Float[Tensor, "T J 3 3"], transl: Float[Tensor, "T 3"]) -> Splats:
+        """The discs in a pose per time."""
+        normals = self.samples.normals
+        points = self.samples.points + normals * _OFFSET_M * (self.inset + self.offsets)[:, None]
+        bones = self.body.canonical_to_world(rotations, transl)
+        means, blended = skin(points, self.samples.weights, bones)
+        linear = blended[..., :3, :3]
+        turned = (linear @ normals[:, :, None]).squeeze(-1)
+        shade = 1 + _harmonics(nn.functional.normalize(turned, dim=-1)) @ self.light
+        opacities = torch.full((len(points),), _OPACITY)
+        colours = self.colours * shade[..., None]
+        return Splats(means, self.quaternions, self.scales, opacities, colours, linear=linear)
+
+    def draw(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        transl: Float[Tensor, "T 3"],
+        camera: Camera,
+        behind: Float[Tensor, "T H W 3"],
+    ) -> Float[Tensor, "T H W 3"]:
+        """Pictures of the discs before the scene."""
+        drawn = render(self.splats(rotations, transl), camera)
+        return drawn.image + (1 - drawn.alpha[..., None]) * behind
+
+    def colour_from(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        transl: Float[Tensor, "T 3"],
+        camera: Camera,
+        images: Float[Tensor, "T H W 3"],
+    ) -> None:
+        """Set each colour to the mean of the pixels that show the disc, by how much they do."""
+        with torch.enable_grad():
+            drawn = render(self.splats(rotations, transl), camera).image
+            shares = [
+                torch.autograd.grad((drawn * of).sum(), self.colours, retain_graph=True)[0]
+                for of in (images, torch.ones_like(images))
+            ]
+        shown, total = shares
+        with torch.no_grad():
+            mean = shown.sum(0) / total.sum(0).clamp_min(1e-6)
+            self.colours.copy_((shown + 0.1 * mean) / (total + 0.1))
+
+    def price(self) -> Float[Tensor, ""]:
+        """What offsets and light cost, as minus the logarithm of a prior."""
+        return 0.5 * self.offsets.square().sum() + 2 * self.light.square().sum()
+
+
+def _harmonics(normals: Float[Tensor, "*T N 3"]) -> Float[Tensor, "*T N 8"]:
+    """Spherical harmonics of first and second order, up to factors."""
+    x, y, z = normals.unbind(-1)
+    return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], -1)
+
+
+def _far_apart(points: Float[Tensor, "M 3"], count: int) -> Int[Tensor, "N"]:
+    """Rows of ``count`` points, each the farthest from those before it."""
+    chosen = torch.zeros(count, dtype=torch.long)
+    distance = (points - points[0]).square().sum(-1)
+    for k in range(1, count):
+        chosen[k] = distance.argmax()
+        distance = torch.minimum(distance, (points - points[chosen[k]]).square().sum(-1))
+    return chosen
+
+
+def _turned_to(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
+    """The shortest rotations of z to each normal, wxyz."""
+    x, y, z = normals.unbind(-1)
+    half = torch.stack([1 + z, -y, x, torch.zeros_like(z)], -1)
+    # Straight down there is no shortest one; half a turn about x serves.
+    half_turn = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    return torch.where((1 + z < 1e-4)[:, None], half_turn, half)

@@ -1,0 +1,126 @@
+"""What a motion is corrected by: sharp pictures, and the scene behind the person in them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+from torch import Tensor
+
+from evsplat.body import BodyTrack
+from evsplat.body.silhouette import silhouette
+from evsplat.camera import Camera
+from evsplat.capture import Frame, TrainingCapture
+from evsplat.errors import DataError
+from evsplat.landmarks.pictures import sharp_pictures
+
+_REACH = 0.08
+"""The person is within this share of its height from the posed body."""
+_CLEAR = 0.04
+"""Beyond this share of the height from the posed body a pixel shows the background."""
+_DARKEST, _BRIGHTEST = 0.3, 1.1
+_LIGHT_BLUR = 0.02
+"""Smoothing of shadows, share of the height."""
+_FAR_PX = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """P pictures of a camera that stands still."""
+
+    times_us: list[int]
+    frames: list[Frame]
+    """The frame in whose exposure each lies."""
+    image: Float[Tensor, "P H W 3"]
+    behind: Float[Tensor, "P H W 3"]
+    """The scene without the person, in the person's shadow."""
+    weight: Float[Tensor, "P H W"]
+    """Trust in each pixel; 0 away from the person."""
+    camera: Camera
+
+    def rows(self, chosen: Sequence[int]) -> "Targets":
+        """Some of the pictures."""
+        index = list(chosen)
+        times = [self.times_us[k] for k in index]
+        frames = [self.frames[k] for k in index]
+        return Targets(
+            times, frames, self.image[index], self.behind[index], self.weight[index], self.camera
+        )
+
+    def smaller(self, times: int) -> "Targets":
+        """Pictures of fewer pixels: means over squares of ``times`` pixels."""
+        camera = self.camera
+        scale = torch.tensor([[1 / times], [1 / times], [1.0]])
+        small = Camera(
+            camera.width // times, camera.height // times, camera.K * scale, camera.world_to_camera
+        )
+
+        def pooled(images: Tensor) -> Tensor:
+            planar = images.permute(0, 3, 1, 2)
+            return torch.nn.functional.avg_pool2d(planar, times).permute(0, 2, 3, 1).contiguous()
+
+        weight = pooled(self.weight[..., None])[..., 0]
+        return Targets(
+            self.times_us, self.frames, pooled(self.image), pooled(self.behind), weight, small
+        )
+
+
+def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
+    """Sharp pictures of all times that the policy shows, with what is behind the person.
+
+    Raises:
+        DataError: the camera moves, or the posed body is in no picture.
+    """
+    if not capture.is_static_camera:
+        raise DataError(
+            f"{capture.path}: has a moving camera or several, and a motion is corrected by what "
+            "differs from a static background; leave the poses as they are."
+        )
+    pictures = sharp_pictures(capture)
+    camera = capture.camera(pictures[0].frame)
+    found, heights = [], []
+    for picture in pictures:
+        inside = silhouette(track.vertices(picture.time_us), track.body.faces, camera).numpy()
+        rows = np.flatnonzero(inside.any(1))
+        heights.append(rows[-1] - rows[0] + 1 if len(rows) else 0)
+        far = np.full(inside.shape, _FAR_PX)
+        found.append(distance_transform_edt(~inside) if len(rows) else far)
+    tall = float(np.median(heights))
+    if tall == 0:
+        raise DataError(
+            f"{capture.path}: the posed body is in few of the pictures or in none, so that they "
+            "tell nothing of its motion; check camera and poses."
+        )
+    away = torch.from_numpy(np.stack(found)).float()
+    image = torch.stack([picture.image for picture in pictures]).float()
+    plain = _background(image, away, _CLEAR * tall)
+    light = [_light(one, plain, distance, tall) for one, distance in zip(image, away, strict=True)]
+    trust = torch.tensor([picture.sigma**-2 for picture in pictures])
+    return Targets(
+        [picture.time_us for picture in pictures],
+        [picture.frame for picture in pictures],
+        image,
+        plain * torch.stack(light),
+        (away < _REACH * tall) * trust[:, None, None],
+        camera,
+    )
+
+
+def _background(
+    image: Float[Tensor, "P H W 3"], away: Float[Tensor, "P H W"], clear: float
+) -> Float[Tensor, "H W 3"]:
+    """Median of each pixel over the pictures in which the person is not near, or nearly so."""
+    least = torch.minimum(away.amax(0), torch.tensor(clear))
+    return torch.where((away >= least)[..., None], image, torch.nan).nanmedian(0).values
+
+
+def _light(image: Tensor, plain: Tensor, away: Tensor, tall: float) -> Float[Tensor, "H W 1"]:
+    """The share of its usual brightness that the background has: less in the person's shadow."""
+    clear = (away > _CLEAR * tall).numpy().astype(np.float32)
+    sigma = max(0.5, _LIGHT_BLUR * tall)
+    shown = gaussian_filter(image.mean(-1).numpy() * clear, sigma)
+    usual = gaussian_filter(plain.mean(-1).numpy() * clear, sigma)
+    share = (shown + 1e-3) / (usual + 1e-3)
+    return torch.from_numpy(np.clip(share, _DARKEST, _BRIGHTEST)).float()[..., None]
