@@ -27,6 +27,8 @@ _HEAT_REACH = 3
 _LEAST_HEAT = 0.5
 LEAST_FLAG = 0.5
 """Below it there is no person in a region, says the network."""
+MOST_DOUBT = 0.015
+"""Beyond it neither, whatever the flag: of an empty room it can be 0.9 where one looks for long."""
 
 
 def _other_side(name: str) -> str:
@@ -88,6 +90,11 @@ class Found:
         region is turned, and one tenth of the disagreement where it is turned with the person.
         """
         return float(np.median(self.spread[list(LIMB_POINTS)])) / self.region.side
+
+    @property
+    def is_person(self) -> bool:
+        """True where the network believes so and its copies agree."""
+        return self.flag >= LEAST_FLAG and self.doubt <= MOST_DOUBT
 
 
 def find_in(

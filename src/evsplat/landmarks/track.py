@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
-from evsplat.landmarks.detect import LEAST_FLAG, Found, Region, find_in
+from evsplat.landmarks.detect import Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
 from evsplat.landmarks.motion import Motion
 from evsplat.landmarks.network import LandmarkNetwork
@@ -61,19 +61,18 @@ def find_landmarks(
         for picture in tqdm(pictures, "landmarks", unit="picture", disable=not progress)
     ]
     tracker.look_back(pictures, found)
-    flags = np.array([person.flag for person in found])
-    refuse_nobody(capture, pictures, flags)
+    refuse_nobody(capture, pictures, found)
     places = np.stack([person.places for person in found])
     refuse_moving_camera(capture, (pictures, places))
     refuse_half_out_of_view(capture, pictures, places)
     refuse_two_people(capture, motion, pictures, found, tracker.search)
-    doubtful = int((flags < SURE).sum())
+    doubtful = sum(not person.is_person for person in found)
     if doubtful:
         logger.warning(
             "%s: the person is hardly recognised in %d of %d pictures.",
             capture.path,
             doubtful,
-            len(flags),
+            len(found),
         )
     return Landmarks(
         np.array([picture.time_us for picture in pictures], dtype=np.int64),
@@ -95,7 +94,7 @@ class _Tracker:
     def find(self, picture: SharpPicture) -> Found:
         """From the last region, turned otherwise where that is doubtful, or by a search."""
         best = None if self._last is None else self.settle(picture.image, self._last)
-        if best is not None and best.flag >= LEAST_FLAG and not _is_clear(best):
+        if best is not None and best.is_person and not _is_clear(best):
             around = Region(best.region.centre, best.region.side)
             best = min(best, self.search(picture.image, [around]), key=_badness)
         if best is None or best.flag < SURE:
@@ -169,7 +168,7 @@ def _alike(one: Region, other: Region) -> bool:
 
 def _sigma(picture: SharpPicture, found: Found) -> Float[np.ndarray, "33"]:
     """Expected error per axis, pixels: what clear points have, and the copies' disagreement."""
-    doubt = 1 if found.flag >= SURE else 2
+    doubt = 1 if found.is_person else 4
     base = _BASE_SIGMA * found.region.side
     sigma: np.ndarray = picture.sigma * doubt * np.hypot(base, found.spread)
     return sigma
@@ -178,5 +177,6 @@ def _sigma(picture: SharpPicture, found: Found) -> Float[np.ndarray, "33"]:
 def _seen(found: Found) -> Float[np.ndarray, "33"]:
     """The network's belief, less where its copies disagree: it believes in hidden arms as well."""
     disagreement = found.spread / (_BASE_SIGMA * found.region.side)
-    seen: np.ndarray = found.flag * found.visible / (1 + (disagreement / 2) ** 2)
+    belief = found.flag if found.is_person else 0.1 * found.flag
+    seen: np.ndarray = belief * found.visible / (1 + (disagreement / 2) ** 2)
     return seen
