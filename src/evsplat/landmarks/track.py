@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
-from evsplat.landmarks.detect import Found, Region, find_in
+from evsplat.landmarks.detect import COPIES, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
 from evsplat.landmarks.motion import Motion
 from evsplat.landmarks.network import LandmarkNetwork
@@ -30,6 +30,8 @@ _TURNS = (0.0, np.pi / 2, -np.pi / 2, np.pi)
 """Uprights of a search: cartwheels and handstands are found by the last three."""
 _CLEAR = 0.008
 """Beyond this doubt other uprights are tried."""
+_LOOKS = 2
+_LEAST_FOLLOWED = 0.3
 _BOX_MARGIN = 1.25
 _SETTLED = 0.08
 """A region is read again where the next one is off by more than this share of its side."""
@@ -124,19 +126,17 @@ class _Tracker:
         assert best is not None
         return best
 
-    def settle(self, image: Float[Tensor, "H W 3"], region: Region, rounds: int = 3) -> Found:
-        """Read a region, and again the one that follows from it until they are the same."""
-        best: Found | None = None
-        for _ in range(rounds):
-            found = find_in(self._network, image, region)
-            if best is not None and found.flag < min(best.flag, SURE):
+    def settle(self, image: Float[Tensor, "H W 3"], region: Region) -> Found:
+        """Read the region that follows from a first look, or from a second one where it is far."""
+        for _ in range(_LOOKS):
+            look = find_in(self._network, image, region, copies=COPIES[:1])
+            if look.flag < _LEAST_FOLLOWED or not 0.4 < look.region.side / region.side < 2.5:
                 break
-            best = found
-            if found.flag < 0.1 or _alike(region, found.region):
+            near = _alike(region, look.region)
+            region = look.region
+            if near:
                 break
-            region = found.region
-        assert best is not None
-        return best
+        return find_in(self._network, image, region)
 
 
 def _is_clear(found: Found) -> bool:
