@@ -91,6 +91,17 @@ def test_training_frames_without_truth_are_refused(tiny_capture, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_person_who_is_in_no_frame_is_remarked(tiny_capture, tmp_path, caplog):
+    path = tiny_capture()
+    assert run(path, tmp_path / "a")["remarks"] == []
+    for mask in (path / "masks").iterdir():
+        Image.new("L", Image.open(mask).size).save(mask)
+    metrics = run(path, tmp_path / "b")
+    (remark,) = metrics["remarks"]
+    assert "the person is in no test frame" in remark and remark in caplog.text
+    assert remark in markdown({**metrics, "policy": {}})
+
+
 def test_missing_weights_are_null_with_the_reason(tiny_capture, tmp_path):
     metrics = run(tiny_capture(), tmp_path / "run")
     assert metrics["protocols"]["standard"]["full"]["lpips_vgg"] is None
@@ -231,7 +242,7 @@ def test_a_person_in_no_test_frame_is_told(tiny_capture, tmp_path, caplog):
     for frame in load_capture(path).test_frames:
         Image.new("L", (32, 24)).save(frame.mask)
     run(path, tmp_path / "none")
-    assert f"{path}: the person is in no test frame; check camera and poses." in caplog.text
+    assert f"{path}: the person is in no test frame, so the figures" in caplog.text
 
 
 def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):

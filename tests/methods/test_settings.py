@@ -212,11 +212,13 @@ def test_a_configuration_of_the_version_before_is_refused(method):
     told = ["optimisation.iterations: renamed to iterations"]
     if method == "hugs":
         old["triplane"] = {"channels": 32, "resolution": 64}
-        told.append("triplane.channels: renamed to channels")
+        told.append("triplane: its settings are channels and resolution")
     else:
         old["deform"] = {"width": 128}
-        new = "width" if method == "evsplat" else "networks.width"
-        told.append(f"deform.width: renamed to {new}")
+        evsplat = method == "evsplat"
+        told.append(
+            "deform: what evsplat reads of it are width" if evsplat else "deform.width: renamed to "
+        )
     if method == "evsplat":
         old["windows"] = {"start": 750, "begun_us": 100_000}
         told += ["windows.begun_us: renamed to event_ramp_us", "windows: its settings are event_st"]

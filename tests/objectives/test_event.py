@@ -6,7 +6,7 @@ import h5py
 import pytest
 import torch
 
-from evsplat.objectives import EventChange, event_loss
+from evsplat.objectives.event import EventChange, event_loss
 from evsplat.pictures import decode, encode, log_brightness_change
 
 from ..seen import seen

@@ -9,8 +9,12 @@ import torch
 from scipy.ndimage import distance_transform_edt
 
 from evsplat.devices import DeviceCache
-from evsplat.objectives import PackedBounds, RenderedSemantics, silhouette_bounds
-from evsplat.objectives.semantic import membership_loss
+from evsplat.objectives.semantic import (
+    PackedBounds,
+    RenderedSemantics,
+    membership_loss,
+    silhouette_bounds,
+)
 
 
 def disc(radius: float) -> np.ndarray:

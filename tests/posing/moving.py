@@ -3,6 +3,8 @@
 import numpy as np
 import torch
 
+from evsplat.body import make_body
+from evsplat.body.smpl_skeleton import NAMES, PARENTS, approximate_rest_joints
 from evsplat.camera import Camera
 from evsplat.landmarks import BLAZEPOSE_33, Landmarks
 from evsplat.posing.kinematics import SIZE, Points, pose, row_slice
@@ -50,3 +52,12 @@ def landmarks(count: int = 24, *, noise_px: float = 0.0, world: bool = True) -> 
         in_camera - in_camera[:, hips].mean(1, keepdims=True) if world else None,
         BLAZEPOSE_33,
     )
+
+
+def stick_figure(betas: np.ndarray):
+    """SMPL's skeleton with a triangle at each joint as its mesh."""
+    joints = approximate_rest_joints() * (1 + 0.1 * betas[0])
+    corners = joints[:, None] + 0.02 * np.eye(3)
+    faces = np.arange(3 * len(joints)).reshape(-1, 3)
+    weights = np.repeat(np.eye(len(joints)), 3, 0)
+    return make_body(corners.reshape(-1, 3), faces, weights, np.array(PARENTS), joints, NAMES)[0]

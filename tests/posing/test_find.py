@@ -104,6 +104,8 @@ def test_what_cannot_be_is_refused_before_work_begins(unposed, tmp_path):
         find_poses(path, path, keypoints=points)
     with pytest.raises(ConfigError, match="--focal wide: expected auto or pixels"):
         PoseSearch(focal="wide")
+    with pytest.raises(ConfigError, match="leave one of them out"):
+        PoseSearch(focal="auto", refine=True)
     with pytest.raises(ConfigError, match="--height 17"):
         PoseSearch(height_m=17)
 

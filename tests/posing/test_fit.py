@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.posing.moving import CAMERA, SPAN_US, landmarks, motion
+from tests.posing.moving import CAMERA, SPAN_US, landmarks, motion, stick_figure
 
 from evsplat.camera import Camera
 from evsplat.errors import DataError
 from evsplat.posing.fit import FitSettings, fit_focal, fit_landmarks
 from evsplat.posing.kinematics import pose
 from evsplat.posing.problem import State
-from evsplat.posing.rig import MEASURED, default_rig
+from evsplat.posing.rig import MEASURED, default_rig, make_rig
 
 TIMES = np.arange(50_000, 800_000, 100_000)
 
@@ -61,6 +61,20 @@ def test_a_known_motion_is_found_again():
 def test_without_depths_the_picture_still_fits():
     pixels, _ = _errors(_fit(landmarks(world=False), flips=False))
     assert pixels < 1.0
+
+
+def test_smpl_s_skeleton_is_fitted_as_well():
+    rig = make_rig(stick_figure, "smpl", 1)
+    fit = fit_landmarks(landmarks(), [CAMERA] * 24, SPAN_US, rig=rig, flips=False)
+    true = pose(default_rig(), motion(TIMES), torch.zeros(10, dtype=torch.float64)).joints
+    track = fit.track(TIMES)
+    found = track.body.joint_transforms(*track.at(TIMES))[..., :3, 3].double()
+    limbs = [name for name in MEASURED if name not in ("neck", "head")]
+    off = (
+        CAMERA.project(found[:, [rig.joint(name) for name in limbs]])[0]
+        - CAMERA.project(true[:, [default_rig().joint(name) for name in limbs]])[0]
+    )
+    assert off.norm(dim=-1).mean() < 3
 
 
 def test_errors_grow_with_those_of_the_landmarks():

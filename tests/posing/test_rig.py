@@ -3,23 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from tests.posing.moving import stick_figure
 
-from evsplat.body import default_body, make_body
+from evsplat.body import default_body
 from evsplat.body.rotations import axis_angle_to_matrix
-from evsplat.body.smpl_skeleton import NAMES, PARENTS, approximate_rest_joints
 from evsplat.errors import DataError
 from evsplat.landmarks import BLAZEPOSE_33, COCO_17, OPENPOSE_25
 from evsplat.posing.prior import ROWS, mirrored, pose_prior
 from evsplat.posing.rig import attach, default_rig, make_rig
-
-
-def _stick_figure(betas: np.ndarray):
-    """SMPL's skeleton with a triangle at each joint as its mesh."""
-    joints = approximate_rest_joints() * (1 + 0.1 * betas[0])
-    corners = joints[:, None] + 0.02 * np.eye(3)
-    faces = np.arange(3 * len(joints)).reshape(-1, 3)
-    weights = np.repeat(np.eye(len(joints)), 3, 0)
-    return make_body(corners.reshape(-1, 3), faces, weights, np.array(PARENTS), joints, NAMES)[0]
 
 
 def test_the_body_that_ships_keeps_its_own_frames():
@@ -32,7 +23,7 @@ def test_bones_of_another_body_point_where_those_of_the_shipped_one_do():
     rows = 0.5 * torch.randn(2, len(ROWS), 3, generator=generator, dtype=torch.float64)
     root = axis_angle_to_matrix(torch.randn(2, 3, generator=generator, dtype=torch.float64))
     directions = []
-    for rig in (default_rig(), make_rig(_stick_figure, "smpl", 1)):
+    for rig in (default_rig(), make_rig(stick_figure, "smpl", 1)):
         poses = torch.from_numpy(rig.poses(root, rows))
         body = rig.body(np.zeros(len(rig.growth)))
         places = body.joint_transforms(axis_angle_to_matrix(poses), torch.zeros(2, 3).double())

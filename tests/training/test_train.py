@@ -189,6 +189,15 @@ def test_wrong_calls_are_refused_before_anything_is_written(tiny_capture, tmp_pa
         train(capture, out=out)
 
 
+def test_the_folder_above_a_run_names_the_run(tmp_path):
+    (tmp_path / "runs" / "evsplat").mkdir(parents=True)
+    with pytest.raises(DataError, match=r"runs: not a run folder, config.yaml is missing\.$"):
+        read_config(RunFolder(tmp_path / "runs"))
+    (tmp_path / "runs" / "evsplat" / "config.yaml").touch()
+    with pytest.raises(DataError, match=r"missing\. A run lies below: .*runs/evsplat\.$"):
+        read_config(RunFolder(tmp_path / "runs"))
+
+
 @pytest.mark.parametrize("change", ["lacks", "holds the unknown"])
 def test_a_checkpoint_of_another_version_is_named(tiny_capture, tmp_path, change):
     capture = tiny_capture(frames=10)

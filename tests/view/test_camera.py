@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.capture import Camera
-from evsplat.view.camera import BrowserCamera, forward, letterboxed, resized, vertical_fov
+from evsplat.view.camera import BrowserCamera, forward, letterboxed, vertical_fov
 
 
 def _random_view(rng):
@@ -64,14 +64,3 @@ def test_a_letterboxed_camera_shows_its_whole_picture_centred(size):
     scale = box.width / 256
     expected = original * scale + torch.tensor([box.left, box.top])
     assert torch.allclose(shown, expected, atol=1e-3)
-
-
-def test_resizing_keeps_what_is_seen_where():
-    camera = BrowserCamera((1, 0, 0, 0), (0, 0, 0), 1.0).sized(640, 480)
-    small = resized(camera, 160, 90)
-    point = torch.tensor([0.3, -0.2, 2.0])
-    pixel, _ = camera.project(point)
-    half, _ = small.project(point)
-    assert (half / torch.tensor([160, 90])).tolist() == pytest.approx(
-        (pixel / torch.tensor([640, 480])).tolist()
-    )

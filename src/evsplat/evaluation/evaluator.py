@@ -116,6 +116,10 @@ def evaluate(
         result["events"] = None if isinstance(events, Absent) else events
         if isinstance(events, Absent):
             reasons["events"] = events.reason
+    remark = measured.human_remark()
+    if remark:
+        logger.warning("%s", remark)
+    result["remarks"] = [remark] if remark else []
     result["weights"] = weights
     result["protocol_notes"] = {protocol.name: protocol.summary for protocol in protocols}
     return result
@@ -170,13 +174,13 @@ class _MeasuredFrames:
         self._means = {(row, p.name): MetricMeans() for row in rows for p in self.protocols}
         self._against_blurry = MetricMeans()
         self._per_frame: list[dict[str, Any]] = []
-        self._nobody = True
+        self._seen = False
 
     def measure(self, frame: Frame) -> None:
         """Measure one frame and write its pictures."""
         ours = _render(self.capture, self.reconstruction, frame)
         mask, human = self.human_regions.in_frame(frame)
-        self._nobody &= isinstance(human, Absent)
+        self._seen |= not isinstance(human, Absent)
         truth = None if frame.sharp is None else self.capture.sharp(frame)
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
@@ -204,12 +208,17 @@ class _MeasuredFrames:
             entry["blurry_ground_truth"] = without_reasons(against_blurry)
         self._per_frame.append(entry | {"pictures": self._save(frame, ours, truth)})
 
+    def human_remark(self) -> str:
+        """A sentence where no measured frame shows the person; then the scene alone counts."""
+        if self._seen or not self._per_frame:
+            return ""
+        return (
+            f"{self.capture.path}: the person is in no {self.split} frame, so the figures are of "
+            "the scene alone and rows without a method may be perfect; check camera and poses."
+        )
+
     def results(self) -> dict[str, Any]:
         """Means of everything; "trivial" and "blurry_input" are of the protocol standard."""
-        if self._nobody and self._per_frame:
-            logger.warning(
-                "%s: the person is in no test frame; check camera and poses.", self.capture.path
-            )
         reasons: dict[str, str] = {}
 
         def means(frames: MetricMeans, path: str) -> dict[str, Any]:

@@ -184,7 +184,8 @@ def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
     means = f"Means over {count} {frames} against the sharp truth. " if count else ""
     intro = f"{means}{terms(metrics)} {LEGEND.format(second='in italics')}"
     title = f"{metrics['method']} on {metrics['capture']}"
-    page = markdown(title, intro, tables, missing_networks(metrics))
+    notes = [*metrics.get("remarks", ()), *missing_networks(metrics)]
+    page = markdown(title, intro, tables, notes)
     write_text(folder / name_of("metrics", split, ".md"), page)
     page = f"% {words.title}. {terms(metrics)}\n{latex(tables)}"
     write_text(folder / name_of("metrics", split, ".tex"), page)

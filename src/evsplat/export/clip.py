@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from evsplat.body import BodyTrack, up_axis
+from evsplat.body import up_axis
 from evsplat.body.rotations import quaternion_to_matrix
-from evsplat.capture import Camera, load_body_track
+from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError
 from evsplat.export.cloud import SplatCloud, cloud_of
 from evsplat.export.gaussians import instant_of
@@ -48,7 +48,9 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
         server.gui.configure_theme(control_layout="collapsible", dark_mode=True)
         server.scene.set_up_direction(tuple(up_axis(track).tolist()))
         view = middle.camera
-        ahead = view.center() + view.world_to_camera[2, :3] * _distance(track, view, middle.time_us)
+        # The reader orbits about a place as far as the person.
+        away = view.project(track.vertices(middle.time_us))[1].mean()
+        ahead = view.center() + view.world_to_camera[2, :3] * away
         server.initial_camera.position = tuple(view.center().tolist())
         server.initial_camera.look_at = tuple(ahead.tolist())
         server.initial_camera.fov = 2 * math.atan(view.height / 2 / float(view.K[1, 1]))
@@ -73,11 +75,6 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
         middle.camera_name,
     )
     return path
-
-
-def _distance(track: BodyTrack, camera: Camera, time_us: int) -> float:
-    """Depth of the person in the camera, metres: what the reader orbits about."""
-    return float(camera.project(track.vertices(time_us))[1].mean())
 
 
 def _show(server: Any, name: str, cloud: SplatCloud, handle: Any = None) -> Any:

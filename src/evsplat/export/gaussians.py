@@ -110,19 +110,14 @@ def write_file(
         raise DataError(f"{path}: there is no Gaussian to write.")
     turned = cloud.rotated(rotation)
     facts = {**facts, "unit": "metre", "world_to_file_rotation": rotation.tolist()}
+    lines = (
+        f"{name}: {value}".encode("ascii", "replace").decode() for name, value in facts.items()
+    )
+    comments = ["written by evsplat", *(" ".join(line.split()) for line in lines)]
     writers: dict[str, Callable[[], None]] = {
-        "ply": lambda: write_ply(path, turned, comments=_comments(facts)),
+        "ply": lambda: write_ply(path, turned, comments=comments),
         "spz": lambda: write_spz(path, turned),
         "splat": lambda: write_splat(path, turned),
         "gltf": lambda: write_gltf(path, turned, extras=facts),
     }
     writers[kind]()
-
-
-def _comments(facts: Mapping[str, Any]) -> list[str]:
-    lines = [f"{name}: {value}" for name, value in facts.items()]
-    return ["written by evsplat", *(" ".join(_ascii(line).split()) for line in lines)]
-
-
-def _ascii(text: str) -> str:
-    return text.encode("ascii", "replace").decode()

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.body import Body, BodyTrack, SkeletonMotion, retarget, up_axis
 from evsplat.body.motion import load_motion
-from evsplat.body.pose_files import PoseSequence, read_poses, skeleton_motion
+from evsplat.body.pose_files import read_poses, skeleton_motion
 from evsplat.body.retarget import smallest_rotation
 from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.skeleton import find_skeleton
@@ -55,7 +55,8 @@ def load_motion_of(
             "give --motion-fps."
         )
     motion = skeleton_motion(replace(sequence, fps=fps or sequence.fps))
-    return place_motion(motion, recorded, up=_up_of(sequence), in_place=in_place)
+    up = np.array(_UP[sequence.world]) if sequence.world in _UP else None
+    return place_motion(motion, recorded, up=up, in_place=in_place)
 
 
 def place_motion(
@@ -94,11 +95,6 @@ def place_motion(
     track = BodyTrack(body, times, turned, root - rest, source=motion.source)
     lift = _floor(recorded, floor_up) - _floor(track, floor_up)
     return BodyTrack(body, times, turned, root - rest + lift * floor_up, source=motion.source)
-
-
-def _up_of(sequence: PoseSequence) -> Float[np.ndarray, "3"] | None:
-    up = _UP.get(sequence.world)
-    return None if up is None else np.array(up)
 
 
 def _facing(track: BodyTrack) -> Float[np.ndarray, "3"]:

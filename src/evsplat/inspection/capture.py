@@ -12,12 +12,12 @@ from evsplat.body import BodyTrack, silhouette
 from evsplat.calibration import SensorEstimate
 from evsplat.camera import Camera
 from evsplat.capture import estimate_sensor, load_body_track
-from evsplat.capture.capture import Capture, load_capture
+from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
 from evsplat.capture.validate import check_capture
-from evsplat.errors import DataError
+from evsplat.errors import EvsplatError
 from evsplat.inspection.belonging import judge_body
 from evsplat.inspection.body_check import FIT_SHEET, body_findings, check_body, fit_sheet
 from evsplat.inspection.drawing import (
@@ -99,11 +99,14 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
 
 def warn_of_body(path: Path) -> None:
     """Log a warning where a new capture's body does not belong to it, as training will see it."""
-    seen = load_capture(path).for_training(Policy())
+    metadata, _ = check_capture(path, deep=False)  # what it finds, the writer has said
+    if metadata is None:
+        return
+    seen = Capture(metadata).for_training(Policy())
     try:
         if seen.has_body:
             check_body(seen, refuse=False)
-    except DataError as error:  # such as an SMPL file that training will have to find
+    except EvsplatError as error:  # such as an SMPL file that training will have to find
         logger.info("The body is not compared with the recording: %s", error)
 
 
@@ -184,6 +187,7 @@ def _body_text(capture: Capture, track: BodyTrack | None) -> str:
     return (
         f"{capture.body_file.model}: {len(body.parents)} joints, {len(body.rest_vertices):,} "
         f"vertices; {len(times)} key poses from {times[0] / 1e6:.3f} to {times[-1] / 1e6:.3f} s"
+        + ("" if track.errors is None else f", {track.errors.source}")
         + (f"; {len(dense.times_us)} dense true poses" if dense is not None else "")
     )
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32, Int, Shaped
 
 from evsplat.inspection.matching import Correlations, normalised, own_time_order
 
@@ -83,7 +83,9 @@ def drawn(
     return inside if kind == "frames" else 0.5 * inside + edges
 
 
-def in_picture(posed: np.ndarray, size: tuple[int, ...], down: int, right: int) -> np.ndarray:
+def in_picture(
+    posed: Shaped[np.ndarray, "K H W"], size: tuple[int, ...], down: int, right: int
+) -> Shaped[np.ndarray, "K h w"]:
     """The picture's part of wider silhouettes that are moved ``down`` and ``right``."""
     top, left = REACH_PX - down, REACH_PX - right
     return posed[:, top : top + size[0], left : left + size[1]]

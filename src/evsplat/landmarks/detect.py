@@ -5,6 +5,7 @@ upright, the points are refined by the heat map around them, and two points that
 span the region in which the person is looked for next.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,8 @@ _HEAT_REACH = 3
 _LEAST_HEAT = 0.5
 LEAST_FLAG = 0.5
 """Below it there is no person in a region, says the network."""
+MOST_DOUBT = 0.015
+"""Beyond it neither, whatever the flag: of an empty room it can be 0.9 where one looks for long."""
 
 
 def _other_side(name: str) -> str:
@@ -89,21 +92,28 @@ class Found:
         """
         return float(np.median(self.spread[list(LIMB_POINTS)])) / self.region.side
 
+    @property
+    def is_person(self) -> bool:
+        """True where the network believes so and its copies agree."""
+        return self.flag >= LEAST_FLAG and self.doubt <= MOST_DOUBT
+
 
 def find_in(
     network: LandmarkNetwork,
     picture: Float[Tensor, "H W 3"],
     region: Region,
+    *,
+    copies: Sequence[tuple[float, bool]] = COPIES,
 ) -> Found:
-    """The person in a region, from `COPIES` of it.
+    """The person in a region, from ``copies`` of it; one alone has no spread.
 
     Places are medians: where limbs hide each other a copy may take one for another.
     """
-    copies = [(region.turned(turn), mirrored) for turn, mirrored in COPIES]
-    crops = torch.stack([crop(picture, *copy) for copy in copies])
+    turned = [(region.turned(turn), mirrored) for turn, mirrored in copies]
+    crops = torch.stack([crop(picture, *copy) for copy in turned])
     output = network(crops)
     points = refined(output)
-    readings = [_reading(output, points, index, *copy) for index, copy in enumerate(copies)]
+    readings = [_reading(output, points, index, *copy) for index, copy in enumerate(turned)]
     places = np.stack([reading[0] for reading in readings])
     world = np.stack([reading[1] for reading in readings])
     visible = np.stack([reading[2] for reading in readings])
@@ -115,7 +125,7 @@ def find_in(
         float(np.arctan2(rim[0], -rim[1])),
     )
     body = slice(len(BLAZEPOSE_33))
-    spread = np.sqrt(places.var(0, ddof=1).mean(-1))
+    spread = np.sqrt(places.var(0, ddof=min(1, len(copies) - 1)).mean(-1))
     return Found(
         median[body],
         spread[body],

@@ -69,6 +69,10 @@ class Motion:
         """Index of the training frame nearest in time."""
         return int(np.abs(self._mids - time_us).argmin())
 
+    def moving(self, time_us: int) -> Bool[np.ndarray, "H W"]:
+        """Pixels that move about a time."""
+        return self._maps[self.nearest(time_us)]
+
     def boxes(self, time_us: int) -> list[Box]:
         """Boxes of the pieces that move about a time, the largest area first; may be none."""
         index = self.nearest(time_us)

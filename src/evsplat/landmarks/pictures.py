@@ -102,7 +102,14 @@ def _in_exposure(
     assert capture.events is not None
     times = _instants(frame, fractions)
     events = capture.events.between(*frame.exposure_us)
-    images = deblur(capture.image(frame), events, frame.exposure_us, times, thresholds)
+    images = deblur(
+        capture.image(frame),
+        events,
+        frame.exposure_us,
+        times,
+        thresholds,
+        transfer=capture.transfer(frame),
+    )
     for time, image in zip(times, images, strict=True):
         yield SharpPicture(time, image, frame, 1.0)
 
@@ -149,7 +156,14 @@ def _carry(
     except HeldOutError:
         return None
     image = capture.image(frame)
-    (carried,) = deblur(image, events, frame.exposure_us, [time_us], thresholds)
+    (carried,) = deblur(
+        image,
+        events,
+        frame.exposure_us,
+        [time_us],
+        thresholds,
+        transfer=capture.transfer(frame),
+    )
     counts = polarity_counts(events, *image.shape[:2]).sum(0)
     return carried, torch.from_numpy(gaussian_filter(counts.numpy(), _SMOOTHING_PX))
 

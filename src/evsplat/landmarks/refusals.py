@@ -10,14 +10,14 @@ from torch import Tensor
 
 from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
-from evsplat.landmarks.detect import LEAST_FLAG, Found, Region
+from evsplat.landmarks.detect import Found, Region
 from evsplat.landmarks.landmarks import LIMB_POINTS
-from evsplat.landmarks.motion import Box, Motion, global_shift
+from evsplat.landmarks.motion import Box, Motion, global_shift, pieces
 from evsplat.landmarks.pictures import SharpPicture
 
 logger = logging.getLogger(__name__)
 
-_SECOND_FLAG = 0.9
+_SECOND_FLAG, _SECOND_DOUBT = 0.9, 0.012
 _SECOND_SIZE = 0.35
 """A second person is at least this tall beside the first."""
 _EXAMINED = 8
@@ -28,10 +28,10 @@ _HALF_OUT = 0.25
 
 
 def refuse_nobody(
-    capture: TrainingCapture, pictures: Sequence[SharpPicture], flags: Float[np.ndarray, "N"]
+    capture: TrainingCapture, pictures: Sequence[SharpPicture], found: Sequence[Found]
 ) -> None:
     """A `DataError` where most pictures show no person."""
-    missed = int((flags < LEAST_FLAG).sum())
+    missed = sum(not person.is_person for person in found)
     if 2 * missed > len(pictures):
         raise DataError(
             f"{capture.path}: nobody was found in {missed} of {len(pictures)} pictures, expected "
@@ -110,13 +110,13 @@ def refuse_two_people(
     The first is painted over with the background; in what else moves another is searched for.
     """
     spread = np.unique(np.linspace(0, len(pictures) - 1, _EXAMINED).round().astype(int))
-    chosen = [k for k in spread if found[k].flag >= LEAST_FLAG]
+    chosen = [k for k in spread if found[k].is_person]
     seconds = [
         person
         for k in chosen
         if (person := _second(motion, pictures[k], found[k], search)) is not None
     ]
-    if 2 * len(seconds) > len(chosen) and seconds:
+    if seconds and 2 * len(seconds) >= len(chosen):
         x, y = np.mean([person.region.centre for person in seconds], axis=0)
         raise DataError(
             f"{capture.path}: a second person moves at about x={x:.0f}, y={y:.0f} (in "
@@ -135,31 +135,25 @@ def _second(
     height, width = picture.image.shape[:2]
     box = body_box(first.places)
     covered = _covered(box, height, width)
-    boxes = [part for part in motion.boxes(picture.time_us) if _outside(part, box)]
+    boxes = pieces(motion.moving(picture.time_us) & ~covered)
     boxes = [part for part in boxes if part.side > _SECOND_SIZE * box.side]
     if not boxes:
         return None
     painted = torch.where(torch.from_numpy(covered)[..., None], motion.background, picture.image)
-    starts = [Region(part.centre, 1.25 * part.side) for part in boxes[:2]]
+    starts = [Region(part.centre, 1.25 * part.side) for part in boxes[:3]]
     person = search(painted, starts)
     tall = body_box(person.places).side > _SECOND_SIZE * box.side
     beside = not np.all(
         (person.region.centre > [box.x0, box.y0]) & (person.region.centre < [box.x1, box.y1])
     )
-    return person if person.flag >= _SECOND_FLAG and tall and beside else None
+    sure = person.flag >= _SECOND_FLAG and person.doubt <= _SECOND_DOUBT
+    return person if sure and tall and beside else None
 
 
 def body_box(places: Float[np.ndarray, "33 2"]) -> Box:
     """Box of all landmarks with room for flesh and clothes."""
     low, high = places.min(0), places.max(0)
     return Box(low[0], low[1], high[0], high[1]).grown(0.15)
-
-
-def _outside(part: Box, box: Box) -> bool:
-    """True where less than half of a box lies in the other one."""
-    width = max(0.0, min(part.x1, box.x1) - max(part.x0, box.x0))
-    height = max(0.0, min(part.y1, box.y1) - max(part.y0, box.y0))
-    return width * height < 0.5 * (part.x1 - part.x0) * (part.y1 - part.y0)
 
 
 def _covered(box: Box, height: int, width: int) -> Bool[np.ndarray, "H W"]:

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
-from evsplat.landmarks.detect import LEAST_FLAG, Found, Region, find_in
+from evsplat.landmarks.detect import COPIES, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
 from evsplat.landmarks.motion import Motion
 from evsplat.landmarks.network import LandmarkNetwork
@@ -30,6 +30,8 @@ _TURNS = (0.0, np.pi / 2, -np.pi / 2, np.pi)
 """Uprights of a search: cartwheels and handstands are found by the last three."""
 _CLEAR = 0.008
 """Beyond this doubt other uprights are tried."""
+_LOOKS = 2
+_LEAST_FOLLOWED = 0.3
 _BOX_MARGIN = 1.25
 _SETTLED = 0.08
 """A region is read again where the next one is off by more than this share of its side."""
@@ -61,19 +63,18 @@ def find_landmarks(
         for picture in tqdm(pictures, "landmarks", unit="picture", disable=not progress)
     ]
     tracker.look_back(pictures, found)
-    flags = np.array([person.flag for person in found])
-    refuse_nobody(capture, pictures, flags)
+    refuse_nobody(capture, pictures, found)
     places = np.stack([person.places for person in found])
     refuse_moving_camera(capture, (pictures, places))
     refuse_half_out_of_view(capture, pictures, places)
     refuse_two_people(capture, motion, pictures, found, tracker.search)
-    doubtful = int((flags < SURE).sum())
+    doubtful = sum(not person.is_person for person in found)
     if doubtful:
         logger.warning(
             "%s: the person is hardly recognised in %d of %d pictures.",
             capture.path,
             doubtful,
-            len(flags),
+            len(found),
         )
     return Landmarks(
         np.array([picture.time_us for picture in pictures], dtype=np.int64),
@@ -95,7 +96,7 @@ class _Tracker:
     def find(self, picture: SharpPicture) -> Found:
         """From the last region, turned otherwise where that is doubtful, or by a search."""
         best = None if self._last is None else self.settle(picture.image, self._last)
-        if best is not None and best.flag >= LEAST_FLAG and not _is_clear(best):
+        if best is not None and best.is_person and not _is_clear(best):
             around = Region(best.region.centre, best.region.side)
             best = min(best, self.search(picture.image, [around]), key=_badness)
         if best is None or best.flag < SURE:
@@ -125,19 +126,17 @@ class _Tracker:
         assert best is not None
         return best
 
-    def settle(self, image: Float[Tensor, "H W 3"], region: Region, rounds: int = 3) -> Found:
-        """Read a region, and again the one that follows from it until they are the same."""
-        best: Found | None = None
-        for _ in range(rounds):
-            found = find_in(self._network, image, region)
-            if best is not None and found.flag < min(best.flag, SURE):
+    def settle(self, image: Float[Tensor, "H W 3"], region: Region) -> Found:
+        """Read the region that follows from a first look, or from a second one where it is far."""
+        for _ in range(_LOOKS):
+            look = find_in(self._network, image, region, copies=COPIES[:1])
+            if look.flag < _LEAST_FOLLOWED or not 0.4 < look.region.side / region.side < 2.5:
                 break
-            best = found
-            if found.flag < 0.1 or _alike(region, found.region):
+            near = _alike(region, look.region)
+            region = look.region
+            if near:
                 break
-            region = found.region
-        assert best is not None
-        return best
+        return find_in(self._network, image, region)
 
 
 def _is_clear(found: Found) -> bool:
@@ -169,7 +168,7 @@ def _alike(one: Region, other: Region) -> bool:
 
 def _sigma(picture: SharpPicture, found: Found) -> Float[np.ndarray, "33"]:
     """Expected error per axis, pixels: what clear points have, and the copies' disagreement."""
-    doubt = 1 if found.flag >= SURE else 2
+    doubt = 1 if found.is_person else 4
     base = _BASE_SIGMA * found.region.side
     sigma: np.ndarray = picture.sigma * doubt * np.hypot(base, found.spread)
     return sigma
@@ -178,5 +177,6 @@ def _sigma(picture: SharpPicture, found: Found) -> Float[np.ndarray, "33"]:
 def _seen(found: Found) -> Float[np.ndarray, "33"]:
     """The network's belief, less where its copies disagree: it believes in hidden arms as well."""
     disagreement = found.spread / (_BASE_SIGMA * found.region.side)
-    seen: np.ndarray = found.flag * found.visible / (1 + (disagreement / 2) ** 2)
+    belief = found.flag if found.is_person else 0.1 * found.flag
+    seen: np.ndarray = belief * found.visible / (1 + (disagreement / 2) ** 2)
     return seen

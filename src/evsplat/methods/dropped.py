@@ -75,13 +75,7 @@ PAPER = {
 EVSPLAT = {
     **_RENAMED,
     **_EVENTS,
-    "deform.width": "renamed to width",
-    "deform.non_rigid_start": "renamed to non_rigid_start",
-    "deform.pose_noise": "renamed to pose_noise",
-    "deform.shading": "renamed to shading",
     "deform.shadow_lights": "renamed to lamps",
-    "deform.self_shadow": "renamed to self_shadow",
-    "deform.low_pass": "renamed to low_pass",
     "deform.pose_correction_start": "evsplat reads pose.refine and pose.start instead",
     "deform": "what evsplat reads of it are width, shading, lamps, self_shadow, low_pass, "
     "non_rigid_start and pose_noise",
@@ -94,15 +88,11 @@ EVSPLAT = {
     "semantic_start": "fixed at 2",
     "edi": "gone, sharpened frames as targets lost 0.15 dB (docs/method.md)",
     "event": "its settings begin with event_, as event_weight",
-    "exposure.px_per_render": "renamed to px_per_render",
-    "exposure.most_renders": "renamed to most_renders",
     "exposure": "its settings are px_per_render and most_renders",
     "pose.noisy_rad": "gone, the shape of a curve does not tell exact poses from wrong ones; "
     "body.source of capture.json does (docs/capture-format.md)",
     "windows.pixel_thresholds": "gone, no run showed a gain (docs/method.md)",
     "windows.begun_us": "renamed to event_ramp_us",
-    "windows.clock": "renamed to clock",
-    "windows.contrast_weight": "renamed to contrast_weight",
     "windows": "its settings are event_start, event_eps, event_reach, event_ramp_us, "
     "event_noise_aware, contrast_weight and clock",
     "pose.knot_frames": "fixed at 1",
@@ -113,8 +103,6 @@ HUGS = {
     **_RENAMED,
     "mode": "gone with the mode human; method avatar3dgs reconstructs a person alone",
     "release_compatible": "gone, it repeated slips of the released code (docs/baselines.md)",
-    "triplane.channels": "renamed to channels",
-    "triplane.resolution": "renamed to resolution",
     "triplane": "its settings are channels and resolution",
     "fit.steps": "renamed to fit_steps",
     "fit": "its setting is fit_steps",

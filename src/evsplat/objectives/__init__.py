@@ -1,14 +1,14 @@
 """Losses, each a small object: which times it needs, what it compares."""
 
 from evsplat.objectives.base import Objective, Step
-from evsplat.objectives.event import EventChange, event_loss
+from evsplat.objectives.event import EventChange
 from evsplat.objectives.event_sensor import EventNoise, EventSensor
 from evsplat.objectives.event_windows import EventWindows, HeldOutWindows
 from evsplat.objectives.exposure import Exposure, motion_px, renders_for
 from evsplat.objectives.isometry import Isometry
 from evsplat.objectives.photometric import Alpha, Photometric
 from evsplat.objectives.priors import PosePrior, SkinningPrior
-from evsplat.objectives.semantic import PackedBounds, RenderedSemantics, silhouette_bounds
+from evsplat.objectives.semantic import PackedBounds, RenderedSemantics
 
 __all__ = [
     "Alpha",
@@ -26,8 +26,6 @@ __all__ = [
     "RenderedSemantics",
     "SkinningPrior",
     "Step",
-    "event_loss",
     "motion_px",
     "renders_for",
-    "silhouette_bounds",
 ]

@@ -194,6 +194,8 @@ class PoseSearch:
     """Stature of the person, metres: it alone tells how far away they are."""
     focal: Annotated[str | None, option("auto|PX", default="the capture's")] = None
     """Focal length in pixels, or auto: the one that fits best."""
+    refine: Flag = False
+    """Correct them by drawing the person; taken where it explains unseen pictures better."""
     use: Use = "training"
     """everything: held-out frames are looked at too."""
     held_out_events: Flag = False
@@ -203,6 +205,11 @@ class PoseSearch:
         check_options(self)
         if self.focal not in (None, "auto") and self.focal_px is None:
             raise ConfigError(f"--focal {self.focal}: expected auto or pixels above 0.")
+        if self.focal is not None and self.refine:
+            raise ConfigError(
+                "--refine draws with the capture's own camera, and --focal gives another; leave "
+                "one of them out."
+            )
 
     @property
     def focal_px(self) -> float | None:

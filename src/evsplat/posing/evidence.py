@@ -51,8 +51,9 @@ class Evidence:
     ) -> Terms:
         """Price of the posed rig: mean over the pictures.
 
-        In standard deviations e, a landmark costs ``4 (sqrt(1 + e^2 / 4) - 1)``: half its square
-        where it is near, linear beyond two. A depth d costs ``depth (sqrt(1 + d^2) - 1) / 2``. The
+        In standard deviations e, a landmark costs ``2 log(1 + e^2 / 4)``: half its square where it
+        is near, hardly more where it is lost (a limb that the detector took for another pulls on
+        nothing). A depth d costs ``depth (sqrt(1 + d^2) - 1) / 2``. The
         detector's depths are multiplied by ``exp(scale_log)``; ``blunt`` multiplies ``sigma_px``.
         """
         count = len(self.times_s)
@@ -61,9 +62,9 @@ class Evidence:
         pixels, by_place = self.views.project(places)
         off = pixels - self.places
         sigma = blunt * self.sigma_px
-        root = (1 + off.square().sum(-1) / sigma**2 / 4).sqrt()
-        price = 4 * (self.weight * (root - 1)).sum()
-        weight = self.weight / sigma**2 / root / count
+        ratio = 1 + off.square().sum(-1) / sigma**2 / 4
+        price = 2 * (self.weight * ratio.log()).sum()
+        weight = self.weight / sigma**2 / ratio / count
         rate = (by_place @ by_vector).flatten(1, 2)
         shared = by_shape.shape[-1] + 1
         rate_shared = torch.zeros(count, rate.shape[1], shared, dtype=rate.dtype)
@@ -103,8 +104,8 @@ class Evidence:
         """The price of each picture, as in `terms`."""
         places = self.points.of(posed)
         off = self.views.project(places)[0] - self.places
-        root = (1 + off.square().sum(-1) / (blunt * self.sigma_px) ** 2 / 4).sqrt()
-        price = 4 * (self.weight * (root - 1)).sum(-1)
+        ratio = 1 + off.square().sum(-1) / (blunt * self.sigma_px) ** 2 / 4
+        price = 2 * (self.weight * ratio.log()).sum(-1)
         if self.depths is not None and depth > 0:
             error = self._depth_error(places, scale_log)[0] / depth_m
             root = (1 + error**2).sqrt()

@@ -32,6 +32,7 @@ from evsplat.options.declare import given
 from evsplat.posing.fit import PoseFit, fit_focal, fit_landmarks
 from evsplat.posing.page import poses_page
 from evsplat.posing.problem import FitSettings
+from evsplat.posing.refine import Refined, refine
 from evsplat.posing.rig import Rig, default_rig, make_rig
 
 logger = logging.getLogger(__name__)
@@ -54,7 +55,7 @@ class FoundPoses:
     """The motion behind them."""
     landmarks: Landmarks
     seconds: dict[str, float]
-    """By stage: pictures, landmarks, fit."""
+    """By stage: pictures, landmarks, fit, refinement."""
     summary: str
     """Some lines of text."""
 
@@ -86,7 +87,8 @@ def find_poses(
     """Find the person's poses in a capture and write a new one with them, whole or not at all.
 
     Landmarks on sharpened pictures (`evsplat.landmarks`; or the key points of a file), and a motion
-    fitted to them (`fit_landmarks`). Of the capture is
+    fitted to them (`fit_landmarks`), on wish corrected by drawing the person (`refine`), which is
+    taken where it explains pictures better that it has not seen. Of the capture is
     seen what its policy shows: by default no picture, mask or event of a held-out interval. Poses
     that the capture has are ignored; its true poses between keys, of another body, are left out of
     the new one. ``changes`` are options of `PoseSearch`. ``poses.html`` in the new capture shows
@@ -105,7 +107,7 @@ def find_poses(
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
     seen = capture.for_training(policy)
     stages = _Stages()
-    with tqdm(total=3, desc="poses", unit="stage") as bar:
+    with tqdm(total=3 + search.refine, desc="poses", unit="stage") as bar:
         with stages(bar, "pictures"):
             pictures = sharp_pictures(seen)
         with stages(bar, "landmarks"):
@@ -113,6 +115,11 @@ def find_poses(
         with stages(bar, "fit"):
             fitted, focal_px = _fit(seen, landmarks, rig, search)
         track = fitted.track(key_times(seen))
+        refined: Refined | None = None
+        if search.refine:
+            with stages(bar, "refinement"):
+                refined = refine(track, seen)
+            track = refined.track if refined.better else track
     made = {
         "from": "key points of a file" if keypoints else "landmarks of BlazePose",
         **to_dict(search),
@@ -121,6 +128,8 @@ def find_poses(
         "evsplat": evsplat.__version__,
         "policy": to_dict(seen.policy),
     }
+    if refined is not None:
+        made["refinement"] = {"gain": round(refined.gain, 4), "taken": refined.better}
     with derived_capture(capture, out) as making:
         _write_body(making, track, fitted)
         if focal_px is not None:

@@ -39,13 +39,13 @@ class FitSettings:
     """Their standard deviation, metres."""
     prior: Annotated[float, AtLeast(0)] = 1.0
     """Weight of the pose prior."""
-    calm: Annotated[float, AtLeast(0)] = 1.0
+    calm: Annotated[float, AtLeast(0)] = 10.0
     """Weight of accelerations."""
     shape: Annotated[float, AtLeast(0)] = 0.2
     """Weight of squared shape coefficients."""
     height_m: Annotated[float, Above(0)] | None = None
     """Known stature, crown to sole."""
-    independent_s: Annotated[float, Above(0)] = 0.2
+    independent_s: Annotated[float, Above(0)] = 0.4
     """Time after which a detector's errors are new: it divides the covariance."""
 
 

@@ -28,7 +28,7 @@ COARSE_PX = 64
 """Least side of the pictures that are compared first."""
 UNKNOWN_RAD, UNKNOWN_M = 0.05, 0.02
 """Errors expected of limb joints and of the root's place, per axis, where nobody says."""
-LEAST_GAIN = 0.12
+LEAST_GAIN = 0.05
 """Share by which pictures kept aside must be explained better, for certain, for a motion to count
 as better. What discs cannot show of a person changes true motions, to a gain below it."""
 _LEAST_RAD, _LEAST_M = 0.006, 0.004
@@ -160,7 +160,7 @@ class _Descent:
         look = self.look
         return [
             {"params": [look.colours], "rate": _RATES["colours"]},
-            {"params": [look.offsets, look.inset], "rate": _RATES["offsets"]},
+            {"params": [look.offsets, look.bone_offsets, look.inset], "rate": _RATES["offsets"]},
             {"params": [look.light], "rate": _RATES["light"]},
         ]
 

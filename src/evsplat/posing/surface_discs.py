@@ -23,8 +23,9 @@ _OFFSET_M = 0.01
 class SurfaceDiscs(nn.Module):
     """N discs of the canonical body, with what is learned of the person's look.
 
-    Each has a colour and an offset along its normal, for clothes and hair; all share a light:
-    shares that the spherical harmonics of the normal in the world add to the colours.
+    Each has a colour and an offset along its normal, and each bone one in any direction, for
+    clothes, hair, and hands that are held in another way; all share a light: shares that the
+    spherical harmonics of the normal in the world add to the colours.
     """
 
     quaternions: Tensor
@@ -47,12 +48,15 @@ class SurfaceDiscs(nn.Module):
         # A disc at an outline reaches beyond it by about its width.
         self.inset = nn.Parameter(torch.tensor(-width / _OFFSET_M))
         self.offsets = nn.Parameter(torch.zeros(count))
+        self.bone_offsets = nn.Parameter(torch.zeros(len(body.parents), 3))
         self.light = nn.Parameter(torch.zeros(8))
 
     def splats(self, rotations: Float[Tensor, "T J 3 3"], transl: Float[Tensor, "T 3"]) -> Splats:
         """The discs in a pose per time."""
         normals = self.samples.normals
-        points = self.samples.points + normals * _OFFSET_M * (self.inset + self.offsets)[:, None]
+        offsets = normals * (self.inset + self.offsets)[:, None]
+        offsets = offsets + self.samples.weights @ self.bone_offsets
+        points = self.samples.points + _OFFSET_M * offsets
         bones = self.body.canonical_to_world(rotations, transl)
         means, blended = skin(points, self.samples.weights, bones)
         linear = blended[..., :3, :3]
@@ -94,7 +98,8 @@ class SurfaceDiscs(nn.Module):
 
     def price(self) -> Float[Tensor, ""]:
         """What offsets and light cost, as minus the logarithm of a prior."""
-        return 0.5 * self.offsets.square().sum() + 2 * self.light.square().sum()
+        offsets = self.offsets.square().sum() + self.bone_offsets.square().sum()
+        return 0.5 * offsets + 2 * self.light.square().sum()
 
 
 def _harmonics(normals: Float[Tensor, "*T N 3"]) -> Float[Tensor, "*T N 8"]:

@@ -25,6 +25,7 @@ from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_conf
 from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
+from evsplat.models.layers import Layers
 from evsplat.models.model import Model
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
@@ -36,6 +37,9 @@ from evsplat.training.checkpoint import (
 )
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
+
+_NAMED_RUNS = 5
+"""Runs that an error about the folder above them names, at most."""
 
 
 class RunFolder:
@@ -111,8 +115,7 @@ class GaussianReconstruction:
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
         with torch.no_grad():
-            camera = camera.to(self.model.device)
-            layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+            camera, layers = self._posed(camera, times_us)
             if parts == "all":
                 drawing = draw(
                     layers, camera, backdrop=self.backdrop, shadow_step_px=self.shadow_step_px
@@ -136,10 +139,13 @@ class GaussianReconstruction:
     ) -> Float[Tensor, "T H W"]:
         """Mean of z in the camera over what a pixel shows, metres; 0 where it shows nothing."""
         with torch.no_grad():
-            camera = camera.to(self.model.device)
-            layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+            camera, layers = self._posed(camera, times_us)
             depth = draw_depth(layers, camera, parts=parts).cpu()
         return depth.expand(len(times_us), *depth.shape[1:])
+
+    def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
+        camera = camera.to(self.model.device)
+        return camera, self.model.at(list(times_us), camera.center(), hard_semantics=True)
 
     @property
     def track(self) -> BodyTrack:
@@ -164,8 +170,7 @@ class GaussianReconstruction:
         Channels are R, G, B (sRGB) and the semantic attribute (1 = person). Colours that depend on
         the direction are those seen from ``camera``.
         """
-        center = camera.to(self.model.device).center()
-        layers = self.model.at(list(times_us), center, hard_semantics=True)
+        _, layers = self._posed(camera, times_us)
         if parts == "all":
             return [layers.human, shadowed_scene(layers)]
         return [layers.human if parts == "human" else layers.scene]
@@ -212,10 +217,21 @@ class Run:
     """Whether the method learned nothing but the person and draws it on black."""
 
 
+def _runs_below(path: Path) -> str:
+    """A sentence that names the runs one level below, the newest first; empty where none is."""
+    runs = sorted(path.glob("*/config.yaml"), key=lambda file: -file.stat().st_mtime)
+    if not runs:
+        return ""
+    names = ", ".join(str(file.parent) for file in runs[:_NAMED_RUNS])
+    return f" A run lies below: {names}." if len(runs) == 1 else f" Runs lie below: {names}."
+
+
 def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     """Method, configuration and facts of a run folder."""
     if not folder.config.exists():
-        raise DataError(f"{folder.path}: not a run folder, config.yaml is missing.")
+        raise DataError(
+            f"{folder.path}: not a run folder, config.yaml is missing.{_runs_below(folder.path)}"
+        )
     values = load_yaml(folder.config)
     method = values.pop("method", DEFAULT_METHOD)
     try:

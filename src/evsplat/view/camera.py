@@ -68,14 +68,6 @@ def vertical_fov(camera: Camera) -> float:
     return 2 * math.atan(camera.height / 2 / float(camera.K[1, 1]))
 
 
-def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The same view with another number of pixels."""
-    K = camera.K.clone()
-    K[0] *= width / camera.width
-    K[1] *= height / camera.height
-    return replace(camera, width=width, height=height, K=K)
-
-
 def forward(camera: Camera) -> np.ndarray:
     """Unit vector along the optical axis, in the world."""
     return camera.world_to_camera[2, :3].double().numpy()

@@ -16,7 +16,7 @@ from evsplat.events.maps import count_map
 from evsplat.film import camera_at
 from evsplat.inspection.drawing import BRIGHTER, DARKER, font
 from evsplat.methods.trivial import nearest_in_time
-from evsplat.view.camera import Box, letterboxed, resized
+from evsplat.view.camera import Box, letterboxed
 from evsplat.view.request import BLURRY, SHARP, ViewRequest
 from evsplat.view.viewed_run import ViewedRun
 
@@ -36,14 +36,6 @@ class Pane:
     box: Box | None
     """Box of the recorded picture; None for a camera that recorded nothing."""
 
-    def resized(self, width: int, height: int) -> "Pane":
-        """The same view with another number of pixels."""
-        x, y = width / self.camera.width, height / self.camera.height
-        box = self.box
-        if box is not None:
-            box = Box(x * box.left, y * box.top, x * box.width, y * box.height)
-        return Pane(resized(self.camera, width, height), box)
-
 
 class Compositor:
     """Draws requests for one run, or for two runs of one capture."""
@@ -61,8 +53,7 @@ class Compositor:
         other = request.compare if self._can_compare(request) else None
         beside = request.layout == "side by side" and other is not None
         share = 0.5 if beside else 1.0
-        pane = self._pane(request, round(share * request.width), request.height)
-        pane = pane.resized(round(share * width), height)
+        pane = self._pane(request, round(share * width), height)
         picture, labels = self._run_picture(self.viewed, pane, request, draft), []
         if other is not None:
             left = self._compared(other, request, pane, picture, draft)

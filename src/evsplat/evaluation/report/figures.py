@@ -28,7 +28,8 @@ def figures(source: Source) -> str:
         return section("Figures", why[0].upper() + why[1:], "")
     first, *others = tables_of(metrics)
     compat = "".join(folded(table.title, _with_note(table)) for table in others)
-    missing = "".join(f"<li>{escape(reason)}</li>" for reason in missing_networks(metrics))
+    remarks = [*metrics.get("remarks", ()), *missing_networks(metrics)]
+    missing = "".join(f"<li>{escape(remark)}</li>" for remark in remarks)
     against = metrics.get("blurry_ground_truth", {}).get("full", {}).get("psnr")
     blurry = (
         f"<li>Against the blurry pictures instead of the sharp truth (no measure of deblurring): "

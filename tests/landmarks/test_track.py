@@ -1,0 +1,176 @@
+"""The person found and tracked, and what is refused instead of finding a wrong one."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from evsplat.body.skeleton import find_skeleton
+from evsplat.capture import Policy, load_body_track, load_capture
+from evsplat.errors import DataError
+from evsplat.landmarks import LandmarkNetwork, find_landmarks, sharp_pictures
+from evsplat.landmarks.detect import MIRRORED, Region, find_in
+from evsplat.landmarks.landmarks import BLAZEPOSE_33
+from evsplat.landmarks.motion import Motion, global_shift, pieces
+from evsplat.landmarks.pictures import SharpPicture
+from evsplat.landmarks.refusals import refuse_half_out_of_view, refuse_moving_camera
+from evsplat.landmarks.track import _Tracker
+from evsplat.shipped import demo_capture
+
+JOINTS = {"shoulder": "upper_arm", "elbow": "forearm", "knee": "shin", "ankle": "foot"}
+
+
+class Changed:
+    """A capture whose pictures are changed on reading."""
+
+    def __init__(self, capture, change: Callable, static: bool = True):
+        self._capture, self._change, self.is_static_camera = capture, change, static
+
+    def __getattr__(self, name):
+        return getattr(self._capture, name)
+
+    def image(self, frame):
+        return self._change(self._capture.image(frame), frame.index)
+
+    def median_background(self):
+        pictures = torch.stack([self.image(frame) for frame in self.train_frames])
+        return pictures.median(0).values
+
+
+@pytest.fixture(scope="module")
+def network() -> LandmarkNetwork:
+    return LandmarkNetwork()
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return load_capture(demo_capture())
+
+
+@pytest.fixture(scope="module")
+def training(demo):
+    return demo.for_training(Policy())
+
+
+@pytest.fixture(scope="module")
+def middles(training):
+    return sharp_pictures(training, fractions=(0.5,))
+
+
+def blurry(capture, every: int) -> list[SharpPicture]:
+    frames = capture.train_frames[::every]
+    return [SharpPicture(frame.mid_us, capture.image(frame), frame, 2.0) for frame in frames]
+
+
+def test_the_person_of_the_demo_capture_is_found(demo, training, middles, network):
+    found = find_landmarks(training, middles[::8], network=network, progress=False)
+    track = load_body_track(demo)
+    joints = track.body.joint_transforms(*track.at(torch.as_tensor(found.times_us)))[..., :3, 3]
+    true = demo.camera(demo.frames[0]).project(joints)[0].numpy()
+    skeleton = find_skeleton(track.body.parents, track.body.joint_names)
+    pairs = [
+        (found.index(f"{side}_{name}"), skeleton.limbs[f"{side}_{part}"])
+        for name, part in JOINTS.items()
+        for side in ("left", "right")
+    ]
+    here, there = (list(column) for column in zip(*pairs, strict=True))
+    error = np.linalg.norm(found.places[:, here] - true[:, there], axis=-1)
+    height = np.ptp(true[..., 1], axis=1).mean()
+    assert np.median(error) < 0.025 * height
+    ratio = error / found.sigma_px[:, here]
+    assert 0.4 < np.median(ratio) < 2.5
+    assert (found.seen > 0).all() and (np.diff(found.times_us) > 0).all()
+
+
+def test_names_change_sides_in_a_mirror():
+    for index, name in enumerate(BLAZEPOSE_33):
+        other = BLAZEPOSE_33[MIRRORED[index]]
+        assert (
+            other == name
+            if name == "nose"
+            else {"left", "right"} <= set(f"{name}_{other}".split("_"))
+        )
+    assert (MIRRORED[MIRRORED] == np.arange(39)).all()
+
+
+def test_a_mirrored_picture_has_mirrored_landmarks(middles, network):
+    picture = middles[0].image
+    width = picture.shape[1]
+    region = Region(np.array([width / 2, picture.shape[0] / 2]), 0.9 * width)
+    one, other = find_in(network, picture, region), find_in(network, picture.flip(1), region)
+    swap = MIRRORED[:33]
+    mirrored = other.places[swap] * [-1, 1] + [width, 0]
+    assert np.median(np.linalg.norm(one.places - mirrored, axis=-1)) < 0.02 * width
+    assert np.median(np.abs(one.world - other.world[swap] * [-1, 1, 1])) < 0.05
+
+
+def test_the_person_is_found_upside_down(training, middles, network):
+    tracker = _Tracker(network, Motion(training))
+    picture = middles[0].image
+    height, width = picture.shape[:2]
+    region = Region(np.array([width / 2, height / 2]), float(max(height, width)))
+    upright = tracker.search(picture, [region])
+    turned = tracker.search(picture.flip(0, 1), [region])
+    there = np.array([width, height]) - turned.places
+    assert np.median(np.linalg.norm(upright.places - there, axis=-1)) < 0.02 * width
+    assert abs(abs(turned.region.angle) - np.pi) < 0.4
+
+
+def test_nobody_is_one_sentence(tiny_capture, network):
+    capture = load_capture(tiny_capture()).for_training(Policy())
+    with pytest.raises(DataError, match="nobody was found in .* of 1 pictures"):
+        find_landmarks(capture, blurry(capture, 10), network=network, progress=False)
+
+
+def test_a_second_person_is_one_sentence(training, network):
+    background = training.median_background()
+    side = background.shape[1] // 3
+
+    def double(picture, index):
+        """The person again, a third of the picture to the side."""
+        moved = picture.roll(side, 1)
+        there = (moved - background.roll(side, 1)).abs().amax(-1, keepdim=True) > 0.08
+        return torch.where(there, moved, picture)
+
+    capture = Changed(training, double)
+    with pytest.raises(DataError, match="second person"):
+        find_landmarks(capture, blurry(capture, 11), network=network, progress=False)
+
+
+def test_a_person_beyond_the_border_is_one_sentence(training, middles):
+    places = np.full((4, 33, 2), 40.0)
+    refuse_half_out_of_view(training, middles[:4], places)
+    places[:3, 23:] = [40, 1000]
+    with pytest.raises(DataError, match="partly out of view in 3 of 4 pictures"):
+        refuse_half_out_of_view(training, middles[:4], places)
+
+
+def test_a_moving_background_is_one_sentence_and_a_moving_person_is_not(training, middles):
+    box = np.array([[60.0, 40.0], [160.0, 240.0]])
+    places = np.resize(box, (len(middles), 33, 2))
+    refuse_moving_camera(training, (middles, places))
+    shaken = Changed(training, lambda picture, index: picture.roll((3 * index, -2 * index), (0, 1)))
+    with pytest.raises(DataError, match="background moves by 4 pixels"):
+        refuse_moving_camera(shaken, (middles, places))
+    with pytest.raises(DataError, match="has a moving camera"):
+        refuse_moving_camera(Changed(training, None, static=False), None)
+
+
+def test_shifts_are_found_outside_of_what_moves_alone():
+    generator = torch.Generator().manual_seed(0)
+    picture = torch.rand(60, 80, 3, generator=generator)
+    after = picture.roll((2, -5), (0, 1))
+    still = np.ones((60, 80), bool)
+    still[20:40, 30:60] = False
+    after[20:40, 30:60] = torch.rand(20, 30, 3, generator=generator)
+    assert global_shift(picture, after, still) == (-5.0, 2.0)
+    assert global_shift(picture, picture, still) == (0.0, 0.0)
+
+
+def test_pieces_near_each_other_are_one():
+    moving = np.zeros((100, 120), bool)
+    moving[10:40, 20:30] = moving[41:60, 20:30] = moving[80:85, 100:110] = True
+    first, second = pieces(moving)
+    assert (first.x0, first.y0, first.x1, first.y1) == (20, 10, 30, 60)
+    assert second.side == 10
