@@ -102,10 +102,10 @@ def main() -> None:
                 refined = refine(track, seen)
                 seconds = time.process_time() - began
                 before, after = errors(track, capture), errors(refined.track, capture)
-                rows.append((level, before, after, after if refined.better else before))
+                rows.append((level, before, after, after if refined.disproves else before))
                 print(
                     f"{path.name:32} gain {refined.gain:.3f} +- {refined.gain_error:.3f}, "
-                    f"{'better' if refined.better else 'not better'}, {seconds:.0f} s:",
+                    f"{'wrong' if refined.disproves else 'not told wrong'}, {seconds:.0f} s:",
                     ", ".join(f"{name} {before[name]:.2f} -> {after[name]:.2f}" for name in before),
                     flush=True,
                 )

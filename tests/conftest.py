@@ -129,7 +129,7 @@ def write_tiny_capture(
         "cameras": cameras,
         "frames": entries,
         "novel_views": views,
-        "body": {"file": "body.npz", "model": "rig"},
+        "body": {"file": "body.npz", "model": "rig", "source": "exact"},
         "events": {
             "file": "events.h5",
             "width": width,

@@ -15,7 +15,7 @@ from evsplat.evaluation import evaluate
 from evsplat.evaluation import run as evaluation_run
 from evsplat.evaluation.event_maps import chosen_pairs
 from evsplat.evaluation.protocols import METRICS, PSNR_CEILING_DB, REGIONS
-from evsplat.evaluation.tables import latex, markdown
+from evsplat.evaluation.tables import write_tables
 from evsplat.methods.trivial import MedianBackground
 from evsplat.similarity.lpips import WEIGHTS_VARIABLE
 
@@ -78,9 +78,10 @@ def test_training_frames_are_measured_against_their_own_truth(tiny_capture, tmp_
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert {f"train_{name}_render.png" for name in names} <= written
     assert {f"test_{frame.name}_render.png" for frame in capture.test_frames} <= written
-    text = markdown({**trained, "policy": {}})
+    write_tables(tmp_path, {**trained, "policy": {}})
+    text = (tmp_path / "metrics_train.md").read_text("utf-8")
     assert f"Means over {len(names)} training frames" in text and "training saw it" in text
-    assert "Training frames" in latex({**trained, "policy": {}})
+    assert "Training frames" in (tmp_path / "metrics_train.tex").read_text("utf-8")
 
 
 def test_training_frames_without_truth_are_refused(tiny_capture, tmp_path):
@@ -99,7 +100,9 @@ def test_a_person_who_is_in_no_frame_is_remarked(tiny_capture, tmp_path, caplog)
     metrics = run(path, tmp_path / "b")
     (remark,) = metrics["remarks"]
     assert "the person is in no test frame" in remark and remark in caplog.text
-    assert remark in markdown({**metrics, "policy": {}})
+    write_tables(tmp_path, {**metrics, "policy": {}})
+    words = (tmp_path / "metrics.md").read_text("utf-8").replace("\\", "")
+    assert remark in words
 
 
 def test_missing_weights_are_null_with_the_reason(tiny_capture, tmp_path):

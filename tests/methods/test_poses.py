@@ -3,6 +3,7 @@
 import json
 import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 
 from evsplat.capture import Capture, TrainingCapture, load_body_track, load_capture
 from evsplat.errors import ConfigError
+from evsplat.methods import poses
 from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.poses import Poses, prepare_poses
 from evsplat.training.clock import Clock
@@ -31,8 +33,14 @@ def with_errors(path: Path, **fields) -> None:
     np.savez(path / "body.npz", **body | fields)
     if source is not None:
         document = json.loads((path / "capture.json").read_text("utf-8"))
-        document["body"]["source"] = source
+        document["body"]["source"] = source or None
         (path / "capture.json").write_text(json.dumps(document), "utf-8")
+
+
+@pytest.fixture(autouse=True)
+def _few_steps(monkeypatch):
+    """What is found before training is another test's (tests/posing/test_refine.py)."""
+    monkeypatch.setattr(poses, "refine", partial(poses.refine, steps=(4, 4), discs=100))
 
 
 @pytest.fixture
@@ -103,6 +111,7 @@ def test_what_a_capture_says_of_its_poses_counts_whatever_their_curve(seed, sour
 def test_what_was_found_out_is_part_of_the_state(captures, tiny_capture):
     """Of poses that say nothing: built to be loaded, the state decides."""
     path = tiny_capture("silent", frames=20)
+    with_errors(path, source=False)
     given = prepare_poses(EvsplatConfig().pose, seen(path), fit=False).correction
     torch.nn.init.normal_(given.errors["fast"].rotations)
     state = given.state_dict()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, axis_angle_to_matrix, default_body
 from evsplat.body.smoothing import spline_error
@@ -137,7 +138,7 @@ def test_what_holds_throughout_and_what_drifts_reaches_held_out_times(seed):
     )
     learned = correction(track, joint_rad=0.1, frames=~unseen)
     goal, zero = torch.from_numpy(wrong).float(), torch.zeros(KEYS, 3)
-    learned.start_at(track.times_us[~unseen].tolist(), goal[~unseen], zero[~unseen])
+    learned.fit(track.times_us[~unseen].tolist(), goal[~unseen], zero[~unseen], misfit=0.05)
     found = learned.residual(track.times_us.tolist())[0].detach()
 
     def rms(value, times):
@@ -155,7 +156,7 @@ def test_the_start_is_the_likeliest_of_given_residuals():
     times = track.times_us.tolist()
     turns = torch.from_numpy(rng.normal(size=track.poses.shape)).float()
     shifts = torch.from_numpy(rng.normal(size=(KEYS, 3))).float()
-    learned.start_at(times, turns, shifts, misfit=0.3)
+    learned.fit(times, turns, shifts, misfit=0.3)
     parts = {name: spline.weights(times).double() for name, spline in learned.errors.items()}
     design = torch.cat([SHARES[name] ** 0.5 * part for name, part in parts.items()], 1).numpy()
     covariance = design @ design.T
@@ -164,3 +165,21 @@ def test_the_start_is_the_likeliest_of_given_residuals():
     expected = np.einsum("st,tjc->sjc", gain, turns.double().numpy())
     assert np.allclose(found[0].detach(), expected, atol=1e-4)
     assert np.allclose(found[1].detach(), gain @ shifts.double().numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_started_at_a_better_motion_it_counts_and_gives_that_motion(seed):
+    rng, given = np.random.default_rng(seed), dance(seed)
+    turns = Rotation.from_rotvec(rng.normal(scale=0.05, size=(given.poses.size // 3, 3)))
+    poses = (Rotation.from_rotvec(given.poses.reshape(-1, 3)) * turns).as_rotvec()
+    place = given.transl + rng.normal(scale=0.02, size=given.transl.shape)
+    better = BodyTrack(given.body, given.times_us, poses.reshape(given.poses.shape), place)
+    learned = correction(given, joint_rad=0.05, root_m=0.02)
+    assert not bool(learned.started)
+    learned.start_at(given, better, misfit=1e-3)
+    times = given.times_us.tolist()
+    (found, at), (expected, there) = given.at(times), better.at(times)
+    corrected, shifts = (value.detach() for value in learned.residual(times))
+    assert torch.allclose(found @ axis_angle_to_matrix(corrected), expected, atol=2e-3)
+    assert torch.allclose(at + shifts, there, atol=1e-3)
+    assert bool(learned.started)

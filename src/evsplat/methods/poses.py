@@ -10,9 +10,10 @@ from evsplat.body import BodyTrack, PoseSource
 from evsplat.body.smoothing import motion_noise, moving_joints, smoothed, spline_error
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
-from evsplat.errors import ConfigError
+from evsplat.errors import ConfigError, DataError
 from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, Weight
 from evsplat.models.pose_correction import SHARES, PoseCorrection
+from evsplat.posing.refine import Refined, refine
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +83,8 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
             track, most_rad=new * float(joint_rad.max()), most_m=new * float(root_m.max())
         )
         track = smoothed(track, noise)
-    decided = exact if exact is not None else not fit or motion_noise(track).rotation_rad < 0.006
+    found = _refined(track, capture) if fit and exact is not True else None
+    decided = exact if exact is not None else found is None or not found.disproves
     if exact is not False and decided and fit:
         _refuse_unread(config, capture)
     if fit:
@@ -94,7 +96,25 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
     correction = PoseCorrection(
         track, frames_us, joint_rad=joint_rad, root_m=root_m, between=between, exact=decided
     )
+    if found is not None and found.better and not decided:
+        correction.start_at(track, found.track)
     return Poses(track, correction)
+
+
+def _refined(track: BodyTrack, capture: TrainingCapture) -> Refined | None:
+    """Other poses, found without any Gaussian; None where a moving camera rules them out."""
+    try:
+        found = refine(track, capture)
+    except DataError as error:
+        logger.info("given poses are not compared with others: %s", error)
+        return None
+    logger.info(
+        "other poses explain the pictures %.0f +- %.0f %% better than the given ones (%.0f s)",
+        100 * found.gain,
+        100 * found.gain_error,
+        found.seconds,
+    )
+    return found
 
 
 def _expected(config: PoseSettings, track: BodyTrack) -> tuple[np.ndarray, np.ndarray]:

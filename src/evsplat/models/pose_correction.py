@@ -1,10 +1,12 @@
 """Learned errors of given poses: what holds throughout, what drifts, what is new in every key."""
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack
@@ -34,6 +36,8 @@ class PoseCorrection(nn.Module):
     """
 
     exact: Tensor
+    started: Tensor
+    """True where the errors began at what was found before training: they count from the start."""
     key_us: Tensor
     joint_rad: Tensor
     root_m: Tensor
@@ -81,6 +85,13 @@ class PoseCorrection(nn.Module):
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
         self.register_buffer("exact", torch.tensor(exact))
+        self.register_buffer("started", torch.tensor(False))
+
+    def _apply(self, fn: Any, recurse: bool = True) -> "PoseCorrection":
+        exact, started = self.exact, self.started
+        super()._apply(fn, recurse)
+        self.exact, self.started = exact, started  # read on the host in every step
+        return self
 
     def residual(
         self, times_us: Sequence[int] | Tensor
@@ -152,19 +163,28 @@ class PoseCorrection(nn.Module):
             assert isinstance(spline, PoseSpline)
             yield name, spline
 
-    def start_at(
+    def start_at(self, given: BodyTrack, better: BodyTrack, *, misfit: float = 0.05) -> None:
+        """Set the errors to the likeliest that turn the given motion into a better one.
+
+        Ridge regression at the given keys: each unknown has variance one, and the better motion
+        errs by ``misfit`` in units of what is expected. From then on the errors count.
+        """
+        times = given.times_us.tolist()
+        (given_turns, given_shifts), (turns, shifts) = given.at(times), better.at(times)
+        apart = (given_turns.mT @ turns).double().cpu().numpy()
+        vectors = Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec()
+        turned = torch.from_numpy(vectors).to(shifts).view(*apart.shape[:2], 3)
+        self.fit(times, turned, shifts - given_shifts, misfit=misfit)
+
+    def fit(
         self,
         times_us: Sequence[int],
         turns: Float[Tensor, "T J 3"],
         shifts: Float[Tensor, "T 3"],
         *,
-        misfit: float = 0.05,
+        misfit: float,
     ) -> None:
-        """Set the errors to the likeliest that give these residuals at ``times_us``.
-
-        Ridge regression: each unknown has variance one by its share, and what is given errs by
-        ``misfit`` in units of what is expected.
-        """
+        """Set the errors to the likeliest that give these residuals; see `start_at`."""
         times = torch.as_tensor(times_us, dtype=torch.float64)
         joint_rad, root_m = self._expected(times)
         goal_turns = torch.where(joint_rad[..., None] > 0, turns / joint_rad[..., None], 0.0)
@@ -172,7 +192,7 @@ class PoseCorrection(nn.Module):
         design = torch.cat(
             [SHARES[name] ** 0.5 * spline.weights(times) for name, spline in parts], 1
         ).double()
-        goal = torch.cat((goal_turns.flatten(1), shifts / root_m), 1).double()
+        goal = torch.cat((goal_turns.flatten(1), shifts / root_m.clamp_min(1e-6)), 1).double()
         normal = design.T @ design + misfit**2 * torch.eye(design.shape[1], dtype=torch.float64)
         found = torch.linalg.solve(normal, design.T @ goal).float()
         with torch.no_grad():
@@ -181,6 +201,7 @@ class PoseCorrection(nn.Module):
             ):
                 spline.rotations.copy_(values[:, :-3].view_as(spline.rotations))
                 spline.translations.copy_(values[:, -3:])
+            self.started.fill_(True)
 
     def forget(self) -> None:
         """Set all residuals to zero."""

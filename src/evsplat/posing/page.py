@@ -75,7 +75,7 @@ def poses_page(
         + section("Made with", "", f"<p class='note'>{escape(str(dict(made)))}</p>")
         + "</main>"
     )
-    return document(f"{name}: poses", body, style=_STYLE)
+    return document(f"{name}: poses", body, style="poses.css")
 
 
 _SURE = (
@@ -85,10 +85,6 @@ _SURE = (
 _DOUBT = (
     "Limbs that may as well point the other way in depth, and the pictures whose landmarks lie "
     "farthest from the pose."
-)
-_STYLE = (
-    ".tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(250px,1fr));gap:12px}"
-    ".tiles img{width:100%;height:auto;border-radius:6px}"
 )
 
 

@@ -112,6 +112,12 @@ class DiscModel(PosedModel):
         """The nearest points of the body's surface."""
         return {"surface": self.surface}
 
+    @property
+    def residual_active(self) -> bool:
+        """Whether the pose residual counts: from its start, or where it began at what was found."""
+        found = self.residual is not None and bool(self.residual.started)
+        return found or super().residual_active
+
     def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Weights of the bones that `at` draws the person's Gaussians with, for any centres."""
         return self.surface.weights(self.gaussians.means[self.gaussians.human])
