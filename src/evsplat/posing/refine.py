@@ -29,9 +29,9 @@ COARSE_PX = 64
 UNKNOWN_RAD, UNKNOWN_M = 0.05, 0.02
 """Errors expected of limb joints and of the root's place, per axis, where nobody says."""
 LEAST_GAIN = 0.12
-"""Share by which pictures kept aside must be explained better, for certain, for given poses to count
-as wrong. What discs cannot show of a person moves true motions: exact poses of staged people were
-explained up to 0.08 better, fitted ones of a real recording 0.15."""
+"""Share by which pictures kept aside must be explained better, for certain, for given poses to
+count as wrong. What discs cannot show of a person moves true motions: exact poses of staged people
+were explained up to 0.08 better, fitted ones of a real recording 0.15."""
 _LEAST_RAD, _LEAST_M = 0.006, 0.004
 """Errors that discs make of true motions, per axis: clothes, hair and hands are not the body's."""
 _MISFIT = 0.06
