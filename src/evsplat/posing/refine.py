@@ -166,7 +166,7 @@ class _Descent:
         look = self.look
         return [
             {"params": [look.colours], "rate": _RATES["colours"]},
-            {"params": [look.offsets, look.bone_offsets, look.inset], "rate": _RATES["offsets"]},
+            {"params": [look.offsets, look.bone_offsets, look.inset, look.layer], "rate": _RATES["offsets"]},
             {"params": [look.light], "rate": _RATES["light"]},
         ]
 

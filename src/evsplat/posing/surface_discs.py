@@ -18,6 +18,9 @@ _FLATNESS = 0.1
 _OPACITY = 0.95
 _OFFSET_M = 0.01
 """How far clothes and hair typically lie from the bare body."""
+_LAYER_M, _LAYER_REACH_M = 0.015, 0.05
+"""Thickness of clothes, hair and shoes that neighbours share, and how far it is about the same."""
+_ANCHORS = 300
 
 
 class SurfaceDiscs(nn.Module):
@@ -28,6 +31,7 @@ class SurfaceDiscs(nn.Module):
     spherical harmonics of the normal in the world add to the colours.
     """
 
+    near: Tensor
     quaternions: Tensor
     scales: Tensor
 
@@ -48,13 +52,16 @@ class SurfaceDiscs(nn.Module):
         # A disc at an outline reaches beyond it by about its width.
         self.inset = nn.Parameter(torch.tensor(-width / _OFFSET_M))
         self.offsets = nn.Parameter(torch.zeros(count))
+        self.register_buffer("near", _nearness(self.samples.points, _ANCHORS))
+        self.layer = nn.Parameter(torch.zeros(self.near.shape[1]))
         self.bone_offsets = nn.Parameter(torch.zeros(len(body.parents), 3))
         self.light = nn.Parameter(torch.zeros(8))
 
     def splats(self, rotations: Float[Tensor, "T J 3 3"], transl: Float[Tensor, "T 3"]) -> Splats:
         """The discs in a pose per time."""
         normals = self.samples.normals
-        offsets = normals * (self.inset + self.offsets)[:, None]
+        layer = _LAYER_M / _OFFSET_M * (self.near @ self.layer)
+        offsets = normals * (self.inset + self.offsets + layer)[:, None]
         offsets = offsets + self.samples.weights @ self.bone_offsets
         points = self.samples.points + _OFFSET_M * offsets
         bones = self.body.canonical_to_world(rotations, transl)
@@ -99,6 +106,7 @@ class SurfaceDiscs(nn.Module):
     def price(self) -> Float[Tensor, ""]:
         """What offsets and light cost, as minus the logarithm of a prior."""
         offsets = self.offsets.square().sum() + self.bone_offsets.square().sum()
+        offsets = offsets + self.layer.square().sum()
         return 0.5 * offsets + 2 * self.light.square().sum()
 
 
@@ -106,6 +114,13 @@ def _harmonics(normals: Float[Tensor, "*T N 3"]) -> Float[Tensor, "*T N 8"]:
     """Spherical harmonics of first and second order, up to factors."""
     x, y, z = normals.unbind(-1)
     return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], -1)
+
+
+def _nearness(points: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "N A"]:
+    """Shares of A of the points, spread out, in each: rows of unit length."""
+    apart = torch.cdist(points, points[: min(count, len(points))])
+    near = torch.exp(-0.5 * (apart / _LAYER_REACH_M).square())
+    return torch.nn.functional.normalize(near, dim=1)
 
 
 def _far_apart(points: Float[Tensor, "M 3"], count: int) -> Int[Tensor, "N"]:
