@@ -46,6 +46,13 @@ class CaptureReader:
         frames = tuple(replace(frame, split="train") for frame in self.frames)
         return type(self)(replace(self._metadata, frames=frames))
 
+    def with_focal(self, focal_px: float) -> Self:
+        """The same recording by cameras of another focal length, but for those of novel views."""
+        cameras = dict(self.cameras)
+        for name in {frame.camera for frame in self.frames}:
+            cameras[name] = cameras[name].with_focal(focal_px)
+        return type(self)(replace(self._metadata, cameras=cameras))
+
     @property
     def metadata(self) -> Metadata:
         """All of capture.json; what other parts need is given by the other members."""

@@ -60,7 +60,9 @@ def find_landmarks(
     tracker = _Tracker(network, motion)
     found = [
         tracker.find(picture)
-        for picture in tqdm(pictures, "landmarks", unit="picture", disable=not progress)
+        for picture in tqdm(
+            pictures, "landmarks", unit="picture", leave=False, disable=not progress
+        )
     ]
     tracker.look_back(pictures, found)
     refuse_nobody(capture, pictures, found)

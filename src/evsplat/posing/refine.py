@@ -22,6 +22,7 @@ from evsplat.errors import DataError
 from evsplat.posing.correction import Correction
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets, find_targets
+from evsplat.posing.time_limit import TimeLimit
 
 DISCS = 4_000
 COARSE_PX = 64
@@ -45,6 +46,8 @@ _RATES = {"motion": 0.05, "colours": 0.03, "offsets": 0.1, "light": 0.01}
 _PARTS = 3
 """Every so many-th picture is drawn in a step."""
 _PROBES = 4
+_PROBE_STEPS = 2 * _PARTS
+"""Steps that each takes as long as."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,8 @@ def refine(
     track: BodyTrack,
     capture: TrainingCapture,
     *,
+    seconds: float | None = None,
+    progress: bool = False,
     steps: tuple[int, int] = _STEPS,
     discs: int = DISCS,
     seed: int = 0,
@@ -94,25 +99,28 @@ def refine(
 
     Pictures in the middle of exposures are kept aside for the `gain`. Where the policy shows events
     of held-out frames, pictures carried there by events count as well. ``steps``: of the coarse
-    and of the fine part.
+    and of the fine part, fewer where they would take more than ``seconds``.
 
     Raises:
         DataError: the camera moves, or the posed body is in no picture.
     """
     began = time.monotonic()
+    planned = 3 * _LOOK_STEPS + sum(steps) + _PROBES * _PROBE_STEPS
+    limit = TimeLimit(seconds, planned, progress=progress)
     targets = find_targets(track, capture)
     joint_rad, root_m = expected_errors(track)
     correction = Correction(track, joint_rad, root_m)
     look = SurfaceDiscs(track.body, discs, torch.Generator().manual_seed(seed))
     aside = _middles(targets)
     fitted = sorted(set(range(len(targets.times_us))) - set(aside)) or aside
-    descent = _Descent(correction, look, targets.rows(fitted))
+    descent = _Descent(correction, look, targets.rows(fitted), limit)
     coarse = max(1, min(targets.camera.width, targets.camera.height) // COARSE_PX)
     stages: list[Stage] = []
     for shrink, count in zip(dict.fromkeys((coarse, 1)), steps, strict=False):
         stages.append(descent.run(shrink, count, first=not stages))
     errors = descent.errors()
     gain, gain_error = _gain(descent, targets.rows(aside))
+    limit.close()
     return Refined(
         correction.corrected(errors), gain, gain_error, tuple(stages), time.monotonic() - began
     )
@@ -141,8 +149,15 @@ def _anatomical(body: Body) -> Float[np.ndarray, "J"]:
 class _Descent:
     """Motion and look, moved downhill together."""
 
-    def __init__(self, correction: Correction, look: SurfaceDiscs, targets: Targets) -> None:
+    def __init__(
+        self,
+        correction: Correction,
+        look: SurfaceDiscs,
+        targets: Targets,
+        limit: TimeLimit | None = None,
+    ) -> None:
         self.correction, self.look, self.targets = correction, look, targets
+        self.limit = limit or TimeLimit(None, 1)
 
     def run(self, shrink: int, steps: int, *, first: bool) -> Stage:
         """Adam on pictures smaller by a factor."""
@@ -176,9 +191,9 @@ class _Descent:
         adam = torch.optim.Adam([{**g, "lr": g["rate"]} for g in groups], betas=(0.9, 0.98))
         count = len(targets.times_us)
         parts = [targets.rows(range(part, count, _PARTS)) for part in range(min(_PARTS, count))]
-        for step in range(steps):
+        for step, place in enumerate(self.limit.steps(steps)):
             for group in adam.param_groups:
-                group["lr"] = group["rate"] * min(1.0, 2 * (1 - step / steps) + 0.02)
+                group["lr"] = group["rate"] * min(1.0, 2 * (1 - place) + 0.02)
             part = parts[step % len(parts)]
             loss = self._data(part) * (shrink**2 * count / len(part.times_us))
             loss = loss + self.correction.price() + self.look.price()
@@ -217,14 +232,16 @@ class _Descent:
         generator = torch.Generator().manual_seed(0)
         params = [correction.turns, correction.shifts]
         total = [torch.zeros_like(p) for p in params]
-        for _ in range(_PROBES):
+        probes = 0
+        for _ in self.limit.steps(_PROBES, _PROBE_STEPS):
+            probes += 1
             signs = [torch.randint(0, 2, p.shape, generator=generator) * 2.0 - 1 for p in params]
             up, down = (self._gradient(params, signs, size) for size in (0.05, -0.05))
             for one, a, b, sign in zip(total, up, down, signs, strict=True):
-                one += sign * (a - b) / (0.1 * _PROBES)
+                one += sign * (a - b) / 0.1
         # What pictures say of a coordinate goes with its share of the variance.
         shares = correction.mixing.square().mean(0)
-        rates = [one.mean(0).clamp_min(0) / shares.mean() for one in total]
+        rates = [one.mean(0).clamp_min(0) / probes / shares.mean() for one in total]
         times = correction.key_times.tolist()
         weights = correction.weights(times).square()
         known = [1 / (1 + torch.einsum("m,...->m...", shares, rate)) for rate in rates]
