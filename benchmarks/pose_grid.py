@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 
 import evsplat as ev
+from evsplat.body.motion import load_motion
 from evsplat.capture import Policy, load_capture
 from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.poses import prepare_poses
-from evsplat.staging.assets import characters, motions
+from evsplat.staging.assets import characters, find_motion, motions
 
 FORCED = {
     "never": ("pose.smooth=never", "pose.refine=never"),
@@ -40,17 +41,25 @@ ROWS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 STATED = ("pose_std_rad", "transl_std_m")
 NOISE = ("none", "mocap", "estimated", "estimated-blurry")
+RATES = (12.5, 15.0, 20.0, 25.0)
+LEAST_FRAMES = 16
+"""Of short motions; the rate is raised until there are as many, or is the highest."""
 CLOSE_DB = 0.2
 """Behind the best of the forced settings by no more than this counts as close."""
 
 
-def draw(rng: np.random.Generator, people: list[str]) -> dict[str, Any]:
+def draw(rng: np.random.Generator, people: list[str], frames: int) -> dict[str, Any]:
     """Settings of one staged capture."""
-    fps = float(rng.choice([12.5, 15, 20, 25]))
+    fps = float(rng.choice(RATES))
+    character, motion = str(rng.choice(people)), str(rng.choice(motions()))
+    lasts_s = float(np.ptp(load_motion(find_motion(motion)).times_us)) * 1e-6
+    if int(lasts_s * fps) < LEAST_FRAMES:
+        fps = next((rate for rate in RATES if int(lasts_s * rate) >= LEAST_FRAMES), RATES[-1])
     return {
-        "character": str(rng.choice(people)),
-        "motion": str(rng.choice(motions())),
+        "character": character,
+        "motion": motion,
         "fps": fps,
+        "frames": min(frames, int(lasts_s * fps)),
         "exposure_ms": float(rng.uniform(0.3, 0.9) * min(1000 / fps, 80)),
         "yaw_deg": float(rng.uniform(0, 360)),
         "events": str(rng.choice(["clean", "davis346", "dvxplorer", "evk4"])),
@@ -125,10 +134,10 @@ def main() -> None:
     behind: defaultdict[str, list[float]] = defaultdict(list)
     print(f"{'capture':44}" + "".join(f"{row:>9}" for row in options.only))
     for number in range(options.captures):
-        settings = draw(rng, options.characters)
+        settings = draw(rng, options.characters, options.frames)
         capture = options.out / f"capture_{options.seed}_{number:02d}"
         if not capture.exists():
-            ev.stage(capture, width=128, frames=options.frames, progress=False, **settings)
+            ev.stage(capture, width=128, progress=False, **settings)
         found = {
             row: trained(
                 capture, options.out / "runs" / f"{capture.name}-{same}", same, options.iterations
