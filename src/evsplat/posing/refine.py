@@ -17,6 +17,7 @@ from torch import Tensor
 
 from evsplat.body import Body, BodyTrack, PoseErrors
 from evsplat.body.pose_noise import PoseNoise, joint_angles
+from evsplat.camera import Camera
 from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
 from evsplat.posing.correction import Correction
@@ -39,7 +40,13 @@ _MISFIT = 0.06
 """Difference of coded colours from which on more of it counts little."""
 _PIXEL_SHARE = 0.05
 """Independent values that a pixel's three colours count for: neighbours err alike."""
-_STEPS = (80, 120)
+_COARSE_DISCS = 1_500
+"""Discs drawn in the smallest pictures; twice as many in each next size, as far as there are."""
+_STEPS = (160, 140)
+_LAST_STEPS = 40
+"""Steps in which pictures kept aside are explained as well, once they have judged."""
+_NEARER = 0.6
+"""How near to the corrected body the background is taken for sure, in shares of before."""
 _LOOK_STEPS = 30
 """Steps in which the look alone is learned, at the start and where two motions are compared."""
 _RATES = {"motion": 0.05, "colours": 0.03, "offsets": 0.1, "light": 0.01}
@@ -105,7 +112,7 @@ def refine(
         DataError: the camera moves, or the posed body is in no picture.
     """
     began = time.monotonic()
-    planned = 3 * _LOOK_STEPS + sum(steps) + _PROBES * _PROBE_STEPS
+    planned = 3 * _LOOK_STEPS + sum(steps) + _LAST_STEPS + _PROBES * _PROBE_STEPS
     limit = TimeLimit(seconds, planned, progress=progress)
     targets = find_targets(track, capture)
     joint_rad, root_m = expected_errors(track)
@@ -114,16 +121,31 @@ def refine(
     aside = _middles(targets)
     fitted = sorted(set(range(len(targets.times_us))) - set(aside)) or aside
     descent = _Descent(correction, look, targets.rows(fitted), limit)
-    coarse = max(1, min(targets.camera.width, targets.camera.height) // COARSE_PX)
+    sizes = _sizes(targets.camera, steps)
     stages: list[Stage] = []
-    for shrink, count in zip(dict.fromkeys((coarse, 1)), steps, strict=False):
+    for shrink, count in sizes:
         stages.append(descent.run(shrink, count, first=not stages))
-    errors = descent.errors()
+        if len(stages) == 1:
+            nearer = targets.around(correction.corrected(), _NEARER)
+            descent.targets = nearer.rows(fitted)
     gain, gain_error = _gain(descent, targets.rows(aside))
+    descent.targets = nearer
+    stages.append(descent.run(1, _LAST_STEPS, first=False))
+    errors = descent.errors()
     limit.close()
     return Refined(
         correction.corrected(errors), gain, gain_error, tuple(stages), time.monotonic() - began
     )
+
+
+def _sizes(camera: Camera, steps: tuple[int, int]) -> list[tuple[int, int]]:
+    """By how much pictures are made smaller, and steps at each size: fewer in larger ones."""
+    shrink = 1
+    while min(camera.width, camera.height) >= 2 * shrink * COARSE_PX:
+        shrink *= 2
+    finer = [1 << k for k in reversed(range(shrink.bit_length() - 1))] or [1]
+    share = steps[1] / sum(finer)
+    return [(shrink, steps[0]), *((size, max(1, round(share * size))) for size in finer)]
 
 
 def expected_errors(track: BodyTrack) -> tuple[Float[np.ndarray, "J"], Float[np.ndarray, "3"]]:
@@ -158,14 +180,18 @@ class _Descent:
     ) -> None:
         self.correction, self.look, self.targets = correction, look, targets
         self.limit = limit or TimeLimit(None, 1)
+        self.discs = 0
 
     def run(self, shrink: int, steps: int, *, first: bool) -> Stage:
         """Adam on pictures smaller by a factor."""
         targets = self.targets.smaller(shrink) if shrink > 1 else self.targets
-        if first:
+        known, self.discs = self.discs, self._discs(targets.camera)
+        if self.discs > known:
             with torch.no_grad():
-                rotations, transl = self.correction.at(targets.times_us)
-            self.look.colour_from(rotations, transl, targets.camera, targets.image)
+                motion = self.correction.at(targets.times_us)
+            camera, image = targets.camera, targets.image
+            self.look.colour_from(*motion, camera, image, first=known, count=self.discs)
+        if first:
             self.learn_look(targets, shrink, _LOOK_STEPS)
         before = self.misfit(targets)
         motion = [self.correction.turns, self.correction.shifts]
@@ -173,15 +199,21 @@ class _Descent:
         self._descend(groups, targets, shrink, steps)
         return Stage(targets.camera.width, before, self.misfit(targets))
 
+    def _discs(self, camera: Camera) -> int:
+        """How many are drawn."""
+        finer = max(1.0, min(camera.width, camera.height) / COARSE_PX)
+        return min(len(self.look.colours), round(_COARSE_DISCS * finer))
+
     def learn_look(self, targets: Targets, shrink: int, steps: int) -> None:
         """Leave the motion as it is."""
         self._descend(self._look_groups(), targets, shrink, steps)
 
     def _look_groups(self) -> list[dict[str, Any]]:
         look = self.look
+        shape = [look.offsets, look.bone_offsets, look.inset, look.layer]
         return [
             {"params": [look.colours], "rate": _RATES["colours"]},
-            {"params": [look.offsets, look.bone_offsets, look.inset, look.layer], "rate": _RATES["offsets"]},
+            {"params": shape, "rate": _RATES["offsets"]},
             {"params": [look.light], "rate": _RATES["light"]},
         ]
 
@@ -209,7 +241,7 @@ class _Descent:
 
     def _differences(self, targets: Targets) -> Float[Tensor, "P"]:
         rotations, transl = self.correction.at(targets.times_us)
-        drawn = self.look.draw(rotations, transl, targets.camera, targets.behind)
+        drawn = self.look.draw(rotations, transl, targets.camera, targets.behind, self.discs)
         square = (drawn - targets.image).square().sum(-1) / _MISFIT**2
         return (torch.log1p(square / 2) * targets.weight).sum((1, 2))
 

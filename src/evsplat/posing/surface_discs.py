@@ -21,6 +21,10 @@ _OFFSET_M = 0.01
 _LAYER_M, _LAYER_REACH_M = 0.015, 0.05
 """Thickness of clothes, hair and shoes that neighbours share, and how far it is about the same."""
 _ANCHORS = 300
+_INSET = 0.3
+"""What is left to learn of how far discs must be set back, in units of `_OFFSET_M`."""
+_LOW_PASS = 0.1
+"""Variance of the low-pass, px^2: about that of a square pixel."""
 
 
 class SurfaceDiscs(nn.Module):
@@ -49,29 +53,42 @@ class SurfaceDiscs(nn.Module):
         self.register_buffer("quaternions", _turned_to(self.samples.normals))
         self.register_buffer("scales", scales)
         self.colours = nn.Parameter(torch.full((count, 3), 0.5))
-        # A disc at an outline reaches beyond it by about its width.
-        self.inset = nn.Parameter(torch.tensor(-width / _OFFSET_M))
+        self.inset = nn.Parameter(torch.tensor(0.0))
         self.offsets = nn.Parameter(torch.zeros(count))
         self.register_buffer("near", _nearness(self.samples.points, _ANCHORS))
         self.layer = nn.Parameter(torch.zeros(self.near.shape[1]))
         self.bone_offsets = nn.Parameter(torch.zeros(len(body.parents), 3))
         self.light = nn.Parameter(torch.zeros(8))
 
-    def splats(self, rotations: Float[Tensor, "T J 3 3"], transl: Float[Tensor, "T 3"]) -> Splats:
-        """The discs in a pose per time."""
-        normals = self.samples.normals
-        layer = _LAYER_M / _OFFSET_M * (self.near @ self.layer)
-        offsets = normals * (self.inset + self.offsets + layer)[:, None]
-        offsets = offsets + self.samples.weights @ self.bone_offsets
-        points = self.samples.points + _OFFSET_M * offsets
+    def splats(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        transl: Float[Tensor, "T 3"],
+        count: int | None = None,
+        pixel_m: float = 0.0,
+    ) -> Splats:
+        """The discs in a pose per time; with ``count`` that many, as much wider.
+
+        They are set back by as much as they reach beyond an outline, by their width and by the
+        low-pass of pixels of ``pixel_m``.
+        """
+        n = len(self.samples.points) if count is None else min(count, len(self.samples.points))
+        normals, weights = self.samples.normals[:n], self.samples.weights[:n]
+        wider = (len(self.samples.points) / n) ** 0.5
+        sizes = self.scales[:n] * wider
+        reach = (sizes[0, 0].square() + _LOW_PASS * pixel_m**2).sqrt() / _OFFSET_M
+        layer = _LAYER_M / _OFFSET_M * (self.near[:n] @ self.layer)
+        offsets = normals * (self.inset + self.offsets[:n] + layer - reach)[:, None]
+        offsets = offsets + weights @ self.bone_offsets
+        points = self.samples.points[:n] + _OFFSET_M * offsets
         bones = self.body.canonical_to_world(rotations, transl)
-        means, blended = skin(points, self.samples.weights, bones)
+        means, blended = skin(points, weights, bones)
         linear = blended[..., :3, :3]
         turned = (linear @ normals[:, :, None]).squeeze(-1)
         shade = 1 + _harmonics(nn.functional.normalize(turned, dim=-1)) @ self.light
         opacities = torch.full((len(points),), _OPACITY)
-        colours = self.colours * shade[..., None]
-        return Splats(means, self.quaternions, self.scales, opacities, colours, linear=linear)
+        colours = self.colours[:n] * shade[..., None]
+        return Splats(means, self.quaternions[:n], sizes, opacities, colours, linear=linear)
 
     def draw(
         self,
@@ -79,9 +96,11 @@ class SurfaceDiscs(nn.Module):
         transl: Float[Tensor, "T 3"],
         camera: Camera,
         behind: Float[Tensor, "T H W 3"],
+        count: int | None = None,
     ) -> Float[Tensor, "T H W 3"]:
-        """Pictures of the discs before the scene."""
-        drawn = render(self.splats(rotations, transl), camera)
+        """Pictures of the discs before the scene; ``count`` as in `splats`."""
+        pixel_m = self._pixel_m(transl, camera)
+        drawn = render(self.splats(rotations, transl, count, pixel_m), camera, low_pass=_LOW_PASS)
         return drawn.image + (1 - drawn.alpha[..., None]) * behind
 
     def colour_from(
@@ -90,10 +109,17 @@ class SurfaceDiscs(nn.Module):
         transl: Float[Tensor, "T 3"],
         camera: Camera,
         images: Float[Tensor, "T H W 3"],
+        *,
+        first: int = 0,
+        count: int | None = None,
     ) -> None:
-        """Set each colour to the mean of the pixels that show the disc, by how much they do."""
+        """Set each colour to the mean of the pixels that show the disc, by how much they do.
+
+        Those before ``first`` stay; ``count`` as in `splats`.
+        """
         with torch.enable_grad():
-            drawn = render(self.splats(rotations, transl), camera).image
+            splats = self.splats(rotations, transl, count, self._pixel_m(transl, camera))
+            drawn = render(splats, camera, low_pass=_LOW_PASS).image
             shares = [
                 torch.autograd.grad((drawn * of).sum(), self.colours, retain_graph=True)[0]
                 for of in (images, torch.ones_like(images))
@@ -101,12 +127,18 @@ class SurfaceDiscs(nn.Module):
         shown, total = shares
         with torch.no_grad():
             mean = shown.sum(0) / total.sum(0).clamp_min(1e-6)
-            self.colours.copy_((shown + 0.1 * mean) / (total + 0.1))
+            self.colours[first:] = ((shown + 0.1 * mean) / (total + 0.1))[first:]
+
+    def _pixel_m(self, transl: Float[Tensor, "T 3"], camera: Camera) -> float:
+        """Side of a pixel at the person's mean distance, metres."""
+        places = transl.detach() + self.body.rest_joints[0]
+        depth = camera.project(places)[1].clamp_min(0.1).mean()
+        return float(depth / camera.K[0, 0])
 
     def price(self) -> Float[Tensor, ""]:
         """What offsets and light cost, as minus the logarithm of a prior."""
         offsets = self.offsets.square().sum() + self.bone_offsets.square().sum()
-        offsets = offsets + self.layer.square().sum()
+        offsets = offsets + self.layer.square().sum() + (self.inset / _INSET).square()
         return 0.5 * offsets + 2 * self.light.square().sum()
 
 

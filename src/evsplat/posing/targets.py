@@ -1,7 +1,7 @@
 """What a motion is corrected by: sharp pictures, and the scene behind the person in them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -38,7 +38,26 @@ class Targets:
     """The scene without the person, in the person's shadow."""
     weight: Float[Tensor, "P H W"]
     """Trust in each pixel; 0 away from the person."""
+    trust: Float[Tensor, "P"]
+    """Trust in each picture."""
     camera: Camera
+
+    def around(self, track: BodyTrack, nearness: float = 1.0) -> "Targets":
+        """The same pictures; what is behind the person, and where it is, by another motion.
+
+        ``nearness`` multiplies how far from the posed body the background is taken for sure.
+        """
+        away, tall = _distances(track, self.times_us, self.camera)
+        plain = _background(self.image, away, nearness * _CLEAR * tall)
+        light = [
+            _light(one, plain, distance, nearness * tall)
+            for one, distance in zip(self.image, away, strict=True)
+        ]
+        return replace(
+            self,
+            behind=plain * torch.stack(light),
+            weight=(away < _REACH * tall) * self.trust[:, None, None],
+        )
 
     def rows(self, chosen: Sequence[int]) -> "Targets":
         """Some of the pictures."""
@@ -46,7 +65,13 @@ class Targets:
         times = [self.times_us[k] for k in index]
         frames = [self.frames[k] for k in index]
         return Targets(
-            times, frames, self.image[index], self.behind[index], self.weight[index], self.camera
+            times,
+            frames,
+            self.image[index],
+            self.behind[index],
+            self.weight[index],
+            self.trust[index],
+            self.camera,
         )
 
     def smaller(self, times: int) -> "Targets":
@@ -62,8 +87,12 @@ class Targets:
             return torch.nn.functional.avg_pool2d(planar, times).permute(0, 2, 3, 1).contiguous()
 
         weight = pooled(self.weight[..., None])[..., 0]
-        return Targets(
-            self.times_us, self.frames, pooled(self.image), pooled(self.behind), weight, small
+        return replace(
+            self,
+            image=pooled(self.image),
+            behind=pooled(self.behind),
+            weight=weight,
+            camera=small,
         )
 
 
@@ -79,10 +108,29 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
             "differs from a static background; leave the poses as they are."
         )
     pictures = sharp_pictures(capture)
-    camera = capture.camera(pictures[0].frame)
+    image = torch.stack([picture.image for picture in pictures]).float()
+    found = Targets(
+        [picture.time_us for picture in pictures],
+        [picture.frame for picture in pictures],
+        image,
+        image,
+        torch.ones(image.shape[:3]),
+        torch.tensor([picture.sigma**-2 for picture in pictures]),
+        capture.camera(pictures[0].frame),
+    )
+    try:
+        return found.around(track)
+    except DataError as error:
+        raise DataError(f"{capture.path}: {error}") from None
+
+
+def _distances(
+    track: BodyTrack, times_us: Sequence[int], camera: Camera
+) -> tuple[Float[Tensor, "P H W"], float]:
+    """Pixels to the posed body at each time, and its median height in pixels."""
     found, heights = [], []
-    for picture in pictures:
-        inside = silhouette(track.vertices(picture.time_us), track.body.faces, camera).numpy()
+    for time_us in times_us:
+        inside = silhouette(track.vertices(time_us), track.body.faces, camera).numpy()
         rows = np.flatnonzero(inside.any(1))
         heights.append(rows[-1] - rows[0] + 1 if len(rows) else 0)
         far = np.full(inside.shape, _FAR_PX)
@@ -90,22 +138,10 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
     tall = float(np.median(heights))
     if tall == 0:
         raise DataError(
-            f"{capture.path}: the posed body is in few of the pictures or in none, so that they "
-            "tell nothing of its motion; check camera and poses."
+            "the posed body is in few of the pictures or in none, so that they tell nothing of "
+            "its motion; check camera and poses."
         )
-    away = torch.from_numpy(np.stack(found)).float()
-    image = torch.stack([picture.image for picture in pictures]).float()
-    plain = _background(image, away, _CLEAR * tall)
-    light = [_light(one, plain, distance, tall) for one, distance in zip(image, away, strict=True)]
-    trust = torch.tensor([picture.sigma**-2 for picture in pictures])
-    return Targets(
-        [picture.time_us for picture in pictures],
-        [picture.frame for picture in pictures],
-        image,
-        plain * torch.stack(light),
-        (away < _REACH * tall) * trust[:, None, None],
-        camera,
-    )
+    return torch.from_numpy(np.stack(found)).float(), tall
 
 
 def _background(
