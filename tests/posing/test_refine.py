@@ -118,7 +118,7 @@ def staged(body, size):
         Frame(str(k), k, "main", Path("none"), (t - 1, t + 1), "train") for k, t in enumerate(TIMES)
     ]
     weight = torch.ones(image.shape[:3])
-    trust = torch.ones(len(TIMES))
+    trust = torch.ones(image.shape[:3])
     return truth, _Descent(
         correction, look, Targets(TIMES, frames, image, behind, weight, trust, camera)
     )

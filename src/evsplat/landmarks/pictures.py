@@ -40,6 +40,9 @@ class SharpPicture:
     sigma: float
     """Factor on the expected error of landmarks: 1 within an exposure, `CARRIED_SIGMA` where there
     is no picture of that time, `BLURRY_SIGMA` where the picture is as blurry as it was recorded."""
+    doubt: Float[Tensor, "H W"] | None = None
+    """Expected squared error per colour where two exposures were carried there: what they differ
+    by, weighted as in their blend."""
 
 
 def sharp_pictures(
@@ -128,7 +131,8 @@ def _carried(
             if (source := _carry(capture, side, time, thresholds)) is not None
         ]
         if sources:
-            yield SharpPicture(time, _blend(sources), frame, CARRIED_SIGMA)
+            image, doubt = _blend(sources)
+            yield SharpPicture(time, image, frame, CARRIED_SIGMA, doubt)
 
 
 def _beside(capture: TrainingCapture, frame: Frame, time_us: int) -> list[Frame]:
@@ -168,12 +172,15 @@ def _carry(
     return carried, torch.from_numpy(gaussian_filter(counts.numpy(), _SMOOTHING_PX))
 
 
-def _blend(sources: Sequence[_Source]) -> Float[Tensor, "H W 3"]:
+def _blend(sources: Sequence[_Source]) -> _Source:
     """The mean weighted per pixel by the inverse square of one and the events passed through.
 
     Each event adds the error of its threshold, and events change brightness but not hue, so that
-    the side on which less happened is the better one by far.
+    the side on which less happened is the better one by far. The second is the variance, mean over
+    the colours.
     """
     weights = torch.stack([(1 + passed) ** -2 for _, passed in sources])
     weights /= weights.sum(0)
-    return (torch.stack([image for image, _ in sources]) * weights[..., None]).sum(0)
+    images = torch.stack([image for image, _ in sources])
+    mean = (images * weights[..., None]).sum(0)
+    return mean, ((images - mean).square().mean(-1) * weights).sum(0)

@@ -14,7 +14,7 @@ from evsplat.body.silhouette import silhouette
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
-from evsplat.landmarks.pictures import sharp_pictures
+from evsplat.landmarks.pictures import SharpPicture, sharp_pictures
 
 _REACH = 0.08
 """The person is within this share of its height from the posed body."""
@@ -24,6 +24,8 @@ _DARKEST, _BRIGHTEST = 0.3, 1.1
 _LIGHT_BLUR = 0.02
 """Smoothing of shadows, share of the height."""
 _FAR_PX = 1e6
+_DOUBTFUL = 0.06
+"""Expected error of coded colours from which on a carried pixel counts little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,8 @@ class Targets:
     """The scene without the person, in the person's shadow."""
     weight: Float[Tensor, "P H W"]
     """Trust in each pixel; 0 away from the person."""
-    trust: Float[Tensor, "P"]
-    """Trust in each picture."""
+    trust: Float[Tensor, "P H W"]
+    """Trust in each pixel, wherever the person is."""
     camera: Camera
 
     def around(self, track: BodyTrack, nearness: float = 1.0) -> "Targets":
@@ -56,7 +58,7 @@ class Targets:
         return replace(
             self,
             behind=plain * torch.stack(light),
-            weight=(away < _REACH * tall) * self.trust[:, None, None],
+            weight=(away < _REACH * tall) * self.trust,
         )
 
     def rows(self, chosen: Sequence[int]) -> "Targets":
@@ -86,12 +88,13 @@ class Targets:
             planar = images.permute(0, 3, 1, 2)
             return torch.nn.functional.avg_pool2d(planar, times).permute(0, 2, 3, 1).contiguous()
 
-        weight = pooled(self.weight[..., None])[..., 0]
+        weight, trust = (pooled(one[..., None])[..., 0] for one in (self.weight, self.trust))
         return replace(
             self,
             image=pooled(self.image),
             behind=pooled(self.behind),
             weight=weight,
+            trust=trust,
             camera=small,
         )
 
@@ -115,13 +118,19 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
         image,
         image,
         torch.ones(image.shape[:3]),
-        torch.tensor([picture.sigma**-2 for picture in pictures]),
+        torch.stack([_trust(picture) for picture in pictures]),
         capture.camera(pictures[0].frame),
     )
     try:
         return found.around(track)
     except DataError as error:
         raise DataError(f"{capture.path}: {error}") from None
+
+
+def _trust(picture: SharpPicture) -> Float[Tensor, "H W"]:
+    """Less where the two exposures that were carried to the picture's time differ."""
+    doubt = picture.doubt if picture.doubt is not None else torch.zeros(picture.image.shape[:2])
+    return picture.sigma**-2 / (1 + doubt / _DOUBTFUL**2)
 
 
 def _distances(
