@@ -187,9 +187,10 @@ class _Descent:
         targets = self.targets.smaller(shrink) if shrink > 1 else self.targets
         known, self.discs = self.discs, self._discs(targets.camera)
         if self.discs > known:
+            shown = targets.rows(torch.nonzero(targets.coloured)[:, 0].tolist())
             with torch.no_grad():
-                motion = self.correction.at(targets.times_us)
-            camera, image = targets.camera, targets.image
+                motion = self.correction.at(shown.times_us)
+            camera, image = shown.camera, shown.image
             self.look.colour_from(*motion, camera, image, first=known, count=self.discs)
         if first:
             self.learn_look(targets, shrink, _LOOK_STEPS)
@@ -242,7 +243,7 @@ class _Descent:
     def _differences(self, targets: Targets) -> Float[Tensor, "P"]:
         rotations, transl = self.correction.at(targets.times_us)
         drawn = self.look.draw(rotations, transl, targets.camera, targets.behind, self.discs)
-        square = (drawn - targets.image).square().sum(-1) / _MISFIT**2
+        square = (targets.as_seen(drawn) - targets.image).square().sum(-1) / _MISFIT**2
         return (torch.log1p(square / 2) * targets.weight).sum((1, 2))
 
     @torch.no_grad()

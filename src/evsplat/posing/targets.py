@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
@@ -15,6 +15,7 @@ from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.landmarks.pictures import SharpPicture, sharp_pictures
+from evsplat.pictures.light import DARKEST, Transfer, decode, encode, luminance
 
 _REACH = 0.08
 """The person is within this share of its height from the posed body."""
@@ -24,6 +25,7 @@ _DARKEST, _BRIGHTEST = 0.3, 1.1
 _LIGHT_BLUR = 0.02
 """Smoothing of shadows, share of the height."""
 _FAR_PX = 1e6
+_BY_PICTURE = ("coloured", "image", "behind", "weight", "trust")
 _DOUBTFUL = 0.06
 """Expected error of coded colours from which on a carried pixel counts little."""
 
@@ -35,7 +37,10 @@ class Targets:
     times_us: list[int]
     frames: list[Frame]
     """The frame in whose exposure each lies."""
+    coloured: Bool[Tensor, "P"]
+    """False where events carried the picture there: they tell brightness but no hue."""
     image: Float[Tensor, "P H W 3"]
+    """Coded; where not coloured, luminance thrice."""
     behind: Float[Tensor, "P H W 3"]
     """The scene without the person, in the person's shadow."""
     weight: Float[Tensor, "P H W"]
@@ -43,6 +48,12 @@ class Targets:
     trust: Float[Tensor, "P H W"]
     """Trust in each pixel, wherever the person is."""
     camera: Camera
+    transfer: Transfer
+
+    def as_seen(self, drawn: Float[Tensor, "P H W 3"]) -> Float[Tensor, "P H W 3"]:
+        """Drawings of these pictures, grey where the pictures are."""
+        rows = torch.nonzero(~self.coloured)[:, 0]
+        return drawn.index_copy(0, rows, _grey(drawn[rows], self.transfer)) if len(rows) else drawn
 
     def around(self, track: BodyTrack, nearness: float = 1.0) -> "Targets":
         """The same pictures; what is behind the person, and where it is, by another motion.
@@ -50,11 +61,10 @@ class Targets:
         ``nearness`` multiplies how far from the posed body the background is taken for sure.
         """
         away, tall = _distances(track, self.times_us, self.camera)
-        plain = _background(self.image, away, nearness * _CLEAR * tall)
-        light = [
-            _light(one, plain, distance, nearness * tall)
-            for one, distance in zip(self.image, away, strict=True)
-        ]
+        known = self.coloured
+        plain = _background(self.image[known], away[known], nearness * _CLEAR * tall)
+        usual = self.as_seen(plain.expand_as(self.image))
+        light = [_light(*one, nearness * tall) for one in zip(self.image, usual, away, strict=True)]
         return replace(
             self,
             behind=plain * torch.stack(light),
@@ -64,16 +74,11 @@ class Targets:
     def rows(self, chosen: Sequence[int]) -> "Targets":
         """Some of the pictures."""
         index = list(chosen)
-        times = [self.times_us[k] for k in index]
-        frames = [self.frames[k] for k in index]
-        return Targets(
-            times,
-            frames,
-            self.image[index],
-            self.behind[index],
-            self.weight[index],
-            self.trust[index],
-            self.camera,
+        return replace(
+            self,
+            times_us=[self.times_us[k] for k in index],
+            frames=[self.frames[k] for k in index],
+            **{name: getattr(self, name)[index] for name in _BY_PICTURE},
         )
 
     def smaller(self, times: int) -> "Targets":
@@ -112,19 +117,30 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
         )
     pictures = sharp_pictures(capture)
     image = torch.stack([picture.image for picture in pictures]).float()
+    transfer = capture.transfer(pictures[0].frame)
+    coloured = torch.tensor([picture.frame.split == "train" for picture in pictures])
+    image[~coloured] = _grey(image[~coloured], transfer)
     found = Targets(
         [picture.time_us for picture in pictures],
         [picture.frame for picture in pictures],
+        coloured,
         image,
         image,
         torch.ones(image.shape[:3]),
         torch.stack([_trust(picture) for picture in pictures]),
         capture.camera(pictures[0].frame),
+        transfer,
     )
     try:
         return found.around(track)
     except DataError as error:
         raise DataError(f"{capture.path}: {error}") from None
+
+
+def _grey(coded: Float[Tensor, "P H W 3"], transfer: Transfer) -> Float[Tensor, "P H W 3"]:
+    """Coded luminance, thrice."""
+    light = luminance(decode(coded.clamp_min(DARKEST), transfer))
+    return encode(light, transfer)[..., None].expand(*coded.shape)
 
 
 def _trust(picture: SharpPicture) -> Float[Tensor, "H W"]:
