@@ -12,7 +12,8 @@ from evsplat.camera import Camera
 from evsplat.capture import Frame
 from evsplat.pictures import decode, encode, luminance
 from evsplat.posing.correction import Correction
-from evsplat.posing.refine import _Descent, _gain, expected_errors
+from evsplat.posing.descent import Descent
+from evsplat.posing.refine import _gain, expected_errors
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets
 
@@ -162,7 +163,7 @@ def staged(body, size):
     weight = torch.ones(image.shape[:3])
     coloured = torch.ones(len(TIMES), dtype=torch.bool)
     targets = Targets(TIMES, frames, coloured, image, behind, weight, weight, camera, "power")
-    return truth, _Descent(correction, look, targets)
+    return truth, Descent(correction, look, targets)
 
 
 @torch.no_grad()
