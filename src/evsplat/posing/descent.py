@@ -95,6 +95,7 @@ class Descent:
             {"params": [look.colours], "rate": _RATES["colours"]},
             {"params": shape, "rate": _RATES["offsets"]},
             {"params": [look.light], "rate": _RATES["light"]},
+            {"params": [look.nearer], "rate": _RATES["motion"]},
         ]
 
     def _descend(

@@ -8,7 +8,7 @@ from evsplat.body import Body
 from evsplat.body.body import skin
 from evsplat.body.surface import SurfaceSamples
 from evsplat.camera import Camera
-from evsplat.render import Splats, render
+from evsplat.render import RenderOutput, Splats, render
 
 _OVERSAMPLED = 5
 """Surface points drawn per disc; the discs lie at those farthest from each other."""
@@ -21,6 +21,9 @@ _OFFSET_M = 0.01
 _LAYER_M, _LAYER_REACH_M = 0.015, 0.05
 """Thickness of clothes, hair and shoes that neighbours share, and how far it is about the same."""
 _ANCHORS = 300
+_SIZE = 0.015
+"""Share by which clothes, hair and shoes make a person look larger or smaller as a whole. Such a
+person is drawn nearer or farther off, so that its motion keeps the distance that it had."""
 _INSET = 0.3
 """What is left to learn of how far discs must be set back, in units of `_OFFSET_M`."""
 _BEYOND = 0.3, 0.55
@@ -62,6 +65,7 @@ class SurfaceDiscs(nn.Module):
         self.layer = nn.Parameter(torch.zeros(self.near.shape[1]))
         self.bone_offsets = nn.Parameter(torch.zeros(len(body.parents), 3))
         self.light = nn.Parameter(torch.zeros(8))
+        self.nearer = nn.Parameter(torch.tensor(0.0))
 
     def splats(
         self,
@@ -102,8 +106,7 @@ class SurfaceDiscs(nn.Module):
         count: int | None = None,
     ) -> Float[Tensor, "T H W 3"]:
         """Pictures of the discs before the scene; ``count`` as in `splats`."""
-        pixel_m = self._pixel_m(transl, camera)
-        drawn = render(self.splats(rotations, transl, count, pixel_m), camera, low_pass=_LOW_PASS)
+        drawn = self._drawn(rotations, transl, camera, count)
         return drawn.image + (1 - drawn.alpha[..., None]) * behind
 
     def colour_from(
@@ -121,8 +124,7 @@ class SurfaceDiscs(nn.Module):
         Those before ``first`` stay; ``count`` as in `splats`.
         """
         with torch.enable_grad():
-            splats = self.splats(rotations, transl, count, self._pixel_m(transl, camera))
-            drawn = render(splats, camera, low_pass=_LOW_PASS).image
+            drawn = self._drawn(rotations, transl, camera, count).image
             shares = [
                 torch.autograd.grad((drawn * of).sum(), self.colours, retain_graph=True)[0]
                 for of in (images, torch.ones_like(images))
@@ -132,16 +134,25 @@ class SurfaceDiscs(nn.Module):
             mean = shown.sum(0) / total.sum(0).clamp_min(1e-6)
             self.colours[first:] = ((shown + 0.1 * mean) / (total + 0.1))[first:]
 
-    def _pixel_m(self, transl: Float[Tensor, "T 3"], camera: Camera) -> float:
-        """Side of a pixel at the person's mean distance, metres."""
-        places = transl.detach() + self.body.rest_joints[0]
-        depth = camera.project(places)[1].clamp_min(0.1).mean()
-        return float(depth / camera.K[0, 0])
+    def _drawn(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        transl: Float[Tensor, "T 3"],
+        camera: Camera,
+        count: int | None,
+    ) -> RenderOutput:
+        away = transl + self.body.rest_joints[0] - camera.center()
+        moved = transl - _SIZE * self.nearer * away
+        depth = camera.project(transl.detach() + self.body.rest_joints[0])[1]
+        pixel_m = float(depth.clamp_min(0.1).mean() / camera.K[0, 0])
+        splats = self.splats(rotations, moved, count, pixel_m)
+        return render(splats, camera, low_pass=_LOW_PASS)
 
     def price(self) -> Float[Tensor, ""]:
         """What offsets and light cost, as minus the logarithm of a prior."""
         offsets = self.offsets.square().sum() + self.bone_offsets.square().sum()
         offsets = offsets + self.layer.square().sum() + (self.inset / _INSET).square()
+        offsets = offsets + self.nearer.square()
         return 0.5 * offsets + 2 * self.light.square().sum()
 
 
