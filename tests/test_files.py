@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import atomic_path, read_json, read_text, write_json, write_text
+from evsplat.files import atomic_path, read_json, read_text, set_aside, write_json, write_text
 
 
 def refused(path: Path) -> str:
@@ -107,3 +107,19 @@ def test_a_file_that_may_not_be_read_is_not_called_broken(
     )
     with pytest.raises(ConfigError, match="a.yaml: may not be read"):
         read_text(tmp_path / "a.yaml", error=ConfigError)
+
+
+def test_a_folder_set_aside_comes_back_unless_the_block_ends_well(tmp_path):
+    folder = tmp_path / "folder"
+    with set_aside(folder):
+        assert not folder.exists()
+    folder.mkdir()
+    (folder / "old").touch()
+    with pytest.raises(KeyboardInterrupt), set_aside(folder):
+        assert not folder.exists()
+        raise KeyboardInterrupt
+    assert (folder / "old").exists()
+    with set_aside(folder):
+        folder.mkdir()
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+    assert not (folder / "old").exists()

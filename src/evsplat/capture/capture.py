@@ -33,10 +33,11 @@ class Capture(CaptureReader):
         return TrainingCapture(self, policy, masker)
 
 
-def load_capture(path: Path | str) -> Capture:
+def load_capture(path: Path | str, *, needs_body: bool = True) -> Capture:
     """Open a capture after the quick checks (descriptions, headers, poses; not every pixel).
 
-    Raises `DataError` with the first error found; warnings are logged.
+    Raises `DataError` with the first error found; warnings are logged, that there is no body only
+    if it ``needs_body``.
     """
     metadata, findings = check_capture(Path(path), deep=False)
     errors = [finding for finding in findings if finding.severity == "error"]
@@ -48,5 +49,6 @@ def load_capture(path: Path | str) -> Capture:
         )
         raise DataError(f"{errors[0]}{more}")
     for finding in findings:
-        logger.warning("%s", finding)
+        if needs_body or finding.field != "body":
+            logger.warning("%s", finding)
     return Capture(metadata)

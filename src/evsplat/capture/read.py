@@ -150,6 +150,25 @@ class CaptureReader:
         """True where body and poses are given."""
         return bool(self._metadata.body_model)
 
+    @property
+    def poses_found(self) -> str | None:
+        """A sentence on how `evsplat poses` found the poses; None where they were given."""
+        found = self.provenance.get("poses")
+        policy = found.get("policy") if isinstance(found, dict) else None
+        if not isinstance(found, dict) or not isinstance(policy, dict):
+            return None
+        seen = "training frames alone"
+        if policy.get("use") == "everything":
+            seen = "all frames, the held-out ones among them"
+        elif policy.get("held_out_events"):
+            seen = "training frames and the events of held-out intervals"
+        refinement = found.get("refinement")
+        drawn = isinstance(refinement, dict) and refinement.get("taken")
+        return (
+            f"Body poses were found by evsplat ({found.get('from')}"
+            f"{', corrected by drawing the person' if drawn else ''}) from {seen}."
+        )
+
     @functools.cached_property
     def body_file(self) -> BodyFile:
         """The body and its key poses as stored; a `DataError` where there are none."""

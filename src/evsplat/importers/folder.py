@@ -22,7 +22,7 @@ from evsplat.importers.base import (
     human_mask,
     need,
 )
-from evsplat.importers.recorded import add_recorded_events, recorded_camera, without_body
+from evsplat.importers.recorded import add_recorded_events, recorded_camera
 from evsplat.importers.smpl import add_body, chosen_poses
 from evsplat.pictures.light import Transfer
 
@@ -108,7 +108,8 @@ class Folder(Importer):
             notes.append(f"{len(middles) - len(seen)} pictures have no pose and were left out")
         writer.provenance |= {"source": "own recording", "focal": focal, "notes": notes}
         if path is None or motion is None:
-            return [*notes, without_body(writer)]
+            writer.leave_out_body()
+            return notes
         writer.provenance["poses"] = path.name
         if isinstance(motion, PoseSequence):
             kept = sorted(seen)
@@ -174,7 +175,9 @@ class Folder(Importer):
         """The poses; None where there are none, or none are wanted."""
         if self.no_poses:
             if self.poses is not None:
-                raise ConfigError(f"--no-poses: contradicts --poses {self.poses}; leave one out.")
+                raise ConfigError(
+                    f"--poses {self.poses}: contradicts --no-poses and --find-poses; leave one out."
+                )
             return None
         if self.poses is not None:
             return need(self.poses, "the poses")

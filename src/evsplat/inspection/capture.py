@@ -154,6 +154,8 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
         made = capture.provenance.get(verb)
         if isinstance(made, dict) and "with" in made:
             lines.append(f"{verb:10} with {made['with']}")
+    if capture.poses_found is not None:
+        lines.append(f"poses      {capture.poses_found}")
     if "text" in capture.provenance:
         lines.append(f"made       {capture.provenance['text']}")
     return "\n".join(lines)

@@ -106,7 +106,7 @@ def find_poses(
     out = Path(out)
     refuse_existing(out)
     rig = _rig(search.body)
-    capture = load_capture(path)
+    capture = load_capture(path, needs_body=False)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
     focal_px = search.focal_px
     if search.focal == "auto":

@@ -77,6 +77,7 @@ def _header(source: Source) -> str:
         ("trained for", None if seconds is None else duration(seconds)),
         ("iterations", _count(metrics.get("iteration"))),
         ("device", metrics.get("device")),
+        ("body poses", "found by evsplat" if metrics.get("poses") else None),
         ("Gaussians, person", _count(gaussians.get("human"))),
         ("Gaussians, scene", _count(gaussians.get("scene"))),
         ("frames, train", _count(metrics["frames"]["train"])),
