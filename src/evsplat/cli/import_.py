@@ -9,7 +9,7 @@ import tyro
 
 from evsplat.errors import ConfigError
 from evsplat.options import PoseOptions
-from evsplat.options.declare import FLAT, Flag, option
+from evsplat.options.declare import FLAT, CaptureFolder, Flag, option
 
 
 def import_() -> None:
@@ -93,6 +93,42 @@ class _ImportToBlur(_Import):
         return {"blur": Blur(self.interpolation, self.weights)} if self.blur else {}
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Poses:
+    """Give a capture the poses of a tool's file, or of another capture's body.npz."""
+
+    capture: CaptureFolder
+    file: Annotated[tyro.conf.Positional[Path], option("FILE")]
+    """Pose file or folder (docs/poses.md); its poses belong to the frames by index."""
+    out: Annotated[Path, option("CAPTURE")]
+    """The new capture; its cameras are those of the old one."""
+    person: Annotated[str | None, option("NAME", default="the only one")] = None
+    """Choice among several people in the file."""
+    pose_source: Annotated[
+        Literal["exact", "markers", "estimated"] | None,
+        option("SOURCE", default="what the tool is known for"),
+    ] = None
+    """Where the poses come from: exact, markers or estimated."""
+    smpl: Annotated[Path | None, option("PATH", default="EVSPLAT_BODY_MODELS")] = None
+    """Your SMPL model file, or the folder that holds it."""
+    overwrite: Flag = False
+    """Replace a capture that is there."""
+
+    def __call__(self) -> None:
+        from evsplat.importers import attach_poses
+
+        path = attach_poses(
+            self.capture,
+            self.file,
+            self.out,
+            person=self.person,
+            pose_source=self.pose_source,
+            smpl=self.smpl,
+            overwrite=self.overwrite,
+        )
+        print(f"written: {path}\nlook at it with: evsplat inspect {path}")
+
+
 def import_with_kinds() -> Callable[..., Any]:
     """`import_` with the kinds as subcommands; loading them takes seconds, so only when asked."""
     from evsplat.importers import KINDS
@@ -104,6 +140,7 @@ def import_with_kinds() -> Callable[..., Any]:
         verb = make_dataclass(kind.__name__, [options], bases=(base,), frozen=True, kw_only=True)
         verb.__doc__ = kind.__doc__
         verbs.append(Annotated[verb, tyro.conf.subcommand(name)])
+    verbs.append(Annotated[_Poses, tyro.conf.subcommand("poses")])
 
     def import_kind(*, kind: Any) -> None:
         kind()

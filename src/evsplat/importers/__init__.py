@@ -16,6 +16,7 @@ from evsplat.importers.folder import Folder
 from evsplat.importers.mmhpsd import Mmhpsd
 from evsplat.importers.neuman import Neuman
 from evsplat.importers.people_snapshot import PeopleSnapshot
+from evsplat.importers.poses import attach_poses
 from evsplat.importers.video import Video
 from evsplat.importers.zju_mocap import ZjuMocap
 from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
@@ -23,7 +24,7 @@ from evsplat.inspection import warn_of_body
 from evsplat.options import PoseOptions, PoseSearch
 from evsplat.options.declare import given
 
-__all__ = ["KINDS", "Blur", "Importer", "import_capture", "run_importer"]
+__all__ = ["KINDS", "Blur", "Importer", "attach_poses", "import_capture", "run_importer"]
 
 logger = logging.getLogger(__name__)
 

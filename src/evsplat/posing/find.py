@@ -239,25 +239,17 @@ def _cameras(capture: TrainingCapture, times_us: Sequence[int]) -> list[Camera]:
 
 def _write_body(making: Derivation, track: BodyTrack, fitted: PoseFit) -> None:
     assert track.errors is not None
-    old = making.document.get("body")
-    for name in {"body.npz", "body_dense.npz", *([old["file"]] if old else [])}:
-        # It may be a hard link, and what it is linked to must stay.
-        (making.folder / name).unlink(missing_ok=True)
-    gender = {"gender": "neutral"} if fitted.rig.model == "smpl" else {}
-    np.savez_compressed(
-        making.folder / "body.npz",
-        allow_pickle=False,
-        model=fitted.rig.model,
-        times_us=track.times_us,
-        poses=track.poses.astype(np.float32),
-        transl=track.transl.astype(np.float32),
-        betas=fitted.betas.astype(np.float32),
-        pose_std_rad=np.asarray(track.errors.joint_rad, np.float32),
-        transl_std_m=np.asarray(track.errors.root_m, np.float32),
-        **gender,
+    making.set_body(
+        fitted.rig.model,
+        track.times_us,
+        track.poses,
+        track.transl,
+        betas=fitted.betas,
+        gender="neutral" if fitted.rig.model == "smpl" else None,
+        source="estimated",
+        pose_std_rad=track.errors.joint_rad,
+        transl_std_m=track.errors.root_m,
     )
-    model = fitted.rig.model
-    making.document["body"] = {"file": "body.npz", "model": model, "source": "estimated"}
 
 
 def _set_focal(making: Derivation, focal_px: float) -> None:
