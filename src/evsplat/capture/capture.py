@@ -16,9 +16,10 @@ logger = logging.getLogger(__name__)
 class Capture(CaptureReader):
     """A blurry video, its events and body poses. Pictures and events are read when asked for.
 
-    Pictures are sRGB-coded float32 in [0, 1]. Lens distortion is removed on reading, from pictures
-    and events alike, so that `camera` describes them exactly. The pose of a moving camera is known
-    at the mid-exposure of its frames only: nothing here interpolates between them.
+    Pictures are float32 in [0, 1], coded as `transfer` says; `shown` codes light for a display.
+    Lens distortion is removed on reading, from pictures and events alike, so that `camera`
+    describes them exactly. The pose of a moving camera is known at the mid-exposure of its frames
+    only: nothing here interpolates between them.
     """
 
     def for_training(

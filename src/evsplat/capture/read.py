@@ -17,7 +17,7 @@ from evsplat.capture.points import read_points
 from evsplat.errors import DataError
 from evsplat.events import EventStore
 from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_rgb, to_unit_range
-from evsplat.pictures.light import Transfer
+from evsplat.pictures.light import Transfer, shown
 
 IMAGE_CACHE_BYTES = 512 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
@@ -85,6 +85,10 @@ class CaptureReader:
     def transfer(self, frame: Frame | str) -> Transfer:
         """From the values of a frame's pictures to light; the power curve where nothing is said."""
         return self._metadata.transfers.get(self._frame(frame).camera, "power")
+
+    def shown(self, values: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Values of the frames' pictures, or of drawings of them, coded for a display."""
+        return shown(values, self.transfer(self.frames[0]))
 
     def is_distorted(self, camera: str) -> bool:
         """True where the lens of a camera distorts, which reading pictures and events undoes."""

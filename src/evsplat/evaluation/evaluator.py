@@ -166,7 +166,7 @@ class _MeasuredFrames:
         if not self.only:
             self._others |= {
                 **{name: _picture_of(kind, self.capture) for name, kind in TRIVIAL.items()},
-                BLURRY_INPUT: self.capture.image,
+                BLURRY_INPUT: self._blurry,
             }
             if self.split == "train":
                 del self._others["nearest_frame"]
@@ -181,7 +181,7 @@ class _MeasuredFrames:
         ours = _render(self.capture, self.reconstruction, frame)
         mask, human = self.human_regions.in_frame(frame)
         self._seen |= not isinstance(human, Absent)
-        truth = None if frame.sharp is None else self.capture.sharp(frame)
+        truth = None if frame.sharp is None else self.capture.shown(self.capture.sharp(frame))
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
         for protocol in self.protocols:
@@ -199,7 +199,7 @@ class _MeasuredFrames:
             },
         }
         if not self.only:
-            blurry = Truth(STANDARD, self.capture.image(frame), mask, human, self.networks)
+            blurry = Truth(STANDARD, self._blurry(frame), mask, human, self.networks)
             against_blurry = blurry.measure(ours)
             self._against_blurry.add(against_blurry)
             entry["others"] = {
@@ -258,6 +258,9 @@ class _MeasuredFrames:
             **frames,
         }
 
+    def _blurry(self, frame: Frame) -> Float[Tensor, "H W 3"]:
+        return self.capture.shown(self.capture.image(frame))
+
     def _other_pictures(self, frame: Frame) -> dict[str, Tensor | Absent]:
         return {
             row: picture if isinstance(picture, Absent) else picture(frame)
@@ -301,12 +304,13 @@ def _novel_views(
         camera = capture.cameras[view.camera]
         ours: Tensor | None = None
         try:
-            ours = drawn(reconstruction, camera, view.time_us)
+            ours = capture.shown(drawn(reconstruction, camera, view.time_us))
         except DataError as error:  # trivial methods know the recording camera only
             measured = all_absent(str(error))
         if ours is not None:
             human = human_regions.in_view(camera, view.time_us)
-            truth = Truth(STANDARD, capture.novel_image(view), None, human, networks)
+            recorded = capture.shown(capture.novel_image(view))
+            truth = Truth(STANDARD, recorded, None, human, networks)
             measured = truth.measure(ours)
         means_by_camera.setdefault(view.camera, MetricMeans(("full", "person_crop"))).add(measured)
         entry = {
@@ -333,7 +337,7 @@ def _novel_views(
 
 
 def _render(capture: Capture, source: Reconstruction, frame: Frame) -> Float[Tensor, "H W 3"]:
-    return drawn(source, capture.camera(frame), frame.mid_us)
+    return capture.shown(drawn(source, capture.camera(frame), frame.mid_us))
 
 
 def _picture_of(

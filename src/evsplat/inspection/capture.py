@@ -229,7 +229,9 @@ def _contact_sheet(capture: Capture) -> Image.Image:
     tiles = []
     for frame in chosen:
         camera = capture.camera(frame)
-        picture = to_picture(capture.image(frame), fit(camera.width, camera.height, 170))
+        picture = to_picture(
+            capture.shown(capture.image(frame)), fit(camera.width, camera.height, 170)
+        )
         tiles.append(Tile(picture, _label(frame), frame.split))
     some = "" if len(chosen) == len(capture.frames) else f"{len(chosen)} of "
     subtitle = f"{some}{len(capture.frames)} frames as the camera saw them"
@@ -240,7 +242,13 @@ def _events_sheet(capture: Capture) -> Image.Image:
     """Events in the middle of the exposure over the greyed picture."""
     assert capture.events is not None
     tiles = [
-        event_tile(capture.events, capture.image(frame), frame.mid_us, _label(frame), frame.split)
+        event_tile(
+            capture.events,
+            capture.shown(capture.image(frame)),
+            frame.mid_us,
+            _label(frame),
+            frame.split,
+        )
         for frame in _spread(capture.frames, DETAIL_FRAMES)
     ]
     subtitle = f"{EVENT_WINDOW_US / 1000:g} ms about mid-exposure; red: brighter, blue: darker"
@@ -253,7 +261,7 @@ def _body_sheet(capture: Capture, track: BodyTrack) -> Image.Image:
     for frame in _spread(capture.frames, DETAIL_FRAMES):
         camera = capture.camera(frame)
         size = fit(camera.width, camera.height, DETAIL_PX)
-        picture = to_picture(capture.image(frame), size)
+        picture = to_picture(capture.shown(capture.image(frame)), size)
         large = _resized(camera, size)
         for time_us in frame.exposure_us:
             draw_outline(picture, _silhouette(track, time_us, large), _OUTLINE_ENDS, halo=False)

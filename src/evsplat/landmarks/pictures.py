@@ -18,6 +18,7 @@ from torch import Tensor
 from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import HeldOutError
 from evsplat.events import EventStream, deblur, polarity_counts
+from evsplat.pictures import shown
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +56,12 @@ def sharp_pictures(
     thresholds = _thresholds(capture)
     if thresholds is None:
         return [
-            SharpPicture(frame.mid_us, capture.image(frame), frame, BLURRY_SIGMA)
+            SharpPicture(
+                frame.mid_us,
+                shown(capture.image(frame), capture.transfer(frame)),
+                frame,
+                BLURRY_SIGMA,
+            )
             for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us)
         ]
     pictures = [
@@ -111,7 +117,7 @@ def _in_exposure(
         transfer=capture.transfer(frame),
     )
     for time, image in zip(times, images, strict=True):
-        yield SharpPicture(time, image, frame, 1.0)
+        yield SharpPicture(time, shown(image, capture.transfer(frame)), frame, 1.0)
 
 
 def _carried(
@@ -165,6 +171,7 @@ def _carry(
         transfer=capture.transfer(frame),
     )
     counts = polarity_counts(events, *image.shape[:2]).sum(0)
+    carried = shown(carried, capture.transfer(frame))
     return carried, torch.from_numpy(gaussian_filter(counts.numpy(), _SMOOTHING_PX))
 
 

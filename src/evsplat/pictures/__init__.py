@@ -8,6 +8,8 @@ from evsplat.pictures.light import (
     log_brightness,
     log_brightness_change,
     luminance,
+    shown,
+    stored,
 )
 
 __all__ = [
@@ -18,6 +20,8 @@ __all__ = [
     "log_brightness",
     "log_brightness_change",
     "luminance",
+    "shown",
     "signed_map",
+    "stored",
     "to_bytes",
 ]

@@ -47,6 +47,19 @@ def encode(
     )
 
 
+def shown(values: Float[Tensor, "*shape"], transfer: Transfer) -> Float[Tensor, "*shape"]:
+    """Values of pictures as screens, people and pretrained networks take them.
+
+    Light as it stands (``linear``) is coded as sRGB, values that are coded stay as they are.
+    """
+    return encode(values, "srgb") if transfer == "linear" else values
+
+
+def stored(coded: Float[Tensor, "*shape"], transfer: Transfer) -> Float[Tensor, "*shape"]:
+    """The opposite of `shown`: values of a picture with that ``transfer``."""
+    return decode(coded, "srgb") if transfer == "linear" else coded
+
+
 def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
     """Rec. 709 luminance of linear RGB, the quantity that an event pixel sees."""
     red, green, blue = linear_rgb.unbind(-1)

@@ -203,7 +203,8 @@ def _novel_views(source: Source) -> str:
         pairs = []
         for entry in spread(drawn, _NOVEL_SHOWN):
             render = source.picture(entry["pictures"]["render"])
-            truth = to_bytes(source.capture.novel_image(views[entry["index"]]))
+            view = views[entry["index"]]
+            truth = to_bytes(source.capture.shown(source.capture.novel_image(view)))
             label = f"{name}, frame {entry['frame']}"
             reached = "" if entry["psnr"] is None else f" · {entry['psnr']:.2f} dB"
             pairs.append(
