@@ -117,13 +117,11 @@ def test_inspection_shows_the_same_pictures(recordings, tmp_path):
         assert np.abs(one[rows] - other[rows]).mean() < 0.5, name
 
 
-def test_figures_and_pictures_of_an_evaluation_are_the_same(recordings, tmp_path):
+def test_pictures_of_an_evaluation_are_the_same(recordings, tmp_path):
     measured = {}
     for kind, capture in recordings.items():
         noisy = TruthWithNoise(capture, 0.0)
         measured[kind] = evaluate(capture, noisy, out_dir=tmp_path / kind)
-    full = [m["blurry_input"]["full"]["psnr"] for m in measured.values()]
-    assert full[0] == pytest.approx(full[1], abs=0.05)
     one, other = (
         np.asarray(Image.open(tmp_path / kind / m["per_frame"][0]["pictures"]["render"]), float)
         for kind, m in measured.items()

@@ -166,7 +166,7 @@ class _MeasuredFrames:
         if not self.only:
             self._others |= {
                 **{name: _picture_of(kind, self.capture) for name, kind in TRIVIAL.items()},
-                BLURRY_INPUT: self._blurry,
+                BLURRY_INPUT: self.capture.image,
             }
             if self.split == "train":
                 del self._others["nearest_frame"]
@@ -181,7 +181,7 @@ class _MeasuredFrames:
         ours = _render(self.capture, self.reconstruction, frame)
         mask, human = self.human_regions.in_frame(frame)
         self._seen |= not isinstance(human, Absent)
-        truth = None if frame.sharp is None else self.capture.shown(self.capture.sharp(frame))
+        truth = None if frame.sharp is None else self.capture.sharp(frame)
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
         for protocol in self.protocols:
@@ -199,7 +199,7 @@ class _MeasuredFrames:
             },
         }
         if not self.only:
-            blurry = Truth(STANDARD, self._blurry(frame), mask, human, self.networks)
+            blurry = Truth(STANDARD, self.capture.image(frame), mask, human, self.networks)
             against_blurry = blurry.measure(ours)
             self._against_blurry.add(against_blurry)
             entry["others"] = {
@@ -258,9 +258,6 @@ class _MeasuredFrames:
             **frames,
         }
 
-    def _blurry(self, frame: Frame) -> Float[Tensor, "H W 3"]:
-        return self.capture.shown(self.capture.image(frame))
-
     def _other_pictures(self, frame: Frame) -> dict[str, Tensor | Absent]:
         return {
             row: picture if isinstance(picture, Absent) else picture(frame)
@@ -269,9 +266,10 @@ class _MeasuredFrames:
 
     def _save(self, frame: Frame, ours: Tensor, truth: Tensor | None) -> dict[str, str]:
         stem = file_stem(self.split, frame.name)
-        pictures = {"render": to_bytes(ours)}
+        shown = self.capture.shown(ours)
+        pictures = {"render": to_bytes(shown)}
         if truth is not None:
-            pictures["error"] = error_map(ours, truth)
+            pictures["error"] = error_map(shown, self.capture.shown(truth))
         for kind, picture in pictures.items():
             save_png(self.out_dir / "pictures" / f"{stem}_{kind}.png", picture)
         return {kind: f"pictures/{stem}_{kind}.png" for kind in pictures}
@@ -304,13 +302,12 @@ def _novel_views(
         camera = capture.cameras[view.camera]
         ours: Tensor | None = None
         try:
-            ours = capture.shown(drawn(reconstruction, camera, view.time_us))
+            ours = drawn(reconstruction, camera, view.time_us)
         except DataError as error:  # trivial methods know the recording camera only
             measured = all_absent(str(error))
         if ours is not None:
             human = human_regions.in_view(camera, view.time_us)
-            recorded = capture.shown(capture.novel_image(view))
-            truth = Truth(STANDARD, recorded, None, human, networks)
+            truth = Truth(STANDARD, capture.novel_image(view), None, human, networks)
             measured = truth.measure(ours)
         means_by_camera.setdefault(view.camera, MetricMeans(("full", "person_crop"))).add(measured)
         entry = {
@@ -323,7 +320,7 @@ def _novel_views(
         }
         if ours is not None:
             path = f"pictures/{file_stem('novel', view.camera, f'{view.index:04d}')}_render.png"
-            save_png(out_dir / path, to_bytes(ours))
+            save_png(out_dir / path, to_bytes(capture.shown(ours)))
             entry["pictures"] = {"render": path}
         per_view.setdefault(view.camera, []).append(entry)
     result = {}
@@ -337,7 +334,7 @@ def _novel_views(
 
 
 def _render(capture: Capture, source: Reconstruction, frame: Frame) -> Float[Tensor, "H W 3"]:
-    return capture.shown(drawn(source, capture.camera(frame), frame.mid_us))
+    return drawn(source, capture.camera(frame), frame.mid_us)
 
 
 def _picture_of(
