@@ -1,7 +1,6 @@
 """The verb ``bench``: run what is left of a suite, then write its tables and its page."""
 
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -63,9 +62,6 @@ def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any
     if not plan.cells:
         raise ConfigError("\n".join(plan.missing.values()))
     with exclusive(folder.lock_of("bench"), wait=False):
-        # What a killed bench left half made.
-        for half in folder.captures.glob(".*"):
-            shutil.rmtree(half, ignore_errors=True)
         todo = pending_cells(plan, folder, retry=options.retry)
         executor = _executor(folder, len(todo), options)
         try:

@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice
@@ -15,7 +14,7 @@ from tqdm import tqdm
 
 from evsplat.camera import Camera
 from evsplat.errors import DataError
-from evsplat.files import atomic_path, read_json, write_json
+from evsplat.files import atomic_path, make_folder, read_json, remove_folder, write_json
 from evsplat.film.looks import Exposure, Look
 from evsplat.names import checked_name
 from evsplat.training.run import GaussianReconstruction
@@ -50,12 +49,12 @@ class FrameCache:
     def __init__(self, path: Path, digest: str) -> None:
         self.path = path
         plan = path / _PLAN
-        if path.exists() and not plan.is_file():
+        if path.exists() and not plan.is_file() and (path.is_file() or any(path.iterdir())):
             raise DataError(f"{path}: is in the way of pictures to be kept; move it elsewhere.")
         if plan.is_file() and read_json(plan) != {"plan": digest}:
             logger.info("%s: kept pictures belong to other options; starting over.", path)
-            shutil.rmtree(path)
-        path.mkdir(parents=True, exist_ok=True)
+            remove_folder(path)
+        make_folder(path)
         write_json(plan, {"plan": digest})
 
     def __len__(self) -> int:
@@ -73,7 +72,7 @@ class FrameCache:
 
     def remove(self) -> None:
         """Delete the folder with all frames."""
-        shutil.rmtree(self.path)
+        remove_folder(self.path)
 
     @torch.no_grad()
     def fill(

@@ -18,7 +18,7 @@ from evsplat.camera import Camera
 from evsplat.capture import Policy, TrainingCapture, load_capture
 from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.config import to_dict
-from evsplat.files import refuse_existing, write_text
+from evsplat.files import refuse_existing, remove_file, write_text
 from evsplat.landmarks import (
     LandmarkNetwork,
     Landmarks,
@@ -225,7 +225,7 @@ def _write_body(making: Derivation, track: BodyTrack, fitted: PoseFit) -> None:
     old = making.document.get("body")
     for name in {"body.npz", "body_dense.npz", *([old["file"]] if old else [])}:
         # It may be a hard link, and what it is linked to must stay.
-        (making.folder / name).unlink(missing_ok=True)
+        remove_file(making.folder / name)
     gender = {"gender": "neutral"} if fitted.rig.model == "smpl" else {}
     np.savez_compressed(
         making.folder / "body.npz",
