@@ -4,11 +4,13 @@ Locks end with the process that holds them, however it ends.
 """
 
 import ctypes
+import errno
 import fcntl
 import os
 import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,6 +21,8 @@ _TEMPORARY = re.compile(r"\.evsplat-\w{8}\.part(\..*)?", re.DOTALL)
 left behind by a process that was killed."""
 _swept: set[str] = set()
 """Folders in which this process has looked for such left-overs."""
+_TRIES, _GLANCE_S = 20, 0.05
+"""Who asks whether a lock is held, holds it for an instant itself."""
 
 
 def lock(handle: int, *, shared: bool = False, wait: bool = False) -> bool | None:
@@ -34,6 +38,55 @@ def lock(handle: int, *, shared: bool = False, wait: bool = False) -> bool | Non
     except OSError:
         return None
     return True
+
+
+@contextmanager
+def held(path: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold the lock of a file, which is made where it is missing and tells the process's number.
+
+    Where the file system has no locks nothing is held. The file stays.
+
+    Raises:
+        BlockingIOError: Another process holds it; its number is the error's ``strerror``.
+    """
+    tries_left = _TRIES
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            if lock(handle, wait=wait) is False:
+                if not tries_left:
+                    raise BlockingIOError(errno.EWOULDBLOCK, os.pread(handle, 32, 0).decode())
+                tries_left -= 1
+                time.sleep(_GLANCE_S)
+                continue
+            if not _is_at(handle, path):
+                continue  # whoever held it has removed it
+            os.truncate(handle, 0)
+            os.pwrite(handle, str(os.getpid()).encode(), 0)
+            yield
+            return
+        finally:
+            os.close(handle)
+
+
+def is_held(path: Path) -> bool:
+    """Whether a process holds the lock of a file; where there are no locks, whether it is there."""
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        return lock(handle, shared=True) is not True
+    finally:
+        os.close(handle)
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    """Whether an open file still has its name."""
+    try:
+        return os.path.samestat(os.fstat(handle), os.stat(path))
+    except OSError:
+        return False
 
 
 @contextmanager

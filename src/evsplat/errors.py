@@ -32,6 +32,11 @@ class BackendError(EvsplatError):
 class OutputError(EvsplatError):
     """A file or folder cannot be written: no room, no permission, something in the way."""
 
+    def __init__(self, message: str, *, no_room: bool = False) -> None:
+        """``no_room``: more room on the disk would help."""
+        super().__init__(message)
+        self.no_room = no_room
+
 
 class MachineError(EvsplatError):
     """Memory, disk or system failed where nobody expected it; `__cause__` is what they said."""

@@ -13,10 +13,19 @@ from evsplat.disk import (
     exchange,
     flush_below,
     flush_folder,
+    held,
     temporary_file,
     temporary_folder,
 )
-from evsplat.errors import DataError, EvsplatError, OutputError, only_writing_says, why_not_written
+from evsplat.errors import (
+    NO_ROOM,
+    ConfigError,
+    DataError,
+    EvsplatError,
+    OutputError,
+    only_writing_says,
+    why_not_written,
+)
 
 
 @contextmanager
@@ -112,7 +121,8 @@ def try_target(path: Path | str, room: int = 0) -> None:
     if free < room:
         raise OutputError(
             f"{path}: {free / 1e6:.1f} MB are free on its disk, expected {room / 1e6:.1f} MB; make "
-            "room there or write elsewhere."
+            "room there or write elsewhere.",
+            no_room=True,
         )
 
 
@@ -122,6 +132,25 @@ def remove_folder(path: Path) -> None:
         raise DataError(f"{path}: is a link to another folder, so it stays; remove it yourself.")
     with _output_errors(path), temporary_folder(path.parent) as temporary:
         path.rename(temporary / "old")
+
+
+@contextmanager
+def held_folder(path: Path, sign: str, busy: str) -> Iterator[None]:
+    """Hold a folder, made where it is missing, by the lock of the file ``sign`` in it.
+
+    The file goes at the end, and so does a folder that was made and has nothing else in it. Where
+    another process holds it there is a `ConfigError` that ends in ``busy``.
+    """
+    with _output_errors(path) as errors, _folder_of(path / sign, keep=False):
+        try:
+            with held(path / sign):
+                try:
+                    with errors.of_writing():
+                        yield
+                finally:
+                    remove_file(path / sign)
+        except BlockingIOError as error:
+            raise ConfigError(f"{path}: process {error.strerror} {busy}") from None
 
 
 def make_folder(path: Path) -> None:
@@ -247,21 +276,25 @@ def _output_errors(path: Path) -> Iterator[_OutputErrors]:
     except OSError as error:
         if isinstance(error, BrokenPipeError) or not (errors.all or only_writing_says(error)):
             raise
-        raise OutputError(f"{path}: {why_not_written(error)}.") from error
+        sentence = f"{path}: {why_not_written(error)}."
+        raise OutputError(sentence, no_room=error.errno in NO_ROOM) from error
 
 
 @contextmanager
-def _folder_of(target: Path) -> Iterator[None]:
-    """The folder of a path and those above it are there; what was made for nothing goes again."""
+def _folder_of(target: Path, *, keep: bool = True) -> Iterator[None]:
+    """The folder of a path and those above it are there; what was made for nothing goes again.
+
+    ``keep`` what was made for something; else what is empty at the end goes in any case.
+    """
     made = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         yield
-    except BaseException:
+        made = [] if keep else made
+    finally:
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()
-        raise
 
 
 def _umask() -> int:

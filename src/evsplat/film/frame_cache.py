@@ -78,8 +78,11 @@ class FrameCache:
     def fill(
         self, reconstruction: GaussianReconstruction, look: Look, frames: Sequence[FilmFrame]
     ) -> None:
-        """Draw what is missing, several times at once where the camera stands still."""
-        missing = [frame for frame in frames if not self.file(frame).is_file()]
+        """Draw what is missing, several times at once where the camera stands still.
+
+        A film that goes on is, bit for bit, the one that was never stopped.
+        """
+        missing = {frame for frame in frames if not self.file(frame).is_file()}
         try:
             with tqdm(
                 total=len(frames),
@@ -88,10 +91,15 @@ class FrameCache:
                 desc="render",
                 dynamic_ncols=True,
             ) as progress:
-                for batch in _of_one_camera(missing):
+                for batch in _of_one_camera(frames):
+                    if not any(frame in missing for frame in batch):
+                        continue
+                    # All of them: one drawn beside fewer others differs in its last bits.
                     times = [frame.time_us for frame in batch]
                     exposures = look.expose(reconstruction, batch[0].camera, times)
                     for frame, exposure in zip(batch, exposures, strict=True):
+                        if frame not in missing:
+                            continue
                         with atomic_path(self.file(frame)) as temporary:
                             Image.fromarray(exposure).save(temporary, compress_level=1)
                         progress.update()
