@@ -24,7 +24,7 @@ from evsplat.benching.suite import read_suite
 from evsplat.benching.tables import SPREAD, make_tables
 from evsplat.errors import ConfigError
 from evsplat.evaluation.tables import LEGEND, latex, markdown
-from evsplat.files import read_json, write_json, write_text
+from evsplat.files import read_json, try_target, write_json, write_text
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.render import choose_device
@@ -58,6 +58,7 @@ def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any
     options = given(BenchOptions, options, changes)
     plan_suite = read_suite(suite)
     folder = BenchFolder(Path(options.out or Path("bench") / plan_suite.name))
+    try_target(folder.path)
     plan = make_plan(plan_suite, folder, options)
     if not plan.cells:
         raise ConfigError("\n".join(plan.missing.values()))

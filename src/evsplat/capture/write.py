@@ -17,7 +17,15 @@ from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import copy_file, make_folder, new_folder, read_json, remove_file, write_json
+from evsplat.files import (
+    copy_file,
+    make_folder,
+    new_folder,
+    read_json,
+    remove_file,
+    try_target,
+    write_json,
+)
 from evsplat.names import checked_name
 from evsplat.pictures.files import image_size, write_image
 from evsplat.pictures.light import Transfer
@@ -254,6 +262,7 @@ class CaptureWriter:
         return self._folder
 
     def _check_target(self) -> None:
+        try_target(self.path)
         if not self.path.exists():
             return
         if not self._overwrite:

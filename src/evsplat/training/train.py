@@ -148,8 +148,10 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     state_bytes = sum(value.nbytes for value in trainer.model.state_dict().values())
     try_target(folder.path, _KEPT_AND_NEW * _WITH_OPTIMISER * state_bytes)
     if loaded is None:
-        save_yaml(folder.config, start.settings, method=start.method)
-        write_facts(folder, capture, start.method, device, start.seed)
+        if not options.resume:
+            write_facts(folder, capture, start.method, device, start.seed)
+            # The last of what resuming needs.
+            save_yaml(folder.config, start.settings, method=start.method)
         if fitting is not None and fitting.verdict != "belongs":
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
         logger.info("%s", schedule_table(start.settings, composition.weights))

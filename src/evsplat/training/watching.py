@@ -29,6 +29,7 @@ _WATCHED_SECONDS = 10.0
 """A watcher that was not seen for so long has gone."""
 _LOOK_SECONDS = 1.0
 _SIGN = ".watch"
+_FACTS = "versions.json"
 
 logger = logging.getLogger(__name__)
 
@@ -99,8 +100,8 @@ def is_training(run: Path) -> bool:
 
 
 def is_unused(run: Path) -> bool:
-    """Whether a folder holds nothing that a training could be mixed up with."""
-    return not run.exists() or {path.name for path in run.iterdir()} <= {_SIGN}
+    """Whether a folder holds nothing but what a training that never began left in it."""
+    return not run.exists() or {path.name for path in run.iterdir()} <= {_SIGN, _FACTS}
 
 
 def watch(run: Path) -> None:
