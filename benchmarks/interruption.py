@@ -10,6 +10,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -72,7 +73,6 @@ class Outcome:
 
 def run(
     command: list[str],
-    log: Path,
     disk: "Disk",
     *,
     prepare: Callable[[], None] = lambda: None,
@@ -81,13 +81,16 @@ def run(
 ) -> Outcome:
     """Run ``evsplat`` with ``command`` in ``disk.path``; see what an interruption makes of it."""
     counted, counting = os.pipe()
+    heard, saying = os.pipe()
     started = time.monotonic()
     sys.stdout.flush()
     child = os.fork()
     if child == 0:
         os.close(counted)
-        _be_command(command, log, disk.path, counting, prepare, interruption, usual)
+        _be_command(command, saying, disk.path, counting, prepare, interruption, usual)
     os.close(counting)
+    os.close(saying)
+    said = _Listener(heard)
     os.read(counted, 1)
     if interruption is not None and usual is not None:
         _interrupt(child, interruption, usual, disk)
@@ -95,12 +98,27 @@ def run(
     calls = os.read(counted, 64)
     os.close(counted)
     disk.empty()
-    return Outcome(
-        code,
-        time.monotonic() - started,
-        int(calls or b"0"),
-        log.read_text(encoding="utf-8", errors="replace"),
-    )
+    return Outcome(code, time.monotonic() - started, int(calls or b"0"), said.text())
+
+
+class _Listener(threading.Thread):
+    """Reads what a command says, which a limit on the size of files does not reach."""
+
+    def __init__(self, pipe: int) -> None:
+        super().__init__(daemon=True)
+        self._pipe, self._parts = pipe, list[bytes]()
+        self.start()
+
+    def run(self) -> None:
+        """Read until nobody holds the other end."""
+        while part := os.read(self._pipe, 1 << 16):
+            self._parts.append(part)
+        os.close(self._pipe)
+
+    def text(self) -> str:
+        """All of it; processes of a killed command end soon after it."""
+        self.join(30)
+        return b"".join(self._parts).decode(errors="replace")
 
 
 def _interrupt(child: int, what: Interruption, usual: Usual, disk: "Disk") -> None:
@@ -133,7 +151,7 @@ def _end_of(child: int) -> int:
 
 def _be_command(
     command: list[str],
-    log: Path,
+    saying: int,
     place: Path,
     counting: int,
     prepare: Callable[[], None],
@@ -146,9 +164,8 @@ def _be_command(
         from evsplat.cli import main
 
         os.setsid()
-        output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         for number in (1, 2):
-            os.dup2(output, number)
+            os.dup2(saying, number)
         os.chdir(place)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         prepare()

@@ -45,7 +45,7 @@ EXPECTED = {
 }
 """Exit codes of what was interrupted; 0 where it came too late."""
 IMPORTED = "benching.run events.convert export importers masks.capture staging training".split()
-LEFT = re.compile(r"\.evsplat-|\.watch$|snapshot\.safetensors$|\.part$|\.partial$")
+LEFT = re.compile(r"\.evsplat-|(^|/)\.?tmp|\.watch$|snapshot\.safetensors$|\.part$|\.partial$")
 NOT_FOUND_OUT = re.compile(r"Traceback \(most recent|Exception ignored|Segmentation|core dumped")
 
 
@@ -187,7 +187,7 @@ def make_inputs(given: Path, place: Path) -> None:
     suite["captures"] = [{"name": "capture", "path": str(given / "capture")}]
     (given / "suite.yaml").write_text(yaml.safe_dump(suite))
     disk = Disk(place / "first")
-    ended = run(list(jobs(given)["train"].command), place / "log", disk)
+    ended = run(list(jobs(given)["train"].command), disk)
     assert ended.code == 0, ended.said
     shutil.copytree(disk.path / "run", given / "run")
     disk.close()
@@ -201,7 +201,7 @@ class Bench:
         self.inputs = digests(given)
         self.number = self.in_time = 0
         disk = Disk(place / f"{name}-whole")
-        ended = run(list(job.command), place / "log", disk, prepare=job.prepare)
+        ended = run(list(job.command), disk, prepare=job.prepare)
         assert ended.code == 0, f"{name}: {ended.said}"
         self.expected = made(disk.path / job.out)
         sizes = [file.stat().st_size for file in disk.path.rglob("*") if file.is_file()]
@@ -220,10 +220,9 @@ class Bench:
             shutil.rmtree(disk.path, ignore_errors=True)
 
     def _interrupted(self, what: Interruption, disk: Disk) -> list[str]:
-        job, log = self.job, self.place / "log"
+        job = self.job
         first = run(
             list(job.command),
-            log,
             disk,
             prepare=job.prepare,
             interruption=what,
@@ -241,7 +240,7 @@ class Bench:
             return wrong if whole else [*wrong, "what is there is not whole"]
         on = job.again is not None and (out / job.goes_on).exists()
         command = job.again if on and job.again is not None else job.command
-        second = run(list(command), log, disk, prepare=job.prepare)
+        second = run(list(command), disk, prepare=job.prepare)
         if second.code != 0:
             return [*wrong, f"the second run ends with {second.code}: {second.said[-600:]}"]
         wrong += _wrong_end(second, set())
@@ -259,9 +258,9 @@ class Bench:
 def _wrong_end(ended: Outcome, expected: set[int]) -> list[str]:
     wrong = []
     if ended.code not in expected | {0}:
-        wrong.append(f"ended with {ended.code}: {ended.said[-1500:]}")
+        wrong.append(f"ended with {ended.code}: {ended.said[-4000:]}")
     elif NOT_FOUND_OUT.search(ended.said):
-        wrong.append(f"said: {ended.said[-1500:]}")
+        wrong.append(f"said: {ended.said[-3000:]}")
     elif ended.code == 2 and ended.said.count("evsplat: ") != 1:
         wrong.append(f"not one sentence: {ended.said[-600:]}")
     return wrong

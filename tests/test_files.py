@@ -166,6 +166,14 @@ def test_what_killed_writers_left_is_swept_and_what_living_ones_write_stays(tmp_
     }
 
 
+def test_an_encoder_that_writes_beside_its_path_is_a_fault(tmp_path: Path) -> None:
+    """Its file would neither be locked nor on the disk."""
+    with pytest.raises(AssertionError), atomic_path(tmp_path / "a") as temporary:
+        (tmp_path / "own").write_text("x")
+        (tmp_path / "own").replace(temporary)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_link_named_like_a_left_over_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "a").touch()

@@ -27,7 +27,6 @@ ENCODING = {
     "pictures/files.py": {"save"},
     "pictures/video.py": {"save", "open"},
     "posing/find.py": {"savez_compressed"},
-    "training/checkpoint.py": {"save_file"},
     "view/save_panel.py": {"save"},
 }
 ALLOWED = {("cli/exits.py", "os.open")}  # the device to which nobody listens

@@ -59,7 +59,7 @@ def held(path: Path, *, wait: bool = False) -> Iterator[None]:
                 tries_left -= 1
                 time.sleep(_GLANCE_S)
                 continue
-            if not _is_at(handle, path):
+            if not is_at(handle, path):
                 continue  # whoever held it has removed it
             os.truncate(handle, 0)
             os.pwrite(handle, str(os.getpid()).encode(), 0)
@@ -81,7 +81,7 @@ def is_held(path: Path) -> bool:
         os.close(handle)
 
 
-def _is_at(handle: int, path: Path) -> bool:
+def is_at(handle: int, path: Path) -> bool:
     """Whether an open file still has its name."""
     try:
         return os.path.samestat(os.fstat(handle), os.stat(path))

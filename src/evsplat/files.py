@@ -14,6 +14,7 @@ from evsplat.disk import (
     flush_below,
     flush_folder,
     held,
+    is_at,
     temporary_file,
     temporary_folder,
 )
@@ -55,6 +56,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         with _folder_of(target), temporary_file(target) as (handle, temporary):
             with errors.of_writing():
                 yield temporary
+            assert is_at(handle, temporary), "an encoder put a file of its own in its place"
             os.fchmod(handle, 0o666 & ~_umask())
             os.fsync(handle)
             os.replace(temporary, target)
@@ -186,7 +188,7 @@ def open_output(
 ) -> BinaryIO:
     """Open a temporary path that this module gave, or a log to be added to."""
     with _output_errors(path):
-        return cast(BinaryIO, path.open(mode, buffering=-1 if buffered else 0))
+        return path.open(mode, buffering=-1 if buffered else 0)
 
 
 def write_bytes(path: Path | str, content: bytes) -> None:

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors import SafetensorError
 
 from evsplat.errors import DataError, OutputError
-from evsplat.training import checkpoint
 from evsplat.training.checkpoint import checkpoints, load_latest, save_checkpoint
 
 
@@ -32,14 +30,14 @@ def steps(folder: Path) -> list[int]:
 
 def full_unless(monkeypatch: pytest.MonkeyPatch, folder: Path, most: int) -> None:
     """Nothing can be written while the folder holds more than ``most`` checkpoints."""
-    write = checkpoint.save_file
+    write = Path.write_bytes
 
-    def on_a_full_disk(*arguments: object, **rest: object) -> None:
+    def on_a_full_disk(path: Path, content: bytes) -> int:
         if len(steps(folder)) > most:
-            raise SafetensorError("Error: No space left on device (os error 28)")
-        write(*arguments, **rest)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, content)
 
-    monkeypatch.setattr(checkpoint, "save_file", on_a_full_disk)
+    monkeypatch.setattr(Path, "write_bytes", on_a_full_disk)
 
 
 def test_on_a_full_disk_the_oldest_gives_way(
@@ -104,9 +102,9 @@ def test_a_training_that_goes_on_from_before_drops_what_is_later(folder: Path) -
 
 def test_the_disk_s_other_faults_keep_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> None:
-        raise SafetensorError("Error: Input/output error (os error 5)")
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(checkpoint, "save_file", broken)
+    monkeypatch.setattr(Path, "write_bytes", broken)
     with pytest.raises(OSError, match=os.strerror(errno.EIO)):
         save(folder, 30)
     assert steps(folder) == [10, 20]

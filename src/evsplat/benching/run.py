@@ -64,7 +64,8 @@ def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any
         raise ConfigError("\n".join(plan.missing.values()))
     with exclusive(folder.lock_of("bench"), wait=False):
         todo = pending_cells(plan, folder, retry=options.retry)
-        executor = _executor(folder, len(todo), options)
+        # Of all cells, done or not: how many threads a cell has decides its last bits.
+        executor = _executor(folder, len(plan.cells), options)
         try:
             _run(plan, todo, folder, executor)
         except KeyboardInterrupt:

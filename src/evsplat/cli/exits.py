@@ -39,7 +39,7 @@ def exit_code(work: Callable[[], object]) -> int:
     except EvsplatError as error:
         return _said(error)
     except KeyboardInterrupt as stop:
-        print(f"\nevsplat: {str(stop) or 'Stopped.'}", file=sys.stderr)
+        _tell(f"\nevsplat: {str(stop) or 'Stopped.'}")
         return _INTERRUPTED
     except BrokenPipeError:
         # Whoever reads, such as head, has enough. What is still buffered goes nowhere, quietly.
@@ -55,8 +55,14 @@ def exit_code(work: Callable[[], object]) -> int:
 
 
 def _said(error: EvsplatError) -> int:
-    print(f"evsplat: {error}{_kept_traceback(error)}", file=sys.stderr)
+    _tell(f"evsplat: {error}{_kept_traceback(error)}")
     return _BAD_INPUT
+
+
+def _tell(text: str) -> None:
+    """Say it where somebody may read it: messages may go to the disk that is full."""
+    with suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def _kept_traceback(error: EvsplatError) -> str:

@@ -2,18 +2,16 @@
 
 import json
 import logging
-import os
-import re
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from evsplat.errors import DataError, OutputError
-from evsplat.files import atomic_path, remove_file
+from evsplat.files import remove_file, write_bytes
 from evsplat.models.model import Model
 
 logger = logging.getLogger(__name__)
@@ -64,14 +62,8 @@ def kept_sentence(folder: Path) -> str:
 def write_state(path: Path, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:
     """Write tensors and state as `load_checkpoint` reads them, whole or not at all."""
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with atomic_path(path) as temporary:
-        try:
-            save_file(kept, temporary, metadata={"state": json.dumps(state)})
-        except SafetensorError as error:
-            number = re.search(r"os error (\d+)", str(error))
-            if number is None:
-                raise
-            raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
+    # Not save_file, which writes to a file of its own and leaves it behind where it is killed.
+    write_bytes(path, save(kept, metadata={"state": json.dumps(state)}))
 
 
 def checkpoints(folder: Path) -> list[Path]:

@@ -8,7 +8,7 @@ import asyncio
 import ipaddress
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
@@ -45,7 +45,8 @@ def own_pages_alone(listens_at: str) -> Iterator[None]:
     Messages that are none end their connection with one line in the log. viser has no setting for
     either.
     """
-    serve: Callable[..., Any] = websockets.asyncio.server.serve
+    module: Any = websockets.asyncio.server
+    serve = module.serve
     silent = logging.getLogger(f"{__name__}.handshakes")
     silent.setLevel(logging.CRITICAL)
 
@@ -63,11 +64,11 @@ def own_pages_alone(listens_at: str) -> Iterator[None]:
         return serve(_said_in_a_line(handler), *arguments, process_request=judged, **rest)
 
     with _one_at_a_time:
-        websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
+        module.serve = guarded
         try:
             yield
         finally:
-            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+            module.serve = serve
 
 
 def log_in_a_line(loop: asyncio.AbstractEventLoop) -> None:
