@@ -14,16 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import yaml
-
 from evsplat.errors import ConfigError
-from evsplat.files import read_text, without_advice
+from evsplat.untrusted.text import parse_yaml, read_text
 
 Config = TypeVar("Config")
-_DEEPEST = 50
-"""Levels of a YAML text; settings have a handful."""
-_MISFITS = (TypeError, KeyError, IndexError, AttributeError, OverflowError)
-"""What PyYAML raises, besides `ValueError` and its own errors, on tags such as ``!!bool 3``."""
 _MOST_NAMED = 5
 """Unknown settings that one message names."""
 
@@ -192,7 +186,7 @@ def load_yaml(path: Path | str) -> dict[str, Any]:
     """Read a YAML mapping; anything else is a `ConfigError` that names the file."""
     path = Path(path)
     try:
-        values = _parse_yaml(read_text(path, error=ConfigError))
+        values = parse_yaml(read_text(path, error=ConfigError))
     except ValueError as error:
         raise ConfigError(f"{path}: not valid YAML ({error}); correct it.") from None
     if not isinstance(values, dict):
@@ -209,7 +203,7 @@ def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, An
                 f"--set {assignment}: expected KEY=VALUE, such as --set event_start=1000."
             )
         try:
-            value = _parse_yaml(text)
+            value = parse_yaml(text)
         except ValueError:
             raise ConfigError(f"--set {assignment}: {text!r} is not a YAML value.") from None
         *sections, last = key.split(".")
@@ -220,25 +214,6 @@ def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, An
                 raise ConfigError(f"--set {assignment}: {section!r} is a value, not a section.")
         place[last] = value
     return values
-
-
-def _parse_yaml(text: str) -> Any:
-    """The value that a YAML text stands for; all that can be wrong with it is a `ValueError`."""
-    depth = 0
-    try:
-        # These come one by one, so that a text of brackets costs no more than its first few.
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > _DEEPEST:
-                raise ValueError(f"nested more than {_DEEPEST} deep")
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(str(error)) from None
-    except ValueError as error:
-        raise ValueError(without_advice(error)) from None
-    except _MISFITS:
-        raise ValueError("a tag that its value does not fit") from None
 
 
 def expected(hint: Any, ranges: Sequence[Range] = (), *, many: bool = False) -> str:

@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from evsplat.errors import WeightsError
+from evsplat.untrusted.tensors import load_torch
 
 
 class MissingWeights(WeightsError):
@@ -27,9 +27,7 @@ def sha256_of(path: Path) -> str:
 def read_state(path: Path) -> dict[str, Any]:
     """A state dict read without running anything that the file may contain."""
     try:
-        state = torch.load(
-            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
-        )
+        state = load_torch(path)
     except Exception as error:  # torch raises many kinds for files that are not its own
         raise WeightsError(f"{path}: not a readable PyTorch weight file ({error}).") from error
     if not isinstance(state, dict):

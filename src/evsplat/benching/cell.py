@@ -18,13 +18,14 @@ from evsplat.capture import Capture, Policy, load_capture
 from evsplat.config import override, to_dict
 from evsplat.errors import ConfigError, EvsplatError
 from evsplat.evaluation.evaluator import evaluate
-from evsplat.files import read_json, write_json
+from evsplat.files import write_json
 from evsplat.methods import method_config
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
 from evsplat.render import choose_device
 from evsplat.restore import restore_capture
 from evsplat.staging import StageSettings, stage
+from evsplat.untrusted.text import read_json
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from evsplat.benching.cell import DONE
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.plan import Plan
 from evsplat.evaluation.tables import Figure
-from evsplat.files import read_json
+from evsplat.untrusted.text import read_json
 
 Record = dict[str, Any]
 

@@ -11,11 +11,11 @@ from evsplat.benching.cell import FAILED, CaptureSource, Cell
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.suite import Suite, SuiteCapture, SuiteRow, check_names
 from evsplat.errors import ConfigError
-from evsplat.files import read_json
 from evsplat.methods.trivial import TRIVIAL
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.shipped import demo_capture
+from evsplat.untrusted.text import read_json
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,11 @@ from evsplat.benching.suite import read_suite
 from evsplat.benching.tables import SPREAD, make_tables
 from evsplat.errors import ConfigError
 from evsplat.evaluation.tables import LEGEND, latex, markdown
-from evsplat.files import read_json, write_json, write_text
+from evsplat.files import write_json, write_text
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.render import choose_device
+from evsplat.untrusted.text import read_json
 
 Executor = LocalPool | RayCluster
 """Processes that cells run in."""

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
-from evsplat.capture.body_file import read_arrays
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import Metadata
 from evsplat.errors import DataError
+from evsplat.untrusted.arrays import read_plain_npz
 
 _JOINTS = {"default": 31, "smpl": 24, "smplh": 52, "smplx": 55}
 _WEIGHT_SUM_TOLERANCE = 1e-3
@@ -48,7 +48,7 @@ def _read(path: Path, findings: Findings) -> dict[str, np.ndarray] | None:
         findings.error(path, "", "no such file", "the body and its poses", "Restore the file.")
         return None
     try:
-        return read_arrays(path)
+        return read_plain_npz(path)
     except DataError as error:
         reason, remedy = reason_and_remedy(error, path)
         reason = reason.split(", expected")[0]

@@ -7,8 +7,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from evsplat.capture.finding import Findings
+from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Metadata
+from evsplat.errors import DataError
+from evsplat.untrusted.faults import BROKEN, reason
+from evsplat.untrusted.hdf5 import open_hdf5, wrong_data_set
 
 _COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 _SCAN_EVENTS = 1 << 20
@@ -25,21 +28,18 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
         findings.error(entry.file, "", "no such file", "the event recording", "Restore the file.")
         return
     try:
-        with h5py.File(entry.file, "r") as file:
+        with open_hdf5(entry.file) as file:
             if not _check_layout(entry.file, file, findings):
                 return
             _check_clock(metadata, entry, file, findings)
             if deep:
                 _Scan(entry, file, findings).run()
-    except OSError as error:
-        denied = isinstance(error, PermissionError)
-        findings.error(
-            entry.file,
-            "",
-            f"a file that HDF5 cannot read ({error})",
-            "a whole HDF5 file",
-            "Give yourself the permission to read it." if denied else _REPAIR,
-        )
+    except DataError as error:
+        found, remedy = reason_and_remedy(error, entry.file)
+        findings.error(entry.file, "", found, "a whole HDF5 file", remedy)
+    except BROKEN as error:
+        found = f"a file that HDF5 cannot read ({reason(error)})"
+        findings.error(entry.file, "", found, "a whole HDF5 file", _REPAIR)
 
 
 def _check_sensor(metadata: Metadata, entry: EventsEntry, findings: Findings) -> None:
@@ -70,7 +70,7 @@ def _check_layout(path: Path, file: h5py.File, findings: Findings) -> bool:
     before = findings.error_count()
     names = [f"events/{column}" for column in _COLUMNS]
     for name in [*names, "ms_to_idx", "t_offset"]:
-        found = _wrong_entry(file, name)
+        found = wrong_data_set(file, name)
         if found:
             findings.error(path, name, found, "a data set", "Write the file anew.")
     if findings.error_count() > before:
@@ -102,16 +102,6 @@ def _check_layout(path: Path, file: h5py.File, findings: Findings) -> bool:
     for name in names:
         _check_filters(path, name, file[name], findings)
     return findings.error_count() == before
-
-
-def _wrong_entry(file: h5py.File, name: str) -> str:
-    """Description of a wrong entry of the file; "" where it is a data set as it should be."""
-    try:
-        found = file.get(name)
-        return "" if isinstance(found, h5py.Dataset) and found.shape is not None else "nothing"
-    except (RuntimeError, OSError) as error:
-        # such as a link to itself
-        return f"what HDF5 cannot open ({error})"
 
 
 def _check_filters(path: Path, name: str, data: h5py.Dataset, findings: Findings) -> None:

@@ -19,8 +19,9 @@ from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import new_folder, read_json, write_json
+from evsplat.files import new_folder, write_json
 from evsplat.pictures.files import write_image
+from evsplat.untrusted.text import read_json
 
 Frames = Sequence[Frame]
 Made = Iterator[tuple[Frame, Float[Tensor, "..."]]]

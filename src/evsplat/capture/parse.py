@@ -15,9 +15,9 @@ from evsplat.capture.fields import MISSING, RENAME, Fields, brief, is_whole
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Frame, Metadata, NovelView
 from evsplat.errors import DataError
-from evsplat.files import read_json
 from evsplat.names import NAME_RULE, is_name
 from evsplat.pictures.light import TRANSFERS, Transfer
+from evsplat.untrusted.text import read_json
 
 FORMAT = "evsplat-capture"
 VERSION = 1

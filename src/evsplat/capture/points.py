@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from evsplat.errors import DataError
-from evsplat.files import atomic_path, why_not_read
+from evsplat.files import atomic_path
+from evsplat.untrusted.arrays import read_table
+from evsplat.untrusted.faults import why_not_read
 
 _TYPES = {
     **{name: "i1" for name in ("char", "int8")},
@@ -37,7 +39,7 @@ def read_points(
                 raise ValueError(f"{left} bytes after the header, too few for {count} vertices")
             dtype = np.dtype([(name, _BYTE_ORDER[layout] + kind) for name, kind in fields])
             if layout == "ascii":
-                table = np.atleast_2d(np.loadtxt(file, max_rows=count, dtype=np.float64))
+                table = read_table(file, rows=count)
                 columns = {name: table[:, i] for i, (name, _) in enumerate(fields)}
                 length = len(table)
             else:

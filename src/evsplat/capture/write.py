@@ -19,10 +19,12 @@ from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import read_json, write_json
+from evsplat.files import write_json
 from evsplat.names import checked_name
-from evsplat.pictures.files import image_size, write_image
+from evsplat.pictures.files import write_image
 from evsplat.pictures.light import Transfer
+from evsplat.untrusted.pictures import image_size
+from evsplat.untrusted.text import read_json
 
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 

@@ -18,6 +18,8 @@ from jaxtyping import Float, Int64
 
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events.stream import EventStream
+from evsplat.untrusted.faults import broken_as
+from evsplat.untrusted.hdf5 import data_set, open_hdf5
 
 Span = tuple[int, int]
 """Start and end of a stretch of time, microseconds, the end exclusive."""
@@ -170,18 +172,11 @@ class EventStore:
 
     def _open(self) -> h5py.File:
         if self._file is None or self._owner_pid != os.getpid():
-            try:
-                self._file = h5py.File(self.path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
-                self._owner_pid = os.getpid()
-                self._shift_us = self.clock_offset_us + int(self._file["t_offset"][()])
-            except FileNotFoundError:
-                raise DataError(f"{self.path}: file not found.") from None
-            except (OSError, KeyError) as error:
-                self._file = None
-                raise DataError(
-                    f"{self.path}: not a readable event file ({error}); copy it again or write it "
-                    "anew."
-                ) from error
+            file = open_hdf5(self.path, rdcc_nbytes=_CHUNK_CACHE_BYTES)
+            for name in ("events/t", "events/x", "events/y", "events/p", "ms_to_idx", "t_offset"):
+                data_set(file, name)
+            self._shift_us = self.clock_offset_us + int(file["t_offset"][()])
+            self._file, self._owner_pid = file, os.getpid()
         return self._file
 
     @functools.cached_property
@@ -223,12 +218,8 @@ class EventStore:
         return int(self._open()["events/t"].shape[0])
 
     def _read(self, file: h5py.File, key: str, first: int, last: int) -> np.ndarray:
-        try:
+        with broken_as(self.path, f"{key}[{first}:{last}] cannot be read", "copy the file again"):
             return file[key][first:last]
-        except OSError as error:
-            raise DataError(
-                f"{self.path}: {key}[{first}:{last}] cannot be read ({error}); copy the file again."
-            ) from error
 
     def _check_pixels(self, x: np.ndarray, y: np.ndarray, first: int) -> None:
         outside = (x >= self.width) | (y >= self.height)

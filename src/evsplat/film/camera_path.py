@@ -28,7 +28,7 @@ from torch import Tensor
 
 from evsplat.capture import Camera, Capture, Frame
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import read_json
+from evsplat.untrusted.text import read_json
 
 CameraPath = Callable[[float], Camera]
 """The camera at a share of the film, 0 to 1."""

@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from evsplat.errors import DataError
 from evsplat.files import atomic_path
 from evsplat.models.model import Model
+from evsplat.untrusted.tensors import read_safetensors
+from evsplat.untrusted.text import parse_json
 
 KEEP = 2
 """Checkpoints kept in a run; the one before the last survives a disk that fills up."""
@@ -44,10 +45,9 @@ def latest_checkpoint(folder: Path) -> Path | None:
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and state of a checkpoint; a damaged file is a `DataError`."""
     try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            state = json.loads(file.metadata()["state"])
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError, OSError) as error:
+        tensors, texts = read_safetensors(path)
+        state = parse_json(texts["state"])
+    except (OSError, KeyError, ValueError) as error:
         raise DataError(
             f"{path}: not a readable checkpoint ({error}); remove it to go on from the one before."
         ) from None

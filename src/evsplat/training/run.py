@@ -1,6 +1,5 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
-import json
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from evsplat.capture.masked import MaskedCapture
 from evsplat.config import load_yaml
 from evsplat.devices import hardware
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import read_json, write_json, write_text
+from evsplat.files import write_json, write_text
 from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Rendering
@@ -35,6 +34,7 @@ from evsplat.training.checkpoint import (
     load_checkpoint,
     load_model,
 )
+from evsplat.untrusted.text import parse_json, read_json
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
@@ -63,9 +63,9 @@ class RunFolder:
         kept = []
         for line in self.log.read_text(encoding="utf-8").splitlines():
             try:
-                if json.loads(line)["iteration"] <= iteration:
+                if parse_json(line)["iteration"] <= iteration:
                     kept.append(line)
-            except (json.JSONDecodeError, KeyError):
+            except (ValueError, KeyError, TypeError):
                 continue  # the last line of a killed process may be half written
         write_text(self.log, "".join(line + "\n" for line in kept))
 

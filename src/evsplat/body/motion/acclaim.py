@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
-from evsplat.files import read_text
+from evsplat.untrusted.text import read_text
 
 FRAME_RATE_HZ = 120.0
 """CMU's; the files do not say."""

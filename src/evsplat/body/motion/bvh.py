@@ -13,7 +13,7 @@ from evsplat.body.retarget import SkeletonMotion, rest_from_zero
 from evsplat.body.skeleton import find_skeleton
 from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
-from evsplat.files import read_text
+from evsplat.untrusted.text import read_text
 
 _CHANNELS = [f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz"]
 

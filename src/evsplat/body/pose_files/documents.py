@@ -13,8 +13,10 @@ import torch
 
 from evsplat.body.smpl_skeleton import rest_pelvis
 from evsplat.errors import DataError
-from evsplat.files import read_json
-from evsplat.safe_pickle import read_npy, read_npz, read_pickle
+from evsplat.untrusted.arrays import read_npy, read_npz
+from evsplat.untrusted.pickles import read_pickle
+from evsplat.untrusted.tensors import load_torch
+from evsplat.untrusted.text import read_json
 
 _WHAT = "pose file"
 
@@ -93,7 +95,7 @@ def _number(path: Path) -> int:
 
 def _read_torch(path: Path) -> Any:
     try:
-        return _arrays(torch.load(path, map_location="cpu", weights_only=True))
+        return _arrays(load_torch(path))
     except FileNotFoundError:
         raise DataError(f"{path}: file not found.") from None
     except Exception as error:  # torch's readers raise nearly anything on damaged files
@@ -127,7 +129,7 @@ class _Storage:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             try:
-                stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+                stored = load_torch(io.BytesIO(data))
                 self.flat = torch.tensor([], dtype=stored.dtype).set_(stored.untyped())
             except Exception:  # as above
                 raise ValueError("a damaged tensor") from None

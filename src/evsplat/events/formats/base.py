@@ -2,11 +2,10 @@
 
 import gzip
 import os
-import re
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +14,6 @@ import numpy as np
 
 from evsplat.errors import DataError
 from evsplat.options import ReadOptions
-from evsplat.safe_pickle import BROKEN
 
 BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
@@ -145,16 +143,6 @@ class ByteReader(ExitStack):
             ) from None
         self.offset += len(data)
         return data
-
-
-@contextmanager
-def broken_as_data_error(path: Path, fault: str) -> Iterator[None]:
-    """Errors that damaged files cause in other libraries as a `DataError` that begins so."""
-    try:
-        yield
-    except BROKEN as error:
-        reason = re.sub(r"\s+", " ", str(error))[:200]
-        raise DataError(f"{path}: {fault} ({reason}).") from None
 
 
 def is_gzipped(path: Path) -> bool:
