@@ -15,9 +15,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from evsplat.errors import ConfigError
+from evsplat.untrusted.faults import brief
 from evsplat.untrusted.text import parse_yaml, read_text
 
 Config = TypeVar("Config")
+_LONGEST_NAME = 80
+"""Of a setting in a message; those that there are have 40."""
 _MOST_NAMED = 5
 """Unknown settings that one message names."""
 
@@ -198,20 +201,20 @@ def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, An
     """Apply ``section.key=value`` assignments (values in YAML) to nested dictionaries."""
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
+        printable = assignment.isprintable() and len(assignment) <= _LONGEST_NAME
+        shown = assignment if printable else brief(assignment)
         if not equals or not key:
-            raise ConfigError(
-                f"--set {assignment}: expected KEY=VALUE, such as --set event_start=1000."
-            )
+            raise ConfigError(f"--set {shown}: expected KEY=VALUE, such as --set event_start=1000.")
         try:
             value = parse_yaml(text)
         except ValueError:
-            raise ConfigError(f"--set {assignment}: {text!r} is not a YAML value.") from None
+            raise ConfigError(f"--set {shown}: {brief(text)} is not a YAML value.") from None
         *sections, last = key.split(".")
         place = values
         for section in sections:
             place = place.setdefault(section, {})
             if not isinstance(place, dict):
-                raise ConfigError(f"--set {assignment}: {section!r} is a value, not a section.")
+                raise ConfigError(f"--set {shown}: {brief(section)} is a value, not a section.")
         place[last] = value
     return values
 
@@ -345,7 +348,8 @@ def _unknown(
     hints = get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind)]
     for name, item in values.items():
-        full = f"{prefix}{name}"
+        full = f"{prefix}{name}" if str(name).isprintable() else f"{prefix}{name!r}"
+        full = full if len(full) <= _LONGEST_NAME else brief(full)
         if full in dropped:
             parts = [f"{full}.{key}" for key in item] if isinstance(item, dict) else []
             named = [part for part in parts if part in dropped]
@@ -387,4 +391,4 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 def _wrong(where: str, key: str, value: Any, expected: str) -> ConfigError:
     if isinstance(value, float) and not math.isfinite(value):
         expected = expected.replace("a number", "a finite number")
-    return ConfigError(f"{where}: {key} is {value!r}; expected {expected}.")
+    return ConfigError(f"{where}: {key} is {brief(value)}; expected {expected}.")

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from evsplat.errors import WeightsError
+from evsplat.untrusted.faults import ordinary_file
 from evsplat.untrusted.tensors import load_torch
 
 
@@ -26,6 +27,7 @@ def sha256_of(path: Path) -> str:
 
 def read_state(path: Path) -> dict[str, Any]:
     """A state dict read without running anything that the file may contain."""
+    ordinary_file(path, error=WeightsError)
     try:
         state = load_torch(path)
     except Exception as error:  # torch raises many kinds for files that are not its own

@@ -11,12 +11,13 @@ from torch import Tensor
 from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
 from evsplat.camera import Camera
 from evsplat.capture.distortion import COEFFICIENT_COUNTS, Distortion
-from evsplat.capture.fields import MISSING, RENAME, Fields, brief, is_whole
+from evsplat.capture.fields import MISSING, RENAME, Fields, is_whole
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Frame, Metadata, NovelView
 from evsplat.errors import DataError
 from evsplat.names import NAME_RULE, is_name
 from evsplat.pictures.light import TRANSFERS, Transfer
+from evsplat.untrusted.faults import brief
 from evsplat.untrusted.text import read_json
 
 FORMAT = "evsplat-capture"

@@ -10,7 +10,7 @@ from jaxtyping import Float32
 from evsplat.errors import DataError
 from evsplat.files import atomic_path
 from evsplat.untrusted.arrays import read_table
-from evsplat.untrusted.faults import why_not_read
+from evsplat.untrusted.faults import ordinary_file
 
 _TYPES = {
     **{name: "i1" for name in ("char", "int8")},
@@ -23,6 +23,7 @@ _TYPES = {
     **{name: "f8" for name in ("double", "float64")},
 }
 _COLOURS = ("red", "green", "blue")
+_LONGEST_LINE = 4096
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
 
@@ -30,6 +31,7 @@ def read_points(
     path: Path,
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 3"]]:
     """Positions (metres, world) and colours in [0, 1] of the vertices; grey 0.5 without colour."""
+    ordinary_file(path)
     try:
         with path.open("rb") as file:
             layout, count, fields = _read_header(file)
@@ -46,8 +48,6 @@ def read_points(
                 rows = np.frombuffer(file.read(count * dtype.itemsize), dtype=dtype)
                 columns = {name: rows[name] for name, _ in fields}
                 length = len(rows)
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise DataError(f"{path}: {why_not_read(error)}.") from error
     except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path}: not a readable PLY ({error}); write it anew.") from error
     if length != count:
@@ -103,7 +103,7 @@ def write_points(
 def _read_header(file: BinaryIO) -> tuple[str, int, list[tuple[str, str]]]:
     """Layout, vertex count and (name, numpy type) of the vertex properties."""
     lines = []
-    for raw in file:
+    while raw := file.readline(_LONGEST_LINE):
         lines.append(raw.decode("ascii").split())
         if lines[-1] == ["end_header"]:
             break

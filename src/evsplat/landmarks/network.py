@@ -116,15 +116,15 @@ class LandmarkNetwork:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Graph and weights of a file."""
+    if not path.is_file():
+        raise WeightsError(
+            f"{path}: file not found; give a network that tools/convert_blazepose.py has written."
+        )
     try:
         weights, texts = read_safetensors(path)
         graph = parse_json(texts["graph"])
         kinds = {node["kind"] for node in graph["nodes"]}
         graph["input"], graph["outputs"]
-    except FileNotFoundError:
-        raise WeightsError(
-            f"{path}: file not found; give a network that tools/convert_blazepose.py has written."
-        ) from None
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise WeightsError(
             f"{path}: not a network that tools/convert_blazepose.py has written "

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from evsplat.errors import DataError, EvsplatError
 
@@ -78,3 +79,14 @@ def reason(error: BaseException) -> str:
     """What an error of a library says, on one line and without advice to programmers."""
     text = str(error).partition("; use sys.set_int_max_str_digits")[0]
     return " ".join(text.split())[:_MOST_LETTERS] or type(error).__name__
+
+
+def brief(value: Any, limit: int = 80) -> str:
+    """``repr`` cut to a length that fits a message."""
+    try:
+        text = repr(value)
+    except RecursionError:
+        text = f"a {type(value).__name__} nested too deeply to be shown"
+    except ValueError:
+        text = "an integer of thousands of digits"
+    return text if len(text) <= limit else text[: limit - 1] + "…"

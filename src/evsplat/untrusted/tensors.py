@@ -8,7 +8,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from evsplat.untrusted.faults import BROKEN
+from evsplat.untrusted.faults import BROKEN, ordinary_file
 from evsplat.untrusted.sizes import open_zip
 
 
@@ -17,6 +17,8 @@ def load_torch(source: Path | IO[bytes]) -> Any:
 
     Large archives are mapped, not copied.
     """
+    if isinstance(source, Path):
+        ordinary_file(source)
     packed = isinstance(source, Path) and zipfile.is_zipfile(source)
     if packed:
         open_zip(str(source)).close()
@@ -25,11 +27,10 @@ def load_torch(source: Path | IO[bytes]) -> Any:
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and texts of a file of safetensors; a `ValueError` where it is none."""
+    ordinary_file(path)
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return tensors, file.metadata() or {}
-    except FileNotFoundError:
-        raise
     except (*BROKEN, SafetensorError) as error:
         raise ValueError(str(error)) from None

@@ -14,6 +14,7 @@ import torch
 from evsplat.body.smpl_skeleton import rest_pelvis
 from evsplat.errors import DataError
 from evsplat.untrusted.arrays import read_npy, read_npz
+from evsplat.untrusted.faults import ordinary_file
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.tensors import load_torch
 from evsplat.untrusted.text import read_json
@@ -94,10 +95,9 @@ def _number(path: Path) -> int:
 
 
 def _read_torch(path: Path) -> Any:
+    ordinary_file(path)
     try:
         return _arrays(load_torch(path))
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found.") from None
     except Exception as error:  # torch's readers raise nearly anything on damaged files
         named = re.search(r"GLOBAL (\S+)", str(error))
         if named:

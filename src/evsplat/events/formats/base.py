@@ -14,6 +14,7 @@ import numpy as np
 
 from evsplat.errors import DataError
 from evsplat.options import ReadOptions
+from evsplat.untrusted.faults import ordinary_file
 
 BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
@@ -96,12 +97,8 @@ class ByteReader(ExitStack):
         super().__init__()
         self.path = path
         self.offset = 0
-        try:
-            self._file = self.enter_context(open(path, "rb", buffering=_BUFFER_BYTES))
-        except FileNotFoundError:
-            raise DataError(f"{path}: file not found.") from None
-        except OSError as error:
-            raise DataError(f"{path}: cannot be opened ({error.strerror}).") from None
+        ordinary_file(path)
+        self._file = self.enter_context(open(path, "rb", buffering=_BUFFER_BYTES))
         self._size = os.fstat(self._file.fileno()).st_size
         self.zipped = self._file.read(2) == b"\x1f\x8b"
         self._file.seek(0)
