@@ -169,7 +169,7 @@ def damaged_npz(data: bytes, rng: Rng) -> bytes:
 def damaged_pickle(data: bytes, rng: Rng) -> bytes:
     """Opcodes left out, doubled or exchanged, with other numbers and names; or values; or bytes."""
     kind = rng.random()
-    if kind < 0.35:
+    if kind < 0.35 or not data.startswith(b"\x80"):
         return damaged_bytes(data, rng)
     if kind < 0.5:
         return pickle.dumps(damaged_tree(pickle.loads(data), rng), int(rng.integers(2, 6)))

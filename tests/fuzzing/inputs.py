@@ -124,7 +124,8 @@ def spoil_hdf5(path: Path, rng: Rng) -> None:
         elif kind == 8 and values.ndim:
             file[name] = np.full_like(values, rng.choice([0, values.max(), 255]))
         elif kind != 9:
-            file[name] = damage.damaged_array(np.asarray(values), rng)
+            array = damage.damaged_array(np.asarray(values), rng)
+            file[name] = array if array.dtype.kind not in "UM" else array.astype("S")
 
 
 def note(error: BaseException) -> str:

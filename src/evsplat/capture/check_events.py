@@ -15,6 +15,7 @@ from evsplat.untrusted.hdf5 import open_hdf5, wrong_data_set
 
 _COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 _SCAN_EVENTS = 1 << 20
+_INDEX_SAMPLES = 64
 _REPAIR = "Copy the file again or write it anew."
 
 
@@ -34,6 +35,8 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
             _check_clock(metadata, entry, file, findings)
             if deep:
                 _Scan(entry, file, findings).run()
+            else:
+                _check_index(entry, file, findings)
     except DataError as error:
         found, remedy = reason_and_remedy(error, entry.file)
         findings.error(entry.file, "", found, "a whole HDF5 file", remedy)
@@ -144,6 +147,41 @@ def _check_clock(
         findings.warning(entry.file, "events/t", found, expected, remedy)
 
 
+def _check_index(entry: EventsEntry, file: h5py.File, findings: Findings) -> None:
+    """Whether `_INDEX_SAMPLES` entries of ms_to_idx, evenly spread, lead to the right events."""
+    t, index = file["events/t"], file["ms_to_idx"]
+    count = len(t)
+    if count == 0:
+        return
+    last_ms = int(t[-1]) // 1000
+    if last_ms >= len(index):
+        _note_short_index(entry, len(index), last_ms + 1, findings)
+        return
+    for ms in np.unique(np.linspace(max(0, int(t[0]) // 1000), last_ms, _INDEX_SAMPLES).round()):
+        row, time = int(index[int(ms)]), 1000 * int(ms)
+        found = 0 <= row <= count
+        found = found and (row == 0 or int(t[row - 1]) < time)
+        if not found or (row < count and int(t[row]) < time):
+            findings.error(
+                entry.file,
+                f"ms_to_idx[{int(ms)}]",
+                str(row),
+                f"the first event with t >= {time}",
+                "Rebuild ms_to_idx, or write the recording anew with evsplat convert.",
+            )
+            return
+
+
+def _note_short_index(entry: EventsEntry, length: int, needed: int, findings: Findings) -> None:
+    findings.error(
+        entry.file,
+        "ms_to_idx",
+        f"{length} milliseconds",
+        f"at least {needed}, one per millisecond up to the last event",
+        "Rebuild ms_to_idx.",
+    )
+
+
 class _Scan:
     """One pass over the events in pieces: order, coordinates, polarity and the index."""
 
@@ -207,13 +245,7 @@ class _Scan:
     def rest_of_index(self, total: int) -> None:
         length = len(self.file["ms_to_idx"])
         if self.next_ms > length:
-            self.findings.error(
-                self.entry.file,
-                "ms_to_idx",
-                f"{length} milliseconds",
-                f"at least {self.next_ms}, one per millisecond up to the last event",
-                "Rebuild ms_to_idx.",
-            )
+            _note_short_index(self.entry, length, self.next_ms, self.findings)
             return
         stored = self.file["ms_to_idx"][self.next_ms :].astype(np.int64)
         self.compare_index(stored, np.full(len(stored), total))

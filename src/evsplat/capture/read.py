@@ -12,6 +12,8 @@ from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile, body_from_arrays
+from evsplat.capture.check_body import check_dense
+from evsplat.capture.finding import Findings
 from evsplat.capture.metadata import Frame, Metadata, NovelView
 from evsplat.capture.points import read_points
 from evsplat.errors import DataError
@@ -164,7 +166,11 @@ class CaptureReader:
         path = self.path / "body_dense.npz"
         if not self.has_body or not path.exists():
             return None
-        return body_from_arrays(path, read_plain_npz(path), self._metadata.body_model)
+        arrays, findings = read_plain_npz(path), Findings()
+        check_dense(path, arrays, self.body_file.poses.shape[1], findings)
+        if findings.items:
+            raise DataError(str(findings.items[0]))
+        return body_from_arrays(path, arrays, self._metadata.body_model)
 
     def median_background(self) -> Float[Tensor, "H W 3"]:
         """Per-pixel temporal median of the train frames (at most 255, evenly spread)."""

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from evsplat.errors import DataError
 from evsplat.untrusted.faults import BROKEN, ordinary_file, reason
 from evsplat.untrusted.pickles import StandIns, Unpickler, read_guarded
-from evsplat.untrusted.sizes import count_of, open_zip
+from evsplat.untrusted.sizes import count_of, open_zip, sound_text
 
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -128,7 +128,7 @@ def _array(stream: IO[bytes], size: int, unpickle: Any = None) -> Any:
     if count * dtype.itemsize > size:
         raise ValueError(f"an array of shape {shape} in {size} bytes")
     data = stream.read(count * dtype.itemsize)
-    array = np.frombuffer(data, dtype, count).copy()
+    array = sound_text(np.frombuffer(data, dtype, count).copy())
     return array.reshape(shape, order="F" if fortran_order else "C")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from evsplat.errors import DataError
 from evsplat.untrusted.faults import BROKEN, ordinary_file, reason
-from evsplat.untrusted.sizes import count_of, unpacked
+from evsplat.untrusted.sizes import count_of, sound_text, unpacked
 
 StandIns = Callable[[str, str], type | None]
 """Maps a module and a name in it to a class to build instead; it gets state by __setstate__."""
@@ -85,7 +85,8 @@ class _JoblibArray:
         if self.aligned:
             read(read(1)[0])
         count = count_of(self.shape)
-        array = np.frombuffer(read(count * self.dtype.itemsize), self.dtype, count).copy()
+        data = read(count * self.dtype.itemsize)
+        array = sound_text(np.frombuffer(data, self.dtype, count).copy())
         return array.reshape(self.shape, order="F" if self.order == "F" else "C")
 
 
@@ -95,11 +96,11 @@ def _new_array(kind: Any, shape: Any, code: Any) -> np.ndarray:
 
 
 def _new_scalar(kind: _DType, data: bytes | str) -> Any:
-    return np.frombuffer(_bytes(data), kind.dtype, 1)[0]
+    return sound_text(np.frombuffer(_bytes(data), kind.dtype, 1))[0]
 
 
 def _from_buffer(data: bytes, kind: _DType, shape: tuple[int, ...], order: str) -> np.ndarray:
-    flat = np.frombuffer(_bytes(data), kind.dtype).copy()
+    flat = sound_text(np.frombuffer(_bytes(data), kind.dtype).copy())
     return flat.reshape(shape, order="F" if order == "F" else "C")
 
 
@@ -223,4 +224,5 @@ def _fill(array: np.ndarray, state: tuple) -> None:
     values = _bytes(values)
     if len(values) != count * dtype.itemsize or (count and not dtype.itemsize):
         raise ValueError(f"an array of shape {shape} of {dtype} in {len(values)} bytes")
+    sound_text(np.frombuffer(values, dtype, count))
     array.__setstate__((1, shape, dtype, bool(fortran_order), values))  # type: ignore[arg-type]

@@ -11,10 +11,13 @@ import zlib
 from collections.abc import Iterable
 from typing import IO, Any
 
+import numpy as np
+
 _FREE_BYTES = 1 << 29
 """What may be unpacked from however little; empty masks pack very well."""
 _MOST_PER_BYTE = 200
 """Bytes unpacked per byte of a larger file: recordings and poses stay below 20."""
+_LAST_CHARACTER = 0x10FFFF
 _BLOCK_BYTES = 1 << 20
 
 
@@ -24,6 +27,17 @@ def count_of(shape: Iterable[Any]) -> int:
     if any(length < 0 for length in lengths):
         raise ValueError(f"an array of shape {tuple(lengths)}")
     return math.prod(lengths)
+
+
+def sound_text(array: np.ndarray) -> np.ndarray:
+    """The array; a `ValueError` where its texts hold numbers that stand for no character."""
+    for name in array.dtype.names or ():
+        sound_text(array[name])
+    if array.dtype.kind == "U" and array.nbytes:
+        codes = np.ascontiguousarray(array).reshape(-1).view(f"{array.dtype.byteorder}u4")
+        if codes.max() > _LAST_CHARACTER:
+            raise ValueError("texts that hold no characters")
+    return array
 
 
 def check_unpacked(unpacked: int, packed: int) -> None:
