@@ -68,6 +68,8 @@ def main() -> None:
         for name in options.only:
             (sound / name).mkdir(parents=True)
             silent(READERS[name].write, sound / name)
+            sound_one = Folder(READERS[name], sound / name, Path(folder) / "first" / name)
+            silent(Folder.check_sound, sound_one)
         print(f"sound files written in {time.monotonic() - started:.0f} s", flush=True)
         deadline = time.monotonic() + options.seconds if options.seconds else None
         batches = planned(options, deadline)
@@ -232,13 +234,13 @@ def peak() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
 
 
-def silent(write: Any, folder: Path) -> None:
-    """Write sound files without progress bars and warnings."""
+def silent(work: Any, folder: Any) -> None:
+    """Do it without progress bars and warnings."""
     kept = os.dup(2)
     null = os.open(os.devnull, os.O_RDWR)
     os.dup2(null, 2)
     try:
-        write(folder)
+        work(folder)
     finally:
         os.dup2(kept, 2)
         os.close(null)

@@ -19,6 +19,8 @@ from evsplat.untrusted.faults import brief
 from evsplat.untrusted.text import parse_yaml, read_text
 
 Config = TypeVar("Config")
+_LARGEST = 2**53
+"""Integers up to here are exact as doubles."""
 _LONGEST_NAME = 80
 """Of a setting in a message; those that there are have 40."""
 _MOST_NAMED = 5
@@ -288,7 +290,9 @@ def _convert(
         converted = _float(value)
         fits = converted is not None
     else:
-        fits = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
+        fits = isinstance(value, kind)
+        if kind is int and fits:
+            fits = not isinstance(value, bool) and abs(value) <= _LARGEST
     if not fits or (kind in (int, float) and not all(converted in r for r in ranges)):
         raise _wrong(where, key, value, expected(kind, ranges))
     return converted
@@ -389,6 +393,8 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _wrong(where: str, key: str, value: Any, expected: str) -> ConfigError:
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        expected = expected.replace("an integer", f"an integer of at most {_LARGEST}")
     if isinstance(value, float) and not math.isfinite(value):
         expected = expected.replace("a number", "a finite number")
     return ConfigError(f"{where}: {key} is {brief(value)}; expected {expected}.")

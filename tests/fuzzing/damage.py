@@ -172,7 +172,10 @@ def damaged_pickle(data: bytes, rng: Rng) -> bytes:
     if kind < 0.35 or not data.startswith(b"\x80"):
         return damaged_bytes(data, rng)
     if kind < 0.5:
-        return pickle.dumps(damaged_tree(pickle.loads(data), rng), int(rng.integers(2, 6)))
+        try:
+            return pickle.dumps(damaged_tree(pickle.loads(data), rng), int(rng.integers(2, 6)))
+        except pickle.UnpicklingError:  # joblib's, whose arrays lie between the opcodes
+            return damaged_bytes(data, rng)
     for _ in range(int(rng.integers(1, 4))):
         try:
             at = [place for _, _, place in pickletools.genops(data) if place is not None]

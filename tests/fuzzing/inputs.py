@@ -42,6 +42,11 @@ class Folder:
         self._groups = list(groups.values())
         self._content: dict[Path, bytes] = {}
 
+    def check_sound(self) -> None:
+        """Sound files are read: else damaged ones would be refused for another reason."""
+        for group in self._groups:
+            assert self.reader.read(self.root, group[0]) != "refused", group[0]
+
     def attempt(self, rng: Rng) -> str:
         """``read`` or ``refused``; whatever else is raised is a failure."""
         group = self._groups[rng.integers(len(self._groups))]

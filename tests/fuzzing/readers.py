@@ -328,10 +328,11 @@ def read_recording(root: Path, damaged: Path) -> str:
 
 
 def write_run(root: Path) -> None:
-    """A run of two steps, its capture in it."""
-    write_capture(root / "capture")
+    """A run of two steps; its capture lies beside the folder."""
+    capture = root.with_name(f"{root.name} capture")
+    write_capture(capture)
     train(
-        root / "capture",
+        capture,
         out=root / "run",
         method="evsplat",
         overrides=small("evsplat"),
@@ -348,30 +349,29 @@ def write_evaluated(root: Path) -> None:
 
 
 def read_run(root: Path, damaged: Path) -> None:
-    """The run with its checkpoint; that of the folder it was written in lies elsewhere."""
+    """The run with its checkpoint, drawn."""
     run = load_run(root / "run")
     finite(run.reconstruction.render(run.capture.camera("0000"), [15_000]))
 
 
 def read_report(root: Path, damaged: Path) -> None:
     """The page made anew."""
-    if "capture" not in damaged.relative_to(root).parts:
-        write_report(root / "run")
+    write_report(root / "run")
 
 
 def write_bench(root: Path) -> None:
     """A bench of what is not trained."""
-    write_tiny_capture(root / "capture", frames=10)
+    capture = root.with_name(f"{root.name} capture")
+    write_tiny_capture(capture, frames=10)
     suite = {
         "name": "tiny",
-        "captures": [{"name": "tiny", "path": str(root / "capture")}],
+        "captures": [{"name": "tiny", "path": str(capture)}],
         "rows": [
             {"name": name, "method": name} for name in ("median_background", "previous_frame")
         ],
     }
     (root / "suite.yaml").write_text(yaml.safe_dump(suite))
     bench(root / "suite.yaml", out=root / "bench", jobs=1)
-    shutil.rmtree(root / "bench" / "runs")
 
 
 def read_bench(root: Path, damaged: Path) -> None:
@@ -398,8 +398,9 @@ def tree(kind: str) -> Reader:
         shutil.rmtree(out, ignore_errors=True)
         try:
             import_capture(name, root / place, out, **options)
-            if any(f.severity == "error" for f in validate_capture(out)):
-                raise Accepted("a capture that the check calls wrong")
+            for finding in validate_capture(out):
+                if finding.severity == "error":
+                    raise Accepted(f"what the check calls wrong: {finding}")
         except EvsplatError:
             if out.exists():
                 raise Accepted("a capture left behind, though it is refused") from None
@@ -449,15 +450,15 @@ def _write_checkpoint(root: Path) -> None:
 
 
 READERS = {
-    "json": Reader(_write_json, lambda root, file: read_json(file), 3_000),
+    "json": Reader(_write_json, lambda root, file: read_json(file), 6_000),
     "settings": Reader(write_settings, read_settings, 250),
-    "arrays": Reader(write_arrays, read_arrays, 1_500),
-    "pickles": Reader(write_pickles, read_pickled, 2_000),
-    "points": Reader(_write_points, lambda root, file: read_points(file), 1_500),
+    "arrays": Reader(write_arrays, read_arrays, 3_000),
+    "pickles": Reader(write_pickles, read_pickled, 3_000),
+    "points": Reader(_write_points, lambda root, file: read_points(file), 4_000),
     "poses": Reader(write_poses, read_tool, 150),
     "motions": Reader(write_motions, read_motion, 300),
     "keypoints": Reader(write_keypoints, read_points_of, 500),
-    "camera paths": Reader(write_path, read_path, 500),
+    "camera paths": Reader(write_path, read_path, 1_000),
     "pictures": Reader(
         write_pictures, lambda root, file: (image_size(file), read_image(file)), 800
     ),

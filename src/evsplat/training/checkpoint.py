@@ -1,6 +1,8 @@
 """Checkpoints: every tensor and number of a training run in one safetensors file."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,8 @@ from torch import Tensor
 from evsplat.errors import DataError
 from evsplat.files import atomic_path
 from evsplat.models.model import Model
+from evsplat.untrusted.faults import MISFITS, broken_as
+from evsplat.untrusted.records import misfit
 from evsplat.untrusted.tensors import read_safetensors
 from evsplat.untrusted.text import parse_json
 
@@ -51,7 +55,33 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise DataError(
             f"{path}: not a readable checkpoint ({error}); remove it to go on from the one before."
         ) from None
+    wrong = misfit(state, _STATE, "state")
+    if wrong:
+        raise DataError(f"{path}: {wrong}; remove it to go on from the one before.")
     return tensors, state
+
+
+_STATE = {
+    "clock": {
+        **{"iteration": int, "iterations": int},
+        **{"fraction": float, "seconds": float, "step_seconds": float},
+    },
+    "human_count": int,
+}
+RESUMED = {"queue": [int], "skipped": int, "previous_nominal": float}
+"""What the state of a checkpoint holds besides, for a training that goes on."""
+
+
+@contextmanager
+def misfits_of(path: Path) -> Iterator[None]:
+    """A `DataError` of what goes wrong where a checkpoint's tensors are not the model's."""
+    with broken_as(
+        path,
+        "does not fit the capture and settings of its run",
+        "restore both as they were, or train again",
+        kinds=MISFITS,
+    ):
+        yield
 
 
 def check_fits(model: Model, tensors: dict[str, Tensor], path: Path) -> None:

@@ -26,9 +26,11 @@ from evsplat.options import TrainOptions
 from evsplat.options.declare import given
 from evsplat.render import choose_device
 from evsplat.training.checkpoint import (
+    RESUMED,
     check_fits,
     latest_checkpoint,
     load_checkpoint,
+    misfits_of,
     save_checkpoint,
 )
 from evsplat.training.clock import Clock
@@ -41,6 +43,7 @@ from evsplat.training.run import (
 )
 from evsplat.training.trainer import StepReport, Trainer
 from evsplat.training.watching import Showcase
+from evsplat.untrusted.records import misfit
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +97,7 @@ def train(
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     capture = load_capture(Path(capture_path))
-    start = _resumed(options) if options.resume else _new(capture, options)
+    start = _resumed(capture, options) if options.resume else _new(capture, options)
     iterations, max_minutes = options.iterations, options.max_minutes
     started = time.perf_counter()
     seen = seen_by_training(capture, start.settings)
@@ -118,7 +121,11 @@ def train(
     if start.checkpoint is not None:
         tensors, state = load_checkpoint(start.checkpoint)
         check_fits(trainer.model, tensors, start.checkpoint)
-        trainer.load_state(tensors, state)
+        wrong = misfit(state, RESUMED, "state")
+        if wrong:
+            raise DataError(f"{start.checkpoint}: {wrong}; train again, without --resume.")
+        with misfits_of(start.checkpoint):
+            trainer.load_state(tensors, state)
         if iterations is None and max_minutes is None:
             clock.iterations = state["clock"]["iterations"]
         folder.truncate_log(clock.iteration)
@@ -136,13 +143,19 @@ def train(
     return folder.path
 
 
-def _resumed(options: TrainOptions) -> _Start:
+def _resumed(capture: Capture, options: TrainOptions) -> _Start:
     """The run of ``options.out`` at its last checkpoint, with its own settings."""
     assert options.out is not None
     folder = RunFolder(Path(options.out))
     method, settings, facts = read_config(folder)
-    seed = int(facts["seed"])
-    return _Start(folder, method, settings, seed, latest_checkpoint(folder.checkpoints))
+    if facts["capture_name"] != capture.name:
+        raise ConfigError(
+            f"{folder.path}: was trained on the capture {facts['capture_name']!r}, and is to go on "
+            f"with {capture.name!r}; give the one of {facts['capture']}, or another --out."
+        )
+    if not (checkpoint := latest_checkpoint(folder.checkpoints)):
+        folder.truncate_log(0)
+    return _Start(folder, method, settings, facts["seed"], checkpoint)
 
 
 def _new(capture: Capture, options: TrainOptions) -> _Start:
@@ -186,7 +199,7 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
         tensors, state = trainer.state()
         save_checkpoint(folder.checkpoints, clock.iteration, tensors, state)
 
-    saved_at = time.perf_counter()
+    saved_at, first = time.perf_counter(), clock.iteration
     with (
         _interrupt_flag() as interrupted,
         folder.log.open("a", encoding="utf-8", buffering=1) as log,
@@ -210,9 +223,19 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
                 save()
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
+        _check_learned(trainer, clock.iteration - first)
         save()
     if clock.iteration == 0:
         raise DataError(f"{folder.path}: no step was made.")
+
+
+def _check_learned(trainer: Trainer, steps: int) -> None:
+    """A `DataError` where steps were made and each gave a loss or gradient that is not finite."""
+    if steps and trainer.bad.in_a_row() >= steps:
+        raise DataError(
+            f"{trainer.capture.path}: none of {steps} steps gave a finite loss and gradient, so "
+            "that nothing was learned; look at camera and poses with evsplat inspect."
+        )
 
 
 def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:

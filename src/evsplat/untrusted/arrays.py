@@ -15,6 +15,7 @@ from evsplat.untrusted.faults import BROKEN, ordinary_file, reason
 from evsplat.untrusted.pickles import StandIns, Unpickler, read_guarded
 from evsplat.untrusted.sizes import count_of, open_zip, sound_text
 
+_KINDS = "biufcSU"
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -124,12 +125,23 @@ def _array(stream: IO[bytes], size: int, unpickle: Any = None) -> Any:
         if unpickle is None:
             raise _HoldsObjects
         return unpickle()
+    if any(kind not in _KINDS for kind in _kinds(dtype)):
+        raise ValueError(f"an array of {dtype}")
     count = count_of(shape)
     if count * dtype.itemsize > size:
         raise ValueError(f"an array of shape {shape} in {size} bytes")
     data = stream.read(count * dtype.itemsize)
     array = sound_text(np.frombuffer(data, dtype, count).copy())
     return array.reshape(shape, order="F" if fortran_order else "C")
+
+
+def _kinds(dtype: np.dtype) -> str:
+    """Letters of the kinds of numbers and texts in an array, those of its fields one by one."""
+    if dtype.subdtype is not None:
+        return _kinds(dtype.subdtype[0])
+    if dtype.fields is None:
+        return dtype.kind
+    return "".join(_kinds(field[0]) for field in dtype.fields.values())
 
 
 def _unpickle(stream: IO[bytes], stand_ins: StandIns | None) -> Any:

@@ -22,6 +22,16 @@ BROKEN = (
     *(SyntaxError, tokenize.TokenError),
 )
 """What the libraries that parse files raise on damaged ones."""
+MISFITS = (
+    KeyError,
+    TypeError,
+    IndexError,
+    AttributeError,
+    ValueError,
+    RuntimeError,
+    ArithmeticError,
+)
+"""What comes of a record with other values than those that were written into it."""
 _MOST_LETTERS = 200
 
 

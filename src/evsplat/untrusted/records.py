@@ -10,10 +10,8 @@ from evsplat.untrusted.text import read_json
 Shape = Any
 """A type; a tuple of types; ``[shape]``, a list of such; ``{"key": shape}``, an object with these
 keys and perhaps others; ``{str: shape}``, one with any keys."""
-_WORDS = {
-    **{int: "a whole number", float: "a number", str: "a text", bool: "true or false"},
-    **{type(None): "null", list: "a list", dict: "an object"},
-}
+_WORDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a text"}
+_WORDS |= {bool: "true or false", type(None): "null", list: "a list", dict: "an object"}
 
 
 def read_record(path: Path, shape: Shape, remedy: str) -> Any:
@@ -29,7 +27,7 @@ def misfit(value: Any, shape: Shape, where: str = "") -> str:
     """What of ``value`` has not the shape, in words; "" where all has."""
     if isinstance(shape, list):
         entries: Any = enumerate(value) if isinstance(value, list) else None
-        inner = {list: shape[0]}
+        inner: dict[Any, Shape] = {list: shape[0]}
     elif isinstance(shape, dict):
         entries = value.items() if isinstance(value, dict) else None
         inner = shape

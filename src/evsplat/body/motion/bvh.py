@@ -16,6 +16,8 @@ from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
 from evsplat.untrusted.text import read_text
 
+_LARGEST = 1e6
+"""Of an offset, in whatever unit."""
 _CHANNELS = [f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz"]
 
 
@@ -89,7 +91,7 @@ def _read(words: Iterator[str]) -> tuple[list[_Joint], float, np.ndarray]:
         elif word == "End":
             ends += 1
         elif word == "OFFSET":
-            offset = tuple([float(next(words)) for _ in range(3)])
+            offset = tuple([_length(next(words)) for _ in range(3)])
             # an end site only says how long the last bone is
             if not ends:
                 joints[-1].offset = offset
@@ -110,6 +112,13 @@ def _read(words: Iterator[str]) -> tuple[list[_Joint], float, np.ndarray]:
     if values.size != count * channels:
         raise ValueError(f"{values.size} numbers, expected {count} frames of {channels}")
     return joints, float(header[4]), values.reshape(count, channels)
+
+
+def _length(word: str) -> float:
+    length = float(word)
+    if not abs(length) <= _LARGEST:
+        raise ValueError(f"an offset of {word[:40]}")
+    return length
 
 
 def _channel(word: str) -> str:
