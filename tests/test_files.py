@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, to where links lead; what cannot be read says why."""
+"""Files are written whole or not at all, to where links lead."""
 
 import ctypes
 import errno
@@ -13,25 +13,15 @@ import pytest
 
 from evsplat import disk
 from evsplat.disk import held, is_held
-from evsplat.errors import ConfigError, DataError, OutputError
+from evsplat.errors import DataError, OutputError
 from evsplat.files import (
     atomic_path,
     new_folder,
-    read_json,
-    read_text,
     remove_folder,
     try_target,
     write_json,
     write_text,
 )
-
-
-def refused(path: Path) -> str:
-    with pytest.raises(DataError) as error:
-        read_json(path)
-    message = str(error.value)
-    assert message.startswith(f"{path}: ") and "\n" not in message
-    return message
 
 
 def test_an_interrupted_writer_leaves_the_old_file(tmp_path: Path) -> None:
@@ -87,44 +77,6 @@ def test_a_writer_refuses_a_folder_and_a_link_to_itself(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "loop"]
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b'{"a": ', "not valid JSON (Expecting value: line 1"),
-        (b"[" * 5_000, "not valid JSON (nested too deeply); repair it"),
-        (b'{"a":' * 5_000, "not valid JSON (nested too deeply)"),
-        (b"1" * 5_000, "value has 5000 digits); repair it or write it anew."),
-        (b"\xff\xfe", "not a text in UTF-8"),
-    ],
-)
-def test_broken_json_is_one_sentence(tmp_path: Path, content: bytes, said: str) -> None:
-    (tmp_path / "a.json").write_bytes(content)
-    assert said in refused(tmp_path / "a.json")
-
-
-def test_what_is_no_file_is_said_to_be_none(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text("{}")
-    assert refused(tmp_path / "no.json").endswith("no.json: file not found.")
-    assert refused(tmp_path / "a.json" / "b").endswith("b: file not found.")
-    assert refused(tmp_path).endswith("a folder, expected a file; correct the path.")
-    assert "File name too long" in refused(tmp_path / ("x" * 300))
-
-
-def test_a_file_that_may_not_be_read_is_not_called_broken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def denied(*_: object, **__: object) -> str:
-        # as the system does, which lets root read everything
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "read_text", denied)
-    assert refused(tmp_path / "a.json").endswith(
-        "a.json: may not be read; give yourself the permission to read it."
-    )
-    with pytest.raises(ConfigError, match="a.yaml: may not be read"):
-        read_text(tmp_path / "a.yaml", error=ConfigError)
-
-
 LEAVES_A_HALF = """
 import os, signal, sys
 from pathlib import Path
@@ -166,6 +118,29 @@ def test_what_killed_writers_left_is_swept_and_what_living_ones_write_stays(tmp_
     }
 
 
+INTERRUPTED_TWICE = """
+import os, signal, sys
+from pathlib import Path
+from evsplat.files import atomic_path
+unlink = os.unlink
+def interrupted(*arguments, **rest):
+    raise KeyboardInterrupt
+os.unlink = interrupted
+try:
+    with atomic_path(Path(sys.argv[1]) / "a"):
+        raise ValueError
+except KeyboardInterrupt:
+    os.unlink = unlink
+"""
+
+
+def test_ctrl_c_in_the_midst_of_removing_leaves_nothing_at_the_end(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", INTERRUPTED_TWICE, str(tmp_path)]
+    (tmp_path / ".evsplat-mine").touch()
+    subprocess.run(command, check=True, timeout=60)
+    assert [path.name for path in tmp_path.iterdir()] == [".evsplat-mine"]
+
+
 def test_an_encoder_that_writes_beside_its_path_is_a_fault(tmp_path: Path) -> None:
     """Its file would neither be locked nor on the disk."""
     with pytest.raises(AssertionError), atomic_path(tmp_path / "a") as temporary:
@@ -178,7 +153,7 @@ def test_a_link_named_like_a_left_over_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "a").touch()
     (tmp_path / "in").mkdir()
-    (tmp_path / "in" / ".evsplat-aaaaaaaa.part").symlink_to(tmp_path / "precious")
+    (tmp_path / "in" / ".evsplat-aaaaaaaa-aaaaaaaa.part").symlink_to(tmp_path / "precious")
     write_text(tmp_path / "in" / "x", "")
     assert (tmp_path / "precious" / "a").exists()
 

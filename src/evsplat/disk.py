@@ -3,11 +3,14 @@
 Locks end with the process that holds them, however it ends.
 """
 
+import atexit
 import ctypes
 import errno
 import fcntl
+import functools
 import os
 import re
+import secrets
 import shutil
 import tempfile
 import time
@@ -15,8 +18,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_PREFIX, _SUFFIX = ".evsplat-", ".part"
-_TEMPORARY = re.compile(r"\.evsplat-\w{8}\.part(\..*)?", re.DOTALL)
+_SUFFIX = ".part"
+_TEMPORARY = re.compile(r"\.evsplat-\w{8}-\w{8}\.part(\..*)?", re.DOTALL)
 """Names of what is being written. The process that writes holds a lock on it: what nobody holds was
 left behind by a process that was killed."""
 _swept: set[str] = set()
@@ -97,7 +100,9 @@ def temporary_file(target: Path) -> Iterator[tuple[int, Path]]:
     """
     _sweep(target.parent)
     while True:
-        handle, name = tempfile.mkstemp(_SUFFIX + target.suffix, _PREFIX, target.parent)
+        handle, name = tempfile.mkstemp(
+            _SUFFIX + target.suffix, _prefix(os.getpid()), target.parent
+        )
         lock(handle, wait=True)
         if os.fstat(handle).st_nlink:
             break  # else it was swept away before it was locked
@@ -114,7 +119,7 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
     """A locked folder in ``parent``; gone at the end, with all in it, if it still has its name."""
     _sweep(parent)
     while True:
-        folder = tempfile.mkdtemp(_SUFFIX, _PREFIX, parent)
+        folder = tempfile.mkdtemp(_SUFFIX, _prefix(os.getpid()), parent)
         try:
             handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         except FileNotFoundError:
@@ -142,6 +147,28 @@ def _sweep(folder: Path) -> None:
                 _remove_left_over(entry)
 
 
+@functools.cache
+def _prefix(process: int) -> str:
+    """With what the temporary names of this process begin; a fork has its own."""
+    return f".evsplat-{secrets.token_hex(4)}-"
+
+
+@atexit.register
+def _remove_own() -> None:
+    """Remove what Ctrl-C in the midst of removing left."""
+    prefix = _prefix(os.getpid())
+    for place in _swept:
+        with suppress(OSError), os.scandir(place) as entries:
+            for entry in [entry for entry in entries if entry.name.startswith(prefix)]:
+                with suppress(OSError):
+                    _remove(entry)
+
+
+def _remove(entry: "os.DirEntry[str]") -> None:
+    is_folder = entry.is_dir(follow_symlinks=False)
+    shutil.rmtree(entry.path) if is_folder else os.unlink(entry.path)
+
+
 def _remove_left_over(entry: "os.DirEntry[str]") -> None:
     is_folder = entry.is_dir(follow_symlinks=False)
     if not is_folder and not entry.is_file(follow_symlinks=False):
@@ -150,7 +177,7 @@ def _remove_left_over(entry: "os.DirEntry[str]") -> None:
     handle = os.open(entry.path, access | os.O_NOFOLLOW)
     try:
         if lock(handle):
-            shutil.rmtree(entry.path) if is_folder else os.unlink(entry.path)
+            _remove(entry)
     finally:
         os.close(handle)
 

@@ -1,4 +1,4 @@
-"""Writing files whole or not at all, and reading text and JSON with errors that name the file."""
+"""Writing files whole or not at all."""
 
 import json
 import os
@@ -22,7 +22,6 @@ from evsplat.errors import (
     NO_ROOM,
     ConfigError,
     DataError,
-    EvsplatError,
     OutputError,
     only_writing_says,
     why_not_written,
@@ -205,54 +204,6 @@ def write_text(path: Path | str, text: str) -> None:
 def write_json(path: Path | str, value: Any) -> None:
     """Write ``value`` as indented JSON, whole or not at all; NaN is refused."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
-
-
-def read_text(path: Path | str, *, error: type[EvsplatError] = DataError) -> str:
-    """Read a UTF-8 text; a file that is missing, no text or not to be read is an ``error``."""
-    path = Path(path)
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as fault:
-        raise error(f"{path}: {why_not_read(fault)}.") from None
-    except UnicodeDecodeError as fault:
-        raise error(f"{path}: not a text in UTF-8 ({fault}); write it anew.") from None
-
-
-def why_not_read(error: OSError) -> str:
-    """What keeps a file from being opened and what to do, in words that follow its path."""
-    match error:
-        case FileNotFoundError() | NotADirectoryError():
-            return "file not found"
-        case IsADirectoryError():
-            return "a folder, expected a file; correct the path"
-        case PermissionError():
-            return "may not be read; give yourself the permission to read it"
-        case _:
-            return f"cannot be read ({error.strerror or error}); copy it again"
-
-
-def read_json(path: Path | str) -> Any:
-    """Read JSON; a missing or broken file is a `DataError` that names it."""
-    path = Path(path)
-    try:
-        return parse_json(read_text(path))
-    except ValueError as error:
-        raise DataError(f"{path}: not valid JSON ({error}); repair it or write it anew.") from None
-
-
-def parse_json(text: str) -> Any:
-    """The value that a JSON text stands for; all that can be wrong with it is a `ValueError`."""
-    try:
-        return json.loads(text)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    except ValueError as error:
-        raise ValueError(without_advice(error)) from None
-
-
-def without_advice(error: ValueError) -> str:
-    """What an error says, but not how a program could read an integer of more digits."""
-    return str(error).partition("; use sys.set_int_max_str_digits")[0]
 
 
 class _OutputErrors:

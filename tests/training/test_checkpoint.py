@@ -11,6 +11,9 @@ import torch
 from evsplat.errors import DataError, OutputError
 from evsplat.training.checkpoint import checkpoints, load_latest, save_checkpoint
 
+CLOCK = {"iteration": 1, "iterations": 9, "fraction": 0.1, "seconds": 1.0, "step_seconds": 1.0}
+STATE = {"clock": CLOCK, "human_count": 4}
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -21,7 +24,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def save(folder: Path, iteration: int) -> Path:
-    return save_checkpoint(folder, iteration, {"a": torch.full((4,), iteration)}, {"step": 1})
+    return save_checkpoint(folder, iteration, {"a": torch.full((4,), iteration)}, STATE)
 
 
 def steps(folder: Path) -> list[int]:

@@ -8,6 +8,9 @@ import torch
 from evsplat.training.checkpoint import load_checkpoint
 from evsplat.training.watching import Showcase, is_training, newest_state, training_in, watch
 
+CLOCK = {"iteration": 1, "iterations": 9, "fraction": 0.1, "seconds": 1.0, "step_seconds": 1.0}
+STATE = {"clock": CLOCK, "human_count": 4}
+
 
 class Clock:
     now = 0.0
@@ -28,7 +31,7 @@ def _train(showcase, clock, seconds, watcher=lambda: None, step=0.25):
     for _ in range(round(seconds / step)):
         clock.now += step
         watcher()
-        showcase.show(lambda: shown.append(clock.now) or ({"a": torch.ones(2)}, {"step": 1}))
+        showcase.show(lambda: shown.append(clock.now) or ({"a": torch.ones(2)}, STATE))
     return shown
 
 
@@ -52,7 +55,7 @@ def test_a_watcher_sees_a_snapshot_every_few_seconds_until_it_goes(run):
         shown = _train(showcase, clock, 30, watcher)
         assert 7 <= len(shown) <= 11
         tensors, state = load_checkpoint(newest_state(run))
-        assert torch.equal(tensors["a"], torch.ones(2)) and state == {"step": 1}
+        assert torch.equal(tensors["a"], torch.ones(2)) and state == STATE
         later = _train(showcase, clock, 60)
         assert len(later) <= 4
         assert not later or later[-1] < shown[-1] + 15

@@ -24,10 +24,12 @@ from evsplat.benching.suite import read_suite
 from evsplat.benching.tables import SPREAD, make_tables
 from evsplat.errors import ConfigError
 from evsplat.evaluation.tables import LEGEND, latex, markdown
-from evsplat.files import read_json, try_target, write_json, write_text
+from evsplat.files import try_target, write_json, write_text
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.render import choose_device
+from evsplat.untrusted.faults import MISFITS, broken_as
+from evsplat.untrusted.text import read_json
 
 Executor = LocalPool | RayCluster
 """Processes that cells run in."""
@@ -206,9 +208,12 @@ def _print(text: str) -> None:
 def write_output(plan: Plan, folder: BenchFolder) -> None:
     """Write tables.md, tables.tex and index.html of what has been recorded so far."""
     records = Records.read(plan, folder)
-    tables = make_tables(records)
     title = plan.suite.title or plan.suite.name
     intro = f"{LEGEND.format(second='in italics')} {SPREAD}"
+    remedy = "remove the record that was changed, and its cell is run again"
+    with broken_as(folder.path / "cells", "not as the bench wrote them", remedy, kinds=MISFITS):
+        tables = make_tables(records)
+        html = page(records, tables, folder)
     write_text(folder.path / "tables.md", markdown(title, intro, tables))
     write_text(folder.path / "tables.tex", latex(tables))
-    write_text(folder.path / "index.html", page(records, tables, folder))
+    write_text(folder.path / "index.html", html)

@@ -14,7 +14,8 @@ from evsplat.body.body import Body
 from evsplat.body.make import fit_betas, make_body
 from evsplat.errors import DataError, WeightsError
 from evsplat.files import open_output, scratch_folder
-from evsplat.safe_pickle import read_npz, read_pickle
+from evsplat.untrusted.arrays import read_npz
+from evsplat.untrusted.pickles import read_pickle
 
 ENVIRONMENT = "EVSPLAT_BODY_MODELS"
 _SITES = {
@@ -107,7 +108,7 @@ def read_model_file(path: Path) -> dict[str, Any]:
     """The arrays of an SMPL-family .pkl or .npz, and joint names by index where they are given.
 
     body-models 0.26 would unpickle without restriction, so that a tampered file could run anything.
-    Here only the few types that these files need are allowed (`evsplat.safe_pickle`).
+    Here only the few types that these files need are allowed (`evsplat.untrusted.pickles`).
 
     Raises:
         DataError: unreadable, or holding a pickled type that no body model needs.

@@ -17,8 +17,9 @@ from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import copy_file, make_folder, new_folder, read_json, remove_file, write_json
+from evsplat.files import copy_file, make_folder, new_folder, remove_file, write_json
 from evsplat.pictures.files import write_image
+from evsplat.untrusted.text import read_json
 
 Frames = Sequence[Frame]
 Made = Iterator[tuple[Frame, Float[Tensor, "..."]]]

@@ -21,14 +21,14 @@ from evsplat.files import (
     copy_file,
     make_folder,
     new_folder,
-    read_json,
     remove_file,
     try_target,
     write_json,
 )
 from evsplat.names import checked_name
-from evsplat.pictures.files import image_size, write_image
+from evsplat.pictures.files import read_image, write_image
 from evsplat.pictures.light import Transfer
+from evsplat.untrusted.text import read_json
 
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
@@ -283,7 +283,9 @@ class CaptureWriter:
         if isinstance(image, np.ndarray):
             source, suffix, size = f"{self.path}: {stem}", ".png", image.shape[1::-1]
         else:
-            source, suffix, size = str(image), Path(image).suffix.lower(), image_size(Path(image))
+            # Decoded whole: a copy of a picture that ends too early would be found much later.
+            source, suffix = str(image), Path(image).suffix.lower()
+            size = read_image(Path(image)).shape[1::-1]
         if suffix not in _PICTURE_SUFFIXES:
             raise DataError(f"{source}: expected a PNG, JPEG or WebP picture; save it as PNG.")
         if size != expected:

@@ -14,10 +14,12 @@ from tqdm import tqdm
 
 from evsplat.camera import Camera
 from evsplat.errors import DataError
-from evsplat.files import atomic_path, make_folder, read_json, remove_folder, write_json
+from evsplat.files import atomic_path, make_folder, remove_folder, write_json
 from evsplat.film.looks import Exposure, Look
 from evsplat.names import checked_name
 from evsplat.training.run import GaussianReconstruction
+from evsplat.untrusted.pictures import read_picture
+from evsplat.untrusted.text import read_json
 
 logger = logging.getLogger(__name__)
 
@@ -67,8 +69,7 @@ class FrameCache:
 
     def read(self, frame: FilmFrame) -> Exposure:
         """The picture of a frame that was drawn."""
-        with Image.open(self.file(frame)) as image:
-            return np.asarray(image)
+        return read_picture(self.file(frame), np.asarray, remedy="remove it")
 
     def remove(self) -> None:
         """Delete the folder with all frames."""

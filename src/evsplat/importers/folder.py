@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence, read_poses
-from evsplat.capture.body_file import BodyFile, read_arrays, stated_body
+from evsplat.capture.body_file import BodyFile, stated_body
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
 from evsplat.footage import Footage, open_footage
@@ -25,6 +25,7 @@ from evsplat.importers.base import (
 from evsplat.importers.recorded import add_recorded_events, recorded_camera, without_body
 from evsplat.importers.smpl import add_body, chosen_poses
 from evsplat.pictures.light import Transfer
+from evsplat.untrusted.arrays import read_plain_npz, read_table
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -152,7 +153,7 @@ class Folder(Importer):
         path, count = source / "exposures.txt", len(footage.times_us)
         if path.exists():
             try:
-                rows = np.loadtxt(path, ndmin=2)
+                rows = read_table(path)
             except ValueError as error:
                 raise DataError(f"{path}: not a table of numbers ({error}).") from None
             if rows.shape != (count, 2):
@@ -187,7 +188,7 @@ class Folder(Importer):
         self, path: Path, size: tuple[int, int], smpl: Path | None
     ) -> "PoseSequence | BodyFile":
         if path.name == "body.npz":
-            return stated_body(path, read_arrays(path), self.pose_source)
+            return stated_body(path, read_plain_npz(path), self.pose_source)
         sequence = read_poses(path, person=self.person, image_size=size, body_models=smpl)
         return replace(sequence, pose_source=self.pose_source or sequence.pose_source)
 

@@ -13,8 +13,9 @@ from evsplat.capture import Capture, Frame, Policy, load_capture
 from evsplat.capture.derive import derived_capture, training_frames_first, write_picture
 from evsplat.config import to_dict
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import new_folder, read_json, refuse_existing, try_target, write_json
+from evsplat.files import new_folder, refuse_existing, try_target, write_json
 from evsplat.masks.base import MASKERS, Masker
+from evsplat.untrusted.text import read_json
 
 
 def mask_capture(

@@ -2,17 +2,22 @@
 
 import json
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from evsplat.errors import DataError, OutputError
 from evsplat.files import remove_file, write_bytes
 from evsplat.models.model import Model
+from evsplat.untrusted.faults import MISFITS, broken_as
+from evsplat.untrusted.records import misfit
+from evsplat.untrusted.tensors import read_safetensors
+from evsplat.untrusted.text import parse_json
 
 logger = logging.getLogger(__name__)
 
@@ -99,14 +104,39 @@ def load_latest(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Any]] 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and state of a checkpoint; a damaged file is a `DataError`."""
     try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            state = json.loads(file.metadata()["state"])
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError, OSError) as error:
+        tensors, texts = read_safetensors(path)
+        state = parse_json(texts["state"])
+    except (OSError, KeyError, ValueError) as error:
         raise DataError(
             f"{path}: not a readable checkpoint ({error}); train again where there is no other."
         ) from None
+    wrong = misfit(state, _STATE, "state")
+    if wrong:
+        raise DataError(f"{path}: {wrong}; train again where there is no other.")
     return tensors, state
+
+
+_STATE = {
+    "clock": {
+        **{"iteration": int, "iterations": int},
+        **{"fraction": float, "seconds": float, "step_seconds": float},
+    },
+    "human_count": int,
+}
+RESUMED = {"queue": [int], "skipped": int, "previous_nominal": float}
+"""What the state of a checkpoint holds besides, for a training that goes on."""
+
+
+@contextmanager
+def misfits_of(path: Path) -> Iterator[None]:
+    """A `DataError` of what goes wrong where a checkpoint's tensors are not the model's."""
+    with broken_as(
+        path,
+        "does not fit the capture and settings of its run",
+        "restore both as they were, or train again",
+        kinds=MISFITS,
+    ):
+        yield
 
 
 def check_fits(model: Model, tensors: dict[str, Tensor], path: Path) -> None:

@@ -28,9 +28,11 @@ from evsplat.options.declare import given
 from evsplat.render import choose_device
 from evsplat.training.checkpoint import (
     KEEP,
+    RESUMED,
     check_fits,
     kept_sentence,
     load_latest,
+    misfits_of,
     save_checkpoint,
 )
 from evsplat.training.clock import Clock
@@ -43,6 +45,7 @@ from evsplat.training.run import (
 )
 from evsplat.training.trainer import StepReport, Trainer
 from evsplat.training.watching import Showcase, is_unused, training_in
+from evsplat.untrusted.records import misfit
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +102,7 @@ def train(
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     capture = load_capture(Path(capture_path))
-    start = _resumed(options) if options.resume else _new(capture, options)
+    start = _resumed(capture, options) if options.resume else _new(capture, options)
     folder = start.folder
     try_target(folder.path, _KEPT_AND_NEW * _LEAST_BYTES)
     with training_in(folder.path), _faults_said(folder):
@@ -141,7 +144,11 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     if loaded is not None:
         checkpoint, tensors, state = loaded
         check_fits(trainer.model, tensors, checkpoint)
-        trainer.load_state(tensors, state)
+        wrong = misfit(state, RESUMED, "state")
+        if wrong:
+            raise DataError(f"{checkpoint}: {wrong}; train again, without --resume.")
+        with misfits_of(checkpoint):
+            trainer.load_state(tensors, state)
         if iterations is None and max_minutes is None:
             clock.iterations = state["clock"]["iterations"]
     folder.truncate_log(clock.iteration)
@@ -171,13 +178,17 @@ def _faults_said(folder: RunFolder) -> Iterator[None]:
         raise fault from error
 
 
-def _resumed(options: TrainOptions) -> _Start:
+def _resumed(capture: Capture, options: TrainOptions) -> _Start:
     """The run of ``options.out``, with its own settings."""
     assert options.out is not None
     folder = RunFolder(Path(options.out))
     method, settings, facts = read_config(folder)
-    seed = int(facts["seed"])
-    return _Start(folder, method, settings, seed)
+    if facts["capture_name"] != capture.name:
+        raise ConfigError(
+            f"{folder.path}: was trained on the capture {facts['capture_name']!r}, and is to go on "
+            f"with {capture.name!r}; give the one of {facts['capture']}, or another --out."
+        )
+    return _Start(folder, method, settings, facts["seed"])
 
 
 def _new(capture: Capture, options: TrainOptions) -> _Start:
@@ -216,7 +227,7 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
         tensors, state = trainer.state()
         save_checkpoint(folder.checkpoints, clock.iteration, tensors, state)
 
-    saved_at = time.perf_counter()
+    saved_at, first = time.perf_counter(), clock.iteration
     with (
         _interrupt_flag() as interrupted,
         open_output(folder.log, "ab", buffered=False) as log,
@@ -240,11 +251,21 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
                 save()
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
+        _check_learned(trainer, clock.iteration - first)
         save()
         if interrupted:
             raise Stopped(folder.path)
     if clock.iteration == 0:
         raise DataError(f"{folder.path}: no step was made.")
+
+
+def _check_learned(trainer: Trainer, steps: int) -> None:
+    """A `DataError` where steps were made and each gave a loss or gradient that is not finite."""
+    if steps and trainer.bad.in_a_row() >= steps:
+        raise DataError(
+            f"{trainer.capture.path}: none of {steps} steps gave a finite loss and gradient, so "
+            "that nothing was learned; look at camera and poses with evsplat inspect."
+        )
 
 
 def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
