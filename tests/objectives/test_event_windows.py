@@ -24,6 +24,9 @@ class Recording:
         self.stretches_us = (self.time_range_us,)
         self.readable_us = (ALWAYS,)
 
+    def __len__(self) -> int:
+        return len(self.stream)
+
     def between(self, start: int, end: int) -> EventStream:
         assert any(low <= start and end <= high for low, high in self.readable_us)
         return self.stream.between(start, end)

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.errors import DataError
-from evsplat.files import why_not_read
-from evsplat.safe_pickle import BROKEN
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,25 +69,6 @@ class BodyFile:
 
 
 RIG_ARRAYS = ("joint_names", "parents", "rest_joints", "rest_vertices", "faces", "weights")
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz; pickled objects are refused, because unpickling can run code."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise DataError(f"{path}: {why_not_read(error)}.") from None
-    except ValueError as error:
-        if "pickle" not in str(error).lower():
-            raise DataError(f"{path}: not a readable npz ({error}); write it anew.") from error
-        raise DataError(
-            f"{path}: holds pickled Python objects, expected plain arrays only; save it with plain "
-            "numeric and string arrays (np.savez never pickles those)."
-        ) from None
-    except BROKEN as error:
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{path}: not a readable npz ({said}); write it anew.") from error
 
 
 def stated_body(path: Path, arrays: dict[str, np.ndarray], source: PoseSource | None) -> BodyFile:

@@ -11,13 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.camera import Camera
-from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
+from evsplat.capture.body_file import BodyFile, body_from_arrays
+from evsplat.capture.check_body import check_dense
+from evsplat.capture.finding import Findings
 from evsplat.capture.metadata import Frame, Metadata, NovelView
 from evsplat.capture.points import read_points
 from evsplat.errors import DataError
 from evsplat.events import EventStore
 from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_rgb, to_unit_range
 from evsplat.pictures.light import Transfer, shown
+from evsplat.untrusted.arrays import read_plain_npz
 
 IMAGE_CACHE_BYTES = 512 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
@@ -184,7 +187,7 @@ class CaptureReader:
             )
         path = self._metadata.body_file
         metadata = self._metadata
-        arrays = read_arrays(path)
+        arrays = read_plain_npz(path)
         return body_from_arrays(path, arrays, metadata.body_model, metadata.body_source)
 
     @functools.cached_property
@@ -193,7 +196,11 @@ class CaptureReader:
         path = self.path / "body_dense.npz"
         if not self.has_body or not path.exists():
             return None
-        return body_from_arrays(path, read_arrays(path), self._metadata.body_model)
+        arrays, findings = read_plain_npz(path), Findings()
+        check_dense(path, arrays, self.body_file.poses.shape[1], findings)
+        if findings.items:
+            raise DataError(str(findings.items[0]))
+        return body_from_arrays(path, arrays, self._metadata.body_model)
 
     def median_background(self) -> Float[Tensor, "H W 3"]:
         """Per-pixel temporal median of the train frames (at most 255, evenly spread)."""

@@ -25,6 +25,7 @@ from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_
 from evsplat.importers.recorded import add_recorded_events, recorded_camera
 from evsplat.importers.smpl import chosen_poses
 from evsplat.pictures.light import Transfer
+from evsplat.untrusted.arrays import read_table
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -141,7 +142,7 @@ class Folder(Importer):
         path, count = source / "exposures.txt", len(footage.times_us)
         if path.exists():
             try:
-                rows = np.loadtxt(path, ndmin=2)
+                rows = read_table(path)
             except ValueError as error:
                 raise DataError(f"{path}: not a table of numbers ({error}).") from None
             if rows.shape != (count, 2):

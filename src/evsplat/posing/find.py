@@ -19,7 +19,7 @@ from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.config import to_dict
 from evsplat.errors import ConfigError
-from evsplat.files import refuse_existing, write_text
+from evsplat.files import refuse_existing, try_target, write_text
 from evsplat.landmarks import (
     LandmarkNetwork,
     Landmarks,
@@ -105,6 +105,7 @@ def find_poses(
     search = given(PoseSearch, search, changes)
     out = Path(out)
     refuse_existing(out)
+    try_target(out)
     rig = _rig(search.body)
     capture = load_capture(path, needs_body=False)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
