@@ -22,8 +22,9 @@ _LIMITS = {"max_pixels": str(_MOST_PIXELS)}
 def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its first video stream; what FFmpeg cannot read is a `DataError`."""
     ordinary_file(path)
+    limits: Any = [_LIMITS]  # of the first stream; PyAV's types say texts and mean dictionaries
     try:
-        with av.open(f"file:{path}", options=_OPTIONS, stream_options=[_LIMITS]) as container:
+        with av.open(f"file:{path}", options=_OPTIONS, stream_options=limits) as container:
             if not container.streams.video:
                 raise DataError(f"{path}: holds no video stream.")
             stream = container.streams.video[0]
