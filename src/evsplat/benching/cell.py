@@ -2,7 +2,6 @@
 
 import logging
 import resource
-import shutil
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -18,7 +17,7 @@ from evsplat.capture import Capture, Policy, load_capture
 from evsplat.config import override, to_dict
 from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.evaluation.evaluator import evaluate
-from evsplat.files import write_json
+from evsplat.files import remove_folder, write_json
 from evsplat.methods import method_config
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
@@ -181,7 +180,8 @@ def _trained(
         # Sums of floats depend on the number of threads, and with it the last bits of a training.
         threads = read_record(folder.facts, {"threads": int}, "remove the run")["threads"]
     else:
-        shutil.rmtree(run, ignore_errors=True)
+        if run.exists():
+            remove_folder(run)
     settings = cell.settings
     iterations = cell.iterations
     if cell.max_minutes is not None and iterations is not None:

@@ -11,6 +11,7 @@ from evsplat.benching.cell import FAILED, CaptureSource, Cell, read_cell_record
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.suite import Suite, SuiteCapture, SuiteRow, check_names
 from evsplat.errors import ConfigError
+from evsplat.files import remove_file
 from evsplat.methods.trivial import TRIVIAL
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
@@ -87,7 +88,7 @@ def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]
         record = read_cell_record(path)
         _check_same_request(path, record["cell"], cell.request(), folder)
         if retry and record["status"] == FAILED:
-            path.unlink()
+            remove_file(path)
             todo.append(cell)
     return todo
 

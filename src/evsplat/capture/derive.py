@@ -1,8 +1,6 @@
 """A capture made of another one: some pictures new, everything else as it was."""
 
 import dataclasses
-import os
-import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +17,7 @@ from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import new_folder, write_json
+from evsplat.files import copy_file, make_folder, new_folder, remove_file, write_json
 from evsplat.pictures.files import write_image
 from evsplat.untrusted.text import read_json
 
@@ -95,9 +93,9 @@ def training_frames_first(
 
 def write_picture(path: Path, picture: Float[Tensor, "..."]) -> None:
     """Write a picture in [0, 1] as 8-bit PNG."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     # It may be a hard link, and what it is linked to must stay.
-    path.unlink(missing_ok=True)
+    remove_file(path)
     write_image(path, np.ascontiguousarray(picture.detach().cpu().numpy()))
 
 
@@ -115,17 +113,7 @@ def _copy_files(making: Derivation) -> None:
     names |= {view["image"] for view in document.get("novel_views", [])}
     names |= {document[key]["file"] for key in ("body", "events") if document.get(key)}
     for name in sorted(names):
-        target = making.folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _link(root / name, target)
-
-
-def _link(source: Path, target: Path) -> None:
-    source = source.resolve()
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
+        copy_file((root / name).resolve(), making.folder / name, link=True)
 
 
 def _undistort(making: Derivation) -> None:
@@ -140,12 +128,12 @@ def _undistort(making: Derivation) -> None:
         for key in set(_PICTURES) & set(entry) if frame.camera in bent else ():
             picture = readers[key](frame)
             assert picture is not None
-            (making.folder / entry[key]).unlink()
+            remove_file(making.folder / entry[key])
             making.set_picture(frame, key, picture)
     for view in source.novel_views:
         entry = making.document["novel_views"][view.index]
         if view.camera in bent:
-            (making.folder / entry["image"]).unlink()
+            remove_file(making.folder / entry["image"])
             entry["image"] = str(Path(entry["image"]).with_suffix(".png"))
             write_picture(making.folder / entry["image"], source.novel_image(view))
     if source.events is not None and source.frames[0].camera in bent:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from evsplat.errors import DataError
-from evsplat.files import atomic_path
+from evsplat.files import write_bytes
 from evsplat.untrusted.arrays import read_table
 from evsplat.untrusted.faults import ordinary_file
 
@@ -96,8 +96,7 @@ def write_points(
             rows[name] = (colours[:, column].clip(0, 1) * 255).round()
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     lines += [*(f"property {word} {name}" for name, _, word in fields), "end_header", ""]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(lines).encode("ascii") + rows.tobytes())
+    write_bytes(path, "\n".join(lines).encode("ascii") + rows.tobytes())
 
 
 def _read_header(file: BinaryIO) -> tuple[str, int, list[tuple[str, str]]]:

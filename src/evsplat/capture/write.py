@@ -1,9 +1,7 @@
 """Writing a capture as a whole, piece by piece, and reading a camera for it."""
 
 import dataclasses
-import os
-import shutil
-import tempfile
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +17,14 @@ from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import write_json
+from evsplat.files import (
+    copy_file,
+    make_folder,
+    new_folder,
+    remove_file,
+    try_target,
+    write_json,
+)
 from evsplat.names import checked_name
 from evsplat.pictures.files import read_image, write_image
 from evsplat.pictures.light import Transfer
@@ -62,11 +67,11 @@ class CaptureWriter:
         self._events: dict[str, Any] | None = None
         self._folder: Path | None = None
         self._overwrite = overwrite
+        self._making = new_folder(self.path, replace=overwrite)
         self._check_target()
 
     def __enter__(self) -> Self:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._folder = Path(tempfile.mkdtemp(dir=self.path.parent, prefix=f".{self.path.name}-"))
+        self._folder = self._making.__enter__()
         return self
 
     def __exit__(
@@ -78,8 +83,12 @@ class CaptureWriter:
         try:
             if kind is None:
                 self._finish()
+        except BaseException:
+            self._making.__exit__(*sys.exc_info())
+            raise
+        else:
+            self._making.__exit__(kind, error, trace)
         finally:
-            shutil.rmtree(self._root, ignore_errors=True)
             self._folder = None
 
     def add_camera(
@@ -201,7 +210,7 @@ class CaptureWriter:
         What `set_body` was given before is taken back.
         """
         for name in ("body.npz", "body_dense.npz"):
-            (self._root / name).unlink(missing_ok=True)
+            remove_file(self._root / name)
         self._body = None
         self._without_body = True
 
@@ -253,6 +262,7 @@ class CaptureWriter:
         return self._folder
 
     def _check_target(self) -> None:
+        try_target(self.path)
         if not self.path.exists():
             return
         if not self._overwrite:
@@ -284,11 +294,11 @@ class CaptureWriter:
                 f"{expected[0]}x{expected[1]} of camera {camera!r}."
             )
         target = self._root / (stem + suffix)
-        target.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(image, np.ndarray):
+            make_folder(target.parent)
             write_image(target, image, source=source)
         else:
-            shutil.copyfile(image, target)
+            copy_file(Path(image), target)
         return stem + suffix
 
     def _finish(self) -> None:
@@ -311,16 +321,6 @@ class CaptureWriter:
                 place = self.path / finding.file.relative_to(self._root)
                 raise DataError(f"{dataclasses.replace(finding, file=place)}")
         self._check_target()
-        umask = os.umask(0)
-        os.umask(umask)
-        self._root.chmod(0o777 & ~umask)
-        if self.path.exists():
-            replaced = self._root.with_name(f"{self._root.name}-replaced")
-            self.path.rename(replaced)
-            self._root.rename(self.path)
-            shutil.rmtree(replaced)
-        else:
-            self._root.rename(self.path)
 
 
 def read_camera(

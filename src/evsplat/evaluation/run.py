@@ -10,7 +10,7 @@ from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import name_of
 from evsplat.evaluation.tables import write_tables
-from evsplat.files import write_json, write_text
+from evsplat.files import try_target, write_json, write_text
 from evsplat.options.runs import Split
 from evsplat.render import choose_device
 from evsplat.training.run import load_run
@@ -33,6 +33,7 @@ def evaluate_run(
     start = time.monotonic()
     device = choose_device(device)
     run = load_run(Path(run_dir), device=device)
+    try_target(run.path)
     measured = evaluate(
         run.capture,
         run.reconstruction,

@@ -18,6 +18,7 @@ from evsplat.events import (
     simulate_events,
     write_events,
 )
+from evsplat.files import try_target
 from evsplat.film.camera_path import check_camera
 from evsplat.film.frame_cache import FilmFrame, FrameCache, film_digest
 from evsplat.film.looks import Look, depth_colours, linear_luma
@@ -63,6 +64,9 @@ def render_run(
     out = Path(run) / "renders" / film.file_name() if out is None else Path(out)
     ours = out.parent == Path(run) / "renders"
     _check_output(film, out, events_out, ours=ours)
+    for target in (out, events_out):
+        if target is not None:
+            try_target(target)
     loaded = load_run(Path(run), device=device)
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)

@@ -18,6 +18,7 @@ from evsplat.export.gaussians import (
     rest_track,
     write_file,
 )
+from evsplat.files import try_target
 from evsplat.options import ExportOptions
 from evsplat.options.declare import given
 from evsplat.options.runs import FileKind, Kind
@@ -61,6 +62,7 @@ def export_run(
     parts, camera = options.parts, options.camera
     _check_use(kind, options)
     target = _checked(options.out, kind)
+    try_target(target or Path(run) / "exports")
     loaded = load_run(Path(run), device=options.device)
     folder = loaded.path / "exports"
     if kind == "avatar":

@@ -18,6 +18,7 @@ from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
 from evsplat.capture.validate import check_capture
 from evsplat.errors import EvsplatError
+from evsplat.files import try_target
 from evsplat.inspection.belonging import judge_body
 from evsplat.inspection.body_check import FIT_SHEET, body_findings, check_body, fit_sheet
 from evsplat.inspection.drawing import (
@@ -65,6 +66,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     is something to draw.
     """
     path, out_dir = Path(path), Path(out_dir)
+    try_target(out_dir)
     metadata, found = check_capture(path, deep=True)
     report = InspectReport(path, tuple(found), "", ())
     if metadata is None or not report.usable:

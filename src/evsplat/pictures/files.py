@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from evsplat.errors import DataError
-from evsplat.files import atomic_path
+from evsplat.files import atomic_path, open_output
 from evsplat.untrusted.pictures import read_16_bit_colour, read_picture
 
 
@@ -93,7 +93,8 @@ def write_image(path: Path, pixels: np.ndarray, *, source: str = "") -> None:
     if pixels.dtype.kind in "fb":
         pixels = _eight_bits(pixels, source)
     if pixels.dtype == np.uint16 and pixels.ndim == 3:
-        path.write_bytes(_encode_16_bit_colour(pixels))
+        with open_output(path) as file:
+            file.write(_encode_16_bit_colour(pixels))
     elif pixels.dtype in (np.uint8, np.uint16):
         Image.fromarray(np.ascontiguousarray(pixels)).save(path)
     else:

@@ -18,7 +18,7 @@ from evsplat.camera import Camera
 from evsplat.capture import Policy, TrainingCapture, load_capture
 from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.config import to_dict
-from evsplat.files import refuse_existing, write_text
+from evsplat.files import refuse_existing, remove_file, try_target, write_text
 from evsplat.landmarks import (
     LandmarkNetwork,
     Landmarks,
@@ -102,6 +102,7 @@ def find_poses(
     search = given(PoseSearch, search, changes)
     out = Path(out)
     refuse_existing(out)
+    try_target(out)
     rig = _rig(search.body)
     capture = load_capture(path)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
@@ -225,7 +226,7 @@ def _write_body(making: Derivation, track: BodyTrack, fitted: PoseFit) -> None:
     old = making.document.get("body")
     for name in {"body.npz", "body_dense.npz", *([old["file"]] if old else [])}:
         # It may be a hard link, and what it is linked to must stay.
-        (making.folder / name).unlink(missing_ok=True)
+        remove_file(making.folder / name)
     gender = {"gender": "neutral"} if fitted.rig.model == "smpl" else {}
     np.savez_compressed(
         making.folder / "body.npz",

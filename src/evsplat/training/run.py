@@ -30,8 +30,8 @@ from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
     check_fits,
     counts,
-    latest_checkpoint,
     load_checkpoint,
+    load_latest,
     load_model,
     misfits_of,
 )
@@ -261,10 +261,10 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     device = choose_device(device)
     folder = RunFolder(Path(run_dir))
     method, config, facts = read_config(folder)
-    path = state or latest_checkpoint(folder.checkpoints)
-    if path is None:
+    loaded = (state, *load_checkpoint(state)) if state else load_latest(folder.checkpoints)
+    if loaded is None:
         raise DataError(f"{folder.checkpoints}: no checkpoint; train the run first.")
-    tensors, progress = load_checkpoint(path)
+    path, tensors, progress = loaded
     capture = load_capture(Path(facts["capture"]))
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()

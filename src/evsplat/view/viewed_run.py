@@ -127,7 +127,10 @@ def load_newest(path: Path, device: str) -> Run:
     while newest_state(path) is None and is_training(path):
         watch(path)
         threading.Event().wait(_POLL_S)
-    return load_run(path, device=device, state=newest_state(path))
+    newest = newest_state(path)
+    # Of checkpoints the newest that can be read.
+    snapshot = newest if newest is not None and newest.parent == path else None
+    return load_run(path, device=device, state=snapshot)
 
 
 class RunFollower:
