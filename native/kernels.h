@@ -13,6 +13,7 @@
 #include "picture.h"
 #include "posing.h"
 #include "sensor_kernels.h"
+#include "shadow.h"
 #include "skinning.h"
 #include "ssim.h"
 #include "surface_light.h"
@@ -132,6 +133,14 @@ struct GaussianGrads {
     KERNEL(void, surface_light, (const SurfaceLight&, size_t begin, size_t end, float* factors)) \
     /* Sums over the points, and the gradient of the shares unless `lit` is null. */ \
     KERNEL(void, surface_light_backward, (const SurfaceLight&, size_t begin, size_t end, const float* above, float* sums, float* lit)) \
+    /* A body's points onto a grid, and from the grid's gradient, which changes, to theirs. */ \
+    KERNEL(void, shadow_splat, (const ShadowSplat&, float* grid)) \
+    KERNEL(void, shadow_splat_backward, (const ShadowSplat&, float* grid, const SplatGrads&)) \
+    /* Places [begin, end); back, it adds to grids and writes (lamps, kViewSums) sums and the shares'. */ \
+    KERNEL(void, shadow_on_scene, (const ShadowLook&, size_t begin, size_t end, float* factor)) \
+    KERNEL(void, shadow_on_scene_backward, (const ShadowLook&, size_t begin, size_t end, const float* above, float* const* grids, float* sums, float* share)) \
+    KERNEL(void, shadow_on_body, (const ShadowLook&, size_t begin, size_t end, float* lit)) \
+    KERNEL(void, shadow_on_body_backward, (const ShadowLook&, size_t begin, size_t end, const float* above, float* grid, float* sums)) \
     KERNEL(void, sensor_step, (const SensorPiece&))
 
 struct Kernels {

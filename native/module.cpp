@@ -362,6 +362,7 @@ NB_MODULE(_native, m) {
           nb::arg("position_grad").none(), nb::arg("weight_grad").none(), nb::arg("bones_grad").none(),
           nb::arg("threads"), "Writes the gradients of skin.");
     bind_sensor(m);
+    bind_shadow(m);
     bind_step(m);
     bind_events(m);
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
