@@ -288,8 +288,8 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
         watch.calls(objective, "loss", f"loss {type(objective).__name__}")
         if isinstance(objective, EventWindows):
             watch.calls(objective.events, "between", "events read")
-            watch.calls(objective, "_counts", "events counted")
-            watch.calls(event_windows, "begun_counts", "events begun")
+            watch.calls(event_windows, "window_counts", "events counted")
+            watch.calls(event_windows, "log_luminance", "log luminance")
     watch.calls(trainer, "_count", "densification")
     watch.calls(trainer.optimiser, "step", "optimiser")
     watch.calls(trainer.optimiser, "finite", "finite check")

@@ -8,6 +8,7 @@
 #include <immintrin.h>
 #endif
 
+#include "event_windows.h"
 #include "list.h"
 #include "mlp_kernels.h"
 #include "picture.h"
@@ -124,6 +125,7 @@ struct GaussianGrads {
     KERNEL(PairOfSums, square_sums, (const float*, const float*, size_t)) \
     KERNEL(PairOfSums, difference_sums, (const float*, const float*, float, float, size_t)) \
     KERNEL(void, difference_slope, (const float*, const float*, float, float, float, float, size_t, float*)) \
+    KERNEL(WindowSums, window_difference, (const WindowDifference&, size_t begin, size_t end, float* slope)) \
     KERNEL(void, view_directions, (const ViewDirections&, size_t begin, size_t end)) \
     KERNEL(void, sh_rows, (const ShRows&, size_t begin, size_t end)) \
     KERNEL(void, tree_softmax, (const TreeSoftmax&, size_t begin, size_t end, float* scratch)) \

@@ -4,7 +4,14 @@ import pytest
 import torch
 from skimage.color import rgb2gray
 
-from evsplat.pictures import decode, encode, log_brightness, log_brightness_change, luminance
+from evsplat.pictures import (
+    decode,
+    encode,
+    log_brightness,
+    log_brightness_change,
+    log_luminance,
+    luminance,
+)
 
 
 @pytest.mark.parametrize("transfer", ["power", "srgb", "linear"])
@@ -95,3 +102,17 @@ def test_a_doubled_luminance_changes_the_logarithm_by_ln_2():
     brighter = rgb * 2 ** (1 / 2.2)
     change = log_brightness_change(rgb, brighter, eps=0.0)
     assert (change - torch.log(torch.tensor(2.0, dtype=torch.float64))).abs().max() < 1e-12
+
+
+def test_compiled_logarithm_of_light_and_its_gradient_equal_the_definition_in_float64():
+    linear = torch.rand(3, 7, 9, 3, generator=torch.Generator().manual_seed(0))
+    linear[0, 0] = 0.0
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        # planar in memory, as the rasteriser's pictures are
+        leaf = linear.to(dtype).movedim(-1, 1).contiguous().requires_grad_()
+        value = log_luminance(leaf.movedim(1, -1), 0.004)
+        weights = torch.arange(value.numel(), dtype=dtype).view(value.shape).cos()
+        results.append((value, *torch.autograd.grad((value * weights).sum(), leaf)))
+    for compiled, plain in zip(*results, strict=True):
+        assert (compiled - plain).abs().max() < 1e-6 * plain.abs().max()

@@ -7,6 +7,7 @@ from evsplat.pictures.light import (
     encode,
     log_brightness,
     log_brightness_change,
+    log_luminance,
     luminance,
 )
 
@@ -17,6 +18,7 @@ __all__ = [
     "error_map",
     "log_brightness",
     "log_brightness_change",
+    "log_luminance",
     "luminance",
     "signed_map",
     "to_bytes",

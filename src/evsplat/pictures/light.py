@@ -53,6 +53,14 @@ def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
     return REC709[0] * red + REC709[1] * green + REC709[2] * blue
 
 
+def log_luminance(linear_rgb: Float[Tensor, "T H W 3"], eps: float) -> Float[Tensor, "T H W"]:
+    """Natural logarithm of the luminance of linear pictures, none below 0, and ``eps``."""
+    if runs_native(linear_rgb):
+        result: Tensor = _NativeLogLuminance.apply(linear_rgb, eps)
+        return result
+    return torch.log(luminance(linear_rgb) + eps)
+
+
 def log_brightness(
     rgb_srgb: Float[Tensor, "*shape 3"], *, eps: float = 1e-5, transfer: Transfer = "power"
 ) -> Float[Tensor, "*shape"]:
@@ -93,6 +101,30 @@ class _NativePower(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> Tensor:
         (slope,) = ctx.saved_tensors
         return slope * upstream[0]
+
+
+class _NativeLogLuminance(torch.autograd.Function):
+    """`log_luminance` in the compiled module, picture by picture; the slopes are found at once."""
+
+    @staticmethod
+    def forward(ctx: Any, linear: Tensor, eps: float) -> Float[Tensor, "T H W"]:
+        planes = linear.detach().movedim(-1, 1).contiguous()
+        slopes = torch.empty_like(planes) if ctx.needs_input_grad[0] else None
+        value = torch.empty_like(planes[:, 0])
+        for t, picture in enumerate(planes):
+            slope = None if slopes is None else slopes[t]
+            native.log_brightness(
+                picture, REC709, 1.0, 0.0, eps, value[t], slope, torch.get_num_threads()
+            )
+        if slopes is not None:
+            ctx.save_for_backward(slopes)
+        return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (slopes,) = ctx.saved_tensors
+        return (slopes * upstream[0][:, None]).movedim(1, -1), None
 
 
 class _PowerLogBrightness(torch.autograd.Function):
