@@ -27,6 +27,8 @@ constexpr uint32_t kBlock = 512;       // Gaussians per unit of projection work;
 constexpr int kMoments = 6;            // gradient slot: sums of h, hu, hv, huu, huv, hvv, then channels
 constexpr int kMaxChannels = 32;       // drawn in one go; more are drawn in blocks
 
+constexpr int kLitChannels = 3;
+
 constexpr int slot_stride(int channels) { return (kMoments + channels + 3) / 4 * 4; }
 
 // Camera and image of one render. `r`, `t`: world to camera, row-major.
@@ -74,6 +76,7 @@ struct ForwardJob {
     ptrdiff_t background_c, background_x, background_y;
     float *image, *alpha;         // planar (T, C, H, W) and (T, H, W)
     size_t image_t, alpha_t;      // floats from one time to the next
+    const float* light;           // (H, W), null for 1: factor on the first kLitChannels of what stands still
 };
 
 // One tile with one list of entries, and the times whose picture it is.
@@ -98,6 +101,7 @@ struct BackwardJob {
     float* slots;                 // (slots, slot_stride(C))
     float* background_grad;       // null, or (tiles, C) or (H, W, value_stride), added to
     bool background_is_image;
+    float* light_grad;            // (H, W), written; null: not wanted
 };
 
 struct PairOfSums {

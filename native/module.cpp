@@ -41,8 +41,8 @@ FieldOf<T>& field_of(LayerOf<T>& l, size_t i) {
 class Render {
   public:
     Render(int width, int height, const Camera& k, const Pose& pose, float near_plane, float low_pass, Fields moving,
-           Fields still, std::optional<In> background, int times, int threads)
-        : moving_(std::move(moving)), still_(std::move(still)), background_(background), threads_(threads) {
+           Fields still, std::optional<In> background, std::optional<In> light, int times, int threads)
+        : moving_(std::move(moving)), still_(std::move(still)), background_(background), light_(light), threads_(threads) {
         require(width > 0 && height > 0 && width <= 1 << 16 && height <= 1 << 16 && times > 0, "the image");
         View& v = scene_.view;
         for (int i = 0; i < 3; ++i) {
@@ -65,6 +65,10 @@ class Render {
         if (background) {
             require(background->size() == c * (scene_.background_is_image ? size_t(width) * height : 1), "background");
             scene_.background = background->data();
+        }
+        if (light) {
+            require(light->size() == size_t(times) * width * height && c >= kLitChannels && c <= kMaxChannels, "the light");
+            scene_.light = light->data();
         }
     }
 
@@ -91,7 +95,7 @@ class Render {
     }
 
     void backward(std::optional<Strided> image_grad, std::optional<Strided> alpha_grad, OutFields moving,
-                  OutFields still, std::optional<Out> view, std::optional<Out> background) {
+                  OutFields still, std::optional<Out> view, std::optional<Out> background, std::optional<Out> light) {
         if (!record_) throw std::runtime_error("evsplat._native: backward before forward");
         const size_t h = scene_.view.height, w = scene_.view.width, t = scene_.times, c = scene_.channels;
         OutputGrads out;
@@ -119,6 +123,10 @@ class Render {
         if (background && scene_.background) {
             require(background->size() == c * (scene_.background_is_image ? h * w : 1), "background gradient");
             in.background = background->data();
+        }
+        if (light && scene_.light) {
+            require(light->size() == t * h * w, "the light's gradient");
+            in.light = light->data();
         }
         nb::gil_scoped_release release;
         render_backward(scene_, *record_, threads_, out, in);
@@ -163,7 +171,7 @@ class Render {
 
     // The arrays keep the memory that scene_ points into alive.
     Fields moving_, still_;
-    std::optional<In> background_;
+    std::optional<In> background_, light_;
     Scene scene_ = {};
     int threads_;
     std::unique_ptr<Record> record_;
@@ -324,15 +332,16 @@ NB_MODULE(_native, m) {
     m.doc() = "CPU kernels of evsplat.";
     nb::set_leak_warnings(false);  // images alive when the interpreter ends are no leak
     nb::class_<Render>(m, "Render", "One render of T times; keeps what its backward pass needs.")
-        .def(nb::init<int, int, const Camera&, const Pose&, float, float, Fields, Fields, std::optional<In>, int,
-                      int>(),
+        .def(nb::init<int, int, const Camera&, const Pose&, float, float, Fields, Fields, std::optional<In>,
+                      std::optional<In>, int, int>(),
              nb::arg("width"), nb::arg("height"), nb::arg("K"), nb::arg("world_to_camera"), nb::arg("near"),
              nb::arg("low_pass"), nb::arg("moving"), nb::arg("still"), nb::arg("background").none(),
-             nb::arg("times"), nb::arg("threads"))
+             nb::arg("light").none(), nb::arg("times"), nb::arg("threads"))
         .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"),
              nb::arg("still_radii"), nb::arg("keep") = false, nb::arg("earlier").none() = nb::none())
         .def("backward", &Render::backward, nb::arg("image_grad").none(), nb::arg("alpha_grad").none(),
-             nb::arg("moving"), nb::arg("still"), nb::arg("view").none(), nb::arg("background").none())
+             nb::arg("moving"), nb::arg("still"), nb::arg("view").none(), nb::arg("background").none(),
+             nb::arg("light").none())
         .def_prop_ro("seconds", &Render::seconds, "Work so far by stage, summed over threads.")
         .def_prop_ro("bytes", &Render::bytes, "Memory kept for the backward pass.")
         .def_prop_ro("intersections", &Render::intersections, "Pairs of Gaussian and tile.")

@@ -7,7 +7,8 @@ import torch
 
 from evsplat.capture import load_capture
 from evsplat.errors import ConfigError
-from evsplat.models.drawing import _places, draw, shadowed_scene
+from evsplat.models.drawing import draw, shadowed_scene
+from evsplat.models.scene_places import places_of
 from evsplat.render import LOW_PASS, Splats, render
 
 from ..small_model import built, small_config
@@ -103,7 +104,7 @@ def test_places_of_a_slanted_plane_are_on_it(shadowed):
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
     z = distance / (rays @ normal)
     share = torch.rand_like(z) * 0.01 + 0.5
-    places = _places(torch.stack([z * share, share], -1), camera, 2)
+    places = places_of(torch.stack([z * share, share], -1), camera, 2)
     local = places @ turn.T + pose[:3, 3]
     # The mean over two by two pixels is the depth in their middle, up to the plane's curvature.
     assert (local @ normal - distance).abs().max() < 0.01
