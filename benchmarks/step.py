@@ -271,7 +271,7 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
         watch.calls(model.shadow, "place", "casters")
         watch.calls(model.shadow, "lit", "shadow on the person")
         watch.calls(model.shadow, "forward", "shadow on the scene")
-        watch.calls(drawing, "_places", "places of the scene")
+        watch.calls(model.places, "of", "places of the scene")
         watch.calls(drawing, "_enlarge", "shadow enlarged")
     else:
         watch.calls(model.skinning, "forward", "skinning network")
@@ -281,7 +281,7 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
     watch.calls(model, "_layers", "posing, rest")
     watch.calls(drawing, "render", "render")
     watch.calls(model, "training_drawing", "drawing, rest")
-    watch.calls(objectives_base, "decode", "decode")
+    watch.calls(exposure, "mean_light", "mean light")
     watch.calls(exposure, "encode", "encode")
     watch.calls(exposure, "l1_and_ssim", "L1 and SSIM")
     for objective in trainer.composition.objectives:
@@ -289,7 +289,7 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
         if isinstance(objective, EventWindows):
             watch.calls(objective.events, "between", "events read")
             watch.calls(event_windows, "window_counts", "events counted")
-            watch.calls(event_windows, "log_luminance", "log luminance")
+            watch.calls(objectives_base, "log_luminance", "log luminance")
     watch.calls(trainer, "_count", "densification")
     watch.calls(trainer.optimiser, "step", "optimiser")
     watch.calls(trainer.optimiser, "finite", "finite check")

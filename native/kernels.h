@@ -123,6 +123,8 @@ struct GaussianGrads {
     KERNEL(SsimSums, ssim_band, (const SsimBand&)) \
     KERNEL(void, log_brightness, (const LogBrightness&, size_t begin, size_t end)) \
     KERNEL(void, power, (const Power&, size_t begin, size_t end)) \
+    KERNEL(void, power_mean, (const PowerMean&, size_t begin, size_t end)) /* of all planes' values */ \
+    KERNEL(void, power_mean_backward, (const PowerMean&, size_t begin, size_t end, const float* above, float* const* grads)) \
     KERNEL(void, add_sign, (const float*, const float*, float, float, size_t, float*)) \
     KERNEL(double, membership, (const Membership&, size_t begin, size_t end)) /* begin: a multiple of 16 */ \
     /* Of two maps: squares; absolute differences and their signs times the first; the gradient of those. */ \

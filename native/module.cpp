@@ -269,6 +269,50 @@ void picture_power(In from, float exponent, Out value, std::optional<Out> slope,
     power({from.data(), exponent, value.data(), data_of(slope)}, from.size(), threads);
 }
 
+// Pictures (H, W, 3), planar in memory.
+PowerMean mean_of(const std::vector<Strided>& pictures, float exponent) {
+    require(!pictures.empty() && pictures.size() <= kMostPictures, "the pictures");
+    PowerMean job = {int(pictures.size()), {}, exponent, 0, nullptr};
+    for (size_t i = 0; i < pictures.size(); ++i) {
+        const Strided& p = pictures[i];
+        require(p.ndim() == 3 && p.shape(2) == 3, "a picture");
+        const size_t count = p.shape(0) * p.shape(1);
+        require((!i || count == job.count) && p.stride(1) == 1 && size_t(p.stride(0)) == p.shape(1) && size_t(p.stride(2)) == count,
+                "a picture: planar");
+        job.coded[i] = p.data(), job.count = count;
+    }
+    return job;
+}
+
+void picture_power_mean(const std::vector<Strided>& pictures, float exponent, Out mean, int threads) {
+    PowerMean job = mean_of(pictures, exponent);
+    require(mean.size() == 3 * job.count, "the mean");
+    job.mean = mean.data();
+    nb::gil_scoped_release release;
+    power_mean(job, threads);
+}
+
+void picture_power_mean_backward(const std::vector<Strided>& pictures, float exponent, In above, Out grads, int threads) {
+    const PowerMean job = mean_of(pictures, exponent);
+    require(above.size() == 3 * job.count && grads.size() == job.pictures * above.size(), "the gradients");
+    float* to[kMostPictures];
+    for (int i = 0; i < job.pictures; ++i) to[i] = grads.data() + i * above.size();
+    nb::gil_scoped_release release;
+    power_mean_backward(job, above.data(), threads, to);
+}
+
+// Whole pictures, or back from their gradient.
+void picture_enlarge(In from, int factor, Out to, bool back, int threads) {
+    require(from.ndim() == 3 && to.ndim() == 3 && from.shape(0) == to.shape(0) && factor >= 1, "the pictures");
+    const auto small = [&](size_t i) { return back ? to.shape(i) : from.shape(i); };
+    const auto large = [&](size_t i) { return back ? from.shape(i) : to.shape(i); };
+    for (size_t i = 1; i < 3; ++i)
+        require(small(i) > 0 && large(i) <= small(i) * factor && large(i) < 1 << 20, "the pictures");
+    const Enlarge job = {small(0), int(small(1)), int(small(2)), int(large(1)), int(large(2)), factor};
+    nb::gil_scoped_release release;
+    (back ? enlarge_backward : enlarge)(job, from.data(), threads, to.data());
+}
+
 // Planes (3, pixels).
 void picture_log_brightness(In coded, const std::array<float, 3>& weight, float gamma, float darkest, float eps,
                             Out value, std::optional<Out> slope, int threads) {
@@ -361,6 +405,12 @@ NB_MODULE(_native, m) {
           "grad = by_difference * sign(image - reference) + scale * grad.");
     m.def("power", &picture_power, nb::arg("given"), nb::arg("exponent"), nb::arg("value"), nb::arg("slope").none(),
           nb::arg("threads"), "value = max(from, 0)^exponent, and its slope.");
+    m.def("power_mean", &picture_power_mean, nb::arg("pictures"), nb::arg("exponent"), nb::arg("mean"),
+          nb::arg("threads"), "Mean of planar pictures' max(coded, 0)^exponent.");
+    m.def("power_mean_backward", &picture_power_mean_backward, nb::arg("pictures"), nb::arg("exponent"),
+          nb::arg("above"), nb::arg("grads"), nb::arg("threads"));
+    m.def("enlarge", &picture_enlarge, nb::arg("given"), nb::arg("factor"), nb::arg("to"), nb::arg("back"),
+          nb::arg("threads"), "Pictures enlarged bilinearly, or the gradient of the small ones.");
     m.def("log_brightness", &picture_log_brightness, nb::arg("coded"), nb::arg("weight"), nb::arg("gamma"),
           nb::arg("darkest"), nb::arg("eps"), nb::arg("value"), nb::arg("slope").none(), nb::arg("threads"),
           "Logarithm of the luminance of (3, H, W) coded values, and its slope by each.");

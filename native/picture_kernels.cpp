@@ -124,6 +124,29 @@ void power(const Power& job, size_t begin, size_t end) {
     });
 }
 
+void power_mean(const PowerMean& job, size_t begin, size_t end) {
+    const float share = 1.f / float(job.pictures);
+    vectors(begin, end, PER_VECTOR {
+        F sum = {};
+        for (int i = 0; i < job.pictures; ++i) {
+            const F given = load_some(job.coded[i] + at, count), v = max(given, splat(1e-6f));
+            sum += select(given >= 1e-6f, exp2(log2(v) * job.exponent), F{}) + (given - given);
+        }
+        store_some(job.mean + at, sum * share, count);
+    });
+}
+
+void power_mean_backward(const PowerMean& job, size_t begin, size_t end, const float* above, float* const* grads) {
+    const float share = job.exponent / float(job.pictures);
+    vectors(begin, end, PER_VECTOR {
+        const F by = load_some(above + at, count) * share;
+        for (int i = 0; i < job.pictures; ++i) {
+            const F given = load_some(job.coded[i] + at, count), v = max(given, splat(1e-6f));
+            store_some(grads[i] + at, select(given >= 1e-6f, exp2(log2(v) * (job.exponent - 1.f)) * by, F{}), count);
+        }
+    });
+}
+
 void log_brightness(const LogBrightness& job, size_t begin, size_t end) {
     vectors(begin, end, PER_VECTOR {
         F light = splat(job.eps), slope[3];

@@ -7,7 +7,7 @@ import torch
 
 from evsplat.capture import load_capture
 from evsplat.errors import ConfigError
-from evsplat.models.drawing import draw, shadowed_scene
+from evsplat.models.drawing import _enlarge, draw, shadowed_scene
 from evsplat.models.scene_places import places_of
 from evsplat.render import LOW_PASS, Splats, render
 
@@ -110,6 +110,20 @@ def test_places_of_a_slanted_plane_are_on_it(shadowed):
     assert (local @ normal - distance).abs().max() < 0.01
     back, _ = camera.project(places.reshape(-1, 3))
     assert torch.allclose(back[0], torch.tensor([1.0, 1.0]), atol=1e-3)
+
+
+@pytest.mark.parametrize(("size", "step"), [((7, 9), 2), ((8, 10), 2), ((5, 11), 3), ((4, 6), 1)])
+def test_the_compiled_enlargement_is_torchs_and_so_is_its_gradient(shadowed, size, step):
+    camera = replace(shadowed[2], height=size[0], width=size[1])
+    small = torch.rand(3, -(-size[0] // step), -(-size[1] // step))
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = small.to(dtype, copy=True).requires_grad_()
+        large = _enlarge(leaf, camera, step)
+        weights = torch.arange(large.numel(), dtype=dtype).view(large.shape).cos()
+        results.append((large, *torch.autograd.grad((large * weights).sum(), leaf)))
+    for compiled, plain in zip(*results, strict=True):
+        assert compiled.shape == plain.shape and (compiled - plain).abs().max() < 2e-6
 
 
 def test_lights_get_a_gradient_from_the_picture(shadowed):

@@ -8,6 +8,7 @@ import torch
 
 from evsplat.events import ALWAYS, EventStream, window_counts
 from evsplat.objectives import EventNoise, EventSensor, EventWindows
+from evsplat.pictures import luminance
 
 HEIGHT, WIDTH, EPS = 9, 11, 0.004
 
@@ -62,10 +63,17 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
     return capture, step_at(times, linear)
 
 
-def step_at(times: tuple[int, ...], linear: torch.Tensor) -> SimpleNamespace:
+class StepAt(SimpleNamespace):
+    """A step whose pictures are known in linear light."""
+
+    def log_luminance(self, which: slice, eps: float) -> torch.Tensor:
+        return torch.log(luminance(self.linear[which]) + eps)
+
+
+def step_at(times: tuple[int, ...], linear: torch.Tensor) -> StepAt:
     """A step of a frame in the middle of ``times``."""
     frame = SimpleNamespace(mid_us=(times[0] + times[-1]) // 2)
-    return SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0, frame=frame)
+    return StepAt(times_us=times, linear=linear, nominal=5_000.0, frame=frame)
 
 
 def make(capture, on: float, off: float, ramp_us: int = 0, **learned) -> EventWindows:

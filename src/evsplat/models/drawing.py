@@ -1,14 +1,16 @@
 """Pictures of posed Gaussians, with the person's shadow on the scene."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from evsplat.camera import Camera
+from evsplat.compiled import native, runs_native
 from evsplat.models.layers import Layers
 from evsplat.models.scene_places import LEAST_SCENE, ScenePlaces
 from evsplat.render import Backdrop, RenderOutput, Splats, render, split_channels
@@ -122,8 +124,30 @@ def shadowed_scene(layers: Layers) -> Splats:
 
 
 def _enlarge(light: Float[Tensor, "T h w"], camera: Camera, step: int) -> Float[Tensor, "T H W"]:
+    if runs_native(light):
+        large: Tensor = _Enlarge.apply(light, camera.height, camera.width, step)
+        return large
     full = F.interpolate(light[:, None], scale_factor=step, mode="bilinear")
     return full[:, 0, : camera.height, : camera.width]
+
+
+class _Enlarge(torch.autograd.Function):
+    """The same in the compiled module."""
+
+    @staticmethod
+    def forward(ctx: Any, light: Tensor, height: int, width: int, step: int) -> Tensor:
+        ctx.step, ctx.size = step, light.shape
+        large = light.new_empty(len(light), height, width)
+        native.enlarge(light.detach().contiguous(), step, large, False, torch.get_num_threads())
+        return large
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        small = upstream[0].new_empty(ctx.size)
+        above = upstream[0].contiguous()
+        native.enlarge(above, ctx.step, small, True, torch.get_num_threads())
+        return small, None, None, None
 
 
 def _with_centers(layer: Splats) -> Splats:

@@ -17,7 +17,6 @@ from evsplat.devices import send
 from evsplat.events import polarity_counts, window_counts
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event_sensor import EventNoise, EventSensor
-from evsplat.pictures import log_luminance
 
 _RATE_US = 1_000
 """Time before and after an instant in which events are counted for their rate there."""
@@ -130,7 +129,7 @@ class EventWindows(Objective):
         late = [time + self._late_us for time in step.times_us[kept]]
         low, high = self.events.readable_around(step.frame.mid_us)
         # A sensor compares logarithms of light, before any transfer curve of a camera.
-        brightness = log_luminance(step.linear[kept], self.eps)
+        brightness = step.log_luminance(kept, self.eps)
         reach = max(_RATE_US, self.ramp_us)
         stream = self.events.between(max(late[0] - reach, low), min(late[-1] + reach, high))
         size = self.events.height, self.events.width

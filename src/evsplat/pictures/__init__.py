@@ -9,6 +9,7 @@ from evsplat.pictures.light import (
     log_brightness_change,
     log_luminance,
     luminance,
+    mean_light,
 )
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "log_brightness_change",
     "log_luminance",
     "luminance",
+    "mean_light",
     "signed_map",
     "to_bytes",
 ]

@@ -158,8 +158,9 @@ class DiscModel(PosedModel):
         The times of a step lie within a frame of each other: the non-rigid network sees the pose
         at the frame's middle alone, and own shadows are looked up at the time nearest to it.
         """
-        _, bones = self.pose(times_us)
-        rotations, _ = self.pose([frame.mid_us])
+        # Posed together: the skeleton is walked once for all times.
+        turned, bones = self.pose([*times_us, frame.mid_us])
+        bones, rotations = bones[:-1], turned[-1:]
         joints = rotations.shape[1]
         rotations = rotations + draw_pose_noise(joints, self.pose_noise, generator, self.device)
         nearest = min(range(len(times_us)), key=lambda t: abs(times_us[t] - frame.mid_us))
