@@ -88,6 +88,17 @@ def test_a_shadow_darkens_the_scene_and_leaves_the_person(shadowed):
             assert torch.allclose(files.channels[time], scene.channels[0])
 
 
+def test_a_picture_does_not_depend_on_who_stands_where_in_the_one_before(shadowed):
+    model, _, camera = shadowed
+    times = [0, 40_000]
+    with torch.no_grad():
+        model.shadow.share_logits.fill_(1.0)
+        together = draw(model.at(times, camera.center()), camera).rgb
+        for time, picture in zip(times, together, strict=True):
+            alone = draw(model.at([time], camera.center()), camera).rgb[0]
+            assert (picture - alone).abs().max() < 1e-5
+
+
 def test_places_of_a_slanted_plane_are_on_it(shadowed):
     _, _, camera = shadowed
     turn = torch.linalg.qr(torch.randn(3, 3))[0]
