@@ -48,6 +48,8 @@ def test_a_capture_without_poses_gets_some(unposed, tmp_path):
         np.testing.assert_allclose(own, stored, atol=1e-4)
     made = new.provenance["poses"]
     assert made["pictures"] == len(new.train_frames)
+    assert "(key points of a file) from training frames alone." in new.poses_found
+    assert load_capture(path).poses_found is None
     page = (tmp_path / "new" / "poses.html").read_text()
     assert "http" not in page.replace("http-equiv", "")
     assert "In doubt" in page

@@ -25,7 +25,7 @@ from evsplat.importers.base import (
 )
 from evsplat.importers.colmap import read_colmap
 from evsplat.importers.smpl import add_body, chosen_poses
-from evsplat.safe_pickle import read_npz
+from evsplat.untrusted.arrays import read_npz
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from evsplat.errors import DataError
-from evsplat.files import read_json
 from evsplat.landmarks.landmarks import SETS
+from evsplat.untrusted.arrays import read_plain_arrays
+from evsplat.untrusted.text import read_json
 
 _KEYS = ("keypoints", "poses", "places", "joints", "landmarks", "arr_0")
 _FORMS = "OpenPose or COCO-style JSON, .npz, .npy or .csv with frames x points x 2 or 3"
@@ -69,7 +70,7 @@ def _from_json(path: Path, content: Any) -> Float[np.ndarray, "N L D"]:
             raise DataError(f"{path}: entry {index}: instances is no list.")
         frames.setdefault(json.dumps(frame), []).extend(found)
     order = sorted(frames, key=_natural)
-    return _stack(path, [_one_person(path, f"frame {key}", frames[key]) for key in order])
+    return _stack(path, [_one_person(path, f"frame {key[:80]}", frames[key]) for key in order])
 
 
 def _natural(key: str) -> tuple[tuple[int, ...], str]:
@@ -155,23 +156,13 @@ def _stack(path: Path, frames: Sequence[np.ndarray | None]) -> Float[np.ndarray,
 
 
 def _from_arrays(path: Path) -> Float[np.ndarray, "N L D"]:
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            array = loaded
-        else:
-            with loaded:
-                key = next((key for key in _KEYS if key in loaded), None)
-                if key is None:
-                    raise DataError(
-                        f"{path}: holds {', '.join(loaded.files) or 'nothing'}, expected an array "
-                        f"{' or '.join(_KEYS)}."
-                    )
-                array = loaded[key]
-    except DataError:
-        raise
-    except Exception as error:  # NumPy and zipfile raise many kinds for files that are not theirs
-        raise DataError(f"{path}: not a readable NumPy file ({error}); write it anew.") from error
+    arrays = read_plain_arrays(path)
+    array = next((arrays[key] for key in ("", *_KEYS) if key in arrays), None)
+    if array is None:
+        raise DataError(
+            f"{path}: holds {', '.join(arrays) or 'nothing'}, expected an array "
+            f"{' or '.join(_KEYS)}."
+        )
     return _checked(path, array)
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import HeldOutError
 from evsplat.events import EventStream, deblur, polarity_counts
+from evsplat.pictures import shown
 from evsplat.pictures.light import Transfer, decode, encode, luminance
 
 logger = logging.getLogger(__name__)
@@ -59,7 +60,12 @@ def sharp_pictures(
     thresholds = _thresholds(capture)
     if thresholds is None:
         return [
-            SharpPicture(frame.mid_us, capture.image(frame), frame, BLURRY_SIGMA)
+            SharpPicture(
+                frame.mid_us,
+                shown(capture.image(frame), capture.transfer(frame)),
+                frame,
+                BLURRY_SIGMA,
+            )
             for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us)
         ]
     pictures = [
@@ -115,7 +121,7 @@ def _in_exposure(
         transfer=capture.transfer(frame),
     )
     for time, image in zip(times, images, strict=True):
-        yield SharpPicture(time, image, frame, 1.0)
+        yield SharpPicture(time, shown(image, capture.transfer(frame)), frame, 1.0)
 
 
 def _carried(
@@ -170,6 +176,7 @@ def _carry(
         transfer=capture.transfer(frame),
     )
     counts = polarity_counts(events, *image.shape[:2]).sum(0)
+    carried = shown(carried, capture.transfer(frame))
     return carried, torch.from_numpy(gaussian_filter(counts.numpy(), _SMOOTHING_PX))
 
 
@@ -184,6 +191,7 @@ def _blend(sources: Sequence[_Source], transfer: Transfer) -> _Source:
     weights /= weights.sum(0)
     images = torch.stack([image for image, _ in sources])
     mean = (images * weights[..., None]).sum(0)
-    grey = encode(luminance(decode(images, transfer)), transfer)
+    coded: Transfer = "srgb" if transfer == "linear" else transfer  # as they are `shown`
+    grey = encode(luminance(decode(images, coded)), coded)
     off = (grey - (grey * weights).sum(0)).square()
     return mean, (off * weights).sum(0)

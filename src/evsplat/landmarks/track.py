@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.capture import TrainingCapture
+from evsplat.capture import TrainingCapture, coded
 from evsplat.errors import DataError
 from evsplat.landmarks.detect import COPIES, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
@@ -56,6 +56,7 @@ def find_landmarks(
     if not pictures:
         raise DataError(f"{capture.path}: has no picture in which to look for the person.")
     pictures = sorted(pictures, key=lambda picture: picture.time_us)
+    capture = coded(capture)
     motion = Motion(capture)
     tracker = _Tracker(network, motion)
     found = [

@@ -183,8 +183,8 @@ class StageSettings:
 
 
 @dataclass(frozen=True)
-class PoseSearch:
-    """Body poses to be found in a capture."""
+class PoseOptions:
+    """Body poses to be found in a recording."""
 
     body: Annotated[Literal["default", "smpl"], option("MODEL")] = "default"
     """default (ships with evsplat) or smpl (your licensed file)."""
@@ -192,8 +192,6 @@ class PoseSearch:
         float | None, Within(0.5, 2.5), option("M", default="an adult's", name="height")
     ] = None
     """Stature of the person, metres: it alone tells how far away they are."""
-    focal: Annotated[str | None, option("auto|PX", default="the capture's")] = None
-    """Focal length in pixels, or auto: the one that fits best."""
     refine_s: Annotated[
         float | None, Within(0, 1e6), option("SECONDS", default="2 per frame", name="refine")
     ] = None
@@ -205,6 +203,17 @@ class PoseSearch:
 
     def __post_init__(self) -> None:
         check_options(self)
+
+
+@dataclass(frozen=True)
+class PoseSearch(PoseOptions):
+    """Body poses to be found in a capture, and the focal length with them."""
+
+    focal: Annotated[str | None, option("auto|PX", default="the capture's")] = None
+    """Focal length in pixels, or auto: the one that fits best."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.focal not in (None, "auto") and self.focal_px is None:
             raise ConfigError(f"--focal {self.focal}: expected auto or pixels above 0.")
 

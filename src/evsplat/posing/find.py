@@ -19,7 +19,7 @@ from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.config import to_dict
 from evsplat.errors import ConfigError
-from evsplat.files import refuse_existing, write_text
+from evsplat.files import refuse_existing, try_target, write_text
 from evsplat.landmarks import (
     LandmarkNetwork,
     Landmarks,
@@ -105,8 +105,9 @@ def find_poses(
     search = given(PoseSearch, search, changes)
     out = Path(out)
     refuse_existing(out)
+    try_target(out)
     rig = _rig(search.body)
-    capture = load_capture(path)
+    capture = load_capture(path, needs_body=False)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
     focal_px = search.focal_px
     if search.focal == "auto":
@@ -239,25 +240,17 @@ def _cameras(capture: TrainingCapture, times_us: Sequence[int]) -> list[Camera]:
 
 def _write_body(making: Derivation, track: BodyTrack, fitted: PoseFit) -> None:
     assert track.errors is not None
-    old = making.document.get("body")
-    for name in {"body.npz", "body_dense.npz", *([old["file"]] if old else [])}:
-        # It may be a hard link, and what it is linked to must stay.
-        (making.folder / name).unlink(missing_ok=True)
-    gender = {"gender": "neutral"} if fitted.rig.model == "smpl" else {}
-    np.savez_compressed(
-        making.folder / "body.npz",
-        allow_pickle=False,
-        model=fitted.rig.model,
-        times_us=track.times_us,
-        poses=track.poses.astype(np.float32),
-        transl=track.transl.astype(np.float32),
-        betas=fitted.betas.astype(np.float32),
-        pose_std_rad=np.asarray(track.errors.joint_rad, np.float32),
-        transl_std_m=np.asarray(track.errors.root_m, np.float32),
-        **gender,
+    making.set_body(
+        fitted.rig.model,
+        track.times_us,
+        track.poses,
+        track.transl,
+        betas=fitted.betas,
+        gender="neutral" if fitted.rig.model == "smpl" else None,
+        source="estimated",
+        pose_std_rad=track.errors.joint_rad,
+        transl_std_m=track.errors.root_m,
     )
-    model = fitted.rig.model
-    making.document["body"] = {"file": "body.npz", "model": model, "source": "estimated"}
 
 
 def _set_focal(making: Derivation, focal_px: float) -> None:

@@ -20,7 +20,12 @@ class TimeLimit:
         self._end = math.inf if seconds is None else time.monotonic() + seconds
         self._planned = planned
         self._bar: Any = tqdm(
-            total=planned, desc="refinement", unit="step", leave=False, disable=not progress
+            desc="refinement",
+            total=planned,
+            leave=False,
+            mininterval=1,
+            bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}",
+            disable=not progress,
         )
 
     def steps(self, count: int, size: int = 1) -> Iterator[float]:

@@ -19,9 +19,10 @@ from evsplat.body.pose_files.sequence import moved
 from evsplat.body.skeleton import find_skeleton
 from evsplat.body.smpl import ENVIRONMENT, smpl_body
 from evsplat.body.smpl_skeleton import NAMES, PARENTS
-from evsplat.capture.body_file import body_from_arrays, read_arrays
+from evsplat.capture.body_file import body_from_arrays
 from evsplat.capture.body_track import load_body
 from evsplat.errors import DataError
+from evsplat.untrusted.arrays import read_plain_npz
 
 from . import synthetic
 from .synthetic import SIZE, TOOLS, make_motion, write, write_models
@@ -319,7 +320,7 @@ def test_the_documented_code_writes_a_body_file(tmp_path, models, monkeypatch):
     blocks = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
     for block, model, joints in zip(blocks, ("default", "smpl"), (31, 24), strict=True):
         exec(block, variables)
-        written = body_from_arrays(Path("body.npz"), read_arrays(Path("body.npz")), "?")
+        written = body_from_arrays(Path("body.npz"), read_plain_npz(Path("body.npz")), "?")
         assert written.model == model
         track = BodyTrack(load_body(written)[0], written.times_us, written.poses, written.transl)
         assert written.poses.shape == (5, joints, 3)

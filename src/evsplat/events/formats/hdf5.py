@@ -17,17 +17,16 @@ from evsplat.events.formats.base import (
     BLOCK_EVENTS,
     RawEvents,
     Source,
-    broken_as_data_error,
 )
 from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
 from evsplat.options import ReadOptions
+from evsplat.untrusted.faults import broken_as
+from evsplat.untrusted.hdf5 import data_set, open_hdf5
 
 _PLACES = ("events", "CD/events", "/")
 _ECF = 36559
 # Filters that HDF5 and h5py bring with them: deflate, shuffle, checksum, scale-offset, lzf
 _BUILT_IN = (1, 2, 3, 4, 5, 6, 32000)
-# More events than this per stored byte of their times are not packed but absent.
-_MAX_EVENTS_PER_BYTE = 4096
 
 
 @dataclass(frozen=True)
@@ -96,18 +95,12 @@ class Hdf5(Source):
         """The count of events, when all columns have it and can be unpacked."""
         counts = {}
         for key, column in self._columns.items():
-            dataset = file[column.dataset]
+            dataset = data_set(file, column.dataset)
             _check_filters(self.path, dataset)
             counts[key] = len(dataset)
         if len(set(counts.values())) != 1:
             text = ", ".join(f"{key}: {count:,}" for key, count in counts.items())
             raise DataError(f"{self.path}: its components differ in length ({text}).")
-        stored = file[self._columns["t"].dataset].id.get_storage_size()
-        if counts["t"] > _MAX_EVENTS_PER_BYTE * (stored + 1):
-            raise DataError(
-                f"{self.path}: announces {counts['t']:,} events but holds {stored:,} bytes of "
-                "times; copy the file again."
-            )
         return counts["t"]
 
 
@@ -191,7 +184,7 @@ def _size(file: h5py.File) -> tuple[int | None, int | None]:
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
     with (
-        broken_as_data_error(path, "its HDF5 content cannot be read"),
-        h5py.File(path, "r") as file,
+        broken_as(path, "its HDF5 content cannot be read"),
+        open_hdf5(path) as file,
     ):
         yield file
