@@ -68,9 +68,9 @@ class Descent:
         if self.discs > known:
             shown = targets.rows(torch.nonzero(targets.coloured)[:, 0].tolist())
             with torch.no_grad():
-                motion = self.correction.at(shown.times_us)
+                poses = self.correction.at(shown.times_us)
             camera, image = shown.camera, shown.image
-            self.look.colour_from(*motion, camera, image, first=known, count=self.discs)
+            self.look.colour_from(*poses, camera, image, first=known, count=self.discs)
         if first:
             self.learn_look(targets, shrink, LOOK_STEPS)
         before = self.misfit(targets)
