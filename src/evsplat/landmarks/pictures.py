@@ -19,7 +19,7 @@ from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import HeldOutError
 from evsplat.events import EventStream, deblur, polarity_counts
 from evsplat.pictures import shown
-from evsplat.pictures.light import Transfer, decode, encode, luminance
+from evsplat.pictures.light import Transfer, decode, encode, luminance, transfer_shown
 
 logger = logging.getLogger(__name__)
 
@@ -191,7 +191,7 @@ def _blend(sources: Sequence[_Source], transfer: Transfer) -> _Source:
     weights /= weights.sum(0)
     images = torch.stack([image for image, _ in sources])
     mean = (images * weights[..., None]).sum(0)
-    coded: Transfer = "srgb" if transfer == "linear" else transfer  # as they are `shown`
+    coded = transfer_shown(transfer)
     grey = encode(luminance(decode(images, coded)), coded)
     off = (grey - (grey * weights).sum(0)).square()
     return mean, (off * weights).sum(0)

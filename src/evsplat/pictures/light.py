@@ -61,6 +61,11 @@ def shown(values: Float[Tensor, "*shape"], transfer: Transfer) -> Float[Tensor, 
     return encode(values, "srgb") if transfer == "linear" else values
 
 
+def transfer_shown(transfer: Transfer) -> Transfer:
+    """Transfer of pictures that are `shown`."""
+    return "srgb" if transfer == "linear" else transfer
+
+
 def stored(coded: Float[Tensor, "*shape"], transfer: Transfer) -> Float[Tensor, "*shape"]:
     """The opposite of `shown`: values of a picture with that ``transfer``."""
     return decode(coded, "srgb") if transfer == "linear" else coded

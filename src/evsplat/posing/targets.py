@@ -15,7 +15,7 @@ from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.landmarks.pictures import SharpPicture, sharp_pictures
-from evsplat.pictures.light import DARKEST, Transfer, decode, encode, luminance
+from evsplat.pictures.light import DARKEST, Transfer, decode, encode, luminance, transfer_shown
 
 _REACH = 0.08
 """The person is within this share of its height from the posed body."""
@@ -117,7 +117,7 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
         )
     pictures = sharp_pictures(capture)
     image = torch.stack([picture.image for picture in pictures]).float()
-    transfer = capture.transfer(pictures[0].frame)
+    transfer = transfer_shown(capture.transfer(pictures[0].frame))
     coloured = torch.tensor([picture.frame.split == "train" for picture in pictures])
     image[~coloured] = _grey(image[~coloured], transfer)
     found = Targets(
