@@ -386,7 +386,8 @@ def tree(kind: str) -> Reader:
     """A data set of a kind, imported."""
 
     def write_data(root: Path) -> None:
-        name, source, options = write_tree(kind, root / "data")
+        # People-Snapshot's sequences begin with the gender.
+        name, source, options = write_tree(kind, root / "female-1")
         place = source.relative_to(root).as_posix()
         (root / "how.where").write_text(json.dumps([name, place, options]))
 

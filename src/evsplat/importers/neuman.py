@@ -117,7 +117,10 @@ def _read_poses(
     transl = numbers(arrays, "transl", (count, 3), where, flat=True)
     scales = np.ones(count)
     if "scale" in arrays:
-        scales = scales * numbers(arrays, "scale", (None,), where, flat=True)
+        found = numbers(arrays, "scale", (None,), where, flat=True)
+        if len(found) not in (1, count):
+            raise DataError(f"{path}: holds {len(found)} scales, expected 1 or {count}.")
+        scales = scales * found
     if not (scales > 0).all():
         raise DataError(f"{path}: scale holds values that are not above 0.")
     scale = float(np.median(scales))
