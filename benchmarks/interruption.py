@@ -260,4 +260,5 @@ class Disk:
     def close(self) -> None:
         """Let the file system go, where there is one."""
         if self.mounted:
-            subprocess.run(["umount", str(self.path)], check=True)
+            # A process of a killed command may be in it for another moment.
+            subprocess.run(["umount", "--lazy", str(self.path)], check=True)
