@@ -9,7 +9,7 @@ RUN ?= $(lastword $(sort $(wildcard runs/demo_*/*/*)))
 SET_UP_INPUTS := pyproject.toml constraints.txt CMakeLists.txt \
 	$(shell find native -type f 2>/dev/null | LC_ALL=C sort)
 
-.PHONY: demo view test kill robustness lint types docs setup clean
+.PHONY: demo view test fuzz kill robustness lint types docs setup clean
 
 demo: $(STAMP)
 	$(BIN)/evsplat demo $(DEMO_OPTIONS)
@@ -20,6 +20,10 @@ view: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(TEST_OPTIONS)
+
+# Damaged files of every kind; make fuzz FUZZ_OPTIONS="--seconds 3600" for longer.
+fuzz: $(STAMP)
+	$(BIN)/python benchmarks/fuzz.py $(or $(FUZZ_OPTIONS),--seconds 120)
 
 # Interruptions of every verb that writes; make kill KILL_OPTIONS="--seconds 3600" for longer.
 kill: $(STAMP)

@@ -164,7 +164,7 @@ def read_settings(root: Path, damaged: Path) -> None:
     run = RunFolder(root)
     run.config = damaged
     run.facts = root / "versions.json"
-    run.facts.write_text('{"seed": 0}')
+    run.facts.write_text('{"capture": "c", "capture_name": "c", "device": "cpu", "seed": 0}')
     read_config(run)
 
 
@@ -443,10 +443,9 @@ def _write_points(root: Path) -> None:
 
 
 def _write_checkpoint(root: Path) -> None:
-    write_run(root / "all")
-    for file in (root / "all" / "run" / "checkpoints").iterdir():
+    write_run(beside := root.with_name(f"{root.name} of"))
+    for file in (beside / "run" / "checkpoints").iterdir():
         shutil.copy(file, root)
-    shutil.rmtree(root / "all")
 
 
 READERS = {

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 import os
 import pickle
 import struct
@@ -19,18 +20,22 @@ from PIL import Image
 
 from evsplat.body.motion import load_motion
 from evsplat.body.pose_files import read_poses
+from evsplat.capture import load_body_track, load_capture
 from evsplat.capture.points import read_points
 from evsplat.config import override
 from evsplat.errors import EvsplatError
 from evsplat.events import EventStore
 from evsplat.film.camera_path import read_camera_path
 from evsplat.footage import open_footage
+from evsplat.landmarks.keypoint_files import read_points as read_keypoints
 from evsplat.methods import method_config
 from evsplat.pictures.files import read_image
 from evsplat.untrusted.arrays import read_npz, read_plain_npz
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.records import misfit
 from evsplat.weights import read_state
+
+from ..conftest import write_tiny_capture
 
 BVH = (
     "HIERARCHY ROOT a {{ OFFSET {offset} CHANNELS 1 Xposition JOINT b {{ OFFSET 0 1 0 CHANNELS 0 "
@@ -288,3 +293,28 @@ def test_records_have_the_shape_that_they_were_written_in(value: object, said: s
     assert found.replace("'a'", "a").replace("'b'", "b").startswith(said) and bool(found) == bool(
         said
     )
+
+
+def test_a_video_announces_no_more_than_8k(tmp_path: Path) -> None:
+    head = b"GIF89a" + struct.pack("<HHBBB", 60_000, 60_000, 0xF0, 0, 0) + bytes(6)
+    frame = b"," + struct.pack("<HHHHB", 0, 0, 60_000, 60_000, 0) + b"\x02\x02L\x01\0;"
+    (tmp_path / "a.gif").write_bytes(head + frame)
+    said = refused(lambda: list(open_footage(tmp_path / "a.gif")))
+    assert "60000x60000 pixels" in said or "cannot be decoded" in said
+
+
+def test_frames_of_key_points_have_names_of_any_length(tmp_path: Path) -> None:
+    people = [{"image_id": "x" * 5_000, "keypoints": [0] * 51}] * 2
+    (tmp_path / "a.json").write_text(json.dumps(people))
+    assert "shows 2 people" in refused(lambda: read_keypoints(tmp_path / "a.json"))
+
+
+def test_dense_poses_need_no_more_than_poses(tmp_path: Path) -> None:
+    capture = write_tiny_capture(tmp_path / "tiny")
+    with np.load(capture / "body.npz") as arrays:
+        keyed = {key: arrays[key] for key in ("times_us", "poses", "transl")}
+    np.savez(capture / "body_dense.npz", **keyed, joint_names=np.array("x"), betas=np.array("y"))
+    assert len(load_body_track(load_capture(capture), dense=True).times_us) == 10
+    np.savez(capture / "body_dense.npz", **keyed | {"transl": np.zeros((10, 3), np.uint8)})
+    said = refused(lambda: load_body_track(load_capture(capture), dense=True))
+    assert "body_dense.npz: transl: found 10x3 of uint8" in said

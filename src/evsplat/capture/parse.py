@@ -31,7 +31,7 @@ _LARGEST_PX = 16_384
 # Sensors have thresholds of 0.1 to 0.6; simulations may go further.
 _THRESHOLDS = (1e-3, 10.0)
 # From a fish eye's middle to a telescope.
-_FOCAL_IN_WIDTHS = (0.05, 200.0)
+_FOCAL_IN_SIDES = (0.05, 200.0)
 _LONGEST_EXPOSURE_US = 60_000_000
 
 
@@ -119,7 +119,7 @@ class _Parser:
                 continue
             entry = self.fields(f"cameras.{name}", value, keys)
             width, height = self.pixels(entry, "width"), self.pixels(entry, "height")
-            K, pose = self.intrinsics(entry, width), self.rigid(entry, "world_to_camera")
+            K, pose = self.intrinsics(entry, width, height), self.rigid(entry, "world_to_camera")
             coefficients, transfer = self.distortion(entry), self.transfer(entry)
             if not entry.valid or K is None or pose is None:
                 continue
@@ -145,7 +145,7 @@ class _Parser:
             )
         return count
 
-    def intrinsics(self, entry: Fields, width: int) -> np.ndarray | None:
+    def intrinsics(self, entry: Fields, width: int, height: int) -> np.ndarray | None:
         K = entry.numbers("K", (3, 3))
         if K is None:
             return None
@@ -158,13 +158,13 @@ class _Parser:
                 "Give the camera's intrinsics (no skew).",
             )
             return None
-        low, high = _FOCAL_IN_WIDTHS
-        focal = K[[0, 1], [0, 1]]
-        if width > 0 and not ((focal >= low * width) & (focal <= high * width)).all():
+        (low, high), focal = _FOCAL_IN_SIDES, K[[0, 1], [0, 1]]
+        shorter, longer = min(width, height), max(width, height)
+        if shorter > 0 and not ((focal >= low * shorter) & (focal <= high * longer)).all():
             entry.fail(
                 "K",
                 f"focal lengths of {focal[0]:g} and {focal[1]:g} pixels",
-                f"{low:g} to {high:g} times the width of {width} pixels",
+                f"{low:g} times the shorter to {high:g} times the longer side of {width}x{height}",
                 "Give the focal length in pixels: that in millimetres over a pixel's size.",
             )
             return None

@@ -170,7 +170,9 @@ class CaptureReader:
         check_dense(path, arrays, self.body_file.poses.shape[1], findings)
         if findings.items:
             raise DataError(str(findings.items[0]))
-        return body_from_arrays(path, arrays, self._metadata.body_model)
+        # Poses alone: what else there may be is the body's, which body.npz describes.
+        keyed = {key: arrays[key] for key in ("times_us", "poses", "transl")}
+        return body_from_arrays(path, keyed, self._metadata.body_model)
 
     def median_background(self) -> Float[Tensor, "H W 3"]:
         """Per-pixel temporal median of the train frames (at most 255, evenly spread)."""

@@ -1,5 +1,6 @@
 """Reading the command line: which verb, with which options."""
 
+import io
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -42,6 +43,10 @@ _DESCRIPTION = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code, see `exit_code`."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # A terminal of the C locale cannot show every name that a capture may have.
+            stream.reconfigure(errors="backslashreplace")
     arguments = _gathered(sys.argv[1:] if arguments is None else arguments)
     if arguments == ["--version"]:
         print(f"evsplat {evsplat.__version__}")

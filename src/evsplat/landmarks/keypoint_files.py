@@ -70,7 +70,7 @@ def _from_json(path: Path, content: Any) -> Float[np.ndarray, "N L D"]:
             raise DataError(f"{path}: entry {index}: instances is no list.")
         frames.setdefault(json.dumps(frame), []).extend(found)
     order = sorted(frames, key=_natural)
-    return _stack(path, [_one_person(path, f"frame {key}", frames[key]) for key in order])
+    return _stack(path, [_one_person(path, f"frame {key[:80]}", frames[key]) for key in order])
 
 
 def _natural(key: str) -> tuple[tuple[int, ...], str]:

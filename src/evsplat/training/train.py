@@ -43,6 +43,7 @@ from evsplat.training.run import (
     seen_by_training,
     write_facts,
 )
+from evsplat.training.sound import check_events_reach, check_learned
 from evsplat.training.trainer import StepReport, Trainer
 from evsplat.training.watching import Showcase, is_unused, training_in
 from evsplat.untrusted.records import misfit
@@ -128,6 +129,8 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     fitting = None
     if purpose == "train" and seen.has_body:
         fitting = check_body(seen, refuse=not options.any_body)
+    if purpose == "train" and getattr(start.settings, "event_weight", 0.0) != 0.0:
+        check_events_reach(seen)
     composition = TRAINABLE[start.method].build(
         start.settings, seen, start.seed, device=device, purpose=purpose
     )
@@ -251,21 +254,12 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
                 save()
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
-        _check_learned(trainer, clock.iteration - first)
+        check_learned(trainer, clock.iteration - first)
         save()
         if interrupted:
             raise Stopped(folder.path)
     if clock.iteration == 0:
         raise DataError(f"{folder.path}: no step was made.")
-
-
-def _check_learned(trainer: Trainer, steps: int) -> None:
-    """A `DataError` where steps were made and each gave a loss or gradient that is not finite."""
-    if steps and trainer.bad.in_a_row() >= steps:
-        raise DataError(
-            f"{trainer.capture.path}: none of {steps} steps gave a finite loss and gradient, so "
-            "that nothing was learned; look at camera and poses with evsplat inspect."
-        )
 
 
 def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:

@@ -3,6 +3,7 @@
 An array's header is compared with the bytes that are there before memory is taken for it.
 """
 
+import warnings
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -97,7 +98,9 @@ def read_table(
 ) -> Float64[np.ndarray, "rows columns"]:
     """Numbers in lines of plain text, the first ``rows`` or all; a `ValueError` where others."""
     try:
-        return np.loadtxt(source, ndmin=2, max_rows=rows, dtype=np.float64)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # empty lines, no lines
+            return np.loadtxt(source, ndmin=2, max_rows=rows, dtype=np.float64)
     except BROKEN as error:
         raise ValueError(reason(error)) from None
 
