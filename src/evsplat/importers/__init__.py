@@ -1,7 +1,6 @@
 """Turning other people's data sets, and your own recording, into captures."""
 
 import logging
-import shutil
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -183,4 +182,4 @@ def _import_and_pose(
             *(unposed, unposed, out),
         )
         raise
-    shutil.rmtree(unposed)
+    remove_folder(unposed)
