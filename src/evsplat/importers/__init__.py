@@ -8,7 +8,7 @@ from typing import Any
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
-from evsplat.files import set_aside
+from evsplat.files import remove_folder, set_aside
 from evsplat.importers.base import Importer
 from evsplat.importers.davis import Davis
 from evsplat.importers.folder import Folder
