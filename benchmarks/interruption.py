@@ -178,8 +178,9 @@ def _be_command(
             code = main(command)
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else 1
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
+        with suppress(KeyboardInterrupt):  # a second one, when all was over
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
         calls.give_back()
         os.write(counting, str(calls.count).encode())
     except BaseException:
