@@ -1,7 +1,6 @@
 """Turning other people's data sets, and your own recording, into captures."""
 
 import logging
-import shutil
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
-from evsplat.files import set_aside
+from evsplat.files import remove_folder
 from evsplat.importers.base import Importer
 from evsplat.importers.davis import Davis
 from evsplat.importers.folder import Folder
@@ -175,12 +174,11 @@ def _import_and_pose(
     writer = CaptureWriter(unposed, out.name, overwrite=overwrite)
     _import(importer, source, writer, smpl, going_on=True)
     try:
-        with set_aside(out):
-            find_poses(unposed, out, PoseSearch(**vars(poses)))
+        find_poses(unposed, out, PoseSearch(**vars(poses)), overwrite=overwrite)
     except BaseException:
         logger.info(
             "without poses it is: %s; find them with: evsplat poses %s --out %s",
             *(unposed, unposed, out),
         )
         raise
-    shutil.rmtree(unposed)
+    remove_folder(unposed)
