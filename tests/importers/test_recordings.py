@@ -131,9 +131,9 @@ def finder(monkeypatch):
     """A stand-in for the search, which takes most of the time; gives what it was asked for."""
     asked = []
 
-    def found(path, out, search):
+    def found(path, out, search, overwrite):
         asked.append((load_capture(path), search))
-        with derived_capture(load_capture(path), out) as making:
+        with derived_capture(load_capture(path), out, replace=overwrite) as making:
             making.document["provenance"]["poses"] = "found"
 
     monkeypatch.setattr(posing, "find_poses", found)
@@ -156,7 +156,7 @@ def test_an_import_goes_on_to_find_poses_and_leaves_one_capture(
 def test_where_no_poses_are_found_the_capture_without_them_stays(
     davis: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    def nobody(path, out, search):
+    def nobody(path, out, search, overwrite):
         raise DataError("nobody")
 
     monkeypatch.setattr(posing, "find_poses", nobody)

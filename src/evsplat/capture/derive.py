@@ -79,7 +79,11 @@ class Derivation:
 
 @contextmanager
 def derived_capture(
-    source: Capture, path: Path | str, *, without: Collection[str] = ()
+    source: Capture,
+    path: Path | str,
+    *,
+    without: Collection[str] = (),
+    replace: bool = False,
 ) -> Iterator[Derivation]:
     """Give a capture in the making that becomes ``path`` when the block ends well and it is valid.
 
@@ -87,10 +91,11 @@ def derived_capture(
     "image", "sharp" and "mask"). They are hard links where the file system can, since evsplat never
     writes into a file that exists; else copies. Where the lens distorts, pictures and events are
     written without distortion, because that is how they are read and new pictures are made.
+    ``replace``: a folder at ``path`` stays until then; see `new_folder`.
     """
     path = Path(path)
     document = read_json(source.path / "capture.json")
-    with new_folder(path) as folder:
+    with new_folder(path, replace=replace) as folder:
         making = Derivation(source, folder, document)
         for entry in document["frames"]:
             for key in without:

@@ -176,6 +176,12 @@ class CaptureReader:
             f"{', corrected by drawing the person' if drawn else ''}) from {seen}."
         )
 
+    @property
+    def poses_refined(self) -> bool:
+        """Whether `evsplat poses` tried to correct what it had found by drawing the person."""
+        found = self.provenance.get("poses")
+        return isinstance(found, dict) and isinstance(found.get("refinement"), dict)
+
     @functools.cached_property
     def body_file(self) -> BodyFile:
         """The body and its key poses as stored; a `DataError` where there are none."""

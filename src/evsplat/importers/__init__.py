@@ -8,7 +8,7 @@ from typing import Any
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
-from evsplat.files import remove_folder, set_aside
+from evsplat.files import remove_folder
 from evsplat.importers.base import Importer
 from evsplat.importers.davis import Davis
 from evsplat.importers.folder import Folder
@@ -174,8 +174,7 @@ def _import_and_pose(
     writer = CaptureWriter(unposed, out.name, overwrite=overwrite)
     _import(importer, source, writer, smpl, going_on=True)
     try:
-        with set_aside(out):
-            find_poses(unposed, out, PoseSearch(**vars(poses)))
+        find_poses(unposed, out, PoseSearch(**vars(poses)), overwrite=overwrite)
     except BaseException:
         logger.info(
             "without poses it is: %s; find them with: evsplat poses %s --out %s",

@@ -17,7 +17,7 @@ from evsplat.capture import Capture, CaptureWriter, load_capture
 from evsplat.capture.body_file import BodyFile, stated_body
 from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.errors import DataError
-from evsplat.files import remove_file, set_aside
+from evsplat.files import remove_file
 from evsplat.importers.smpl import add_body, chosen_poses, model_file
 from evsplat.inspection import warn_of_body
 from evsplat.untrusted.arrays import read_plain_npz
@@ -76,7 +76,7 @@ def attach_poses(
         if motion.world == "camera":
             motion, moved_by = _before_cameras(motion, capture, kept, smpl)
             notes += moved_by
-    with set_aside(out), derived_capture(capture, out) as making:
+    with derived_capture(capture, out, replace=overwrite) as making:
         making.keep([capture.frames[index] for index in kept])
         notes += add_motion(making, motion, middles[kept].tolist(), smpl)
         made = {"file": file.name, "notes": notes}

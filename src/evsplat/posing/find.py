@@ -86,6 +86,7 @@ def find_poses(
     *,
     keypoints: Path | str | None = None,
     policy: Policy | None = None,
+    overwrite: bool = False,
     **changes: Any,
 ) -> FoundPoses:
     """Find the person's poses in a capture and write a new one with them, whole or not at all.
@@ -95,7 +96,8 @@ def find_poses(
     where it explains pictures better that it has not seen. Of the capture is seen what its policy
     shows: by default no picture, mask or event of a held-out interval. Poses that the capture has
     are ignored; its true poses between keys, of another body, are left out of the new one.
-    ``changes`` are options of `PoseSearch`. ``poses.html`` in the new capture shows what was found.
+    ``poses.html`` in the new capture shows what was found. ``overwrite`` replaces a folder that is
+    at ``out``; ``changes`` are options of `PoseSearch`.
 
     Raises:
         ConfigError: An option is out of range.
@@ -104,7 +106,8 @@ def find_poses(
     """
     search = given(PoseSearch, search, changes)
     out = Path(out)
-    refuse_existing(out)
+    if not overwrite:
+        refuse_existing(out)
     try_target(out)
     rig = _rig(search.body)
     capture = load_capture(path, needs_body=False)
@@ -145,7 +148,7 @@ def find_poses(
             "taken": refined.better,
             "seconds": round(refined.seconds, 1),
         }
-    with derived_capture(capture, out) as making:
+    with derived_capture(capture, out, replace=overwrite) as making:
         _write_body(making, track, fitted)
         if focal_px is not None:
             _set_focal(making, focal_px)
