@@ -18,6 +18,7 @@ from jaxtyping import Float
 from evsplat.errors import DataError
 from evsplat.landmarks.landmarks import SETS
 from evsplat.untrusted.arrays import read_plain_arrays
+from evsplat.untrusted.faults import brief
 from evsplat.untrusted.text import read_json
 
 _KEYS = ("keypoints", "poses", "places", "joints", "landmarks", "arr_0")
@@ -147,7 +148,9 @@ def _stack(path: Path, frames: Sequence[np.ndarray | None]) -> Float[np.ndarray,
     if not shapes:
         raise DataError(f"{path}: shows nobody in any of {len(frames)} frames.")
     if len(shapes) > 1:
-        raise DataError(f"{path}: frames have points of shapes {sorted(shapes)}, expected one.")
+        raise DataError(
+            f"{path}: frames have points of shapes {brief(sorted(shapes))}, expected one."
+        )
     (shape,) = shapes
     if len(shape) != 2 or shape[1] not in (2, 3):
         raise DataError(f"{path}: points of a frame have shape {shape}, expected (points, 2 or 3).")
@@ -160,7 +163,7 @@ def _from_arrays(path: Path) -> Float[np.ndarray, "N L D"]:
     array = next((arrays[key] for key in ("", *_KEYS) if key in arrays), None)
     if array is None:
         raise DataError(
-            f"{path}: holds {', '.join(arrays) or 'nothing'}, expected an array "
+            f"{path}: holds {', '.join(arrays)[:300] or 'nothing'}, expected an array "
             f"{' or '.join(_KEYS)}."
         )
     return _checked(path, array)
