@@ -18,7 +18,7 @@ from jaxtyping import Float
 from evsplat.errors import DataError
 from evsplat.landmarks.landmarks import SETS
 from evsplat.untrusted.arrays import read_plain_arrays
-from evsplat.untrusted.faults import brief
+from evsplat.untrusted.faults import brief, ordinary_file, reason
 from evsplat.untrusted.text import read_json
 
 _KEYS = ("keypoints", "poses", "places", "joints", "landmarks", "arr_0")
@@ -171,6 +171,7 @@ def _from_arrays(path: Path) -> Float[np.ndarray, "N L D"]:
 
 def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
     """Rows of frames; x, y and perhaps confidence of each point one after the other."""
+    ordinary_file(path)
     try:
         with path.open(newline="", encoding="utf-8") as stream:
             rows = [row for row in csv.reader(stream) if row]
@@ -178,7 +179,7 @@ def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
         array = np.array([[float(cell or "nan") for cell in row] for row in rows[first:]])
     except (ValueError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(
-            f"{path}: not a table of numbers ({error}), expected a row per frame with x, y (and "
+            f"{path}: not a table of numbers ({reason(error)}), expected a row per frame with x, y (and "
             "confidence) of each point, after at most one line of names."
         ) from error
     if array.ndim != 2 or not array.size:
