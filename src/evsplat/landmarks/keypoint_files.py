@@ -179,8 +179,8 @@ def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
         array = np.array([[float(cell or "nan") for cell in row] for row in rows[first:]])
     except (ValueError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(
-            f"{path}: not a table of numbers ({reason(error)}), expected a row per frame with x, y (and "
-            "confidence) of each point, after at most one line of names."
+            f"{path}: not a table of numbers ({reason(error)}), expected a row per frame with x, y "
+            "(and confidence) of each point, after at most one line of names."
         ) from error
     if array.ndim != 2 or not array.size:
         raise DataError(f"{path}: holds no rows of numbers.")
