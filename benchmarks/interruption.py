@@ -178,8 +178,9 @@ def _be_command(
             code = main(command)
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else 1
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
+        with suppress(KeyboardInterrupt):  # a second one, when all was over
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
         calls.give_back()
         os.write(counting, str(calls.count).encode())
     except BaseException:
@@ -260,4 +261,5 @@ class Disk:
     def close(self) -> None:
         """Let the file system go, where there is one."""
         if self.mounted:
-            subprocess.run(["umount", str(self.path)], check=True)
+            # A process of a killed command may be in it for another moment.
+            subprocess.run(["umount", "--lazy", str(self.path)], check=True)

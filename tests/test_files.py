@@ -18,6 +18,7 @@ from evsplat.files import (
     atomic_path,
     new_folder,
     remove_folder,
+    set_aside,
     try_target,
     write_json,
     write_text,
@@ -275,3 +276,19 @@ def test_a_lock_is_held_once_and_ends_with_its_holder(tmp_path: Path) -> None:
             pass
         assert error.value.strerror == str(os.getpid())
     assert sign.exists() and not is_held(sign)
+
+
+def test_a_folder_set_aside_comes_back_unless_the_block_ends_well(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    with set_aside(folder):
+        assert not folder.exists()
+    folder.mkdir()
+    (folder / "old").touch()
+    with pytest.raises(KeyboardInterrupt), set_aside(folder):
+        assert not folder.exists()
+        raise KeyboardInterrupt
+    assert (folder / "old").exists()
+    with set_aside(folder):
+        folder.mkdir()
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+    assert not (folder / "old").exists()

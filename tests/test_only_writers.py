@@ -19,14 +19,13 @@ CALLS["os"] |= {"rmdir", "removedirs", "truncate", "mkfifo", "mknod"}
 # Libraries that write a format: into a path that `atomic_path` or `new_folder` gave, or to memory.
 ENCODERS = {"save", "savez", "savez_compressed", "save_file", "File", "ZipFile"}
 ENCODING = {
-    "capture/write.py": {"savez_compressed"},
+    "capture/body_file.py": {"savez_compressed"},
     "events/write.py": {"File", "ZipFile", "open"},
     "film/frame_cache.py": {"save"},
     "inspection/drawing.py": {"save"},
     "pages.py": {"save"},
     "pictures/files.py": {"save"},
     "pictures/video.py": {"save", "open"},
-    "posing/find.py": {"savez_compressed"},
     "view/save_panel.py": {"save"},
 }
 ALLOWED = {("cli/exits.py", "os.open")}  # the device to which nobody listens

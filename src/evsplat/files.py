@@ -97,6 +97,24 @@ def scratch_folder() -> Iterator[Path]:
         yield folder
 
 
+@contextmanager
+def set_aside(path: Path | str) -> Iterator[None]:
+    """Make room at ``path`` while the block runs: a folder there comes back unless it ends well."""
+    path = Path(path)
+    if not path.exists():
+        yield
+        return
+    aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-")) / path.name
+    path.rename(aside)
+    try:
+        yield
+    except BaseException:
+        aside.rename(path)
+        raise
+    finally:
+        shutil.rmtree(aside.parent, ignore_errors=True)
+
+
 def refuse_existing(path: Path) -> None:
     """A `DataError` where something is there already: before long work, or just before writing."""
     if os.path.lexists(path):

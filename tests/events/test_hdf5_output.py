@@ -2,6 +2,7 @@
 
 import errno
 import io
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,32 @@ def test_a_full_disk_is_one_sentence_and_nothing_is_left(
     with pytest.raises(OutputError, match=r"a\.h5: not written, the disk is full; make room"):
         write_events(tmp_path / "a.h5", pieces)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_at_any_call_of_hdf5_waits_for_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An exception in the midst of one crashes the process when the file is closed."""
+    calls = 0
+    seek = Hdf5Output.seek
+
+    def pressed(output: Hdf5Output, *place: int) -> int:
+        nonlocal calls
+        calls += 1
+        if calls == at:
+            signal.raise_signal(signal.SIGINT)
+        return seek(output, *place)
+
+    monkeypatch.setattr(Hdf5Output, "seek", pressed)
+    heard = at = 0
+    while at < 60:
+        calls, at = 0, at + 4
+        try:
+            write_events(tmp_path / "a.h5", [events(70_000)])
+        except KeyboardInterrupt:
+            heard += 1
+        assert list(tmp_path.glob(".*")) == []
+    assert heard > 5
 
 
 def test_what_the_disk_did_not_take_is_still_read_back(

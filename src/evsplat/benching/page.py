@@ -100,9 +100,10 @@ def _frame(
 ) -> str:
     box, camera = human_regions.crop(frame), capture.camera(frame)
     style = "" if box is None else _window(box, camera.height, camera.width)
-    tiles = [_tile(embed.image(to_bytes(capture.image(frame)), "blurry input"), style, "recorded")]
+    blurry = to_bytes(capture.shown(capture.image(frame)))
+    tiles = [_tile(embed.image(blurry, "blurry input"), style, "recorded")]
     if frame.sharp is not None:
-        truth = embed.image(to_bytes(capture.sharp(frame)), "sharp truth")
+        truth = embed.image(to_bytes(capture.shown(capture.sharp(frame))), "sharp truth")
         tiles.append(_tile(truth, style, "truth"))
     for row in rows:
         entry = None if row.record is None else _entry(row.record, frame.name)

@@ -1,11 +1,13 @@
 """The body and its key poses as they stand in ``body.npz``."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
+from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.errors import DataError
@@ -99,3 +101,47 @@ def body_from_arrays(
         betas=None if "betas" not in arrays else np.ravel(arrays["betas"]),
         **{key: arrays.get(key) for key in RIG_ARRAYS if key != "joint_names"},
     )
+
+
+def write_body(
+    folder: Path,
+    model: str,
+    times_us: ArrayLike,
+    poses: ArrayLike,
+    transl: ArrayLike,
+    *,
+    rig: Mapping[str, Any] | None = None,
+    betas: ArrayLike | None = None,
+    gender: str | None = None,
+    source: PoseSource | None = None,
+    pose_std_rad: ArrayLike | None = None,
+    transl_std_m: ArrayLike | None = None,
+) -> dict[str, str]:
+    """Write ``body.npz``, as `CaptureWriter.set_body` says; gives ``body`` of capture.json."""
+    arrays: dict[str, Any] = {"model": model, **key_poses(times_us, poses, transl)}
+    if rig is not None:
+        arrays |= {key: np.asarray(rig[key]) for key in RIG_ARRAYS}
+    if betas is not None:
+        arrays["betas"] = np.asarray(betas, dtype=np.float64).ravel()
+    if gender is not None:
+        arrays["gender"] = gender
+    for key, value in (("pose_std_rad", pose_std_rad), ("transl_std_m", transl_std_m)):
+        if value is not None:
+            arrays[key] = np.asarray(value, dtype=np.float32)
+    save_arrays(folder / "body.npz", arrays)
+    entry = {"file": "body.npz", "model": model}
+    return entry if source is None else {**entry, "source": source}
+
+
+def key_poses(times_us: ArrayLike, poses: ArrayLike, transl: ArrayLike) -> dict[str, np.ndarray]:
+    """Times and poses as they are stored."""
+    return {
+        "times_us": np.asarray(times_us, dtype=np.int64),
+        "poses": np.asarray(poses, dtype=np.float32),
+        "transl": np.asarray(transl, dtype=np.float32),
+    }
+
+
+def save_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an npz that holds nothing pickled."""
+    np.savez_compressed(path, allow_pickle=False, **arrays)

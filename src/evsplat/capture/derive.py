@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from evsplat.capture.body_file import write_body
 from evsplat.capture.capture import Capture
 from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
@@ -49,6 +51,30 @@ class Derivation:
         entry = self.entry(frame)
         entry[key] = f"{_FOLDERS[key]}/{self._stems[frame.name]}.png"
         write_picture(self.folder / entry[key], picture)
+
+    def set_body(
+        self, model: str, times_us: ArrayLike, poses: ArrayLike, transl: ArrayLike, **details: Any
+    ) -> None:
+        """Replace body and poses, as `CaptureWriter.set_body`; there are no dense ones then."""
+        old = self.document.get("body")
+        for name in {"body.npz", "body_dense.npz", *([old["file"]] if old else [])}:
+            # It may be a hard link, and what it is linked to must stay.
+            remove_file(self.folder / name)
+        self.document["body"] = write_body(self.folder, model, times_us, poses, transl, **details)
+
+    def keep(self, frames: Frames) -> None:
+        """Leave out all but some frames, and novel views at the times of others."""
+        kept = {frame.name for frame in frames}
+        for key, name in (("frames", "name"), ("novel_views", "frame")):
+            entries = self.document.get(key, [])
+            for entry in entries:
+                if entry[name] not in kept:
+                    for picture in set(_PICTURES) & set(entry):
+                        remove_file(self.folder / entry[picture])
+            self.document[key] = [entry for entry in entries if entry[name] in kept]
+        for frame in frames:
+            # Without one it would follow from the place in the list.
+            self.entry(frame)["split"] = frame.split
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import PoseSource
-from evsplat.capture.body_file import RIG_ARRAYS
+from evsplat.capture.body_file import key_poses, save_arrays, write_body
 from evsplat.capture.parse import FORMAT, VERSION, default_split
 from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
@@ -187,22 +187,21 @@ class CaptureWriter:
         truth between key poses, for evaluation only. ``source`` says where the key poses come from;
         ``pose_std_rad`` (P, J) and ``transl_std_m`` (P, 3), how far they err (`PoseErrors`).
         """
-        arrays: dict[str, Any] = {"model": model, **_poses(times_us, poses, transl)}
-        if rig is not None:
-            arrays |= {key: np.asarray(rig[key]) for key in RIG_ARRAYS}
-        if betas is not None:
-            arrays["betas"] = np.asarray(betas, dtype=np.float64).ravel()
-        if gender is not None:
-            arrays["gender"] = gender
-        for key, value in (("pose_std_rad", pose_std_rad), ("transl_std_m", transl_std_m)):
-            if value is not None:
-                arrays[key] = np.asarray(value, dtype=np.float32)
-        _save_arrays(self._root / "body.npz", arrays)
-        self._body = {"file": "body.npz", "model": model}
-        if source is not None:
-            self._body["source"] = source
+        self._body = write_body(
+            self._root,
+            model,
+            times_us,
+            poses,
+            transl,
+            rig=rig,
+            betas=betas,
+            gender=gender,
+            source=source,
+            pose_std_rad=pose_std_rad,
+            transl_std_m=transl_std_m,
+        )
         if dense is not None:
-            _save_arrays(self._root / "body_dense.npz", _poses(*dense))
+            save_arrays(self._root / "body_dense.npz", key_poses(*dense))
 
     def leave_out_body(self) -> None:
         """Say that nobody has posed the person yet; without this a capture needs `set_body`.
@@ -363,17 +362,5 @@ def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarra
     return matrix
 
 
-def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    np.savez_compressed(path, allow_pickle=False, **arrays)
-
-
 def _numbers(matrix: ArrayLike) -> list[Any]:
     return np.asarray(matrix, dtype=np.float64).tolist()
-
-
-def _poses(times_us: ArrayLike, poses: ArrayLike, transl: ArrayLike) -> dict[str, np.ndarray]:
-    return {
-        "times_us": np.asarray(times_us, dtype=np.int64),
-        "poses": np.asarray(poses, dtype=np.float32),
-        "transl": np.asarray(transl, dtype=np.float32),
-    }

@@ -54,6 +54,12 @@ def exit_code(work: Callable[[], object]) -> int:
     return 0
 
 
+def end_quietly() -> None:
+    """From here on, when nothing is left to be saved, Ctrl-C has no words."""
+    with suppress(ValueError, KeyboardInterrupt):
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def _said(error: EvsplatError) -> int:
     _tell(f"evsplat: {error}{_kept_traceback(error)}")
     return _BAD_INPUT

@@ -52,6 +52,7 @@ def evaluate_run(
         "gaussians": run.gaussians,
         "evaluate_seconds": round(time.monotonic() - start, 1),
         "policy": to_dict(run.policy),
+        "poses": run.capture.poses_found,
         **measured,
     }
     write_json(Path(run.path) / name_of("metrics", split, ".json"), metrics)

@@ -164,9 +164,10 @@ def composited(metrics: dict[str, Any]) -> dict[str, Any]:
 
 
 def terms(metrics: dict[str, Any]) -> str:
-    """Terms of the run: one sentence on what training saw."""
+    """Terms of the run: a sentence on what training saw, and one on poses that were not given."""
     policy = policy_of(metrics)
-    return "The run does not tell what training saw." if policy is None else policy.sentence
+    seen = "The run does not tell what training saw." if policy is None else policy.sentence
+    return " ".join(filter(None, (seen, metrics.get("poses"))))
 
 
 def missing_networks(metrics: dict[str, Any]) -> list[str]:

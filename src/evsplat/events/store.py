@@ -5,10 +5,13 @@ t >= 1000 m; `t_offset` is added to every t. Times that leave this module are on
 ``t + t_offset + clock_offset_us``.
 """
 
+import copy
 import functools
 import os
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +33,12 @@ ALWAYS: Span = (-(1 << 62), 1 << 62)
 _CHUNK_CACHE_BYTES = 4 << 20
 _COLUMNS = ("events/t", "events/x", "events/y", "events/p")
 _POLARITY_BLOCK = 1 << 16
+_KEPT_BLOCK = 1 << 16
+"""Rows that are decoded and kept together."""
+_CHECKED_ROWS = 1 << 16
+"""Entries of the index that are remembered as right."""
+_EVENT_BYTES = 13
+"""Of an `EventStream`."""
 _HIDDEN = (
     ", which this training's policy hides; with --set policy.held_out_events=true it is seen, and "
     "figures are those of interpolation."
@@ -62,13 +71,16 @@ class EventStore:
         self.clock_offset_us = clock_offset_us
         self._pixel_lookup = pixel_lookup
         self._readable_us = tuple(readable_us)
+        self._keep_bytes = 0
+        self._kept: OrderedDict[int, EventStream] = OrderedDict()
+        self._checked_rows: dict[int, int] = {}
         self._file: h5py.File | None = None
         self._owner_pid = -1
         self._shift_us = 0
         self._has_polarity: bool | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None, "_owner_pid": -1}
+        return {**self.__dict__, "_file": None, "_owner_pid": -1, "_kept": OrderedDict()}
 
     def __len__(self) -> int:
         """Count of events, without held-out ones."""
@@ -106,6 +118,13 @@ class EventStore:
         size, lookup = (self.width, self.height), self._pixel_lookup
         return EventStore(self.path, *size, self.clock_offset_us, lookup, readable_us)
 
+    def keeping(self, limit_bytes: int) -> "EventStore":
+        """The same recording, for slices that overlap: up to so many bytes of it stay decoded."""
+        kept = copy.copy(self)
+        kept._keep_bytes, kept._kept = limit_bytes, OrderedDict()
+        kept._file = None
+        return kept
+
     @property
     def has_polarity(self) -> bool:
         """False where every stored polarity is 0: the sensor did not say, and slices have p = 0."""
@@ -122,22 +141,61 @@ class EventStore:
         return self._has_polarity
 
     def between(self, start_us: int, end_us: int) -> EventStream:
-        """Events with ``start_us <= t < end_us``, read from disk.
+        """Events with ``start_us <= t < end_us``, read from disk where they are not kept.
 
-        Only the milliseconds that the window touches are read. Raises `DataError` where what was
-        read is out of order or outside of the sensor, so that a bad file is never used silently,
-        and `HeldOutError` where the window reaches into a held-out interval.
+        Only the milliseconds that the window touches are read, or the blocks of what is kept.
+        Raises `DataError` where what was read is out of order or outside of the sensor, so that a
+        bad file is never used silently, and `HeldOutError` where the window reaches into a held-out
+        interval.
         """
         self._check_readable(start_us, end_us)
         file = self._open()
         start, end = start_us - self._shift_us, end_us - self._shift_us
-        first, t = self._times_around(file, start, max(start, end))
+        if not self._keep_bytes:
+            return self._decoded(
+                *self._times_around(file, start, max(start, end)), start_us, end_us
+            )
+        first = self._checked_index_at_ms(start // 1000)
+        last = self._checked_index_at_ms(-(-max(start, end) // 1000))
+        blocks = (self._block(*rows) for rows in self._block_rows(first, last))
+        parts = [block.between(start_us, end_us) for block in blocks]
+        ends = [(a.t[-1], b.t[0]) for a, b in pairwise(part for part in parts if len(part))]
+        if any(before > after for before, after in ends):
+            raise DataError(
+                f"{self.path}: events/t is not ascending between rows {first} and {last}; sort the "
+                "events by t and rebuild ms_to_idx."
+            )
+        return parts[0] if len(parts) == 1 else EventStream.joined(parts)
+
+    def _block_rows(self, first: int, last: int) -> Iterator[tuple[int, int]]:
+        """Rows of the blocks that hold readable ones of [first, last)."""
+        for low, high in self._readable_rows:
+            start, end = max(first, low), min(last, high)
+            if start >= end:
+                continue
+            for row in range(start - (start - low) % _KEPT_BLOCK, end, _KEPT_BLOCK):
+                yield row, min(row + _KEPT_BLOCK, high)
+
+    def _block(self, first: int, last: int) -> EventStream:
+        if first not in self._kept:
+            t = self._read(self._open(), "events/t", first, last).astype(np.int64)
+            self._kept[first] = self._decoded(first, t, *ALWAYS)
+            most = max(1, self._keep_bytes // (_KEPT_BLOCK * _EVENT_BYTES))
+            while len(self._kept) > most:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(first)
+        return self._kept[first]
+
+    def _decoded(self, first: int, t: np.ndarray, start_us: int, end_us: int) -> EventStream:
+        """The events within two times, of the rows from ``first`` on whose times are ``t``."""
+        file = self._open()
         if len(t) and (np.diff(t) < 0).any():
             index = first + int(np.argmax(np.diff(t) < 0)) + 1
             raise DataError(
                 f"{self.path}: events/t[{index}] is earlier than the event before it, expected "
                 "ascending times; sort the events by t and rebuild ms_to_idx."
             )
+        start, end = start_us - self._shift_us, end_us - self._shift_us
         low, high = np.searchsorted(t, [start, end], side="left")
         high = max(low, high)
         x, y, p = (self._read(file, f"events/{name}", first + low, first + high) for name in "xyp")
@@ -237,6 +295,19 @@ class EventStore:
         if not 0 <= row <= count:
             raise self._wrong_index(millisecond)
         return row
+
+    def _checked_index_at_ms(self, millisecond: int) -> int:
+        """`_index_at_ms`, compared with the times of the event there and the one before, once."""
+        if millisecond not in self._checked_rows:
+            row = self._index_at_ms(millisecond)
+            t = self._read(self._open(), "events/t", max(row - 1, 0), row + 1)
+            before = min(row, 1)
+            if (t[:before] >= 1000 * millisecond).any() or (t[before:] < 1000 * millisecond).any():
+                raise self._wrong_index(millisecond)
+            if len(self._checked_rows) >= _CHECKED_ROWS:
+                self._checked_rows.clear()
+            self._checked_rows[millisecond] = row
+        return self._checked_rows[millisecond]
 
     def _times_around(self, file: h5py.File, start: int, end: int) -> tuple[int, np.ndarray]:
         """Times of the milliseconds from ``start`` to ``end``, and the row of the first of them.

@@ -11,6 +11,7 @@ from typing import IO, Any
 import h5py
 import numpy as np
 
+from evsplat.disk import uninterrupted
 from evsplat.errors import ConfigError, DataError
 from evsplat.events.hdf5_output import Hdf5Output
 from evsplat.events.stream import EventStream
@@ -87,7 +88,9 @@ def write_events(
     }
     last_us: int | None = None
     count = 0
-    with atomic_path(path) as temporary, makers[format](temporary) as writer:
+    with atomic_path(path) as temporary, ExitStack() as stack:
+        with uninterrupted():
+            writer = stack.enter_context(makers[format](temporary))
         for piece in (events,) if isinstance(events, EventStream) else events:
             if not len(piece):
                 continue
@@ -125,7 +128,8 @@ class Hdf5Writer(Writer):
         super().__init__()
         # In this order, as the last one is closed first.
         self._output = self.enter_context(Hdf5Output(path))
-        self._file = self.enter_context(h5py.File(self._output, "w"))
+        self._file = h5py.File(self._output, "w")
+        self.callback(self._close)
         self._count = self._offset = self._next_ms = 0
         self._index: list[np.ndarray] = []
         packing: dict[str, Any] = {
@@ -141,6 +145,11 @@ class Hdf5Writer(Writer):
 
     def append(self, piece: EventStream) -> None:
         """Add rows to the columns and to the index of milliseconds."""
+        with uninterrupted():
+            self._append(piece)
+        self._output.raise_error()
+
+    def _append(self, piece: EventStream) -> None:
         if self._count == 0:
             self._offset = int(piece.t[0]) // 1000 * 1000
         t = piece.t.astype(np.int64) - self._offset
@@ -153,16 +162,20 @@ class Hdf5Writer(Writer):
         self._index.append(np.searchsorted(t, edges * 1000, side="left") + self._count)
         self._next_ms += len(edges)
         self._count = end
-        self._output.raise_error()
 
     def finish(self) -> None:
         """Add the index: entry m is the first event with t >= 1000 m, the last one the count."""
         # an empty recording has the millisecond 0 as any other
         tail = np.full(1 if self._count else 2, self._count)
-        self._file["ms_to_idx"] = np.concatenate([*self._index, tail]).astype(np.uint64)
-        self._file["t_offset"] = np.int64(self._offset)
-        self._file.close()
+        with uninterrupted():
+            self._file["ms_to_idx"] = np.concatenate([*self._index, tail]).astype(np.uint64)
+            self._file["t_offset"] = np.int64(self._offset)
+        self._close()
         self._output.raise_error()
+
+    def _close(self) -> None:
+        with uninterrupted():
+            self._file.close()
 
 
 class NpzWriter(Writer):

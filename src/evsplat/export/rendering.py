@@ -181,7 +181,7 @@ def _beside(
     else:
         frames_recorded = recorded_by(capture, film.camera)
         nearest = (nearest_in_time(frames_recorded, frame.time_us) for frame in frames)
-        recorded = (to_bytes(capture.image(frame)) for frame in nearest)
+        recorded = (to_bytes(capture.shown(capture.image(frame))) for frame in nearest)
     for left, right in zip(recorded, pictures, strict=True):
         yield _side_by_side(left, right)
 

@@ -98,6 +98,7 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
         facts |= {"time_us": instant.time_us, "colours_seen_by": instant.camera_name}
     if target is None:
         target = run.path / "exports" / f"{label}{_SUFFIXES[kind][0]}"
+    cloud = cloud.shown(capture.transfer(capture.frames[0]))
     write_file(target, kind, cloud, rotation, facts)
     human = int((cloud.semantic > 0.5).sum())
     upright = "y" if kind in ALWAYS_Y_UP else options.up

@@ -104,7 +104,7 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
 def _refined(track: BodyTrack, capture: TrainingCapture) -> Refined | None:
     """Other poses, found without any Gaussian; None where a moving camera rules them out."""
     try:
-        found = refine(track, capture)
+        found = refine(track, capture, progress=True)
     except DataError as error:
         logger.info("given poses are not compared with others: %s", error)
         return None

@@ -65,8 +65,13 @@ class EventSensor(nn.Module):
         self, on: Float[Tensor, "*batch H W"], off: Float[Tensor, "*batch H W"]
     ) -> Float[Tensor, "*batch H W"]:
         """Log-brightness change that counts of events of both polarities report."""
-        threshold = self.logs.exp()
+        threshold = self.thresholds
         return threshold[0] * on - threshold[1] * off
+
+    @property
+    def thresholds(self) -> Float[Tensor, "2"]:
+        """Change of log-brightness per event, ON and OFF, above 0."""
+        return self.logs.exp()
 
     def path(self, count: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
         """Size of the log-brightness change that counts of events without polarity report."""

@@ -66,7 +66,8 @@ def make_clip(capture: Capture, reconstruction: Reconstruction) -> Clip | None:
             with torch.no_grad():
                 rgb = reconstruction.render(capture.camera(nearest[0]), batch).rgb
             for frame, image in zip(nearest, rgb, strict=True):
-                yield _beside(to_bytes(capture.image(frame)), to_bytes(image))
+                halves = capture.image(frame), image.cpu()
+                yield _beside(*(to_bytes(capture.shown(half)) for half in halves))
 
     with scratch_folder() as folder:
         path = folder / "clip.mp4"
