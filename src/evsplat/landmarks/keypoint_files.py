@@ -18,6 +18,7 @@ from jaxtyping import Float
 from evsplat.errors import DataError
 from evsplat.landmarks.landmarks import SETS
 from evsplat.untrusted.arrays import read_plain_arrays
+from evsplat.untrusted.faults import brief, ordinary_file, reason
 from evsplat.untrusted.text import read_json
 
 _KEYS = ("keypoints", "poses", "places", "joints", "landmarks", "arr_0")
@@ -147,7 +148,9 @@ def _stack(path: Path, frames: Sequence[np.ndarray | None]) -> Float[np.ndarray,
     if not shapes:
         raise DataError(f"{path}: shows nobody in any of {len(frames)} frames.")
     if len(shapes) > 1:
-        raise DataError(f"{path}: frames have points of shapes {sorted(shapes)}, expected one.")
+        raise DataError(
+            f"{path}: frames have points of shapes {brief(sorted(shapes))}, expected one."
+        )
     (shape,) = shapes
     if len(shape) != 2 or shape[1] not in (2, 3):
         raise DataError(f"{path}: points of a frame have shape {shape}, expected (points, 2 or 3).")
@@ -160,7 +163,7 @@ def _from_arrays(path: Path) -> Float[np.ndarray, "N L D"]:
     array = next((arrays[key] for key in ("", *_KEYS) if key in arrays), None)
     if array is None:
         raise DataError(
-            f"{path}: holds {', '.join(arrays) or 'nothing'}, expected an array "
+            f"{path}: holds {', '.join(arrays)[:300] or 'nothing'}, expected an array "
             f"{' or '.join(_KEYS)}."
         )
     return _checked(path, array)
@@ -168,6 +171,7 @@ def _from_arrays(path: Path) -> Float[np.ndarray, "N L D"]:
 
 def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
     """Rows of frames; x, y and perhaps confidence of each point one after the other."""
+    ordinary_file(path)
     try:
         with path.open(newline="", encoding="utf-8") as stream:
             rows = [row for row in csv.reader(stream) if row]
@@ -175,8 +179,8 @@ def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
         array = np.array([[float(cell or "nan") for cell in row] for row in rows[first:]])
     except (ValueError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(
-            f"{path}: not a table of numbers ({error}), expected a row per frame with x, y (and "
-            "confidence) of each point, after at most one line of names."
+            f"{path}: not a table of numbers ({reason(error)}), expected a row per frame with x, y "
+            "(and confidence) of each point, after at most one line of names."
         ) from error
     if array.ndim != 2 or not array.size:
         raise DataError(f"{path}: holds no rows of numbers.")

@@ -22,18 +22,20 @@ _LIMITS = {"max_pixels": str(_MOST_PIXELS)}
 def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its first video stream; what FFmpeg cannot read is a `DataError`."""
     ordinary_file(path)
-    limits: Any = [_LIMITS]  # of the first stream; PyAV's types say texts and mean dictionaries
     try:
-        with av.open(f"file:{path}", options=_OPTIONS, stream_options=limits) as container:
+        with av.open(f"file:{path}", options=_OPTIONS) as container:
             if not container.streams.video:
                 raise DataError(f"{path}: holds no video stream.")
             stream = container.streams.video[0]
-            if stream.width * stream.height > _MOST_PIXELS:
+            context = stream.codec_context
+            if context is None:
+                raise DataError(f"{path}: a video whose codec is not known; encode it again.")
+            if context.width * context.height > _MOST_PIXELS:
                 raise DataError(
-                    f"{path}: pictures of {stream.width}x{stream.height} pixels, expected at most "
-                    f"{_MOST_PIXELS:,}; make them smaller."
+                    f"{path}: pictures of {context.width}x{context.height} pixels, expected at "
+                    f"most {_MOST_PIXELS:,}; make them smaller."
                 )
-            stream.codec_context.options = _LIMITS
+            context.options = _LIMITS
             yield container, stream
     except (av.error.FFmpegError, OSError, UnicodeError) as error:
         raise DataError(
