@@ -141,13 +141,8 @@ def find_poses(
         "in_doubt": [doubt.part for doubt in fitted.doubts],
         "evsplat": evsplat.__version__,
         "policy": to_dict(seen.policy),
+        **_refinement_made(refined),
     }
-    if refined is not None:
-        made["refinement"] = {
-            "gain": round(refined.gain, 4),
-            "taken": refined.better,
-            "seconds": round(refined.seconds, 1),
-        }
     with derived_capture(capture, out, replace=overwrite) as making:
         _write_body(making, track, fitted)
         if focal_px is not None:
@@ -207,6 +202,14 @@ def _rig(model: str) -> Rig:
 def _seen(capture: Capture, policy: Policy, focal_px: float | None) -> TrainingCapture:
     """What a policy shows of a capture; with a focal length where one is given."""
     return (capture if focal_px is None else capture.with_focal(focal_px)).for_training(policy)
+
+
+def _refinement_made(refined: Refined | None) -> dict[str, Any]:
+    """What the provenance says of it; nothing where there was none."""
+    if refined is None:
+        return {}
+    gain, seconds = round(refined.gain, 4), round(refined.seconds, 1)
+    return {"refinement": {"gain": gain, "taken": refined.better, "seconds": seconds}}
 
 
 def _refinement_s(capture: TrainingCapture, search: PoseSearch) -> float:
