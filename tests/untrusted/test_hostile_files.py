@@ -282,7 +282,7 @@ def test_weights_that_torch_cannot_read(tmp_path: Path) -> None:
         ({"a": 1, "b": {"c": [1, 2.5]}}, ""),
         ({"a": True, "b": {"c": []}}, "a is True, expected a whole number"),
         ({"a": 1}, "it has no b"),
-        ({"a": 1, "b": {"c": [1, None]}}, "b.'c'.1 is None, expected a number"),
+        ({"a": 1, "b": {"c": [1, None]}}, "b.c.1 is None, expected a number"),
         ({"a": 1, "b": []}, "b is [], expected an object"),
         ({"a": 10**400, "b": {}}, "a is 1000"),
         ([], "it is [], expected an object"),

@@ -41,7 +41,8 @@ def misfit(value: Any, shape: Shape, where: str = "") -> str:
         return f"{where or 'it'} has no {missing[0]}"
     for key, entry in entries:
         each = inner.get(key, inner.get(str, inner.get(list)))
-        found = "" if each is None else misfit(entry, each, f"{where}.{brief(key)}".strip("."))
+        name = key if str(key).isidentifier() else brief(key)
+        found = "" if each is None else misfit(entry, each, f"{where}.{name}".strip("."))
         if found:
             return found
     return ""
