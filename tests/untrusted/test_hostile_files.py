@@ -31,6 +31,7 @@ from evsplat.landmarks.keypoint_files import read_points as read_keypoints
 from evsplat.methods import method_config
 from evsplat.pictures.files import read_image
 from evsplat.untrusted.arrays import read_npz, read_plain_npz
+from evsplat.untrusted.hdf5 import holds, open_hdf5
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.records import misfit
 from evsplat.weights import read_state
@@ -209,6 +210,21 @@ def test_event_files_name_no_other_file(tmp_path: Path, little_memory: None) -> 
                 file.create_dataset("events/x", (100,), "i8", chunks=(1 << 26,), maxshape=(None,))
         said = refused(lambda: len(EventStore(path, 4, 4)))  # noqa: B023
         assert ("too large to be unpacked" if kind == "piece" else "of another file") in said
+
+
+def test_a_damaged_index_of_an_hdf5_file_is_one_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "poses.hdf5"
+    with h5py.File(path, "w") as file:
+        file["pose"] = np.zeros((2, 72))
+    content = bytearray(path.read_bytes())
+    content[content.index(b"TREE") + 4] ^= 1  # the kind of its nodes
+    path.write_bytes(content)
+
+    def look() -> None:
+        with open_hdf5(path) as file:
+            holds(file, "pose")
+
+    assert "pose: cannot be looked up" in refused(look)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from evsplat.importers.base import (
 )
 from evsplat.importers.smpl import add_body, chosen_poses
 from evsplat.untrusted.faults import broken_as
-from evsplat.untrusted.hdf5 import data_set, open_hdf5, wrong_data_set
+from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5, wrong_data_set
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.videos import opened_video
 
@@ -122,7 +122,8 @@ def _read_camera(path: Path) -> tuple[SourceCamera, int, int]:
 def _read_poses(path: Path, consensus: Path, gender: str) -> PoseSequence:
     need(path, "the poses")
     with open_hdf5(path) as file:
-        arrays = {key: _whole(path, file, key) for key in ("pose", "trans", "betas") if key in file}
+        keys = (key for key in ("pose", "trans", "betas") if holds(file, key))
+        arrays = {key: _whole(path, file, key) for key in keys}
     if "betas" not in arrays and consensus.exists():
         shape = read_pickle(consensus, what="consensus shape")
         arrays["betas"] = numbers(shape, "betas", (10,), str(consensus), flat=True)

@@ -25,6 +25,17 @@ def open_hdf5(path: Path, **options: Any) -> h5py.File:
         ) from error
 
 
+def holds(file: h5py.File, name: str) -> bool:
+    """Whether something of that name is in the file; a `DataError` where its index is damaged."""
+    try:
+        return name in file
+    except BROKEN as error:
+        raise DataError(
+            f"{file.filename}: {name}: cannot be looked up ({reason(error)}); copy the file again "
+            "or write it anew."
+        ) from error
+
+
 def data_set(file: h5py.File, name: str) -> h5py.Dataset:
     """A data set of the file; a `DataError` where there is none, or none that is safe to read."""
     wrong = wrong_data_set(file, name)

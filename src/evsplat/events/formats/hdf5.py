@@ -21,7 +21,7 @@ from evsplat.events.formats.base import (
 from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
 from evsplat.options import ReadOptions
 from evsplat.untrusted.faults import broken_as
-from evsplat.untrusted.hdf5 import data_set, open_hdf5
+from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5
 
 _PLACES = ("events", "CD/events", "/")
 _ECF = 36559
@@ -52,7 +52,7 @@ class Hdf5(Source):
         with _opened(self.path) as file:
             self._columns = _find_columns(self.path, file, options)
             self._count = self._check_columns(file)
-            self._offset_us = int(file["t_offset"][()]) if "t_offset" in file else 0
+            self._offset_us = int(file["t_offset"][()]) if holds(file, "t_offset") else 0
             if abs(self._offset_us) > 1 << 60:
                 raise DataError(f"{self.path}: t_offset is {self._offset_us} us, which is no time.")
             self.width, self.height = _size(file)
@@ -107,7 +107,7 @@ class Hdf5(Source):
 def _find_columns(path: Path, file: h5py.File, options: ReadOptions) -> dict[str, _Column]:
     given = options.columns
     if isinstance(given, Mapping):
-        missing = [name for name in given.values() if name not in file]
+        missing = [name for name in given.values() if not holds(file, name)]
         if missing or not {"t", "x", "y"} <= set(given):
             raise DataError(
                 f"{path}: columns is {dict(given)}, expected datasets for t, x, y and perhaps p"
@@ -115,7 +115,7 @@ def _find_columns(path: Path, file: h5py.File, options: ReadOptions) -> dict[str
             )
         return {key: _Column(name) for key, name in given.items()}
     for place in _PLACES:
-        if place not in file:
+        if not holds(file, place):
             continue
         node = file[place]
         if isinstance(node, h5py.Group):
@@ -169,7 +169,7 @@ def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
 def _size(file: h5py.File) -> tuple[int | None, int | None]:
     """Width and height, where an attribute says."""
     for place in _PLACES:
-        attributes = file[place].attrs if place in file else {}
+        attributes = file[place].attrs if holds(file, place) else {}
         if "width" in attributes and "height" in attributes:
             return int(attributes["width"]), int(attributes["height"])
         if "sensor_resolution" in attributes:  # e2vid: rows first
