@@ -166,6 +166,8 @@ def _be_command(
         os.setsid()
         for number in (1, 2):
             os.dup2(saying, number)
+        # Those of before take what they write to for a file of theirs.
+        sys.stdout, sys.stderr = (os.fdopen(number, "w", buffering=1) for number in (1, 2))
         os.chdir(place)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         prepare()
