@@ -13,7 +13,7 @@ from evsplat.capture import Frame
 from evsplat.pictures import decode, encode, luminance
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import Descent
-from evsplat.posing.refine import _gain, expected_errors
+from evsplat.posing.refine import _gain, _given_errors, expected_errors
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets
 
@@ -91,6 +91,23 @@ def test_where_nobody_says_limbs_err_more_than_the_trunk(body):
     joint_rad, root_m = expected_errors(still_track(body))
     assert joint_rad[0] < joint_rad.max()
     assert (root_m > 0).all()
+
+
+@pytest.mark.parametrize("size", [0.2, 1.0])
+def test_a_motion_errs_by_how_far_it_was_corrected(body, size):
+    """A correction drawn from its prior, ``size`` times as large, gives errors of that size."""
+    torch.manual_seed(2)
+    rad, metres = 0.05, 0.02
+    correction = correction_of(body, rad, metres)
+    with torch.no_grad():
+        correction.turns.normal_(std=size)
+        correction.shifts.normal_(std=size)
+    errors = _given_errors(correction)
+    assert errors.source == "estimated" and not errors.typical
+    assert errors.joint_rad == pytest.approx(np.full_like(errors.joint_rad, size * rad), rel=0.2)
+    # Three axes of a handful of coordinates: a rough estimate, no axis far below the worst.
+    assert size * metres / 3 < errors.root_m.max() < 3 * size * metres
+    assert errors.root_m.min() >= 0.5 * errors.root_m.max()
 
 
 def test_discs_take_the_colours_of_the_pixels_that_show_them(body):
