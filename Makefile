@@ -9,7 +9,7 @@ RUN ?= $(lastword $(sort $(wildcard runs/demo_*/*/*)))
 SET_UP_INPUTS := pyproject.toml constraints.txt CMakeLists.txt \
 	$(shell find native -type f 2>/dev/null | LC_ALL=C sort)
 
-.PHONY: demo view test lint types docs setup clean
+.PHONY: demo view test fuzz kill robustness lint types docs setup clean
 
 demo: $(STAMP)
 	$(BIN)/evsplat demo $(DEMO_OPTIONS)
@@ -20,6 +20,16 @@ view: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(TEST_OPTIONS)
+
+# Damaged files of every kind, the same ones in every run; make fuzz FUZZ_OPTIONS="--seconds 3600 --seed 1" for others.
+fuzz: $(STAMP)
+	$(BIN)/python benchmarks/fuzz.py $(or $(FUZZ_OPTIONS),--seconds 120 --inputs 200000)
+
+# Interruptions of every verb that writes; make kill KILL_OPTIONS="--seconds 3600" for longer.
+kill: $(STAMP)
+	$(BIN)/python benchmarks/kill.py $(or $(KILL_OPTIONS),--seconds 120)
+
+robustness: fuzz kill
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
 """Errors of found body poses against the truth, by stage: landmarks, fit, refinement.
 
-    python benchmarks/find_poses.py CAPTURE … [--held-out-events] [--keypoints-px 2] [--threads 1]
+    python benchmarks/find_poses.py CAPTURE … [--held-out-events] [--refine] [--keypoints-px 2]
+                                              [--threads 1]
 
 Per capture and stage the mean distance of 14 joints in pixels (through the frame's camera), in
 millimetres about the pelvis (MPJPE), and after a similarity per frame (PA-MPJPE), at the times of
@@ -33,6 +34,7 @@ from evsplat.landmarks import (
 from evsplat.posing.find import key_times
 from evsplat.posing.fit import FitSettings, fit_landmarks
 from evsplat.posing.prior import pose_prior
+from evsplat.posing.refine import refine
 
 PARTS = [f"{s}_{p}" for p in ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
          for s in ("left", "right")]  # fmt: skip
@@ -46,6 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--held-out-events", action="store_true")
+    parser.add_argument("--refine", action="store_true", help="correct fits by drawing the person")
     parser.add_argument("--keypoints-px", type=float)
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
@@ -53,11 +56,13 @@ def main() -> None:
     policy = Policy(held_out_events=options.held_out_events)
     results = []
     for path in options.captures:
-        results += measure(load_capture(path), policy, options.keypoints_px)
+        results += measure(load_capture(path), policy, options.keypoints_px, options.refine)
     print(json.dumps({"policy": policy.sentence, "rows": results}))
 
 
-def measure(capture: Capture, policy: Policy, keypoints_px: float | None) -> list[dict]:
+def measure(
+    capture: Capture, policy: Policy, keypoints_px: float | None, refined: bool
+) -> list[dict]:
     """A row per stage."""
     seen = capture.for_training(policy)
     truth = load_body_track(capture, dense=capture.dense_body_file is not None)
@@ -87,6 +92,10 @@ def measure(capture: Capture, policy: Policy, keypoints_px: float | None) -> lis
         track = fitted.track(key_times(seen))
         seconds = time.perf_counter() - start
         rows.append({"stage": stage, "seconds": seconds, **pose_errors(capture, truth, track)})
+        if refined:
+            better = refine(track, seen)
+            errors = pose_errors(capture, truth, better.track)
+            rows.append({"stage": f"{stage}, refined", "seconds": better.seconds, **errors})
     for row in rows:
         row["capture"] = capture.name
         shown = {k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}

@@ -135,7 +135,7 @@ def native_job(scene: Scene) -> _native.Render:
     ]
     job = _native.Render(
         camera.width, camera.height, camera.K, camera.world_to_camera, 0.01, LOW_PASS, fields, [],
-        None, 1, torch.get_num_threads(),
+        None, None, 1, torch.get_num_threads(),
     )  # fmt: skip
     job.forward(
         torch.empty(1, channels, *size), torch.empty(1, *size),

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evsplat.files import read_json
+from evsplat.untrusted.text import read_json
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,13 @@
 """Where the time of a whole training step goes.
 
 python benchmarks/step.py [--method evsplat|paper] [--size PX] [--human N] [--scene N] [--renders T]
+python benchmarks/step.py --capture FOLDER
 
 Each part's forward time is that of its calls, its backward time that of the gradient nodes that
 its forward pass made; the stages of `render` are timed inside the native module. "rest" is what no
-part explains: Python, the loop and what lies between the parts. The limit is the time of the
+part explains: Python, the loop and what lies between the parts. All steps draw one frame, one with
+the most renders, so that they do the same work. Without a capture it is the demo's, stretched to
+``--size``, with so many Gaussians; a capture is taken as it is. The limit is the time of the
 networks' matrix products at the core's measured multiply-add peak. The last line is JSON with a
 unit in each key.
 """
@@ -41,7 +44,10 @@ from evsplat.models.discs import DiscModel
 from evsplat.models.discs import model as discs_model
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.paper import model as paper_model
+from evsplat.objectives import base as objectives_base
+from evsplat.objectives import event_windows, exposure
 from evsplat.objectives.base import Objective, Step
+from evsplat.objectives.event_windows import EventWindows
 from evsplat.render import native as native_backend
 from evsplat.shipped import demo_capture
 from evsplat.training.clock import Clock
@@ -52,6 +58,7 @@ def main() -> None:
     """Print the table and one line of JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--method", choices=("evsplat", "paper"), default="evsplat")
+    parser.add_argument("--capture", type=Path, help="in place of the demo, as it is")
     parser.add_argument("--size", type=int, default=512, help="image side, px")
     parser.add_argument("--human", type=int, default=20_000)
     parser.add_argument("--scene", type=int, default=30_000)
@@ -65,21 +72,22 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     folder = tempfile.TemporaryDirectory()
-    capture = resized_demo(arguments.size, Path(folder.name))
-    size = arguments.human, arguments.scene, arguments.renders
-    trainer = build_on(capture, *size, method=arguments.method)
+    capture = arguments.capture or resized_demo(arguments.size, Path(folder.name))
+    size = (None, None) if arguments.capture else (arguments.human, arguments.scene)
+    trainer = build_on(capture, *size, arguments.renders, method=arguments.method)
+    draw_one_frame(trainer)
     for _ in range(5):
         trainer.step()
 
     steps = [_timed(trainer.step) for _ in range(arguments.steps)]
     median, best = 1e3 * statistics.median(steps), 1e3 * min(steps)
-    renders, gflop = work(trainer, arguments.steps)
+    renders, gflop = work(trainer, 3)
     peak = _peak() * arguments.threads
     limit = 1e3 * gflop / peak
     forward, backward, stages = measure(trainer, arguments.steps)
     counts = trainer.counts()
     print(
-        f"{arguments.method}: step {median:.1f} ms (best {best:.1f}): {arguments.size} px, "
+        f"{arguments.method}: step {median:.1f} ms (best {best:.1f}): {image_px(trainer)} px, "
         f"{counts['human']} person and {counts['scene']} scene Gaussians, {renders:.1f} renders, "
         f"{arguments.threads} thread(s)"
     )
@@ -95,7 +103,7 @@ def main() -> None:
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     results: dict[str, float | str] = {
         "method": arguments.method,
-        "image_px": arguments.size,
+        "image_px": image_px(trainer),
         "human": counts["human"],
         "scene": counts["scene"],
         "renders": round(renders, 1),
@@ -108,7 +116,7 @@ def main() -> None:
     }
     for label, times in (("forward", forward), ("backward", backward), ("render", stages)):
         for part, value in times.items():
-            results[f"{label}_{part.replace(' ', '_')}_ms"] = round(value, 3)
+            results[f"{label}_{part.replace(',', '').replace(' ', '_')}_ms"] = round(value, 3)
     print(json.dumps(results))
 
 
@@ -138,6 +146,27 @@ def build_on(
     if scene is not None:
         composition.model.gaussians = with_scene_count(composition.model.gaussians, scene)
     return Trainer(composition, capture, Clock(100_000, fraction=0.4))
+
+
+def image_px(trainer: Trainer) -> int:
+    """Side of the pictures, the longer one."""
+    camera = trainer.capture.camera(trainer.capture.train_frames[0])
+    return max(camera.width, camera.height)
+
+
+def draw_one_frame(trainer: Trainer) -> None:
+    """Let every step draw the frame in the middle of those with the most renders."""
+    nominal = trainer.clock.nominal
+    generator = trainer.composition.generator
+    state = generator.get_state()
+    counts = {
+        frame: len({t for o in trainer.composition.objectives for t in o.times(frame, nominal)})
+        for frame in trainer.capture.train_frames
+    }
+    generator.set_state(state)
+    most = [frame for frame, count in counts.items() if count == max(counts.values())]
+    frame = most[len(most) // 2]
+    trainer._draw_frame = lambda: frame
 
 
 def resized_demo(size: int, folder: Path) -> Path:
@@ -238,8 +267,12 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
         watch.calls(model.surface, "weights", "nearest surface")
         watch.calls(discs_model, "skin", "blend skinning")
         watch.calls(model, "_light", "light")
+        watch.calls(model.lamps, "places", "lamps")
+        watch.calls(model.shadow, "place", "casters")
         watch.calls(model.shadow, "lit", "shadow on the person")
         watch.calls(model.shadow, "forward", "shadow on the scene")
+        watch.calls(model.places, "of", "places of the scene")
+        watch.calls(drawing, "_enlarge", "shadow enlarged")
     else:
         watch.calls(model.skinning, "forward", "skinning network")
         watch.calls(paper_model, "skin", "blend skinning")
@@ -248,8 +281,16 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
     watch.calls(model, "_layers", "posing, rest")
     watch.calls(drawing, "render", "render")
     watch.calls(model, "training_drawing", "drawing, rest")
+    watch.calls(exposure, "mean_light", "mean light")
+    watch.calls(exposure, "encode", "encode")
+    watch.calls(exposure, "l1_and_ssim", "L1 and SSIM")
     for objective in trainer.composition.objectives:
         watch.calls(objective, "loss", f"loss {type(objective).__name__}")
+        if isinstance(objective, EventWindows):
+            watch.calls(objective.events, "between", "events read")
+            watch.calls(event_windows, "window_counts", "events counted")
+            watch.calls(objectives_base, "log_luminance", "log luminance")
+    watch.calls(trainer, "_count", "densification")
     watch.calls(trainer.optimiser, "step", "optimiser")
     watch.calls(trainer.optimiser, "finite", "finite check")
     jobs: list[Any] = []

@@ -37,6 +37,7 @@ inline float* data_of(const std::optional<Out>& array) { return array ? array->d
 
 void bind_events(nb::module_&);
 void bind_sensor(nb::module_&);
+void bind_shadow(nb::module_&);
 void bind_step(nb::module_&);
 void bind_zbuffer(nb::module_&);
 

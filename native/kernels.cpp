@@ -305,6 +305,7 @@ INLINE void load_plane(const Tile& t, F* patches, int step, const float* plane, 
 struct Chunk {
     Projected projected[kChunk];
     const float* values[kChunk];
+    bool still[kChunk];
     uint32_t count;
 };
 
@@ -328,6 +329,7 @@ INLINE void fill_chunk(const ForwardJob& job, const Entry* entries, uint32_t fro
         const Found found = find(job, entries[from + j].gaussian);
         chunk.projected[j] = *found.projected;
         chunk.values[j] = found.values;
+        chunk.still[j] = entries[from + j].gaussian >= job.split;
     }
     for (uint32_t i = next; i < next_end; ++i) {
         const Found found = find(job, entries[i].gaussian);
@@ -369,8 +371,8 @@ INLINE void transpose_masks(const Entry* entries, uint32_t count, uint32_t* word
 #endif
 }
 
-// C > 0: that many channels, kept in registers; C = 0: up to kMaxChannels, kept in memory.
-template <int C>
+// C > 0: that many channels, kept in registers; C = 0: up to kMaxChannels, kept in memory. Lit: there is a light.
+template <int C, bool Lit>
 void forward_tile(const ForwardJob& job, const TileWork& work) {
     const View& view = job.view;
     const int channels = C ? C : job.channels;
@@ -386,6 +388,8 @@ void forward_tile(const ForwardJob& job, const TileWork& work) {
         last[p] = I{} - 1;
     }
     for (int k = 0; k < kPatches * channels; ++k) colour[k] = F{};
+    F light[Lit ? kPatches : 1];
+    if (Lit) load_plane(tile, light, 1, job.light, 1, view.width);
 
     uint64_t open = 0;
     for (int p = 0; p < kPatches; ++p) {
@@ -417,11 +421,12 @@ void forward_tile(const ForwardJob& job, const TileWork& work) {
                 t_final = select(go, next, t_final);
                 t_last = go ? I{} + int32_t(first + j) : t_last;
                 t = select(go, next, F{});
+                const F lit = Lit && chunk.still[j] ? weight * light[p] : weight;
                 const float* value = chunk.values[j];
                 if (C) {
-                    for (int k = 0; k < C; ++k) c[k] += weight * value[k];
+                    for (int k = 0; k < C; ++k) c[k] += (Lit && k < kLitChannels ? lit : weight) * value[k];
                 } else {
-                    for (int k = 0; k < channels; ++k) out[k] += weight * value[k];
+                    for (int k = 0; k < channels; ++k) out[k] += (Lit && k < kLitChannels ? lit : weight) * value[k];
                 }
             }
             for (int k = 0; k < C; ++k) out[k] = c[k];
@@ -439,7 +444,8 @@ void forward_tile(const ForwardJob& job, const TileWork& work) {
         F value[kPatches];
         for (int k = 0; k < channels; ++k) {
             load_plane(tile, value, 1, job.background + k * job.background_c, job.background_x, job.background_y);
-            for (int p = 0; p < kPatches; ++p) colour[p * channels + k] += final[p] * value[p];
+            for (int p = 0; p < kPatches; ++p)
+                colour[p * channels + k] += final[p] * value[p] * (Lit && k < kLitChannels ? light[p] : splat(1.f));
         }
     }
     const size_t plane = size_t(view.width) * view.height;
@@ -467,7 +473,7 @@ INLINE void load_gradient(const Tile& t, const TileWork& work, F* patches, int s
 // dL/dalpha_i = T_i (s_i - behind_i) and behind_(i-1) = behind_i + alpha_i (s_i - behind_i).
 // Unlike a front-to-back pass, which gets the light from behind as (total - sum so far), this loses no
 // digits behind nearly opaque Gaussians.
-template <int C>
+template <int C, bool Lit>
 void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
     const ForwardJob& job = back.forward;
     const View& view = job.view;
@@ -485,6 +491,9 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
     if (back.alpha_grad)
         load_gradient(tile, work, value, 1, back.alpha_grad, back.alpha_grad_t, back.alpha_grad_x, back.alpha_grad_y);
     for (int p = 0; p < kPatches; ++p) behind[p] = back.alpha_grad ? -value[p] : F{};
+    F light[Lit ? kPatches : 1], light_grad[Lit ? kPatches : 1];
+    if (Lit) load_plane(tile, light, 1, job.light, 1, view.width);
+    for (int p = 0; p < kPatches && Lit; ++p) light_grad[p] = F{};
     for (int k = 0; k < channels; ++k) {
         if (back.image_grad) {
             load_gradient(tile, work, grad + k, channels, back.image_grad + k * back.image_grad_c, back.image_grad_t,
@@ -494,7 +503,12 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
         }
         if (job.background) {
             load_plane(tile, value, 1, job.background + k * job.background_c, job.background_x, job.background_y);
-            for (int p = 0; p < kPatches; ++p) behind[p] += grad[p * channels + k] * value[p];
+            for (int p = 0; p < kPatches; ++p) {
+                const F by = grad[p * channels + k] * value[p];
+                const bool lit = Lit && k < kLitChannels;
+                behind[p] += lit ? by * light[p] : by;
+                if (lit) light_grad[p] += by * transmittance[p];
+            }
         }
     }
     if (back.background_grad) {
@@ -502,12 +516,13 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
             for (int k = 0; k < channels; ++k)
                 for_pixels(tile, [&](int p, int l, int x, int y) {
                     back.background_grad[(size_t(y) * view.width + x) * job.value_stride + k] +=
-                        grad[p * channels + k][l] * transmittance[p][l];
+                        grad[p * channels + k][l] * transmittance[p][l] * (Lit && k < kLitChannels ? light[p][l] : 1.f);
                 });
         } else {
             for (int k = 0; k < channels; ++k) {
                 F total = F{};
-                for (int p = 0; p < kPatches; ++p) total += grad[p * channels + k] * transmittance[p];
+                for (int p = 0; p < kPatches; ++p)
+                    total += grad[p * channels + k] * transmittance[p] * (Lit && k < kLitChannels ? light[p] : splat(1.f));
                 back.background_grad[size_t(work.index) * channels + k] += sum(total);
             }
         }
@@ -539,7 +554,18 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
                 transmittance[p] = t;
                 const F* v = grad + p * channels;
                 F shade = F{};
-                for (int k = 0; k < channels; ++k) {
+                if (Lit) {
+                    const F lit = chunk.still[j] ? weight * light[p] : weight;
+                    for (int k = 0; k < kLitChannels; ++k) {
+                        shade += colour[k] * v[k];
+                        hc[k] += lit * v[k];
+                    }
+                    if (chunk.still[j]) {
+                        light_grad[p] += weight * shade;
+                        shade *= light[p];
+                    }
+                }
+                for (int k = Lit ? kLitChannels : 0; k < channels; ++k) {
                     shade += colour[k] * v[k];
                     hc[k] += weight * v[k];
                 }
@@ -554,28 +580,32 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
                  add && entry.gaussian >= job.split);
         }
     }
+    if (Lit && back.light_grad) store_plane(tile, light_grad, 1, back.light_grad, view.width);
 }
 
-#define BY_CHANNELS(function, ...)               \
-    switch (channels) {                          \
-        case 1: function<1>(__VA_ARGS__); break; \
-        case 2: function<2>(__VA_ARGS__); break; \
-        case 3: function<3>(__VA_ARGS__); break; \
-        case 4: function<4>(__VA_ARGS__); break; \
-        case 5: function<5>(__VA_ARGS__); break; \
-        case 6: function<6>(__VA_ARGS__); break; \
-        case 7: function<7>(__VA_ARGS__); break; \
-        case 8: function<8>(__VA_ARGS__); break; \
-        default: function<0>(__VA_ARGS__);       \
+#define BY_CHANNELS(function, ...)                       \
+    switch (channels) {                                  \
+        case 1: function<1, false>(__VA_ARGS__); break; \
+        case 2: function<2, false>(__VA_ARGS__); break; \
+        case 3: function<3, false>(__VA_ARGS__); break; \
+        case 4: function<4, false>(__VA_ARGS__); break; \
+        case 5: function<5, false>(__VA_ARGS__); break; \
+        case 6: function<6, false>(__VA_ARGS__); break; \
+        case 7: function<7, false>(__VA_ARGS__); break; \
+        case 8: function<8, false>(__VA_ARGS__); break; \
+        default: function<0, false>(__VA_ARGS__);       \
     }
 
 void forward(const ForwardJob& job, const TileWork& work) {
     const int channels = job.channels;
+    if (job.light) return channels == 4 ? forward_tile<4, true>(job, work) : forward_tile<0, true>(job, work);
     BY_CHANNELS(forward_tile, job, work)
 }
 
 void backward(const BackwardJob& job, const TileWork& work, bool add) {
     const int channels = job.forward.channels;
+    if (job.forward.light)
+        return channels == 4 ? backward_tile<4, true>(job, work, add) : backward_tile<0, true>(job, work, add);
     BY_CHANNELS(backward_tile, job, work, add)
 }
 

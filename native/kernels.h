@@ -8,11 +8,13 @@
 #include <immintrin.h>
 #endif
 
+#include "event_windows.h"
 #include "list.h"
 #include "mlp_kernels.h"
 #include "picture.h"
 #include "posing.h"
 #include "sensor_kernels.h"
+#include "shadow.h"
 #include "skinning.h"
 #include "ssim.h"
 #include "surface_light.h"
@@ -24,6 +26,8 @@ constexpr int kTilePixels = kTile * kTile;
 constexpr uint32_t kBlock = 512;       // Gaussians per unit of projection work; fixes the order of sums
 constexpr int kMoments = 6;            // gradient slot: sums of h, hu, hv, huu, huv, hvv, then channels
 constexpr int kMaxChannels = 32;       // drawn in one go; more are drawn in blocks
+
+constexpr int kLitChannels = 3;
 
 constexpr int slot_stride(int channels) { return (kMoments + channels + 3) / 4 * 4; }
 
@@ -72,6 +76,7 @@ struct ForwardJob {
     ptrdiff_t background_c, background_x, background_y;
     float *image, *alpha;         // planar (T, C, H, W) and (T, H, W)
     size_t image_t, alpha_t;      // floats from one time to the next
+    const float* light;           // (H, W), null for 1: factor on the first kLitChannels of what stands still
 };
 
 // One tile with one list of entries, and the times whose picture it is.
@@ -96,6 +101,7 @@ struct BackwardJob {
     float* slots;                 // (slots, slot_stride(C))
     float* background_grad;       // null, or (tiles, C) or (H, W, value_stride), added to
     bool background_is_image;
+    float* light_grad;            // (H, W), written; null: not wanted
 };
 
 struct PairOfSums {
@@ -117,12 +123,15 @@ struct GaussianGrads {
     KERNEL(SsimSums, ssim_band, (const SsimBand&)) \
     KERNEL(void, log_brightness, (const LogBrightness&, size_t begin, size_t end)) \
     KERNEL(void, power, (const Power&, size_t begin, size_t end)) \
+    KERNEL(void, power_mean, (const PowerMean&, size_t begin, size_t end)) /* of all planes' values */ \
+    KERNEL(void, power_mean_backward, (const PowerMean&, size_t begin, size_t end, const float* above, float* const* grads)) \
     KERNEL(void, add_sign, (const float*, const float*, float, float, size_t, float*)) \
     KERNEL(double, membership, (const Membership&, size_t begin, size_t end)) /* begin: a multiple of 16 */ \
     /* Of two maps: squares; absolute differences and their signs times the first; the gradient of those. */ \
     KERNEL(PairOfSums, square_sums, (const float*, const float*, size_t)) \
     KERNEL(PairOfSums, difference_sums, (const float*, const float*, float, float, size_t)) \
     KERNEL(void, difference_slope, (const float*, const float*, float, float, float, float, size_t, float*)) \
+    KERNEL(WindowSums, window_difference, (const WindowDifference&, size_t begin, size_t end, float* slope)) \
     KERNEL(void, view_directions, (const ViewDirections&, size_t begin, size_t end)) \
     KERNEL(void, sh_rows, (const ShRows&, size_t begin, size_t end)) \
     KERNEL(void, tree_softmax, (const TreeSoftmax&, size_t begin, size_t end, float* scratch)) \
@@ -132,6 +141,14 @@ struct GaussianGrads {
     KERNEL(void, surface_light, (const SurfaceLight&, size_t begin, size_t end, float* factors)) \
     /* Sums over the points, and the gradient of the shares unless `lit` is null. */ \
     KERNEL(void, surface_light_backward, (const SurfaceLight&, size_t begin, size_t end, const float* above, float* sums, float* lit)) \
+    /* A body's points onto a grid, and from the grid's gradient, which changes, to theirs. */ \
+    KERNEL(void, shadow_splat, (const ShadowSplat&, float* grid)) \
+    KERNEL(void, shadow_splat_backward, (const ShadowSplat&, float* grid, const SplatGrads&)) \
+    /* Places [begin, end); back, it adds to grids and writes (lamps, kViewSums) sums and the shares'. */ \
+    KERNEL(void, shadow_on_scene, (const ShadowLook&, size_t begin, size_t end, float* factor)) \
+    KERNEL(void, shadow_on_scene_backward, (const ShadowLook&, size_t begin, size_t end, const float* above, float* const* grids, float* sums, float* share)) \
+    KERNEL(void, shadow_on_body, (const ShadowLook&, size_t begin, size_t end, float* lit)) \
+    KERNEL(void, shadow_on_body_backward, (const ShadowLook&, size_t begin, size_t end, const float* above, float* grid, float* sums)) \
     KERNEL(void, sensor_step, (const SensorPiece&))
 
 struct Kernels {

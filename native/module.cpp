@@ -41,8 +41,8 @@ FieldOf<T>& field_of(LayerOf<T>& l, size_t i) {
 class Render {
   public:
     Render(int width, int height, const Camera& k, const Pose& pose, float near_plane, float low_pass, Fields moving,
-           Fields still, std::optional<In> background, int times, int threads)
-        : moving_(std::move(moving)), still_(std::move(still)), background_(background), threads_(threads) {
+           Fields still, std::optional<In> background, std::optional<In> light, int times, int threads)
+        : moving_(std::move(moving)), still_(std::move(still)), background_(background), light_(light), threads_(threads) {
         require(width > 0 && height > 0 && width <= 1 << 16 && height <= 1 << 16 && times > 0, "the image");
         View& v = scene_.view;
         for (int i = 0; i < 3; ++i) {
@@ -65,6 +65,10 @@ class Render {
         if (background) {
             require(background->size() == c * (scene_.background_is_image ? size_t(width) * height : 1), "background");
             scene_.background = background->data();
+        }
+        if (light) {
+            require(light->size() == size_t(times) * width * height && c >= kLitChannels && c <= kMaxChannels, "the light");
+            scene_.light = light->data();
         }
     }
 
@@ -91,7 +95,7 @@ class Render {
     }
 
     void backward(std::optional<Strided> image_grad, std::optional<Strided> alpha_grad, OutFields moving,
-                  OutFields still, std::optional<Out> view, std::optional<Out> background) {
+                  OutFields still, std::optional<Out> view, std::optional<Out> background, std::optional<Out> light) {
         if (!record_) throw std::runtime_error("evsplat._native: backward before forward");
         const size_t h = scene_.view.height, w = scene_.view.width, t = scene_.times, c = scene_.channels;
         OutputGrads out;
@@ -119,6 +123,10 @@ class Render {
         if (background && scene_.background) {
             require(background->size() == c * (scene_.background_is_image ? h * w : 1), "background gradient");
             in.background = background->data();
+        }
+        if (light && scene_.light) {
+            require(light->size() == t * h * w, "the light's gradient");
+            in.light = light->data();
         }
         nb::gil_scoped_release release;
         render_backward(scene_, *record_, threads_, out, in);
@@ -163,7 +171,7 @@ class Render {
 
     // The arrays keep the memory that scene_ points into alive.
     Fields moving_, still_;
-    std::optional<In> background_;
+    std::optional<In> background_, light_;
     Scene scene_ = {};
     int threads_;
     std::unique_ptr<Record> record_;
@@ -261,6 +269,50 @@ void picture_power(In from, float exponent, Out value, std::optional<Out> slope,
     power({from.data(), exponent, value.data(), data_of(slope)}, from.size(), threads);
 }
 
+// Pictures (H, W, 3), planar in memory.
+PowerMean mean_of(const std::vector<Strided>& pictures, float exponent) {
+    require(!pictures.empty() && pictures.size() <= kMostPictures, "the pictures");
+    PowerMean job = {int(pictures.size()), {}, exponent, 0, nullptr};
+    for (size_t i = 0; i < pictures.size(); ++i) {
+        const Strided& p = pictures[i];
+        require(p.ndim() == 3 && p.shape(2) == 3, "a picture");
+        const size_t count = p.shape(0) * p.shape(1);
+        require((!i || count == job.count) && p.stride(1) == 1 && size_t(p.stride(0)) == p.shape(1) && size_t(p.stride(2)) == count,
+                "a picture: planar");
+        job.coded[i] = p.data(), job.count = count;
+    }
+    return job;
+}
+
+void picture_power_mean(const std::vector<Strided>& pictures, float exponent, Out mean, int threads) {
+    PowerMean job = mean_of(pictures, exponent);
+    require(mean.size() == 3 * job.count, "the mean");
+    job.mean = mean.data();
+    nb::gil_scoped_release release;
+    power_mean(job, threads);
+}
+
+void picture_power_mean_backward(const std::vector<Strided>& pictures, float exponent, In above, Out grads, int threads) {
+    const PowerMean job = mean_of(pictures, exponent);
+    require(above.size() == 3 * job.count && grads.size() == job.pictures * above.size(), "the gradients");
+    float* to[kMostPictures];
+    for (int i = 0; i < job.pictures; ++i) to[i] = grads.data() + i * above.size();
+    nb::gil_scoped_release release;
+    power_mean_backward(job, above.data(), threads, to);
+}
+
+// Whole pictures, or back from their gradient.
+void picture_enlarge(In from, int factor, Out to, bool back, int threads) {
+    require(from.ndim() == 3 && to.ndim() == 3 && from.shape(0) == to.shape(0) && factor >= 1, "the pictures");
+    const auto small = [&](size_t i) { return back ? to.shape(i) : from.shape(i); };
+    const auto large = [&](size_t i) { return back ? from.shape(i) : to.shape(i); };
+    for (size_t i = 1; i < 3; ++i)
+        require(small(i) > 0 && large(i) <= small(i) * factor && large(i) < 1 << 20, "the pictures");
+    const Enlarge job = {small(0), int(small(1)), int(small(2)), int(large(1)), int(large(2)), factor};
+    nb::gil_scoped_release release;
+    (back ? enlarge_backward : enlarge)(job, from.data(), threads, to.data());
+}
+
 // Planes (3, pixels).
 void picture_log_brightness(In coded, const std::array<float, 3>& weight, float gamma, float darkest, float eps,
                             Out value, std::optional<Out> slope, int threads) {
@@ -324,15 +376,16 @@ NB_MODULE(_native, m) {
     m.doc() = "CPU kernels of evsplat.";
     nb::set_leak_warnings(false);  // images alive when the interpreter ends are no leak
     nb::class_<Render>(m, "Render", "One render of T times; keeps what its backward pass needs.")
-        .def(nb::init<int, int, const Camera&, const Pose&, float, float, Fields, Fields, std::optional<In>, int,
-                      int>(),
+        .def(nb::init<int, int, const Camera&, const Pose&, float, float, Fields, Fields, std::optional<In>,
+                      std::optional<In>, int, int>(),
              nb::arg("width"), nb::arg("height"), nb::arg("K"), nb::arg("world_to_camera"), nb::arg("near"),
              nb::arg("low_pass"), nb::arg("moving"), nb::arg("still"), nb::arg("background").none(),
-             nb::arg("times"), nb::arg("threads"))
+             nb::arg("light").none(), nb::arg("times"), nb::arg("threads"))
         .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"),
              nb::arg("still_radii"), nb::arg("keep") = false, nb::arg("earlier").none() = nb::none())
         .def("backward", &Render::backward, nb::arg("image_grad").none(), nb::arg("alpha_grad").none(),
-             nb::arg("moving"), nb::arg("still"), nb::arg("view").none(), nb::arg("background").none())
+             nb::arg("moving"), nb::arg("still"), nb::arg("view").none(), nb::arg("background").none(),
+             nb::arg("light").none())
         .def_prop_ro("seconds", &Render::seconds, "Work so far by stage, summed over threads.")
         .def_prop_ro("bytes", &Render::bytes, "Memory kept for the backward pass.")
         .def_prop_ro("intersections", &Render::intersections, "Pairs of Gaussian and tile.")
@@ -352,6 +405,12 @@ NB_MODULE(_native, m) {
           "grad = by_difference * sign(image - reference) + scale * grad.");
     m.def("power", &picture_power, nb::arg("given"), nb::arg("exponent"), nb::arg("value"), nb::arg("slope").none(),
           nb::arg("threads"), "value = max(from, 0)^exponent, and its slope.");
+    m.def("power_mean", &picture_power_mean, nb::arg("pictures"), nb::arg("exponent"), nb::arg("mean"),
+          nb::arg("threads"), "Mean of planar pictures' max(coded, 0)^exponent.");
+    m.def("power_mean_backward", &picture_power_mean_backward, nb::arg("pictures"), nb::arg("exponent"),
+          nb::arg("above"), nb::arg("grads"), nb::arg("threads"));
+    m.def("enlarge", &picture_enlarge, nb::arg("given"), nb::arg("factor"), nb::arg("to"), nb::arg("back"),
+          nb::arg("threads"), "Pictures enlarged bilinearly, or the gradient of the small ones.");
     m.def("log_brightness", &picture_log_brightness, nb::arg("coded"), nb::arg("weight"), nb::arg("gamma"),
           nb::arg("darkest"), nb::arg("eps"), nb::arg("value"), nb::arg("slope").none(), nb::arg("threads"),
           "Logarithm of the luminance of (3, H, W) coded values, and its slope by each.");
@@ -362,6 +421,7 @@ NB_MODULE(_native, m) {
           nb::arg("position_grad").none(), nb::arg("weight_grad").none(), nb::arg("bones_grad").none(),
           nb::arg("threads"), "Writes the gradients of skin.");
     bind_sensor(m);
+    bind_shadow(m);
     bind_step(m);
     bind_events(m);
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");

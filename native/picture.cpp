@@ -34,6 +34,77 @@ void power(const Power& job, size_t count, int threads) {
     in_pieces(threads, count, kPiece, [&](size_t begin, size_t end) { kernel(job, begin, end); });
 }
 
+void power_mean(const PowerMean& job, int threads) {
+    const auto kernel = select_kernels().power_mean;
+    in_pieces(threads, 3 * job.count, kPiece, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+}
+
+void power_mean_backward(const PowerMean& job, const float* above, int threads, float* const* grads) {
+    const auto kernel = select_kernels().power_mean_backward;
+    in_pieces(threads, 3 * job.count, kPiece, [&](size_t begin, size_t end) { kernel(job, begin, end, above, grads); });
+}
+
+namespace {
+
+// Where each row or column of the large picture lies between two of the small one.
+struct Between {
+    int low, high;
+    float share;  // of the higher
+};
+
+std::vector<Between> places(int small, int large, int factor) {
+    std::vector<Between> at(large);
+    for (int i = 0; i < large; ++i) {
+        const float place = std::max(0.f, (float(i) + 0.5f) / float(factor) - 0.5f);
+        const int low = std::min(int(place), small - 1);
+        at[i] = {low, std::min(low + 1, small - 1), place - float(low)};
+    }
+    return at;
+}
+
+}  // namespace
+
+void enlarge(const Enlarge& e, const float* from, int threads, float* to) {
+    const std::vector<Between> rows = places(e.height, e.to_height, e.factor), columns = places(e.width, e.to_width, e.factor);
+    parallel_for(threads, e.times, [&](size_t t) {
+        const float* small = from + t * e.height * e.width;
+        float* large = to + t * e.to_height * e.to_width;
+        std::vector<float> row(e.width);
+        for (int y = 0; y < e.to_height; ++y) {
+            const float *a = small + size_t(rows[y].low) * e.width, *b = small + size_t(rows[y].high) * e.width;
+            const float share = rows[y].share;
+            for (int x = 0; x < e.width; ++x) row[x] = a[x] + share * (b[x] - a[x]);
+            for (int x = 0; x < e.to_width; ++x) {
+                const Between& c = columns[x];
+                large[size_t(y) * e.to_width + x] = row[c.low] + c.share * (row[c.high] - row[c.low]);
+            }
+        }
+    });
+}
+
+void enlarge_backward(const Enlarge& e, const float* above, int threads, float* grad) {
+    const std::vector<Between> rows = places(e.height, e.to_height, e.factor), columns = places(e.width, e.to_width, e.factor);
+    parallel_for(threads, e.times, [&](size_t t) {
+        float* small = grad + t * e.height * e.width;
+        const float* large = above + t * e.to_height * e.to_width;
+        std::fill_n(small, size_t(e.height) * e.width, 0.f);
+        std::vector<float> row(e.width);
+        for (int y = 0; y < e.to_height; ++y) {
+            std::fill(row.begin(), row.end(), 0.f);
+            for (int x = 0; x < e.to_width; ++x) {
+                const Between& c = columns[x];
+                const float by = large[size_t(y) * e.to_width + x], high = by * c.share;
+                row[c.low] += by - high, row[c.high] += high;
+            }
+            float *a = small + size_t(rows[y].low) * e.width, *b = small + size_t(rows[y].high) * e.width;
+            for (int x = 0; x < e.width; ++x) {
+                const float high = row[x] * rows[y].share;
+                a[x] += row[x] - high, b[x] += high;
+            }
+        }
+    });
+}
+
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count,
               int threads, float* grad) {
     const auto kernel = select_kernels().add_sign;

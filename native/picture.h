@@ -29,6 +29,30 @@ struct Power {
 
 void power(const Power&, size_t count, int threads);
 
+// The mean over pictures of max(coded, 0)^exponent, of their three planes of `count` pixels; zero below 1e-6. Back it
+// writes the pictures' gradients from that of the mean.
+constexpr int kMostPictures = 256;
+struct PowerMean {
+    int pictures;
+    const float* coded[kMostPictures];  // (3, count) each
+    float exponent;
+    size_t count;
+    float* mean;                        // (3, count)
+};
+
+void power_mean(const PowerMean&, int threads);
+void power_mean_backward(const PowerMean&, const float* above, int threads, float* const* grads);
+
+// Pictures (times, height, width) twice or more as large in each direction, linear between the places of their pixels,
+// the first size (times, to_height, to_width) of it; as F.interpolate(..., "bilinear") has it.
+struct Enlarge {
+    size_t times;
+    int height, width, to_height, to_width, factor;
+};
+
+void enlarge(const Enlarge&, const float* from, int threads, float* to);
+void enlarge_backward(const Enlarge&, const float* above, int threads, float* grad);
+
 // grad = by_difference * sign(image - reference) + scale * grad, over `count` values.
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count,
               int threads, float* grad);

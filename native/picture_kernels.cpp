@@ -80,12 +80,70 @@ void difference_slope(const float* map, const float* reference, float scale, flo
     }
 }
 
+WindowSums window_difference(const WindowDifference& job, size_t begin, size_t end, float* slope) {
+    F value = {}, on = {}, off = {}, lag = {};
+    const size_t pixels = job.pixels;
+    vectors(begin, end, PER_VECTOR {
+        const F sound = load_some(job.sound + at, count);
+        const auto picture = [&](size_t t) { return load_some(job.brightness + t * pixels + at, count); };
+        const auto map = [&](size_t row) { return load_some(job.maps + row * pixels + at, count); };
+        const auto difference = [&](size_t w, F change) {
+            return change - job.on * map(2 * w) + job.off * map(2 * w + 1);
+        };
+        const auto sign = [&](F d) { return select(d > 0.f, splat(1.f), select(d < 0.f, splat(-1.f), F{})); };
+        F sum = {}, before = picture(0);
+        for (size_t w = 0; w < job.windows; ++w) {
+            const F after = picture(w + 1);
+            sum += difference(w, after - before);
+            before = after;
+        }
+        const F whole = sound * job.whole, by_sum = whole * sign(sum);
+        value += whole * max(sum, -sum) + (sum - sum);  // max forgets what is no number
+        F earlier = {};
+        before = picture(0);
+        for (size_t w = 0; w < job.windows; ++w) {
+            const F after = picture(w + 1), d = difference(w, after - before), weight = sound * job.weight[w];
+            value += weight * max(d, -d);
+            const F by = weight * sign(d) + by_sum;
+            on -= by * map(2 * w), off += by * map(2 * w + 1);
+            if (job.drift) lag -= by * load_some(job.drift + w * pixels + at, count);
+            store_some(slope + w * pixels + at, earlier - by, count);
+            earlier = by, before = after;
+        }
+        store_some(slope + job.windows * pixels + at, earlier, count);
+    });
+    return {sum(value), sum(on), sum(off), sum(lag)};
+}
+
 void power(const Power& job, size_t begin, size_t end) {
     vectors(begin, end, PER_VECTOR {
         const F given = load_some(job.from + at, count), v = max(given, splat(1e-6f));
         const F less = select(given >= 1e-6f, exp2(log2(v) * (job.exponent - 1.f)), F{});
         store_some(job.value + at, less * v, count);
         if (job.slope) store_some(job.slope + at, less * job.exponent, count);
+    });
+}
+
+void power_mean(const PowerMean& job, size_t begin, size_t end) {
+    const float share = 1.f / float(job.pictures);
+    vectors(begin, end, PER_VECTOR {
+        F sum = {};
+        for (int i = 0; i < job.pictures; ++i) {
+            const F given = load_some(job.coded[i] + at, count), v = max(given, splat(1e-6f));
+            sum += select(given >= 1e-6f, exp2(log2(v) * job.exponent), F{}) + (given - given);
+        }
+        store_some(job.mean + at, sum * share, count);
+    });
+}
+
+void power_mean_backward(const PowerMean& job, size_t begin, size_t end, const float* above, float* const* grads) {
+    const float share = job.exponent / float(job.pictures);
+    vectors(begin, end, PER_VECTOR {
+        const F by = load_some(above + at, count) * share;
+        for (int i = 0; i < job.pictures; ++i) {
+            const F given = load_some(job.coded[i] + at, count), v = max(given, splat(1e-6f));
+            store_some(grads[i] + at, select(given >= 1e-6f, exp2(log2(v) * (job.exponent - 1.f)) * by, F{}), count);
+        }
     });
 }
 

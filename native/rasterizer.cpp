@@ -274,6 +274,64 @@ void copy_tile(const View& view, uint32_t tile, size_t planes, const float* from
         }
 }
 
+// Calls f(at, count) for the rows of a tile, `at` being the pixel that a row begins with.
+template <class F>
+void for_rows(const View& view, uint32_t tile, F f) {
+    const size_t width = view.width, x = tile % view.tiles_x * kTile, y = tile / view.tiles_x * kTile;
+    const size_t columns = std::min<size_t>(kTile, width - x), rows = std::min<size_t>(kTile, view.height - y);
+    for (size_t row = y; row < y + rows; ++row) f(row, row * width + x, columns);
+}
+
+// A tile where nothing moves, drawn without light, to its times under their lights.
+void light_tile(const Scene& s, const TileWork& work, float* image) {
+    const size_t pixels = size_t(s.view.width) * s.view.height;
+    for (uint32_t i = 0; i < work.time_count; ++i)
+        for_rows(s.view, work.index, [&](size_t, size_t at, size_t columns) {
+            const float* light = s.light + work.times[i] * pixels + at;
+            for (int k = 0; k < kLitChannels; ++k) {
+                float* to = image + (size_t(work.times[i]) * s.channels + k) * pixels + at;
+                for (size_t x = 0; x < columns; ++x) to[x] *= light[x];
+            }
+        });
+}
+
+// The gradient of such a tile: the image's (channels, tile) and the alpha's (tile), summed over the times, of the
+// picture without light; and that of the lights.
+void light_tile_backward(const Scene& s, const Record& r, const TileWork& work, const OutputGrads& out, float* image,
+                         float* alpha, float* light_grad) {
+    const size_t pixels = size_t(s.view.width) * s.view.height;
+    std::fill_n(image, s.channels * kTilePixels, 0.f);
+    std::fill_n(alpha, kTilePixels, 0.f);
+    const size_t left = work.index % s.view.tiles_x * kTile, top = work.index / s.view.tiles_x * kTile;
+    for (uint32_t i = 0; i < work.time_count; ++i)
+        for_rows(s.view, work.index, [&](size_t row, size_t at, size_t columns) {
+            const ptrdiff_t t = work.times[i];
+            const size_t to = (row - top) * kTile;
+            float given[kTile], by_light[kTile] = {};
+            const auto load = [&](const float* from, ptrdiff_t step) {
+                for (size_t x = 0; x < columns; ++x) given[x] = from[ptrdiff_t(x) * step];
+            };
+            if (out.alpha_data) {
+                load(out.alpha_data + t * out.alpha[0] + ptrdiff_t(row) * out.alpha[1] + ptrdiff_t(left) * out.alpha[2], out.alpha[2]);
+                for (size_t x = 0; x < columns; ++x) alpha[to + x] += given[x];
+            }
+            const float* light = s.light + size_t(t) * pixels + at;
+            for (int k = 0; k < s.channels && out.image_data; ++k) {
+                load(out.image_data + t * out.image[0] + ptrdiff_t(row) * out.image[1] + ptrdiff_t(left) * out.image[2] + k * out.image[3],
+                     out.image[2]);
+                float* sum = image + k * kTilePixels + to;
+                if (k >= kLitChannels) {
+                    for (size_t x = 0; x < columns; ++x) sum[x] += given[x];
+                    continue;
+                }
+                const float* unlit = r.unlit.data() + k * pixels + at;
+                for (size_t x = 0; x < columns; ++x) sum[x] += given[x] * light[x];
+                for (size_t x = 0; x < columns; ++x) by_light[x] += given[x] * unlit[x];
+            }
+            if (light_grad) std::copy_n(by_light, columns, light_grad + size_t(t) * pixels + at);
+        });
+}
+
 size_t bytes_of(const Binned& d) {
     return d.projected.bytes() + d.first_slot.bytes() + d.entries.bytes() + d.tile_begin.bytes();
 }
@@ -302,7 +360,7 @@ size_t Still::bytes() const {
 }
 
 size_t Record::bytes() const {
-    size_t total = still->bytes() + picture.bytes() + final_t.bytes() + last.bytes() + patch_end.bytes();
+    size_t total = still->bytes() + unlit.bytes() + picture.bytes() + final_t.bytes() + last.bytes() + patch_end.bytes();
     for (const Binned& d : moving) total += bytes_of(d);
     return total;
 }
@@ -354,6 +412,7 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, bool keep, s
     r.final_t.reset(size_t(pictures) * kTilePixels);
     r.last.reset(size_t(pictures) * kTilePixels);
     r.patch_end.reset(size_t(pictures) * kernels.patches);
+    r.unlit.reset(s.light ? kLitChannels * pixels : 0);
 
     const auto draw = [&](uint32_t tile) {
         for_pictures(r, tile, [&](const TileWork& work) {
@@ -364,12 +423,14 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, bool keep, s
                     copy_tile(s.view, tile, s.channels, still.image.data(), image + t * s.channels * pixels);
                     copy_tile(s.view, tile, 1, still.alpha.data(), alpha + t * pixels);
                 }
+                if (s.light) light_tile(s, work, image);
                 return;
             }
             for (int c = 0; c < s.channels; c += kMaxChannels) {
                 ForwardJob job = forward_job(s, r, work.times[0], c, std::min(kMaxChannels, s.channels - c));
                 job.image = image + c * pixels, job.image_t = s.channels * pixels;
                 job.alpha = alpha, job.alpha_t = pixels;
+                job.light = s.light && !work.bare ? s.light + work.times[0] * pixels : nullptr;
                 kernels.forward(job, work);
             }
             if (kept) {
@@ -377,6 +438,10 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, bool keep, s
                 copy_tile(s.view, tile, s.channels, image + t * s.channels * pixels, still.image.data());
                 copy_tile(s.view, tile, 1, alpha + t * pixels, still.alpha.data());
                 still.drawn[tile] = 1;
+            }
+            if (s.light && work.bare) {
+                copy_tile(s.view, tile, kLitChannels, image + work.times[0] * s.channels * pixels, r.unlit.data());
+                light_tile(s, work, image);
             }
         });
     };
@@ -392,6 +457,9 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, bool keep, s
 
 void render_backward(const Scene& s, const Record& r, int threads, const OutputGrads& out, const InputGrads& in) {
     if (r.still->kept) throw std::runtime_error("a render whose still layer is kept has no backward pass");
+    if (s.light && s.background && in.background)
+        throw std::runtime_error("a background under a light has no gradient");
+    const size_t pixels = size_t(s.view.width) * s.view.height;
     const Kernels& kernels = *r.kernels;
     const size_t tiles = size_t(s.view.tiles_x) * s.view.tiles_y;
     const auto blocks_of = [](const Layer& l) { return (size_t(l.count) + kBlock - 1) / kBlock; };
@@ -423,7 +491,22 @@ void render_backward(const Scene& s, const Record& r, int threads, const OutputG
                 job.background_is_image = s.background_is_image;
                 if (in.background)
                     job.background_grad = s.background_is_image ? in.background + c : background_parts.data();
-                kernels.backward(job, work, add);
+                TileWork seen = work;
+                if (s.light && work.bare) {
+                    thread_local std::vector<float> grads;
+                    grads.resize(size_t(s.channels + 1) * kTilePixels);
+                    float* alpha = grads.data() + s.channels * kTilePixels;
+                    light_tile_backward(s, r, work, out, grads.data(), alpha, in.light);
+                    const ptrdiff_t first = tile / s.view.tiles_x * kTile * kTile + tile % s.view.tiles_x * kTile;
+                    job.image_grad = grads.data() - first, job.alpha_grad = alpha - first;
+                    job.image_grad_c = kTilePixels, job.image_grad_t = job.alpha_grad_t = 0;
+                    job.image_grad_y = job.alpha_grad_y = kTile, job.image_grad_x = job.alpha_grad_x = 1;
+                    seen.time_count = 1;
+                } else if (s.light) {
+                    job.forward.light = s.light + work.times[0] * pixels;
+                    job.light_grad = in.light ? in.light + work.times[0] * pixels : nullptr;
+                }
+                kernels.backward(job, seen, add);
                 add = true;
             });
         };

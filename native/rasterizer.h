@@ -41,6 +41,7 @@ struct Scene {
     Layer moving, still;
     const float* background;  // null, (C) or, with background_is_image, (H, W, C)
     bool background_is_image;
+    const float* light;       // null or (T, H, W): factor on the first kLitChannels of the still layer and background
 };
 
 // A layer at one time: its Gaussians on the screen and their intersections, by tile.
@@ -79,6 +80,7 @@ struct Record {
     Buffer<float> final_t;
     Buffer<int32_t> last;
     Buffer<uint32_t> patch_end;
+    Buffer<float> unlit;           // (kLitChannels, H, W), the still layer where nothing moves, before a light
     mutable std::atomic<int64_t> nanoseconds[kStages] = {};  // of work, summed over threads
 
     size_t bytes() const;
@@ -102,6 +104,7 @@ struct InputGrads {
     LayerGrads moving, still;
     float* view = nullptr;        // (12), written
     float* background = nullptr;  // (C), written, or (H, W, C), added to
+    float* light = nullptr;       // (T, H, W), written; null: not wanted
 };
 
 void render_backward(const Scene&, const Record&, int threads, const OutputGrads&, const InputGrads&);

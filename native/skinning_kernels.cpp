@@ -16,6 +16,15 @@ INLINE void add_matrix(F (&to)[V], float a, const float* b) {
     for (int v = 0; v < V; ++v) to[v] += a * load(b + v * W);
 }
 
+// Calls f(joint) for the joints that a point hangs on: of a surface they are few.
+template <class Function>
+INLINE void for_joints(const float* weight, size_t joints, Function f) {
+    for (size_t j = 0; j < joints; j += W) {
+        const uint64_t nothing = bits(load_some(weight + j, joints - j) == 0.f);
+        for (uint64_t left = ~nothing & ((uint64_t(1) << W) - 1); left; left &= left - 1) f(j + __builtin_ctzll(left));
+    }
+}
+
 }  // namespace
 
 void skin(const Skinning& s, size_t begin, size_t end, float* moved, float* blended) {
@@ -36,20 +45,21 @@ void skin(const Skinning& s, size_t begin, size_t end, float* moved, float* blen
 }
 
 void skin_backward(const Skinning& s, const SkinningGrads& g, const float* blended, size_t begin, size_t end) {
-    for (size_t n = begin; n < end; ++n)
-        for (size_t t = 0; t < s.times; ++t) {
+    for (size_t t = 0; t < s.times; ++t)
+        for (size_t n = begin; n < end; ++n) {
             const float* p = s.position + t * s.position_step + n * 3;
             const float* b = blended + (t * s.points + n) * 16;
-            float by_blended[16] = {}, by_position[3] = {};
-            if (g.blended) __builtin_memcpy(by_blended, g.blended + (t * s.points + n) * 16, sizeof by_blended);
+            // Rows of the blended matrix's gradient; narrow vectors, which are read back as they were written.
+            F4 by_row[4] = {}, by_position = {};
+            if (g.blended) __builtin_memcpy(by_row, g.blended + (t * s.points + n) * 16, sizeof by_row);
             if (g.moved) {
                 const float* v = g.moved + (t * s.points + n) * 3;
+                const F4 at = {p[0], p[1], p[2], 1.f};
                 for (int r = 0; r < 3; ++r) {
-                    for (int c = 0; c < 3; ++c) {
-                        by_blended[4 * r + c] += v[r] * p[c];
-                        by_position[c] += v[r] * b[4 * r + c];
-                    }
-                    by_blended[4 * r + 3] += v[r];
+                    F4 row;
+                    __builtin_memcpy(&row, b + 4 * r, sizeof row);
+                    by_row[r] += v[r] * at;
+                    by_position += v[r] * row;
                 }
             }
             if (g.position) {
@@ -57,6 +67,8 @@ void skin_backward(const Skinning& s, const SkinningGrads& g, const float* blend
                 for (int c = 0; c < 3; ++c) out[c] = by_position[c] + (t && !s.position_step ? out[c] : 0.f);
             }
             if (g.weight) {
+                float by_blended[16];
+                __builtin_memcpy(by_blended, by_row, sizeof by_blended);
                 const float* columns = g.bones_columns + t * 16 * g.padded_joints;
                 float* out = g.weight + t * s.weight_step + n * s.joints;
                 for (size_t j = 0; j < s.joints; j += 16) {
@@ -72,9 +84,14 @@ void skin_backward(const Skinning& s, const SkinningGrads& g, const float* blend
             if (g.bones) {
                 const float* weight = s.weight + t * s.weight_step + n * s.joints;
                 float* out = g.bones + t * s.joints * 16;
-                for (size_t j = 0; j < s.joints; ++j)
-#pragma GCC ivdep
-                    for (int i = 0; i < 16; ++i) out[16 * j + i] += weight[j] * by_blended[i];
+                for_joints(weight, s.joints, [&](size_t j) {
+                    for (int r = 0; r < 4; ++r) {
+                        F4 row;
+                        __builtin_memcpy(&row, out + 16 * j + 4 * r, sizeof row);
+                        row += weight[j] * by_row[r];
+                        __builtin_memcpy(out + 16 * j + 4 * r, &row, sizeof row);
+                    }
+                });
             }
         }
 }

@@ -4,6 +4,7 @@
 #include "isometry.h"
 #include "picture.h"
 #include "posing.h"
+#include "shadow.h"
 #include "surface_light.h"
 
 using namespace evsplat;
@@ -210,7 +211,7 @@ SurfaceLight light_on(const In& transforms, const In& normals, const In& places,
     const size_t times = places.shape(0), points = places.shape(1), count = lamps.size() / 3;
     require(transforms.size() == times * points * 16 && normals.size() == points * 3, "the surface");
     require(coefficients.size() == size_t(kLightCoefficients), "the coefficients");
-    require(lamps.size() == count * 3 && intensities.size() == count * 3, "the lamps");
+    require(lamps.size() == count * 3 && intensities.size() == count * 3 && count <= size_t(kMaxLamps), "the lamps");
     const size_t lit_times = lit && lit->ndim() == 3 ? lit->shape(1) : 1;
     require(!lit || (lit->ndim() == 3 && lit->shape(0) == count && (lit_times == 1 || lit_times == times) &&
                      lit->shape(2) == points),

@@ -112,8 +112,7 @@ void surface_light(const SurfaceLight& job, size_t begin, size_t end, float* fac
 void surface_light_backward(const SurfaceLight& job, size_t begin, size_t end, const float* above, float* sums,
                             float* lit) {
     F coefficients[kLightCoefficients] = {};
-    float* lamp_sums = sums + kLightCoefficients;
-    for (int i = 0; i < 6 * job.lamps; ++i) lamp_sums[i] = 0.f;
+    F lamp_sums[6 * kMaxLamps] = {};
     for (size_t n = begin; n < end; n += W) {
         const uint32_t count = lanes(n, end);
         for (size_t t = 0; t < job.times; ++t) {
@@ -148,13 +147,14 @@ void surface_light_backward(const SurfaceLight& job, size_t begin, size_t end, c
                                select(b.square > kLampNearest * kLampNearest, by_beam * light * 2.f / b.square, F{});
                 const F grow = by_beam * b.facing * b.near * (2.f / b.own);
                 for (int r = 0; r < 3; ++r) {
-                    lamp_sums[3 * l + r] += sum(turn * s.normal[r] - away * b.ray[r] + grow * b.from_center[r]);
-                    lamp_sums[3 * (job.lamps + l) + r] += sum(g[r] * light * share);
+                    lamp_sums[3 * l + r] += turn * s.normal[r] - away * b.ray[r] + grow * b.from_center[r];
+                    lamp_sums[3 * (job.lamps + l) + r] += g[r] * light * share;
                 }
             }
         }
     }
     for (int i = 0; i < kLightCoefficients; ++i) sums[i] = sum(coefficients[i]);
+    for (int i = 0; i < 6 * job.lamps; ++i) sums[kLightCoefficients + i] = sum(lamp_sums[i]);
 }
 
 }  // namespace EVSPLAT_LEVEL

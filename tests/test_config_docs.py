@@ -107,7 +107,7 @@ TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
 @given(
     st.builds(
         Config,
-        st.builds(Lamps, count=st.integers(1), width=st.floats(1e-300, 1e300)),
+        st.builds(Lamps, count=st.integers(1, 2**53), width=st.floats(1e-300, 1e300)),
         st.booleans(),
         more=st.builds(MoreLamps, names=st.lists(TEXTS).map(tuple)),
         weight=st.floats(allow_nan=False, allow_infinity=False),

@@ -1,21 +1,27 @@
-"""Files are written whole or not at all, to where links lead; what cannot be read says why."""
+"""Files are written whole or not at all, to where links lead."""
 
+import ctypes
+import errno
 import os
+import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
 import pytest
 
-from evsplat.errors import ConfigError, DataError
-from evsplat.files import atomic_path, read_json, read_text, write_json, write_text
-
-
-def refused(path: Path) -> str:
-    with pytest.raises(DataError) as error:
-        read_json(path)
-    message = str(error.value)
-    assert message.startswith(f"{path}: ") and "\n" not in message
-    return message
+from evsplat import disk
+from evsplat.disk import held, is_held
+from evsplat.errors import DataError, OutputError
+from evsplat.files import (
+    atomic_path,
+    new_folder,
+    remove_folder,
+    try_target,
+    write_json,
+    write_text,
+)
 
 
 def test_an_interrupted_writer_leaves_the_old_file(tmp_path: Path) -> None:
@@ -71,39 +77,201 @@ def test_a_writer_refuses_a_folder_and_a_link_to_itself(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "loop"]
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b'{"a": ', "not valid JSON (Expecting value: line 1"),
-        (b"[" * 5_000, "not valid JSON (nested too deeply); repair it"),
-        (b'{"a":' * 5_000, "not valid JSON (nested too deeply)"),
-        (b"1" * 5_000, "value has 5000 digits); repair it or write it anew."),
-        (b"\xff\xfe", "not a text in UTF-8"),
-    ],
-)
-def test_broken_json_is_one_sentence(tmp_path: Path, content: bytes, said: str) -> None:
-    (tmp_path / "a.json").write_bytes(content)
-    assert said in refused(tmp_path / "a.json")
+LEAVES_A_HALF = """
+import os, signal, sys
+from pathlib import Path
+from evsplat.files import atomic_path, new_folder
+with new_folder(Path(sys.argv[1]) / "folder") as folder:
+    (folder / "a").write_text("half")
+    with atomic_path(Path(sys.argv[1]) / "file.txt") as temporary:
+        temporary.write_text("half")
+        if sys.argv[2] == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        print("written", flush=True)
+        sys.stdin.read()
+"""
 
 
-def test_what_is_no_file_is_said_to_be_none(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text("{}")
-    assert refused(tmp_path / "no.json").endswith("no.json: file not found.")
-    assert refused(tmp_path / "a.json" / "b").endswith("b: file not found.")
-    assert refused(tmp_path).endswith("a folder, expected a file; correct the path.")
-    assert "File name too long" in refused(tmp_path / ("x" * 300))
+def writing(folder: Path, end: str) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-c", LEAVES_A_HALF, str(folder), end]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
-def test_a_file_that_may_not_be_read_is_not_called_broken(
+def test_what_killed_writers_left_is_swept_and_what_living_ones_write_stays(tmp_path: Path) -> None:
+    (tmp_path / ".evsplat-mine").touch()  # no name of ours
+    assert writing(tmp_path, "die").wait(60) == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 3
+    living = writing(tmp_path, "wait")
+    assert living.stdout is not None and living.stdout.readline() == "written\n"
+    left = {path.name for path in tmp_path.iterdir()}
+    assert len(left) == 3, "the living one swept what the dead one left"
+    disk._swept.clear()
+    write_text(tmp_path / "other.txt", "new")
+    assert {path.name for path in tmp_path.iterdir()} == left | {"other.txt"}
+    living.communicate("")
+    assert living.returncode == 0
+    assert {path.name for path in tmp_path.iterdir()} == {
+        ".evsplat-mine",
+        "other.txt",
+        "file.txt",
+        "folder",
+    }
+
+
+INTERRUPTED_TWICE = """
+import os, signal, sys
+from pathlib import Path
+from evsplat.files import atomic_path
+unlink = os.unlink
+def interrupted(*arguments, **rest):
+    raise KeyboardInterrupt
+os.unlink = interrupted
+try:
+    with atomic_path(Path(sys.argv[1]) / "a"):
+        raise ValueError
+except KeyboardInterrupt:
+    os.unlink = unlink
+"""
+
+
+def test_ctrl_c_in_the_midst_of_removing_leaves_nothing_at_the_end(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", INTERRUPTED_TWICE, str(tmp_path)]
+    (tmp_path / ".evsplat-mine").touch()
+    subprocess.run(command, check=True, timeout=60)
+    assert [path.name for path in tmp_path.iterdir()] == [".evsplat-mine"]
+
+
+def test_an_encoder_that_writes_beside_its_path_is_a_fault(tmp_path: Path) -> None:
+    """Its file would neither be locked nor on the disk."""
+    with pytest.raises(AssertionError), atomic_path(tmp_path / "a") as temporary:
+        (tmp_path / "own").write_text("x")
+        (tmp_path / "own").replace(temporary)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_named_like_a_left_over_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "a").touch()
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / ".evsplat-aaaaaaaa-aaaaaaaa.part").symlink_to(tmp_path / "precious")
+    write_text(tmp_path / "in" / "x", "")
+    assert (tmp_path / "precious" / "a").exists()
+
+
+def test_what_takes_a_name_is_on_the_disk_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def denied(*_: object, **__: object) -> str:
-        # as the system does, which lets root read everything
-        raise PermissionError(13, "Permission denied")
+    done: list[str] = []
+    flush, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (done.append("fsync"), flush(handle)))
+    monkeypatch.setattr(os, "replace", lambda a, b: (done.append("replace"), replace(a, b)))
+    write_text(tmp_path / "a", "x")
+    assert done == ["fsync", "replace", "fsync"], "the file, its name, the folder"
+    done.clear()
+    with new_folder(tmp_path / "folder") as folder:
+        (folder / "in").mkdir()
+        (folder / "in" / "a").touch()
+    assert done.count("fsync") == 4, "the file, both folders, the folder around"
 
-    monkeypatch.setattr(Path, "read_text", denied)
-    assert refused(tmp_path / "a.json").endswith(
-        "a.json: may not be read; give yourself the permission to read it."
-    )
-    with pytest.raises(ConfigError, match="a.yaml: may not be read"):
-        read_text(tmp_path / "a.yaml", error=ConfigError)
+
+@pytest.mark.parametrize("exchanges", [True, False])
+def test_a_folder_is_replaced_whole_and_a_link_to_it_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: bool
+) -> None:
+    if not exchanges:
+        monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "a").touch()
+    (tmp_path / "link").symlink_to("old")
+    with new_folder(tmp_path / "link", replace=True) as folder:
+        (folder / "b").touch()
+        assert (tmp_path / "link" / "a").exists()
+    assert [path.name for path in (tmp_path / "old").iterdir()] == ["b"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "old"]
+
+
+def test_a_folder_that_is_a_link_is_not_removed(tmp_path: Path) -> None:
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "link").symlink_to("precious")
+    with pytest.raises(DataError, match="link: is a link to another folder, so it stays"):
+        remove_folder(tmp_path / "link")
+    remove_folder(tmp_path / "precious")
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
+
+
+def test_folders_made_for_nothing_go_again(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), atomic_path(tmp_path / "a" / "b" / "c.txt"):
+        raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError), new_folder(tmp_path / "d" / "e"):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "said", "no_room"),
+    [
+        (errno.ENOSPC, "not written, the disk is full; make room there", True),
+        (errno.EDQUOT, "not written, the disk is full", True),
+        (errno.EFBIG, "not written, files may not grow so large here", True),
+        (errno.EROFS, "lies on a disk that is read-only; write elsewhere", False),
+    ],
+)
+def test_a_write_that_fails_is_one_sentence(
+    tmp_path: Path, number: int, said: str, no_room: bool
+) -> None:
+    with pytest.raises(OutputError) as error, atomic_path(tmp_path / "a.bin"):
+        raise OSError(number, os.strerror(number))
+    assert str(error.value).startswith(f"{tmp_path / 'a.bin'}: {said}")
+    assert error.value.no_room == no_room and list(tmp_path.iterdir()) == []
+
+
+def test_a_read_that_fails_while_something_is_written_is_not_the_output_s_fault(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "a"):
+        (tmp_path / "source").read_text()
+
+
+def test_a_target_is_tried_and_stays_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("old")
+    for target in ("file", "new/deep/file", "."):
+        try_target(tmp_path / target)
+    try_target("/dev/null")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "old"
+    with pytest.raises(OutputError, match="a file is where a folder is needed"):
+        try_target(tmp_path / "file" / "in")
+    with pytest.raises(OutputError, match="the name is too long"):
+        try_target(tmp_path / ("x" * 300))
+    with pytest.raises(OutputError, match="MB are free on its disk, expected 1000000000000.0 MB"):
+        try_target(tmp_path / "run", 10**18)
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.EACCES, "may not be written; give yourself"),
+        (errno.EROFS, "a disk that is read-only"),
+    ],
+)
+def test_a_target_without_permission_is_found_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, said: str
+) -> None:
+    def denied(*_: object) -> None:
+        # as the system does, which lets root write everywhere
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("tempfile.mkstemp", denied)
+    with pytest.raises(OutputError, match=said):
+        try_target(tmp_path / "out")
+
+
+def test_a_lock_is_held_once_and_ends_with_its_holder(tmp_path: Path) -> None:
+    sign = tmp_path / "sign"
+    assert not is_held(sign)
+    with held(sign):
+        assert is_held(sign) and sign.read_text() == str(os.getpid())
+        with pytest.raises(BlockingIOError) as error, held(sign):
+            pass
+        assert error.value.strerror == str(os.getpid())
+    assert sign.exists() and not is_held(sign)

@@ -21,6 +21,7 @@ SEE_EVERYTHING |= {
     "masks.capture",
     "restore.capture",
     "posing.find",
+    "importers.poses",
     "training.run",
     "training.train",
 }

@@ -14,7 +14,8 @@ from PIL import Image
 
 from evsplat.capture import validate_capture
 from evsplat.events import EventStore, EventStream, write_events
-from evsplat.files import atomic_path, read_json, write_json
+from evsplat.files import atomic_path, write_json
+from evsplat.untrusted.text import read_json
 
 TIME_QUANTUM_US = 500
 

@@ -9,9 +9,9 @@ from PIL import Image
 
 from evsplat.capture import Capture
 from evsplat.export import render_run
-from evsplat.files import read_json
 from evsplat.pictures import to_bytes
 from evsplat.training import load_run
+from evsplat.untrusted.text import read_json
 
 OUT = Path(__file__).parents[1] / "docs" / "images"
 EXPOSURE = 4

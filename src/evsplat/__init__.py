@@ -10,7 +10,7 @@ The verbs of the command line are functions here, imported on first use:
 
 ``evsplat render`` is `render_run` here, ``view`` is `view_run`, ``export`` is `export_run`,
 ``restore`` is `restore_capture`, ``masks`` is `mask_capture` and ``poses`` is `find_poses`: the
-first words are names of packages.
+first words are names of packages. ``import poses`` is `attach_poses`.
 """
 
 import os
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from evsplat.events.convert import convert_recording as convert
     from evsplat.export import export_run, render_run
     from evsplat.footage.simulate import simulate
-    from evsplat.importers import import_capture
+    from evsplat.importers import attach_poses, import_capture
     from evsplat.inspection import inspect
     from evsplat.masks import mask_capture
     from evsplat.posing import find_poses
@@ -49,6 +49,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Policy",
     "__version__",
+    "attach_poses",
     "bench",
     "convert",
     "demo",
@@ -72,6 +73,7 @@ __all__ = [
 
 _LAZY = {
     "Policy": "evsplat.capture:Policy",
+    "attach_poses": "evsplat.importers:attach_poses",
     "bench": "evsplat.benching.run:bench",
     "convert": "evsplat.events.convert:convert_recording",
     "demo": "evsplat.cli.runs:demo",

@@ -29,6 +29,12 @@ class Camera:
         """The same camera with its pose on ``device``; K stays where it is read, on the CPU."""
         return replace(self, world_to_camera=send(self.world_to_camera, device))
 
+    def with_focal(self, focal_px: float) -> "Camera":
+        """The same camera with another focal length, pixels being square."""
+        K = self.K.clone()
+        K[0, 0] = K[1, 1] = focal_px
+        return replace(self, K=K)
+
     def project(
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:

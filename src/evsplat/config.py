@@ -14,16 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import yaml
-
 from evsplat.errors import ConfigError
-from evsplat.files import read_text, without_advice
+from evsplat.untrusted.faults import brief
+from evsplat.untrusted.text import parse_yaml, read_text
 
 Config = TypeVar("Config")
-_DEEPEST = 50
-"""Levels of a YAML text; settings have a handful."""
-_MISFITS = (TypeError, KeyError, IndexError, AttributeError, OverflowError)
-"""What PyYAML raises, besides `ValueError` and its own errors, on tags such as ``!!bool 3``."""
+_LARGEST = 2**53
+"""Integers up to here are exact as doubles."""
+_LONGEST_NAME = 80
+"""Of a setting in a message; those that there are have 40."""
 _MOST_NAMED = 5
 """Unknown settings that one message names."""
 
@@ -192,7 +191,7 @@ def load_yaml(path: Path | str) -> dict[str, Any]:
     """Read a YAML mapping; anything else is a `ConfigError` that names the file."""
     path = Path(path)
     try:
-        values = _parse_yaml(read_text(path, error=ConfigError))
+        values = parse_yaml(read_text(path, error=ConfigError))
     except ValueError as error:
         raise ConfigError(f"{path}: not valid YAML ({error}); correct it.") from None
     if not isinstance(values, dict):
@@ -204,41 +203,22 @@ def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, An
     """Apply ``section.key=value`` assignments (values in YAML) to nested dictionaries."""
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
+        printable = assignment.isprintable() and len(assignment) <= _LONGEST_NAME
+        shown = assignment if printable else brief(assignment)
         if not equals or not key:
-            raise ConfigError(
-                f"--set {assignment}: expected KEY=VALUE, such as --set event_start=1000."
-            )
+            raise ConfigError(f"--set {shown}: expected KEY=VALUE, such as --set event_start=1000.")
         try:
-            value = _parse_yaml(text)
+            value = parse_yaml(text)
         except ValueError:
-            raise ConfigError(f"--set {assignment}: {text!r} is not a YAML value.") from None
+            raise ConfigError(f"--set {shown}: {brief(text)} is not a YAML value.") from None
         *sections, last = key.split(".")
         place = values
         for section in sections:
             place = place.setdefault(section, {})
             if not isinstance(place, dict):
-                raise ConfigError(f"--set {assignment}: {section!r} is a value, not a section.")
+                raise ConfigError(f"--set {shown}: {brief(section)} is a value, not a section.")
         place[last] = value
     return values
-
-
-def _parse_yaml(text: str) -> Any:
-    """The value that a YAML text stands for; all that can be wrong with it is a `ValueError`."""
-    depth = 0
-    try:
-        # These come one by one, so that a text of brackets costs no more than its first few.
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > _DEEPEST:
-                raise ValueError(f"nested more than {_DEEPEST} deep")
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(str(error)) from None
-    except ValueError as error:
-        raise ValueError(without_advice(error)) from None
-    except _MISFITS:
-        raise ValueError("a tag that its value does not fit") from None
 
 
 def expected(hint: Any, ranges: Sequence[Range] = (), *, many: bool = False) -> str:
@@ -310,7 +290,9 @@ def _convert(
         converted = _float(value)
         fits = converted is not None
     else:
-        fits = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
+        fits = isinstance(value, kind)
+        if kind is int and fits:
+            fits = not isinstance(value, bool) and abs(value) <= _LARGEST
     if not fits or (kind in (int, float) and not all(converted in r for r in ranges)):
         raise _wrong(where, key, value, expected(kind, ranges))
     return converted
@@ -370,7 +352,8 @@ def _unknown(
     hints = get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind)]
     for name, item in values.items():
-        full = f"{prefix}{name}"
+        full = f"{prefix}{name}" if str(name).isprintable() else f"{prefix}{name!r}"
+        full = full if len(full) <= _LONGEST_NAME else brief(full)
         if full in dropped:
             parts = [f"{full}.{key}" for key in item] if isinstance(item, dict) else []
             named = [part for part in parts if part in dropped]
@@ -410,6 +393,8 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _wrong(where: str, key: str, value: Any, expected: str) -> ConfigError:
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        expected = expected.replace("an integer", f"an integer of at most {_LARGEST}")
     if isinstance(value, float) and not math.isfinite(value):
         expected = expected.replace("a number", "a finite number")
-    return ConfigError(f"{where}: {key} is {value!r}; expected {expected}.")
+    return ConfigError(f"{where}: {key} is {brief(value)}; expected {expected}.")

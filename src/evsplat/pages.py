@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from evsplat.errors import DataError
+from evsplat.untrusted.pictures import read_picture
 
 Item = TypeVar("Item")
 
@@ -108,13 +108,11 @@ class Embedder:
         )
 
 
-def read_picture(path: Path, remedy: str) -> UInt8[np.ndarray, "H W 3"]:
+def read_rgb(path: Path, remedy: str) -> UInt8[np.ndarray, "H W 3"]:
     """A picture that was written by an evaluation; ``remedy`` says what to do without it."""
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-    except OSError as error:
-        raise DataError(f"{path}: not readable ({error}); {remedy}.") from None
+    return read_picture(
+        path, lambda image: np.asarray(image.convert("RGB")), fault="not readable", remedy=remedy
+    )
 
 
 def data_uri(content: bytes, media_type: str) -> str:

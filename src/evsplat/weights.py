@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from evsplat.errors import WeightsError
+from evsplat.untrusted.faults import ordinary_file
+from evsplat.untrusted.tensors import load_torch
 
 
 class MissingWeights(WeightsError):
@@ -26,10 +27,9 @@ def sha256_of(path: Path) -> str:
 
 def read_state(path: Path) -> dict[str, Any]:
     """A state dict read without running anything that the file may contain."""
+    ordinary_file(path, error=WeightsError)
     try:
-        state = torch.load(
-            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
-        )
+        state = load_torch(path)
     except Exception as error:  # torch raises many kinds for files that are not its own
         raise WeightsError(f"{path}: not a readable PyTorch weight file ({error}).") from error
     if not isinstance(state, dict):

@@ -20,10 +20,10 @@ from evsplat.capture import Policy, load_capture
 from evsplat.cli import main
 from evsplat.errors import ConfigError
 from evsplat.evaluation import evaluate
-from evsplat.files import read_json
 from evsplat.training import load_run
 from evsplat.training.checkpoint import latest_checkpoint
 from evsplat.training.trainer import Trainer
+from evsplat.untrusted.text import read_json
 
 from ..small_model import SMALL
 from .helpers import MEDIAN, PAPER, records, write_suite

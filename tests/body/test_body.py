@@ -136,14 +136,17 @@ def test_skinning_gradients_reach_points_weights_and_bones():
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("point_times", [1, 3])
 @pytest.mark.parametrize("weight_times", [1, 3])
+@pytest.mark.parametrize("share", [1.0, 0.15])
 def test_compiled_skinning_and_its_gradients_equal_plain_torch_in_float64(
-    seed, point_times, weight_times
+    seed, point_times, weight_times, share
 ):
+    """Whether points hang on all joints or on a few."""
     generator = torch.Generator().manual_seed(seed)
     shapes = ((point_times, 700, 3), (weight_times, 700, 17), (3, 17, 4, 4), (3, 700, 3))
     *inputs, by_moved, by_blended = (
         torch.randn(shape, generator=generator) for shape in (*shapes, (3, 700, 4, 4))
     )
+    inputs[1] *= torch.rand(inputs[1].shape, generator=generator) < share
     results = []
     for dtype in (torch.float32, torch.float64):
         leaves = [value.to(dtype).requires_grad_() for value in inputs]

@@ -13,6 +13,7 @@ from evsplat.calibration import (
     SensorEstimate,
     estimate_from_pairs,
     exposure,
+    noise_of,
     pair,
     pair_indices,
 )
@@ -203,3 +204,44 @@ def test_simulated_events_of_shared_captures_lag_little(captures_root: Path, nam
     assert abs(found.clock.lag_us) < 1_500
     assert found.thresholds.plus == pytest.approx(0.2, rel=0.15)
     assert found.thresholds.minus == pytest.approx(0.2, rel=0.15)
+
+
+class LongRecording:
+    """An hour of background activity and a hot pixel, made when it is asked for."""
+
+    width, height, rate_hz, hour_us = 40, 30, 40, 3_600_000_000
+    stretches_us = ((0, hour_us // 2), (hour_us // 2 + 1_000, hour_us))
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, int]] = []
+
+    def __len__(self) -> int:
+        return self.rate_hz * self.width * self.height * 3_600
+
+    def between(self, start: int, end: int) -> EventStream:
+        assert any(low <= start < end <= high for low, high in self.stretches_us)
+        self.asked.append((start, end))
+        rng = np.random.default_rng(start % 2**32)
+        count = rng.poisson(self.rate_hz * self.width * self.height * (end - start) / 1e6)
+        hot = int(900 * (end - start) / 1e6)
+        t = np.sort(rng.integers(start, end, count + hot))
+        place = np.concatenate([rng.integers(0, self.width * self.height, count), np.full(hot, 77)])
+        y, x = np.divmod(rng.permutation(place), self.width)
+        p = rng.choice([-1, 1], len(t))
+        return EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
+
+
+@pytest.mark.parametrize(
+    ("during_us", "most", "pieces"), [(None, 10**9, 60), ((10**9, 10**9 + 9 * 10**6), 10**5, 9)]
+)
+def test_noise_of_an_hour_is_that_of_sixty_pieces(monkeypatch, during_us, most, pieces) -> None:
+    monkeypatch.setattr("evsplat.calibration.noise._MOST_EVENTS", most)
+    recording = LongRecording()
+    found = noise_of(recording, *([during_us] if during_us else []))
+    assert len(recording.asked) == pieces
+    start, end = during_us or (0, recording.hour_us)
+    assert all(start <= first < last <= end for first, last in recording.asked)
+    seconds = sum(last - first for first, last in recording.asked) / 1e6
+    assert seconds * recording.rate_hz * recording.width * recording.height < 1.2 * most
+    assert found.background_hz == pytest.approx(recording.rate_hz, rel=0.1)
+    assert found.hot_pixels.tolist() == [[77 - 40, 1]]

@@ -1,6 +1,7 @@
 """The validator: one test per kind of fault; good captures have no findings."""
 
 import json
+import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -315,6 +316,22 @@ def test_unknown_key_names_the_nearest(
             "-0.2",
             "positive",
         ),
+        *(
+            (("events", "contrast_threshold"), [c, c], "events.contrast_threshold", str(c), "0.001")
+            for c in (1e-30, 1e6)
+        ),
+        *(
+            (
+                ("cameras", "main", "K", 0, 0),
+                f,
+                "cameras.main.K",
+                f"{f:g}",
+                "times the shorter",
+            )
+            for f in (1e-6, 1e9)
+        ),
+        (("cameras", "side", "width"), 20_000, "cameras.side.width", "20000", "at most 16384"),
+        (("frames", 9, "exposure_us"), [360_000, 10**9], "frames[9].exposure_us", "", "a minute"),
         (("events", "clock_offset_us"), 1.5, "events.clock_offset_us", "1.5", "whole number"),
         (("events", "simulated"), "yes", "events.simulated", "'yes'", "true or false"),
     ],
@@ -447,18 +464,17 @@ def test_a_picture_too_large_to_be_decoded_is_refused(tiny_capture: Factory) -> 
 def test_files_that_may_not_be_read_are_not_to_be_written_anew(
     tiny_capture: Factory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def denied(*_: Any, **__: Any) -> Any:
-        # as the system does, which lets root read everything
-        raise PermissionError(13, "Permission denied")
-
     path = tiny_capture()
-    for reader in ("PIL.Image.open", "numpy.load", "h5py.File"):
+    allowed = os.access
+    for name in ("png", "npz", "h5"):
+        # as the system says, which lets root read everything
+        denied = lambda file, mode: not str(file).endswith(name) and allowed(file, mode)  # noqa: B023, E731
         with monkeypatch.context() as patch:
-            patch.setattr(reader, denied)
+            patch.setattr(os, "access", denied)
             findings = validate_capture(path, deep=False)
         assert findings and all(finding.severity == "error" for finding in findings)
         for finding in findings:
-            assert finding.remedy == "Give yourself the permission to read it.", reader
+            assert finding.remedy == "Give yourself the permission to read it.", name
 
 
 def test_pairing_by_sort_order_is_noticed(tiny_capture: Factory) -> None:
@@ -612,6 +628,8 @@ def set_at(index: int, value: int) -> Callable[[np.ndarray], np.ndarray]:
         ("events/y", set_at(40, 999), "events/y[40]", "999 (1 of", "below 24", False),
         ("events/p", set_at(50, 2), "events/p[50]", "2 (1 of", "0 (darker) or 1", False),
         ("ms_to_idx", set_at(100, 7), "ms_to_idx[100]", "7", "t >= 100000", False),
+        ("ms_to_idx", lambda a: a * 0 + a.max(), "ms_to_idx[0]", "", "t >= 0", True),
+        ("ms_to_idx", lambda a: a + 1, "ms_to_idx[0]", "1", "t >= 0", True),
         ("ms_to_idx", None, "ms_to_idx", "nothing", "a data set", True),
         ("t_offset", None, "t_offset", "nothing", "a data set", True),
         ("events/p", None, "events/p", "nothing", "a data set", True),

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
@@ -111,6 +112,24 @@ def test_ctrl_c_is_code_130_and_says_how_to_go_on(capsys, monkeypatch, tmp_path)
     assert code == 130
     assert f"evsplat train 'my capture' --out '{tmp_path}/my run' --resume" in stderr
     assert "Traceback" not in stderr
+
+
+def test_the_demo_trains_on_poses_that_were_found(capsys, monkeypatch, tmp_path):
+    import evsplat.posing
+    import evsplat.training
+
+    def found(capture, out, search, **_):
+        assert capture == demo_capture()
+        return SimpleNamespace(summary=f"found: {out}")
+
+    def stopped(capture, options, **_):
+        raise evsplat.training.Stopped(capture)
+
+    monkeypatch.setattr(evsplat.posing, "find_poses", found)
+    monkeypatch.setattr(evsplat.training, "train", stopped)
+    _, stdout, stderr = _outcome(capsys, "demo", "--find-poses")
+    assert "found: captures/demo_" in stdout
+    assert f"--out {stdout.split()[1]} --resume" in stderr
 
 
 def test_ctrl_c_during_evaluation_says_that_the_training_is_safe(capsys, monkeypatch, tmp_path):

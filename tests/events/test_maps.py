@@ -17,6 +17,7 @@ from evsplat.events import (
     polarity_counts,
     time_surface,
     voxel_grid,
+    window_counts,
 )
 
 WIDTH, HEIGHT = 19, 13
@@ -178,6 +179,23 @@ def test_what_has_begun_is_that_of_each_pixel_alone(
                 expected[row, channel, y, x] = (now - stream.t[a]) / gap
     begun = begun_counts(stream, at, HEIGHT, WIDTH, reach_us=reach_us)
     assert np.allclose(begun.numpy(), expected, atol=1e-6)
+
+
+@given(st.integers(0, 10_000), st.integers(0, 2_000), st.integers(2, 5), st.integers(-9, 9_000))
+def test_counts_of_windows_are_those_of_each_and_what_has_begun(
+    seed: int, count: int, times: int, reach_us: int
+) -> None:
+    stream = random_stream(seed, count)
+    at = np.sort(np.random.default_rng(seed).integers(0, 25_000, times)).tolist()
+    maps = [
+        polarity_counts(stream.between(*ends), HEIGHT, WIDTH) for ends in itertools.pairwise(at)
+    ]
+    expected = torch.stack(maps)
+    if reach_us > 0:
+        begun = begun_counts(stream, at, HEIGHT, WIDTH, reach_us=reach_us)
+        expected = expected + begun[1:] - begun[:-1]
+    counts = window_counts(stream, at, HEIGHT, WIDTH, reach_us=reach_us)
+    assert (counts - expected).abs().max() < 1e-5
 
 
 def test_nothing_has_begun_between_opposite_or_distant_events() -> None:

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from evsplat.errors import DataError
+from evsplat.errors import DataError, HeldOutError
 from evsplat.events import EventStore, EventStream, write_events
+from evsplat.events import store as store_module
 
 WIDTH, HEIGHT = 24, 18
 
@@ -138,6 +139,38 @@ def test_memory_of_a_slice_does_not_grow_with_the_recording(tmp_path: Path) -> N
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.5 * peaks[0]
+
+
+def test_kept_events_are_those_on_disk_in_bounded_memory(tmp_path: Path) -> None:
+    path, rows = tmp_path / "events.h5", store_module._KEPT_BLOCK
+    write_events(path, random_events(7, 4 * rows, 900_000))
+    lookup = np.random.default_rng(0).integers(-1, 5, (HEIGHT, WIDTH, 2)).astype(np.int32)
+    spans = [(-100, 200_001), (400_000, 401_000), (500_003, 2_000_000)]
+    for options in ({}, {"pixel_lookup": lookup}):
+        store = EventStore(path, WIDTH, HEIGHT, 500, **options, readable_us=spans)
+        kept = store.keeping(2 * rows * 13)
+        for start, end in (
+            (0, 200_001),
+            (400_100, 400_900),
+            (500_003, 950_000),
+            (600_000, 600_000),
+        ):
+            assert same(kept.between(start, end), store.between(start, end))
+            assert same(kept.between(start, end), store.between(start, end))
+            assert len(kept._kept) <= 2
+        with pytest.raises(HeldOutError):
+            kept.between(0, 300_000)
+    assert same(pickle.loads(pickle.dumps(kept)).between(0, 9_000), store.between(0, 9_000))
+
+
+def test_disordered_events_between_kept_blocks_are_never_returned(tmp_path: Path) -> None:
+    path, rows = tmp_path / "events.h5", store_module._KEPT_BLOCK
+    write_events(path, random_events(4, rows + 100, 90_000))
+    with h5py.File(path, "r+") as file:
+        file["events/t"][rows] = file["events/t"][rows - 1] - 1
+    store = EventStore(path, WIDTH, HEIGHT).keeping(1 << 30)
+    with pytest.raises(DataError, match="is not ascending"):
+        store.between(*store.time_range_us)
 
 
 def test_disordered_events_are_never_returned(tmp_path: Path) -> None:

@@ -57,6 +57,9 @@ class _Recording:
     def transfer(self, frame: Frame) -> str:
         return "power"
 
+    def shown(self, values: torch.Tensor) -> torch.Tensor:
+        return values
+
     def camera(self, frame: Frame) -> Camera:
         camera = self.cameras[frame.camera]
         if frame.world_to_camera is None:

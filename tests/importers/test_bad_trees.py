@@ -15,7 +15,8 @@ from evsplat.body.smpl import ENVIRONMENT
 from evsplat.cli import main
 from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.importers import KINDS, import_capture
-from evsplat.safe_pickle import read_npy, read_npz, read_pickle
+from evsplat.untrusted.arrays import read_npy, read_npz
+from evsplat.untrusted.pickles import read_pickle
 
 from . import trees
 from .person import write_smpl

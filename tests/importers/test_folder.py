@@ -163,7 +163,7 @@ FAULTS = {
         lambda root: None,
         {"fps": 25.0, "exposure_us": 3e4, "no_poses": True, "poses": Path("poses.npz")},
         ConfigError,
-        "--no-poses: contradicts --poses poses.npz",
+        "--poses poses.npz: contradicts --no-poses",
     ),
     "no camera": (
         lambda root: (root / "camera.json").unlink(),

@@ -6,10 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evsplat import posing
 from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
+from evsplat.capture.derive import derived_capture
+from evsplat.cli.main import main
 from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.events import EventStream, write_events
 from evsplat.importers import import_capture
+from evsplat.options import PoseOptions
 from evsplat.pictures.video import write_video
 
 from ..events.formats.encoders import aedat4
@@ -120,6 +124,56 @@ def test_a_video_with_events_beside_it(tmp_path: Path) -> None:
     assert capture.events is not None and capture.events.time_range_us[0] == 0
     assert capture.provenance["focal"] == "calibrated"
     assert capture.transfer(capture.frames[0]) == "srgb"
+
+
+@pytest.fixture
+def finder(monkeypatch):
+    """A stand-in for the search, which takes most of the time; gives what it was asked for."""
+    asked = []
+
+    def found(path, out, search, overwrite):
+        asked.append((load_capture(path), search))
+        with derived_capture(load_capture(path), out, replace=overwrite) as making:
+            making.document["provenance"]["poses"] = "found"
+
+    monkeypatch.setattr(posing, "find_poses", found)
+    return asked
+
+
+def test_an_import_goes_on_to_find_poses_and_leaves_one_capture(
+    davis: Path, tmp_path: Path, finder: list
+) -> None:
+    out = tmp_path / "out"
+    for height, overwrite in ((1.7, False), (1.8, True)):
+        options = PoseOptions(height_m=height)
+        import_capture("davis", davis, out, find_poses=options, overwrite=overwrite)
+        assert load_capture(out).provenance["poses"] == "found"
+        capture, search = finder.pop()
+        assert not capture.has_body and capture.name == "out" and search.height_m == height
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["dance.aedat4", "out"]
+
+
+def test_where_no_poses_are_found_the_capture_without_them_stays(
+    davis: Path, tmp_path: Path, monkeypatch
+) -> None:
+    def nobody(path, out, search, overwrite):
+        raise DataError("nobody")
+
+    monkeypatch.setattr(posing, "find_poses", nobody)
+    out = tmp_path / "out"
+    import_capture("davis", davis, out, frames=(0, 5))
+    with pytest.raises(DataError, match="nobody"):
+        import_capture("davis", davis, out, find_poses=True, overwrite=True)
+    assert len(load_capture(out).frames) == 5, "what was there comes back"
+    assert len(load_capture(tmp_path / "out_unposed").frames) == COUNT
+    names = ["dance.aedat4", "out", "out_unposed"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+
+
+def test_options_of_poses_that_are_not_searched_for_are_refused(davis: Path, capsys) -> None:
+    command = ["import", "davis", str(davis), "--out", str(davis.with_name("out"))]
+    assert main([*command, "--height", "1.7"]) == 2
+    assert "belong to --find-poses" in capsys.readouterr().err
 
 
 def test_poses_of_a_data_set_can_be_left_out(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import torch
 
 from evsplat.capture import Policy, load_capture
 from evsplat.landmarks import BLAZEPOSE_33, COCO_17, OPENPOSE_25, WHOLEBODY_133, sharp_pictures
-from evsplat.landmarks.pictures import BLURRY_SIGMA, CARRIED_SIGMA
+from evsplat.landmarks.pictures import BLURRY_SIGMA, CARRIED_SIGMA, _blend
 from evsplat.pictures import decode, luminance
 
 WITH_EVENTS = Policy(held_out_events=True)
@@ -45,6 +45,16 @@ def test_carried_pictures_have_the_brightness_of_their_time(tiny_capture):
             truth = capture.sharp(capture.frames[picture.frame.index])
             image, near, true = (luminance(decode(x)) for x in (picture.image, before, truth))
             assert (image - true).abs().mean() < 0.75 * (near - true).abs().mean()
+
+
+def test_carried_pictures_are_in_doubt_where_two_exposures_disagree():
+    white, black = torch.ones(1, 2, 3), torch.zeros(1, 2, 3)
+    passed = torch.tensor([[0.0, 9.0]]), torch.tensor([[0.0, 0.0]])
+    mean, doubt = _blend([(white, passed[0]), (black, passed[1])], "power")
+    # Weights of one half each, and of 1 and 100.
+    torch.testing.assert_close(mean[0, :, 0], torch.tensor([1 / 2, 1 / 101]))
+    torch.testing.assert_close(doubt, torch.tensor([[1 / 4, 100 / 101**2]]))
+    assert not _blend([(white, passed[0])], "power")[1].any()
 
 
 def test_a_capture_without_a_body_has_the_same_pictures(tiny_capture):

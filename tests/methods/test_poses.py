@@ -93,6 +93,16 @@ def test_poses_that_err_are_smoothed_and_corrected_by_what_is_said_of_them(captu
     assert np.array_equal(off.track.poses, noisy)
 
 
+def test_poses_that_were_corrected_when_found_are_not_drawn_again(captures, monkeypatch):
+    monkeypatch.setattr(poses, "refine", lambda *_: pytest.fail("drawn again"))
+    file = captures[1].path / "capture.json"
+    document = json.loads(file.read_text())
+    document.setdefault("provenance", {})["poses"] = {"refinement": {"taken": False}}
+    file.write_text(json.dumps(document))
+    found = prepared(seen(load_capture(file.parent)))
+    assert found.correction is not None and not bool(found.correction.exact)
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("source", ["exact", "markers", "estimated"])
 def test_what_a_capture_says_of_its_poses_counts_whatever_their_curve(seed, source, tiny_capture):

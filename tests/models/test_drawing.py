@@ -7,7 +7,8 @@ import torch
 
 from evsplat.capture import load_capture
 from evsplat.errors import ConfigError
-from evsplat.models.drawing import _places, draw, shadowed_scene
+from evsplat.models.drawing import _enlarge, draw, shadowed_scene
+from evsplat.models.scene_places import places_of
 from evsplat.render import LOW_PASS, Splats, render
 
 from ..small_model import built, small_config
@@ -87,6 +88,17 @@ def test_a_shadow_darkens_the_scene_and_leaves_the_person(shadowed):
             assert torch.allclose(files.channels[time], scene.channels[0])
 
 
+def test_a_picture_does_not_depend_on_who_stands_where_in_the_one_before(shadowed):
+    model, _, camera = shadowed
+    times = [0, 40_000]
+    with torch.no_grad():
+        model.shadow.share_logits.fill_(1.0)
+        together = draw(model.at(times, camera.center()), camera).rgb
+        for time, picture in zip(times, together, strict=True):
+            alone = draw(model.at([time], camera.center()), camera).rgb[0]
+            assert (picture - alone).abs().max() < 1e-5
+
+
 def test_places_of_a_slanted_plane_are_on_it(shadowed):
     _, _, camera = shadowed
     turn = torch.linalg.qr(torch.randn(3, 3))[0]
@@ -103,12 +115,26 @@ def test_places_of_a_slanted_plane_are_on_it(shadowed):
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
     z = distance / (rays @ normal)
     share = torch.rand_like(z) * 0.01 + 0.5
-    places = _places(torch.stack([z * share, share], -1), camera, 2)
+    places = places_of(torch.stack([z * share, share], -1), camera, 2)
     local = places @ turn.T + pose[:3, 3]
     # The mean over two by two pixels is the depth in their middle, up to the plane's curvature.
     assert (local @ normal - distance).abs().max() < 0.01
     back, _ = camera.project(places.reshape(-1, 3))
     assert torch.allclose(back[0], torch.tensor([1.0, 1.0]), atol=1e-3)
+
+
+@pytest.mark.parametrize(("size", "step"), [((7, 9), 2), ((8, 10), 2), ((5, 11), 3), ((4, 6), 1)])
+def test_the_compiled_enlargement_is_torchs_and_so_is_its_gradient(shadowed, size, step):
+    camera = replace(shadowed[2], height=size[0], width=size[1])
+    small = torch.rand(3, -(-size[0] // step), -(-size[1] // step))
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = small.to(dtype, copy=True).requires_grad_()
+        large = _enlarge(leaf, camera, step)
+        weights = torch.arange(large.numel(), dtype=dtype).view(large.shape).cos()
+        results.append((large, *torch.autograd.grad((large * weights).sum(), leaf)))
+    for compiled, plain in zip(*results, strict=True):
+        assert compiled.shape == plain.shape and (compiled - plain).abs().max() < 2e-6
 
 
 def test_lights_get_a_gradient_from_the_picture(shadowed):

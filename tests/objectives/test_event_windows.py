@@ -1,14 +1,14 @@
 """Event windows: right thresholds explain what a changing picture did, wrong ones do not."""
 
-import itertools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from evsplat.events import ALWAYS, EventStream
+from evsplat.events import ALWAYS, EventStream, window_counts
 from evsplat.objectives import EventNoise, EventSensor, EventWindows
+from evsplat.pictures import luminance
 
 HEIGHT, WIDTH, EPS = 9, 11, 0.004
 
@@ -23,6 +23,12 @@ class Recording:
         self.time_range_us = (int(stream.t[0]), int(stream.t[-1]) + 1)
         self.stretches_us = (self.time_range_us,)
         self.readable_us = (ALWAYS,)
+
+    def __len__(self) -> int:
+        return len(self.stream)
+
+    def keeping(self, limit_bytes: int) -> "Recording":
+        return self
 
     def between(self, start: int, end: int) -> EventStream:
         assert any(low <= start and end <= high for low, high in self.readable_us)
@@ -60,10 +66,17 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
     return capture, step_at(times, linear)
 
 
-def step_at(times: tuple[int, ...], linear: torch.Tensor) -> SimpleNamespace:
+class StepAt(SimpleNamespace):
+    """A step whose pictures are known in linear light."""
+
+    def log_luminance(self, which: slice, eps: float) -> torch.Tensor:
+        return torch.log(luminance(self.linear[which]) + eps)
+
+
+def step_at(times: tuple[int, ...], linear: torch.Tensor) -> StepAt:
     """A step of a frame in the middle of ``times``."""
     frame = SimpleNamespace(mid_us=(times[0] + times[-1]) // 2)
-    return SimpleNamespace(times_us=times, linear=linear, nominal=5_000.0, frame=frame)
+    return StepAt(times_us=times, linear=linear, nominal=5_000.0, frame=frame)
 
 
 def make(capture, on: float, off: float, ramp_us: int = 0, **learned) -> EventWindows:
@@ -80,8 +93,8 @@ def test_right_thresholds_explain_every_window_and_wrong_ones_by_how_much(seed):
     assert float(make(capture, 0.3, 0.2).loss(step)["event"]) < 1e-6
     wrong = make(capture, 0.4, 0.2)
     loss = wrong.loss(step)["event"]
-    edges = list(itertools.pairwise(step.times_us))
-    counts = wrong._counts(capture.events.stream, edges, torch.device("cpu")).double()[:, 0]
+    stream = capture.events.stream
+    counts = window_counts(stream, step.times_us, HEIGHT, WIDTH).double()[:, 0]
     expected = 0.5 * 0.1 * (float(counts.mean()) + float(counts.sum(0).mean()))
     assert float(loss) == pytest.approx(expected, rel=1e-6)
     loss.backward()
@@ -231,3 +244,25 @@ def test_noise_lowers_the_weight_and_hot_pixels_have_none(seed, rate_hz):
     assert low < noise.weight(500_000) < high
     assert noise.sound[17, 23] == 0 and float(noise.sound.sum()) == pixels - 1
     assert EventNoise(events, aware=False).weight(500_000) == 1.0
+
+
+@pytest.mark.parametrize("ramp_us", [0, 4_000])
+@pytest.mark.parametrize("late_us", [None, 120.0])
+def test_the_compiled_comparison_and_its_gradients_are_those_of_the_plain_one(ramp_us, late_us):
+    results = []
+    for dtype in (torch.float64, torch.float32):
+        capture, step = scene(3)
+        windows = make(capture, 0.25, 0.22, ramp_us, late_us=late_us)
+        windows.sensor.to(dtype)
+        windows.noise = SimpleNamespace(
+            sound=(torch.arange(HEIGHT * WIDTH).view(HEIGHT, WIDTH) % 7 > 0).float(),
+            weight=lambda duration: 1 / (1 + 1e-4 * duration),
+        )
+        step.linear = step.linear.to(dtype, copy=True).contiguous().requires_grad_()
+        terms = windows.loss(step)
+        learned = [windows.sensor.logs, *([] if late_us is None else [windows.sensor.offset])]
+        gradients = torch.autograd.grad(terms["event"], [step.linear, *learned])
+        results.append([terms["event"], *gradients])
+    for plain, compiled in zip(*results, strict=True):
+        assert plain.abs().max() > 0
+        assert (compiled - plain).abs().max() < 1e-5 * plain.abs().max()

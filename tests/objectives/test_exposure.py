@@ -8,8 +8,6 @@ import torch
 from evsplat.objectives import Exposure, renders_for
 from evsplat.similarity import ssim
 
-POWER = SimpleNamespace(transfer=lambda frame: "power")
-
 
 def frame(start: int = 1_000, end: int = 31_000) -> SimpleNamespace:
     return SimpleNamespace(name="a", exposure_us=(start, end), mid_us=(start + end) // 2)
@@ -43,10 +41,10 @@ def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
     pictures = torch.rand(4, 20, 24, 3, generator=generator, dtype=torch.float64)
     observed = torch.rand(20, 24, 3, generator=generator, dtype=torch.float64)
     step = SimpleNamespace(
-        capture=POWER,
+        transfer="power",
         frame=frame(),
         times_us=(500, 2_000, 16_000, 30_999),
-        linear=pictures**2.2,
+        rgb=pictures,
         observed=lambda _: observed,
     )
     terms = Exposure(None, lambda frame: 3, generator).loss(step)
@@ -69,13 +67,13 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
     late = [31_000, *drawn(31_000, 70_000, after - 1)]
     times = sorted(early + inside + late)
     pictures = torch.rand(len(times), 16, 16, 3, generator=generator, dtype=torch.float64)
-    linear = (pictures**2.2).requires_grad_()
+    coded = pictures.clone().requires_grad_()
     observed = torch.rand(16, 16, 3, generator=generator, dtype=torch.float64)
     step = SimpleNamespace(
-        capture=POWER,
+        transfer="power",
         frame=frame(),
         times_us=tuple(times),
-        linear=linear,
+        rgb=coded.unbind(0),
         observed=lambda _: observed,
     )
     terms = Exposure(None, lambda frame: 3, generator).loss(step)
@@ -84,16 +82,16 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
     assert terms["l1"].item() == pytest.approx(float((blurry - observed).abs().mean()), rel=1e-9)
     assert terms["dssim"].item() == pytest.approx(1 - float(ssim(blurry, observed)), rel=1e-9)
     (terms["l1"] + terms["dssim"]).backward()
-    assert torch.equal(linear.grad.flatten(1).abs().sum(1) > 0, seen)
+    assert torch.equal(coded.grad.flatten(1).abs().sum(1) > 0, seen)
 
 
 def test_a_black_exposure_has_a_finite_gradient():
     pictures = torch.zeros(3, 16, 16, 3, requires_grad=True)
     step = SimpleNamespace(
-        capture=POWER,
+        transfer="power",
         frame=frame(),
         times_us=(2_000, 16_000, 30_000),
-        linear=pictures,
+        rgb=pictures.unbind(0),
         observed=lambda _: torch.ones(16, 16, 3),
     )
     Exposure(None, lambda frame: 3, torch.Generator()).loss(step)["l1"].backward()

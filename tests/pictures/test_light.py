@@ -4,7 +4,15 @@ import pytest
 import torch
 from skimage.color import rgb2gray
 
-from evsplat.pictures import decode, encode, log_brightness, log_brightness_change, luminance
+from evsplat.pictures import (
+    decode,
+    encode,
+    log_brightness,
+    log_brightness_change,
+    log_luminance,
+    luminance,
+    mean_light,
+)
 
 
 @pytest.mark.parametrize("transfer", ["power", "srgb", "linear"])
@@ -95,3 +103,29 @@ def test_a_doubled_luminance_changes_the_logarithm_by_ln_2():
     brighter = rgb * 2 ** (1 / 2.2)
     change = log_brightness_change(rgb, brighter, eps=0.0)
     assert (change - torch.log(torch.tensor(2.0, dtype=torch.float64))).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("function", [mean_light, lambda coded: log_luminance(coded, 0.004)])
+def test_compiled_light_of_pictures_and_its_gradient_equal_the_definition_in_float64(
+    function, planar
+):
+    coded = torch.rand(3, 7, 9, 3, generator=torch.Generator().manual_seed(0)) - 0.1
+    coded[0, 0] = 0.0
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = (coded.movedim(-1, 1) if planar else coded).to(dtype).contiguous().requires_grad_()
+        value = function((leaf.movedim(1, -1) if planar else leaf).unbind(0))
+        weights = torch.arange(value.numel(), dtype=dtype).view(value.shape).cos()
+        results.append((value, *torch.autograd.grad((value * weights).sum(), leaf)))
+    for compiled, plain in zip(*results, strict=True):
+        assert (compiled - plain).abs().max() < 2e-6 * plain.abs().max()
+
+
+@pytest.mark.parametrize("transfer", ["srgb", "linear"])
+def test_light_of_pictures_by_other_curves(transfer):
+    coded = torch.rand(3, 4, 5, 3)
+    linear = decode(coded, transfer)
+    assert torch.allclose(mean_light(coded.unbind(0), transfer), linear.mean(0))
+    logs = log_luminance(coded.unbind(0), 0.01, transfer)
+    assert torch.allclose(logs, torch.log(luminance(linear) + 0.01))

@@ -10,6 +10,7 @@ from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.options import PoseSearch
 from evsplat.posing import find, find_poses
+from evsplat.posing.refine import refine
 
 FRAMES = 10
 
@@ -34,7 +35,7 @@ def unposed(tiny_capture, tmp_path):
 def test_a_capture_without_poses_gets_some(unposed, tmp_path):
     path, points = unposed
     before = (path / "capture.json").read_bytes()
-    found = find_poses(path, tmp_path / "new", keypoints=points, height_m=1.8)
+    found = find_poses(path, tmp_path / "new", keypoints=points, height_m=1.8, refine_s=0)
     new = load_capture(tmp_path / "new")
     track = load_body_track(new)
     mids = [frame.mid_us for frame in new.frames]
@@ -47,6 +48,8 @@ def test_a_capture_without_poses_gets_some(unposed, tmp_path):
         np.testing.assert_allclose(own, stored, atol=1e-4)
     made = new.provenance["poses"]
     assert made["pictures"] == len(new.train_frames)
+    assert "(key points of a file) from training frames alone." in new.poses_found
+    assert load_capture(path).poses_found is None
     page = (tmp_path / "new" / "poses.html").read_text()
     assert "http" not in page.replace("http-equiv", "")
     assert "In doubt" in page
@@ -55,21 +58,25 @@ def test_a_capture_without_poses_gets_some(unposed, tmp_path):
 
 def test_pictures_and_key_points_of_held_out_frames_change_nothing(unposed, tmp_path):
     path, points = unposed
-    first = find_poses(path, tmp_path / "first", keypoints=points)
+    first = find_poses(path, tmp_path / "first", keypoints=points, refine_s=0)
     values = np.load(points)
     values[7:, :, :2] += 20
     np.save(points, values)
     frames = load_capture(path).frames
     for frame in frames[7:]:
         frame.image.write_bytes(frames[0].image.read_bytes())
-    second = find_poses(path, tmp_path / "second", keypoints=points)
+    second = find_poses(path, tmp_path / "second", keypoints=points, refine_s=0)
     np.testing.assert_array_equal(first.track.poses, second.track.poses)
 
 
-def test_a_given_focal_length_is_written(unposed, tmp_path):
+def test_a_given_focal_length_is_written_and_refined_with(unposed, tmp_path, monkeypatch):
     path, points = unposed
-    find_poses(path, tmp_path / "new", keypoints=points, focal="45")
+    seen = []
+    monkeypatch.setattr(find, "refine", lambda *a, **k: seen.append(a[1]) or refine(*a, **k))
+    find_poses(path, tmp_path / "new", keypoints=points, focal="45", refine_s=0.2)
+    assert seen[0].camera(seen[0].frames[0]).K[0, 0] == 45
     new = load_capture(tmp_path / "new")
+    assert new.provenance["poses"]["refinement"]["seconds"] > 0
     assert new.camera(new.frames[0]).K[0, 0] == 45
     assert load_capture(path).camera(new.frames[0]).K[0, 0] == 37.5
 
@@ -81,7 +88,7 @@ def test_poses_that_were_there_are_ignored_and_stay(tiny_capture, unposed, tmp_p
     document["body"] = {"file": "body.npz", "model": "rig"}
     (posed / "capture.json").write_text(json.dumps(document))
     before = (posed / "body.npz").read_bytes()
-    find_poses(posed, tmp_path / "new", keypoints=points)
+    find_poses(posed, tmp_path / "new", keypoints=points, refine_s=0)
     assert (posed / "body.npz").read_bytes() == before
     assert load_capture(tmp_path / "new").body_file.model == "default"
 
@@ -89,12 +96,13 @@ def test_poses_that_were_there_are_ignored_and_stay(tiny_capture, unposed, tmp_p
 def test_ctrl_c_leaves_nothing(unposed, tmp_path, monkeypatch):
     path, points = unposed
 
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(find, "poses_page", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        find_poses(path, tmp_path / "new", keypoints=points)
+    for name in ("refine", "poses_page"):
+        monkeypatch.setattr(find, name, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            find_poses(path, tmp_path / "new", keypoints=points, refine_s=int(name == "refine"))
     assert [file.name for file in tmp_path.iterdir() if "new" in file.name] == []
 
 
@@ -104,8 +112,8 @@ def test_what_cannot_be_is_refused_before_work_begins(unposed, tmp_path):
         find_poses(path, path, keypoints=points)
     with pytest.raises(ConfigError, match="--focal wide: expected auto or pixels"):
         PoseSearch(focal="wide")
-    with pytest.raises(ConfigError, match="leave one of them out"):
-        PoseSearch(focal="auto", refine=True)
+    with pytest.raises(ConfigError, match="--refine -1"):
+        PoseSearch(refine_s=-1)
     with pytest.raises(ConfigError, match="--height 17"):
         PoseSearch(height_m=17)
 
@@ -114,3 +122,15 @@ def test_training_on_a_capture_without_poses_offers_to_find_them(unposed):
     path, _ = unposed
     with pytest.raises(DataError, match=f"evsplat poses {path} --out NEW"):
         load_body_track(load_capture(path))
+
+
+def test_a_moving_camera_is_not_refined_and_refused_where_it_was_asked_for(unposed, tmp_path):
+    path, points = unposed
+    document = json.loads((path / "capture.json").read_text())
+    for frame in document["frames"]:
+        frame["world_to_camera"] = CAMERA.world_to_camera.tolist()
+    (path / "capture.json").write_text(json.dumps(document))
+    with pytest.raises(ConfigError, match="--refine 5: .* moving camera"):
+        find_poses(path, tmp_path / "new", keypoints=points, refine_s=5)
+    find_poses(path, tmp_path / "new", keypoints=points)
+    assert "refinement" not in load_capture(tmp_path / "new").provenance["poses"]

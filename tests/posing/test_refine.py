@@ -7,10 +7,13 @@ import pytest
 import torch
 
 from evsplat.body import BodyTrack, default_body
+from evsplat.body.silhouette import silhouette
 from evsplat.camera import Camera
 from evsplat.capture import Frame
+from evsplat.pictures import decode, encode, luminance
 from evsplat.posing.correction import Correction
-from evsplat.posing.refine import _Descent, _gain, expected_errors
+from evsplat.posing.descent import Descent
+from evsplat.posing.refine import _gain, expected_errors
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets
 
@@ -99,6 +102,46 @@ def test_discs_take_the_colours_of_the_pixels_that_show_them(body):
     torch.testing.assert_close(look.colours.detach(), red[0, 0, :1].expand(500, 3))
 
 
+@pytest.mark.parametrize(("size", "count"), [(128, 1_500), (128, 3_000), (256, 3_000)])
+def test_drawn_discs_end_where_the_body_does(body, size, count):
+    look = SurfaceDiscs(body, 3_000, torch.Generator().manual_seed(1))
+    camera = front_camera(body, size)
+    track = still_track(body)
+    behind = torch.zeros(1, size, size, 3)
+    with torch.no_grad():
+        look.colours.fill_(1)
+        drawn = look.draw(*track.at([0]), camera, behind, count)[0, ..., 0]
+    inside = silhouette(track.vertices(0), body.faces, camera).float()
+    assert float(drawn.sum()) == pytest.approx(float(inside.sum()), rel=0.05)
+    assert (drawn - inside).abs().sum() < 0.2 * inside.sum()
+
+
+def grey_and_coloured():
+    """Two pictures of one colour, the second carried by events."""
+    image = torch.tensor([0.2, 0.5, 0.9]).expand(2, 4, 4, 3).clone()
+    ones = torch.ones(2, 4, 4)
+    frame = Frame("0", 0, "main", Path("none"), (0, 1), "train")
+    camera = Camera(4, 4, torch.eye(3), torch.eye(4))
+    coloured = torch.tensor([True, False])
+    return Targets([0, 1], [frame] * 2, coloured, image, image, ones, ones, camera, "power")
+
+
+def test_carried_pictures_tell_luminance_alone():
+    targets = grey_and_coloured()
+    seen = targets.as_seen(targets.image)
+    assert torch.equal(seen[0], targets.image[0])
+    light = luminance(decode(targets.image[1]))
+    torch.testing.assert_close(seen[1], encode(light)[..., None].expand(4, 4, 3))
+
+
+def test_smaller_targets_keep_what_is_alike():
+    targets = grey_and_coloured()
+    small = targets.rows([1, 0]).smaller(2)
+    assert small.coloured.tolist() == [False, True]
+    assert small.camera.width == 2
+    torch.testing.assert_close(small.image, targets.image[:, :2, :2])
+
+
 def staged(body, size):
     """A correction at zero, and drawings of the motion that one of ``size`` deviations makes."""
     look = SurfaceDiscs(body, 500, torch.Generator().manual_seed(1))
@@ -118,7 +161,9 @@ def staged(body, size):
         Frame(str(k), k, "main", Path("none"), (t - 1, t + 1), "train") for k, t in enumerate(TIMES)
     ]
     weight = torch.ones(image.shape[:3])
-    return truth, _Descent(correction, look, Targets(TIMES, frames, image, behind, weight, camera))
+    coloured = torch.ones(len(TIMES), dtype=torch.bool)
+    targets = Targets(TIMES, frames, coloured, image, behind, weight, weight, camera, "power")
+    return truth, Descent(correction, look, targets)
 
 
 @torch.no_grad()

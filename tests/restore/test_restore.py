@@ -158,7 +158,7 @@ def test_a_restorer_that_fails_midway_leaves_nothing(
     target = tmp_path / "out" / "sharp"
     with pytest.raises(KeyboardInterrupt):
         restore_capture(tiny_capture(), target, method="broken")
-    assert list(target.parent.iterdir()) == []
+    assert not target.parent.exists()
 
 
 def test_edi_is_nearer_to_the_truth_than_the_blurry_frame(demo_capture_path: Path) -> None:

@@ -6,7 +6,10 @@ import pytest
 import torch
 
 from evsplat.training.checkpoint import load_checkpoint
-from evsplat.training.watching import Showcase, is_training, newest_state, watch
+from evsplat.training.watching import Showcase, is_training, newest_state, training_in, watch
+
+CLOCK = {"iteration": 1, "iterations": 9, "fraction": 0.1, "seconds": 1.0, "step_seconds": 1.0}
+STATE = {"clock": CLOCK, "human_count": 4}
 
 
 class Clock:
@@ -28,13 +31,13 @@ def _train(showcase, clock, seconds, watcher=lambda: None, step=0.25):
     for _ in range(round(seconds / step)):
         clock.now += step
         watcher()
-        showcase.show(lambda: shown.append(clock.now) or ({"a": torch.ones(2)}, {"step": 1}))
+        showcase.show(lambda: shown.append(clock.now) or ({"a": torch.ones(2)}, STATE))
     return shown
 
 
 def test_an_unwatched_training_shows_nothing(run):
     clock = Clock()
-    with Showcase(run, clock).open() as showcase:
+    with training_in(run), Showcase(run, clock).open() as showcase:
         assert is_training(run)
         assert _train(showcase, clock, 60) == []
         assert newest_state(run) is None
@@ -48,11 +51,11 @@ def test_a_watcher_sees_a_snapshot_every_few_seconds_until_it_goes(run):
     def watcher():
         os.utime(run / ".watch", (0, next(ticks)))  # on a machine with any other clock
 
-    with Showcase(run, clock).open() as showcase:
+    with training_in(run), Showcase(run, clock).open() as showcase:
         shown = _train(showcase, clock, 30, watcher)
         assert 7 <= len(shown) <= 11
         tensors, state = load_checkpoint(newest_state(run))
-        assert torch.equal(tensors["a"], torch.ones(2)) and state == {"step": 1}
+        assert torch.equal(tensors["a"], torch.ones(2)) and state == STATE
         later = _train(showcase, clock, 60)
         assert len(later) <= 4
         assert not later or later[-1] < shown[-1] + 15
@@ -63,7 +66,7 @@ def test_a_slow_disk_takes_no_more_than_its_share(run):
     clock = Clock()
     ticks = iter(range(1, 10_000))
 
-    with Showcase(run, clock).open() as showcase:
+    with training_in(run), Showcase(run, clock).open() as showcase:
         shown = []
 
         def slow():

@@ -2,7 +2,6 @@
 
 import logging
 import resource
-import shutil
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -16,19 +15,42 @@ import evsplat
 from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.capture import Capture, Policy, load_capture
 from evsplat.config import override, to_dict
-from evsplat.errors import ConfigError, EvsplatError
+from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.evaluation.evaluator import evaluate
-from evsplat.files import read_json, write_json
+from evsplat.files import remove_folder, write_json
 from evsplat.methods import method_config
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
 from evsplat.render import choose_device
 from evsplat.restore import restore_capture
 from evsplat.staging import StageSettings, stage
+from evsplat.untrusted.records import Shape, misfit, read_record
 
 logger = logging.getLogger(__name__)
 
 DONE, FAILED = "done", "failed"
+_RECORD = {"status": str, "cell": {"seed": int}}
+_OF_STATUS: dict[str, Shape] = {
+    FAILED: {"reason": str},
+    DONE: {
+        "seconds": float,
+        "peak_memory_mb": float,
+        "protocols": {"standard": {str: {str: (float, type(None))}}},
+        "per_frame": [dict],
+        "frames": {str: int},
+    },
+}
+
+
+def read_cell_record(path: Path) -> dict[str, Any]:
+    """The record of a cell that is over, as `run_cell` wrote it."""
+    remedy = "remove the file to run its cell again"
+    record: dict[str, Any] = read_record(path, _RECORD, remedy)
+    status = record["status"]
+    wrong = misfit(record, _OF_STATUS[status]) if status in _OF_STATUS else f"status is {status!r}"
+    if wrong:
+        raise DataError(f"{path}: {wrong}; {remedy}.")
+    return record
 
 
 @dataclass(frozen=True)
@@ -156,9 +178,10 @@ def _trained(
     resume = latest_checkpoint(folder.checkpoints) is not None
     if resume:
         # Sums of floats depend on the number of threads, and with it the last bits of a training.
-        threads = read_json(folder.facts)["threads"]
+        threads = read_record(folder.facts, {"threads": int}, "remove the run")["threads"]
     else:
-        shutil.rmtree(run, ignore_errors=True)
+        if run.exists():
+            remove_folder(run)
     settings = cell.settings
     iterations = cell.iterations
     if cell.max_minutes is not None and iterations is not None:

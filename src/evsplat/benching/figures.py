@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any
 
-from evsplat.benching.cell import DONE
+from evsplat.benching.cell import DONE, read_cell_record
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.plan import Plan
 from evsplat.evaluation.tables import Figure
-from evsplat.files import read_json
 
 Record = dict[str, Any]
 
@@ -29,7 +28,7 @@ class Records:
         for cell in plan.cells:
             path = folder.record_of(cell.id)
             if path.exists():
-                found[cell.capture.name, cell.row, cell.seed] = read_json(path)
+                found[cell.capture.name, cell.row, cell.seed] = read_cell_record(path)
         return cls(plan, found)
 
     @property

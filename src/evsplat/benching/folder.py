@@ -1,16 +1,13 @@
 """The results folder of a bench and its locks."""
 
-import fcntl
-import logging
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from evsplat.disk import held
 from evsplat.errors import ConfigError
-
-logger = logging.getLogger(__name__)
+from evsplat.files import make_folder
 
 
 @dataclass(frozen=True)
@@ -48,18 +45,12 @@ def exclusive(lock: Path, *, wait: bool = True) -> Iterator[None]:
     The file holds the process's number. Where the file system has no locks nothing is held: all
     writing is whole or not at all anyway, so that work may be done twice but not spoilt.
     """
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    with lock.open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            raise ConfigError(
-                f"{lock.parents[1]}: another bench works in this folder; wait for it or choose "
-                "another --out."
-            ) from None
-        except OSError as error:
-            logger.warning("%s: no locks on this file system (%s)", lock, error)
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
-        yield
+    make_folder(lock.parent)
+    try:
+        with held(lock, wait=wait):
+            yield
+    except BlockingIOError:
+        raise ConfigError(
+            f"{lock.parents[1]}: another bench works in this folder; wait for it or choose "
+            "another --out."
+        ) from None

@@ -16,6 +16,7 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 from evsplat.benching.folder import BenchFolder
+from evsplat.files import make_folder, open_output
 
 if TYPE_CHECKING:
     # A cell's process imports it once it can be stopped.
@@ -86,12 +87,12 @@ class LocalPool:
 
     def _process(self, cell: "Cell", slot: int, log: Path) -> int:
         """Run the cell's process to its end; gives the exit code, negative for a signal."""
-        log.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(log.parent)
         threads = str(self.threads)
         variables = {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
         if self.gpus > 1:
             variables["CUDA_VISIBLE_DEVICES"] = str(slot % self.gpus)
-        with log.open("ab") as output:
+        with open_output(log, "ab") as output:
             process = subprocess.Popen(
                 [sys.executable, "-m", "evsplat.benching.local"],
                 stdin=subprocess.PIPE,

@@ -10,7 +10,7 @@ from evsplat.benching.tables import SPREAD
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.tables import LEGEND, Table, html
-from evsplat.pages import Embedder, document, folded, read_picture, section, spread
+from evsplat.pages import Embedder, document, folded, read_rgb, section, spread
 from evsplat.pictures import to_bytes
 
 _PIXELS = 60_000_000
@@ -100,9 +100,10 @@ def _frame(
 ) -> str:
     box, camera = human_regions.crop(frame), capture.camera(frame)
     style = "" if box is None else _window(box, camera.height, camera.width)
-    tiles = [_tile(embed.image(to_bytes(capture.image(frame)), "blurry input"), style, "recorded")]
+    blurry = to_bytes(capture.shown(capture.image(frame)))
+    tiles = [_tile(embed.image(blurry, "blurry input"), style, "recorded")]
     if frame.sharp is not None:
-        truth = embed.image(to_bytes(capture.sharp(frame)), "sharp truth")
+        truth = embed.image(to_bytes(capture.shown(capture.sharp(frame))), "sharp truth")
         tiles.append(_tile(truth, style, "truth"))
     for row in rows:
         entry = None if row.record is None else _entry(row.record, frame.name)
@@ -116,7 +117,7 @@ def _frame(
         psnr = figures["person_crop"]["psnr"] or figures["full"]["psnr"]
         file = folder.run_of(row.run) / entry["pictures"]["render"]
         remedy = f"remove {folder.record_of(row.run)} to measure it again"
-        picture = read_picture(file, remedy)
+        picture = read_rgb(file, remedy)
         note = "" if psnr is None else f"{psnr:.2f}\u00a0dB"
         tiles.append(_tile(embed.image(picture, row.title), style, row.title, note))
     return (

@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from evsplat.benching.cell import FAILED, CaptureSource, Cell
+from evsplat.benching.cell import FAILED, CaptureSource, Cell, read_cell_record
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.suite import Suite, SuiteCapture, SuiteRow, check_names
 from evsplat.errors import ConfigError
-from evsplat.files import read_json
+from evsplat.files import remove_file
 from evsplat.methods.trivial import TRIVIAL
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
@@ -85,10 +85,10 @@ def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]
         if not path.exists():
             todo.append(cell)
             continue
-        record = read_json(path)
+        record = read_cell_record(path)
         _check_same_request(path, record["cell"], cell.request(), folder)
         if retry and record["status"] == FAILED:
-            path.unlink()
+            remove_file(path)
             todo.append(cell)
     return todo
 

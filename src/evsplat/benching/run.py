@@ -1,7 +1,6 @@
 """The verb ``bench``: run what is left of a suite, then write its tables and its page."""
 
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -25,10 +24,12 @@ from evsplat.benching.suite import read_suite
 from evsplat.benching.tables import SPREAD, make_tables
 from evsplat.errors import ConfigError
 from evsplat.evaluation.tables import LEGEND, latex, markdown
-from evsplat.files import read_json, write_json, write_text
+from evsplat.files import try_target, write_json, write_text
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.render import choose_device
+from evsplat.untrusted.faults import MISFITS, broken_as
+from evsplat.untrusted.text import read_json
 
 Executor = LocalPool | RayCluster
 """Processes that cells run in."""
@@ -59,15 +60,14 @@ def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any
     options = given(BenchOptions, options, changes)
     plan_suite = read_suite(suite)
     folder = BenchFolder(Path(options.out or Path("bench") / plan_suite.name))
+    try_target(folder.path)
     plan = make_plan(plan_suite, folder, options)
     if not plan.cells:
         raise ConfigError("\n".join(plan.missing.values()))
     with exclusive(folder.lock_of("bench"), wait=False):
-        # What a killed bench left half made.
-        for half in folder.captures.glob(".*"):
-            shutil.rmtree(half, ignore_errors=True)
         todo = pending_cells(plan, folder, retry=options.retry)
-        executor = _executor(folder, len(todo), options)
+        # Of all cells, done or not: how many threads a cell has decides its last bits.
+        executor = _executor(folder, len(plan.cells), options)
         try:
             _run(plan, todo, folder, executor)
         except KeyboardInterrupt:
@@ -208,9 +208,12 @@ def _print(text: str) -> None:
 def write_output(plan: Plan, folder: BenchFolder) -> None:
     """Write tables.md, tables.tex and index.html of what has been recorded so far."""
     records = Records.read(plan, folder)
-    tables = make_tables(records)
     title = plan.suite.title or plan.suite.name
     intro = f"{LEGEND.format(second='in italics')} {SPREAD}"
+    remedy = "remove the record that was changed, and its cell is run again"
+    with broken_as(folder.path / "cells", "not as the bench wrote them", remedy, kinds=MISFITS):
+        tables = make_tables(records)
+        html = page(records, tables, folder)
     write_text(folder.path / "tables.md", markdown(title, intro, tables))
     write_text(folder.path / "tables.tex", latex(tables))
-    write_text(folder.path / "index.html", page(records, tables, folder))
+    write_text(folder.path / "index.html", html)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from evsplat.body.body import Body
 from evsplat.body.skeleton import Skeleton, find_skeleton
 from evsplat.body.tree import topological_order
 from evsplat.errors import DataError
+from evsplat.untrusted.arrays import read_plain_npz
 
 _BETAS = 10
 # A coefficient of 1 is as likely as a length that is off by this much.
@@ -155,8 +157,7 @@ def fit_betas(
 @cache
 def _default_arrays() -> dict[str, np.ndarray]:
     resource = files("evsplat") / "data" / "default_body.npz"
-    with resource.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-        return {key: archive[key] for key in archive.files}
+    return read_plain_npz(Path(str(resource)))
 
 
 def _lengths(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import os
 import pickle
-import tempfile
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,9 @@ from jaxtyping import Float
 from evsplat.body.body import Body
 from evsplat.body.make import fit_betas, make_body
 from evsplat.errors import DataError, WeightsError
-from evsplat.safe_pickle import read_npz, read_pickle
+from evsplat.files import open_output, scratch_folder
+from evsplat.untrusted.arrays import read_npz
+from evsplat.untrusted.pickles import read_pickle
 
 ENVIRONMENT = "EVSPLAT_BODY_MODELS"
 _SITES = {
@@ -107,7 +108,7 @@ def read_model_file(path: Path) -> dict[str, Any]:
     """The arrays of an SMPL-family .pkl or .npz, and joint names by index where they are given.
 
     body-models 0.26 would unpickle without restriction, so that a tampered file could run anything.
-    Here only the few types that these files need are allowed (`evsplat.safe_pickle`).
+    Here only the few types that these files need are allowed (`evsplat.untrusted.pickles`).
 
     Raises:
         DataError: unreadable, or holding a pickled type that no body model needs.
@@ -144,9 +145,9 @@ def _open(family: str, file: Path) -> Any:
     missing = [key for key in ("v_template", "shapedirs", "J_regressor") if key not in arrays]
     if missing:
         raise DataError(f"{file}: not a {family.upper()} model, {', '.join(missing)} is missing.")
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "model.pkl"
-        with copy.open("wb") as stream:
+    with scratch_folder() as folder:
+        copy = folder / "model.pkl"
+        with open_output(copy) as stream:
             pickle.dump(arrays, stream, protocol=pickle.HIGHEST_PROTOCOL)
         try:
             return getattr(module, family.upper())(model_path=copy)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from evsplat.body.canonical import SMPL_PARENTS
 from evsplat.body.smpl import smpl_body
 from evsplat.errors import DataError, WeightsError
+from evsplat.untrusted.arrays import read_plain_npz
 
 _log = logging.getLogger(__name__)
 
@@ -82,8 +83,8 @@ def rest_joints(
 def _calibrated_rest_joints(betas: Float[np.ndarray, "B"] | None) -> Float[np.ndarray, "22 3"]:
     """SMPL-X joints as a linear function of ten betas, from mannequin-x (Apache-2.0)."""
     file = files("mannequin") / "assets" / "smplx_calibration.npz"
-    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as table:
-        rest, directions = table["joint_rest"], table["joint_dirs"]
+    table = read_plain_npz(Path(str(file)))
+    rest, directions = table["joint_rest"], table["joint_dirs"]
     shape = np.zeros(directions.shape[-1])
     given = np.zeros(0) if betas is None else np.asarray(betas, np.float64).ravel()[: len(shape)]
     shape[: len(given)] = given

@@ -7,10 +7,13 @@ from jaxtyping import Int64
 from scipy.ndimage import binary_dilation, rank_filter
 
 from evsplat.events import EventStore, EventStream
+from evsplat.events.store import ALWAYS, Span
 
 SUPPORT_US = 10_000
 """An event with another one at or beside its pixel within about this time is not noise."""
 _PIECE_US = 1_000_000
+_MOST_PIECES = 60
+_MOST_EVENTS = 20_000_000
 HOT_RATIO = 10.0
 HOT_RATE_HZ = 5.0
 _FLOOR_QUANTILE = 0.2
@@ -90,13 +93,45 @@ class NoiseMeter:
         )
 
 
-def noise_of(events: EventStore) -> NoiseEstimate:
-    """Background rate and hot pixels of all of a recording that may be read, second by second."""
-    meter, stretches = NoiseMeter(events.width, events.height), events.stretches_us
-    for start, end in stretches:
-        for first in range(start, end, _PIECE_US):
-            meter.add(events.between(first, min(first + _PIECE_US, end)))
-    return meter.estimate(sum(end - start for start, end in stretches))
+def noise_of(events: EventStore, during_us: Span = ALWAYS) -> NoiseEstimate:
+    """Background rate and hot pixels of what may be read of a recording, or of a part of it.
+
+    Of a long part it is measured in `_MOST_PIECES` pieces of at most a second, evenly spread, which
+    hold about `_MOST_EVENTS` events at most.
+    """
+    meter, seen_us = NoiseMeter(events.width, events.height), 0
+    for start, end in _pieces(events, during_us):
+        meter.add(events.between(start, end))
+        seen_us += end - start
+    return meter.estimate(seen_us)
+
+
+def _pieces(events: EventStore, during_us: Span) -> list[Span]:
+    """Stretches to read, in order of time, each within what may be read."""
+    stretches = [
+        (max(start, during_us[0]), min(end, during_us[1]))
+        for start, end in events.stretches_us
+        if start < during_us[1] and end > during_us[0]
+    ]
+    pieces = [
+        (first, min(first + _PIECE_US, end))
+        for start, end in stretches
+        for first in range(start, end, _PIECE_US)
+    ]
+    if len(pieces) > _MOST_PIECES:
+        chosen = np.linspace(0, len(pieces) - 1, _MOST_PIECES).round().astype(int)
+        pieces = [pieces[index] for index in chosen]
+    whole_us = sum(end - start for start, end in events.stretches_us)
+    seen_us = sum(end - start for start, end in pieces)
+    expected = len(events) * seen_us / max(whole_us, 1)
+    if expected <= _MOST_EVENTS:
+        return pieces
+    share = _MOST_EVENTS / expected
+    shorter = [round(share * (end - start)) for start, end in pieces]
+    return [
+        (start, min(end, start + max(length, 2 * SUPPORT_US)))
+        for (start, end), length in zip(pieces, shorter, strict=True)
+    ]
 
 
 def _has_support(chunk: EventStream, width: int, height: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
 from evsplat.capture.body_track import load_body_track
 from evsplat.capture.capture import Capture, load_capture
+from evsplat.capture.coded import coded
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.policy import Policy
@@ -22,6 +23,7 @@ __all__ = [
     "NovelView",
     "Policy",
     "TrainingCapture",
+    "coded",
     "estimate_sensor",
     "warn_of_linear_frames",
     "load_body_track",

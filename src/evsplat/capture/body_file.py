@@ -1,16 +1,16 @@
 """The body and its key poses as they stand in ``body.npz``."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
+from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.errors import DataError
-from evsplat.files import why_not_read
-from evsplat.safe_pickle import BROKEN
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,25 +71,6 @@ class BodyFile:
 RIG_ARRAYS = ("joint_names", "parents", "rest_joints", "rest_vertices", "faces", "weights")
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz; pickled objects are refused, because unpickling can run code."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise DataError(f"{path}: {why_not_read(error)}.") from None
-    except ValueError as error:
-        if "pickle" not in str(error).lower():
-            raise DataError(f"{path}: not a readable npz ({error}); write it anew.") from error
-        raise DataError(
-            f"{path}: holds pickled Python objects, expected plain arrays only; save it with plain "
-            "numeric and string arrays (np.savez never pickles those)."
-        ) from None
-    except BROKEN as error:
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{path}: not a readable npz ({said}); write it anew.") from error
-
-
 def stated_body(path: Path, arrays: dict[str, np.ndarray], source: PoseSource | None) -> BodyFile:
     """A `BodyFile` outside of a capture, whose poses' ``source`` the user states."""
     if source is None and "pose_std_rad" in arrays:
@@ -120,3 +101,47 @@ def body_from_arrays(
         betas=None if "betas" not in arrays else np.ravel(arrays["betas"]),
         **{key: arrays.get(key) for key in RIG_ARRAYS if key != "joint_names"},
     )
+
+
+def write_body(
+    folder: Path,
+    model: str,
+    times_us: ArrayLike,
+    poses: ArrayLike,
+    transl: ArrayLike,
+    *,
+    rig: Mapping[str, Any] | None = None,
+    betas: ArrayLike | None = None,
+    gender: str | None = None,
+    source: PoseSource | None = None,
+    pose_std_rad: ArrayLike | None = None,
+    transl_std_m: ArrayLike | None = None,
+) -> dict[str, str]:
+    """Write ``body.npz``, as `CaptureWriter.set_body` says; gives ``body`` of capture.json."""
+    arrays: dict[str, Any] = {"model": model, **key_poses(times_us, poses, transl)}
+    if rig is not None:
+        arrays |= {key: np.asarray(rig[key]) for key in RIG_ARRAYS}
+    if betas is not None:
+        arrays["betas"] = np.asarray(betas, dtype=np.float64).ravel()
+    if gender is not None:
+        arrays["gender"] = gender
+    for key, value in (("pose_std_rad", pose_std_rad), ("transl_std_m", transl_std_m)):
+        if value is not None:
+            arrays[key] = np.asarray(value, dtype=np.float32)
+    save_arrays(folder / "body.npz", arrays)
+    entry = {"file": "body.npz", "model": model}
+    return entry if source is None else {**entry, "source": source}
+
+
+def key_poses(times_us: ArrayLike, poses: ArrayLike, transl: ArrayLike) -> dict[str, np.ndarray]:
+    """Times and poses as they are stored."""
+    return {
+        "times_us": np.asarray(times_us, dtype=np.int64),
+        "poses": np.asarray(poses, dtype=np.float32),
+        "transl": np.asarray(transl, dtype=np.float32),
+    }
+
+
+def save_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an npz that holds nothing pickled."""
+    np.savez_compressed(path, allow_pickle=False, **arrays)

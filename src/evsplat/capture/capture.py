@@ -16,9 +16,10 @@ logger = logging.getLogger(__name__)
 class Capture(CaptureReader):
     """A blurry video, its events and body poses. Pictures and events are read when asked for.
 
-    Pictures are sRGB-coded float32 in [0, 1]. Lens distortion is removed on reading, from pictures
-    and events alike, so that `camera` describes them exactly. The pose of a moving camera is known
-    at the mid-exposure of its frames only: nothing here interpolates between them.
+    Pictures are float32 in [0, 1], coded as `transfer` says; `shown` codes light for a display.
+    Lens distortion is removed on reading, from pictures and events alike, so that `camera`
+    describes them exactly. The pose of a moving camera is known at the mid-exposure of its frames
+    only: nothing here interpolates between them.
     """
 
     def for_training(
@@ -33,10 +34,11 @@ class Capture(CaptureReader):
         return TrainingCapture(self, policy, masker)
 
 
-def load_capture(path: Path | str) -> Capture:
+def load_capture(path: Path | str, *, needs_body: bool = True) -> Capture:
     """Open a capture after the quick checks (descriptions, headers, poses; not every pixel).
 
-    Raises `DataError` with the first error found; warnings are logged.
+    Raises `DataError` with the first error found; warnings are logged, that there is no body only
+    if it ``needs_body``.
     """
     metadata, findings = check_capture(Path(path), deep=False)
     errors = [finding for finding in findings if finding.severity == "error"]
@@ -48,5 +50,6 @@ def load_capture(path: Path | str) -> Capture:
         )
         raise DataError(f"{errors[0]}{more}")
     for finding in findings:
-        logger.warning("%s", finding)
+        if needs_body or finding.field != "body":
+            logger.warning("%s", finding)
     return Capture(metadata)

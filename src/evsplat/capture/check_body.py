@@ -6,15 +6,17 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
-from evsplat.capture.body_file import read_arrays
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import Metadata
 from evsplat.errors import DataError
+from evsplat.untrusted.arrays import read_plain_npz
 
 _JOINTS = {"default": 31, "smpl": 24, "smplh": 52, "smplx": 55}
 _WEIGHT_SUM_TOLERANCE = 1e-3
 # A key pose that is missing leaves a frame a whole spacing away from the next one.
 _COVERAGE_IN_SPACINGS = 0.6
+_LARGEST = 1e6
+"""Of metres, radians and weights."""
 _REWRITE = "Write body.npz anew with this shape."
 
 
@@ -38,9 +40,15 @@ def check_body(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
         _check_coverage(metadata, arrays, findings)
     dense = metadata.path / "body_dense.npz"
     if deep and dense.exists():
-        dense_arrays = _read(dense, findings)
-        if dense_arrays is not None:
-            _Check(dense, dense_arrays, findings).poses(check.joint_count())
+        check_dense(dense, _read(dense, findings), check.joint_count(), findings)
+
+
+def check_dense(
+    path: Path, arrays: dict[str, np.ndarray] | None, joints: int | None, findings: Findings
+) -> None:
+    """The arrays of body_dense.npz: poses of as many joints as the body has."""
+    if arrays is not None:
+        _Check(path, arrays, findings).poses(joints)
 
 
 def _read(path: Path, findings: Findings) -> dict[str, np.ndarray] | None:
@@ -48,7 +56,7 @@ def _read(path: Path, findings: Findings) -> dict[str, np.ndarray] | None:
         findings.error(path, "", "no such file", "the body and its poses", "Restore the file.")
         return None
     try:
-        return read_arrays(path)
+        return read_plain_npz(path)
     except DataError as error:
         reason, remedy = reason_and_remedy(error, path)
         reason = reason.split(", expected")[0]
@@ -92,13 +100,14 @@ class _Check:
             found = f"{'x'.join(map(str, array.shape)) or 'a single value'} of {array.dtype}"
             self.error(key, found, f"{wanted} {kind}")
             return None
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-            count = int((~np.isfinite(array)).sum())
+        wrong = ~(np.abs(array) <= _LARGEST) if array.dtype.kind == "f" else np.zeros(0, bool)
+        if wrong.any():
+            index = tuple(int(i) for i in np.argwhere(wrong)[0])
+            count = int(wrong.sum())
             self.error(
                 f"{key}[{', '.join(map(str, index))}]",
                 f"{array[index]}{self.pose_words(key, index)} ({count} such values)",
-                "finite numbers",
+                f"finite numbers up to {_LARGEST:g}",
                 "Interpolate or fit these again, or remove the frames.",
             )
             return None

@@ -7,11 +7,15 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from evsplat.capture.finding import Findings
+from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Metadata
+from evsplat.errors import DataError
+from evsplat.untrusted.faults import BROKEN, reason
+from evsplat.untrusted.hdf5 import open_hdf5, wrong_data_set
 
 _COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 _SCAN_EVENTS = 1 << 20
+_INDEX_SAMPLES = 64
 _REPAIR = "Copy the file again or write it anew."
 
 
@@ -25,21 +29,20 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
         findings.error(entry.file, "", "no such file", "the event recording", "Restore the file.")
         return
     try:
-        with h5py.File(entry.file, "r") as file:
+        with open_hdf5(entry.file) as file:
             if not _check_layout(entry.file, file, findings):
                 return
             _check_clock(metadata, entry, file, findings)
             if deep:
                 _Scan(entry, file, findings).run()
-    except OSError as error:
-        denied = isinstance(error, PermissionError)
-        findings.error(
-            entry.file,
-            "",
-            f"a file that HDF5 cannot read ({error})",
-            "a whole HDF5 file",
-            "Give yourself the permission to read it." if denied else _REPAIR,
-        )
+            else:
+                _check_index(entry, file, findings)
+    except DataError as error:
+        found, remedy = reason_and_remedy(error, entry.file)
+        findings.error(entry.file, "", found, "a whole HDF5 file", remedy)
+    except BROKEN as error:
+        found = f"a file that HDF5 cannot read ({reason(error)})"
+        findings.error(entry.file, "", found, "a whole HDF5 file", _REPAIR)
 
 
 def _check_sensor(metadata: Metadata, entry: EventsEntry, findings: Findings) -> None:
@@ -70,7 +73,7 @@ def _check_layout(path: Path, file: h5py.File, findings: Findings) -> bool:
     before = findings.error_count()
     names = [f"events/{column}" for column in _COLUMNS]
     for name in [*names, "ms_to_idx", "t_offset"]:
-        found = _wrong_entry(file, name)
+        found = wrong_data_set(file, name)
         if found:
             findings.error(path, name, found, "a data set", "Write the file anew.")
     if findings.error_count() > before:
@@ -102,16 +105,6 @@ def _check_layout(path: Path, file: h5py.File, findings: Findings) -> bool:
     for name in names:
         _check_filters(path, name, file[name], findings)
     return findings.error_count() == before
-
-
-def _wrong_entry(file: h5py.File, name: str) -> str:
-    """Description of a wrong entry of the file; "" where it is a data set as it should be."""
-    try:
-        found = file.get(name)
-        return "" if isinstance(found, h5py.Dataset) and found.shape is not None else "nothing"
-    except (RuntimeError, OSError) as error:
-        # such as a link to itself
-        return f"what HDF5 cannot open ({error})"
 
 
 def _check_filters(path: Path, name: str, data: h5py.Dataset, findings: Findings) -> None:
@@ -152,6 +145,41 @@ def _check_clock(
     spacing = (end - start) / len(metadata.frames)
     if first > start + spacing or last < end - spacing:
         findings.warning(entry.file, "events/t", found, expected, remedy)
+
+
+def _check_index(entry: EventsEntry, file: h5py.File, findings: Findings) -> None:
+    """Whether `_INDEX_SAMPLES` entries of ms_to_idx, evenly spread, lead to the right events."""
+    t, index = file["events/t"], file["ms_to_idx"]
+    count = len(t)
+    if count == 0:
+        return
+    last_ms = int(t[-1]) // 1000
+    if last_ms >= len(index):
+        _note_short_index(entry, len(index), last_ms + 1, findings)
+        return
+    for ms in np.unique(np.linspace(max(0, int(t[0]) // 1000), last_ms, _INDEX_SAMPLES).round()):
+        row, time = int(index[int(ms)]), 1000 * int(ms)
+        found = 0 <= row <= count
+        found = found and (row == 0 or int(t[row - 1]) < time)
+        if not found or (row < count and int(t[row]) < time):
+            findings.error(
+                entry.file,
+                f"ms_to_idx[{int(ms)}]",
+                str(row),
+                f"the first event with t >= {time}",
+                "Rebuild ms_to_idx, or write the recording anew with evsplat convert.",
+            )
+            return
+
+
+def _note_short_index(entry: EventsEntry, length: int, needed: int, findings: Findings) -> None:
+    findings.error(
+        entry.file,
+        "ms_to_idx",
+        f"{length} milliseconds",
+        f"at least {needed}, one per millisecond up to the last event",
+        "Rebuild ms_to_idx.",
+    )
 
 
 class _Scan:
@@ -217,13 +245,7 @@ class _Scan:
     def rest_of_index(self, total: int) -> None:
         length = len(self.file["ms_to_idx"])
         if self.next_ms > length:
-            self.findings.error(
-                self.entry.file,
-                "ms_to_idx",
-                f"{length} milliseconds",
-                f"at least {self.next_ms}, one per millisecond up to the last event",
-                "Rebuild ms_to_idx.",
-            )
+            _note_short_index(self.entry, length, self.next_ms, self.findings)
             return
         stored = self.file["ms_to_idx"][self.next_ms :].astype(np.int64)
         self.compare_index(stored, np.full(len(stored), total))

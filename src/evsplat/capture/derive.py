@@ -1,8 +1,6 @@
 """A capture made of another one: some pictures new, everything else as it was."""
 
 import dataclasses
-import os
-import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,8 +8,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from evsplat.capture.body_file import write_body
 from evsplat.capture.capture import Capture
 from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
@@ -19,8 +19,9 @@ from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import new_folder, read_json, write_json
+from evsplat.files import copy_file, make_folder, new_folder, remove_file, write_json
 from evsplat.pictures.files import write_image
+from evsplat.untrusted.text import read_json
 
 Frames = Sequence[Frame]
 Made = Iterator[tuple[Frame, Float[Tensor, "..."]]]
@@ -51,10 +52,38 @@ class Derivation:
         entry[key] = f"{_FOLDERS[key]}/{self._stems[frame.name]}.png"
         write_picture(self.folder / entry[key], picture)
 
+    def set_body(
+        self, model: str, times_us: ArrayLike, poses: ArrayLike, transl: ArrayLike, **details: Any
+    ) -> None:
+        """Replace body and poses, as `CaptureWriter.set_body`; there are no dense ones then."""
+        old = self.document.get("body")
+        for name in {"body.npz", "body_dense.npz", *([old["file"]] if old else [])}:
+            # It may be a hard link, and what it is linked to must stay.
+            remove_file(self.folder / name)
+        self.document["body"] = write_body(self.folder, model, times_us, poses, transl, **details)
+
+    def keep(self, frames: Frames) -> None:
+        """Leave out all but some frames, and novel views at the times of others."""
+        kept = {frame.name for frame in frames}
+        for key, name in (("frames", "name"), ("novel_views", "frame")):
+            entries = self.document.get(key, [])
+            for entry in entries:
+                if entry[name] not in kept:
+                    for picture in set(_PICTURES) & set(entry):
+                        remove_file(self.folder / entry[picture])
+            self.document[key] = [entry for entry in entries if entry[name] in kept]
+        for frame in frames:
+            # Without one it would follow from the place in the list.
+            self.entry(frame)["split"] = frame.split
+
 
 @contextmanager
 def derived_capture(
-    source: Capture, path: Path | str, *, without: Collection[str] = ()
+    source: Capture,
+    path: Path | str,
+    *,
+    without: Collection[str] = (),
+    replace: bool = False,
 ) -> Iterator[Derivation]:
     """Give a capture in the making that becomes ``path`` when the block ends well and it is valid.
 
@@ -62,10 +91,11 @@ def derived_capture(
     "image", "sharp" and "mask"). They are hard links where the file system can, since evsplat never
     writes into a file that exists; else copies. Where the lens distorts, pictures and events are
     written without distortion, because that is how they are read and new pictures are made.
+    ``replace``: a folder at ``path`` stays until then; see `new_folder`.
     """
     path = Path(path)
     document = read_json(source.path / "capture.json")
-    with new_folder(path) as folder:
+    with new_folder(path, replace=replace) as folder:
         making = Derivation(source, folder, document)
         for entry in document["frames"]:
             for key in without:
@@ -94,9 +124,9 @@ def training_frames_first(
 
 def write_picture(path: Path, picture: Float[Tensor, "..."]) -> None:
     """Write a picture in [0, 1] as 8-bit PNG."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     # It may be a hard link, and what it is linked to must stay.
-    path.unlink(missing_ok=True)
+    remove_file(path)
     write_image(path, np.ascontiguousarray(picture.detach().cpu().numpy()))
 
 
@@ -114,17 +144,7 @@ def _copy_files(making: Derivation) -> None:
     names |= {view["image"] for view in document.get("novel_views", [])}
     names |= {document[key]["file"] for key in ("body", "events") if document.get(key)}
     for name in sorted(names):
-        target = making.folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _link(root / name, target)
-
-
-def _link(source: Path, target: Path) -> None:
-    source = source.resolve()
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
+        copy_file((root / name).resolve(), making.folder / name, link=True)
 
 
 def _undistort(making: Derivation) -> None:
@@ -139,12 +159,12 @@ def _undistort(making: Derivation) -> None:
         for key in set(_PICTURES) & set(entry) if frame.camera in bent else ():
             picture = readers[key](frame)
             assert picture is not None
-            (making.folder / entry[key]).unlink()
+            remove_file(making.folder / entry[key])
             making.set_picture(frame, key, picture)
     for view in source.novel_views:
         entry = making.document["novel_views"][view.index]
         if view.camera in bent:
-            (making.folder / entry["image"]).unlink()
+            remove_file(making.folder / entry["image"])
             entry["image"] = str(Path(entry["image"]).with_suffix(".png"))
             write_picture(making.folder / entry["image"], source.novel_image(view))
     if source.events is not None and source.frames[0].camera in bent:

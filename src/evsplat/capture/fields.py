@@ -7,6 +7,7 @@ import numpy as np
 
 from evsplat.capture.finding import Findings, nearest
 from evsplat.names import NAME_RULE, is_name, is_path_of_names, leads_out
+from evsplat.untrusted.faults import brief
 
 MISSING = object()
 RENAME = "Rename it: files may be named after it."
@@ -127,12 +128,3 @@ def is_whole(value: Any) -> bool:
     """True for a JSON integer that a double holds exactly."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return number and abs(value) <= _LARGEST and int(value) == value
-
-
-def brief(value: Any, limit: int = 80) -> str:
-    """``repr`` cut to a length that fits a message."""
-    try:
-        text = repr(value)
-    except RecursionError:
-        text = f"a {type(value).__name__} nested too deeply to be shown"
-    return text if len(text) <= limit else text[: limit - 1] + "…"

@@ -11,13 +11,14 @@ from torch import Tensor
 from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
 from evsplat.camera import Camera
 from evsplat.capture.distortion import COEFFICIENT_COUNTS, Distortion
-from evsplat.capture.fields import MISSING, RENAME, Fields, brief, is_whole
+from evsplat.capture.fields import MISSING, RENAME, Fields, is_whole
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Frame, Metadata, NovelView
 from evsplat.errors import DataError
-from evsplat.files import read_json
 from evsplat.names import NAME_RULE, is_name
 from evsplat.pictures.light import TRANSFERS, Transfer
+from evsplat.untrusted.faults import brief
+from evsplat.untrusted.text import read_json
 
 FORMAT = "evsplat-capture"
 VERSION = 1
@@ -26,6 +27,12 @@ BODY_MODELS = ("rig", "default", "smpl", "smplh", "smplx")
 _ROTATION_TOLERANCE = 1e-4
 # Training and evaluation compare pictures by SSIM, whose window has this side.
 _SMALLEST_PX = 11
+_LARGEST_PX = 16_384
+# Sensors have thresholds of 0.1 to 0.6; simulations may go further.
+_THRESHOLDS = (1e-3, 10.0)
+# From a fish eye's middle to a telescope.
+_FOCAL_IN_SIDES = (0.05, 200.0)
+_LONGEST_EXPOSURE_US = 60_000_000
 
 
 def read_metadata(path: Path, findings: Findings) -> Metadata | None:
@@ -112,7 +119,7 @@ class _Parser:
                 continue
             entry = self.fields(f"cameras.{name}", value, keys)
             width, height = self.pixels(entry, "width"), self.pixels(entry, "height")
-            K, pose = self.intrinsics(entry), self.rigid(entry, "world_to_camera")
+            K, pose = self.intrinsics(entry, width, height), self.rigid(entry, "world_to_camera")
             coefficients, transfer = self.distortion(entry), self.transfer(entry)
             if not entry.valid or K is None or pose is None:
                 continue
@@ -127,6 +134,8 @@ class _Parser:
     def pixels(self, entry: Fields, key: str) -> int:
         """A side of the camera's pictures."""
         count = entry.integer(key, minimum=1)
+        if count > _LARGEST_PX:
+            entry.fail(key, f"{count} pixels", f"at most {_LARGEST_PX}", "Shrink the pictures.")
         if 0 < count < _SMALLEST_PX:
             entry.fail(
                 key,
@@ -136,7 +145,7 @@ class _Parser:
             )
         return count
 
-    def intrinsics(self, entry: Fields) -> np.ndarray | None:
+    def intrinsics(self, entry: Fields, width: int, height: int) -> np.ndarray | None:
         K = entry.numbers("K", (3, 3))
         if K is None:
             return None
@@ -147,6 +156,16 @@ class _Parser:
                 brief(K.tolist()),
                 "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with fx and fy above 0",
                 "Give the camera's intrinsics (no skew).",
+            )
+            return None
+        (low, high), focal = _FOCAL_IN_SIDES, K[[0, 1], [0, 1]]
+        shorter, longer = min(width, height), max(width, height)
+        if shorter > 0 and not ((focal >= low * shorter) & (focal <= high * longer)).all():
+            entry.fail(
+                "K",
+                f"focal lengths of {focal[0]:g} and {focal[1]:g} pixels",
+                f"{low:g} times the shorter to {high:g} times the longer side of {width}x{height}",
+                "Give the focal length in pixels: that in millimetres over a pixel's size.",
             )
             return None
         return K
@@ -262,6 +281,14 @@ class _Parser:
                 f"{kind} [{start}, {end}]",
                 "[start, end] with start < end in microseconds",
                 "Give the times when the shutter opened and closed.",
+            )
+            return None
+        if end - start > _LONGEST_EXPOSURE_US:
+            entry.fail(
+                "exposure_us",
+                f"{end - start} us",
+                f"at most {_LONGEST_EXPOSURE_US}, a minute",
+                "Give times in microseconds.",
             )
             return None
         return start, end
@@ -384,12 +411,13 @@ class _Parser:
         file = entry.path("file", self.path)
         width, height = entry.integer("width", minimum=1), entry.integer("height", minimum=1)
         thresholds = entry.numbers("contrast_threshold", (2,), None)
-        if thresholds is not None and (thresholds <= 0).any():
+        low, high = _THRESHOLDS
+        if thresholds is not None and not ((thresholds >= low) & (thresholds <= high)).all():
             entry.fail(
                 "contrast_threshold",
                 str(thresholds.tolist()),
-                "two positive numbers [C+, C-] or null",
-                "Give magnitudes, or null where unknown.",
+                f"two positive numbers [C+, C-], {low:g} to {high:g}, or null",
+                "Give magnitudes of a change of the natural logarithm, or null where unknown.",
             )
         simulated = entry.get("simulated", False)
         if not isinstance(simulated, bool):

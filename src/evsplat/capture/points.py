@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from evsplat.errors import DataError
-from evsplat.files import atomic_path, why_not_read
+from evsplat.files import write_bytes
+from evsplat.untrusted.arrays import read_table
+from evsplat.untrusted.faults import ordinary_file
 
 _TYPES = {
     **{name: "i1" for name in ("char", "int8")},
@@ -21,6 +23,7 @@ _TYPES = {
     **{name: "f8" for name in ("double", "float64")},
 }
 _COLOURS = ("red", "green", "blue")
+_LONGEST_LINE = 4096
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
 
@@ -28,6 +31,7 @@ def read_points(
     path: Path,
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 3"]]:
     """Positions (metres, world) and colours in [0, 1] of the vertices; grey 0.5 without colour."""
+    ordinary_file(path)
     try:
         with path.open("rb") as file:
             layout, count, fields = _read_header(file)
@@ -37,15 +41,13 @@ def read_points(
                 raise ValueError(f"{left} bytes after the header, too few for {count} vertices")
             dtype = np.dtype([(name, _BYTE_ORDER[layout] + kind) for name, kind in fields])
             if layout == "ascii":
-                table = np.atleast_2d(np.loadtxt(file, max_rows=count, dtype=np.float64))
+                table = read_table(file, rows=count)
                 columns = {name: table[:, i] for i, (name, _) in enumerate(fields)}
                 length = len(table)
             else:
                 rows = np.frombuffer(file.read(count * dtype.itemsize), dtype=dtype)
                 columns = {name: rows[name] for name, _ in fields}
                 length = len(rows)
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise DataError(f"{path}: {why_not_read(error)}.") from error
     except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path}: not a readable PLY ({error}); write it anew.") from error
     if length != count:
@@ -94,14 +96,13 @@ def write_points(
             rows[name] = (colours[:, column].clip(0, 1) * 255).round()
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     lines += [*(f"property {word} {name}" for name, _, word in fields), "end_header", ""]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(lines).encode("ascii") + rows.tobytes())
+    write_bytes(path, "\n".join(lines).encode("ascii") + rows.tobytes())
 
 
 def _read_header(file: BinaryIO) -> tuple[str, int, list[tuple[str, str]]]:
     """Layout, vertex count and (name, numpy type) of the vertex properties."""
     lines = []
-    for raw in file:
+    while raw := file.readline(_LONGEST_LINE):
         lines.append(raw.decode("ascii").split())
         if lines[-1] == ["end_header"]:
             break

@@ -11,13 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.camera import Camera
-from evsplat.capture.body_file import BodyFile, body_from_arrays, read_arrays
+from evsplat.capture.body_file import BodyFile, body_from_arrays
+from evsplat.capture.check_body import check_dense
+from evsplat.capture.finding import Findings
 from evsplat.capture.metadata import Frame, Metadata, NovelView
 from evsplat.capture.points import read_points
 from evsplat.errors import DataError
 from evsplat.events import EventStore
 from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_rgb, to_unit_range
-from evsplat.pictures.light import Transfer
+from evsplat.pictures.light import Transfer, shown
+from evsplat.untrusted.arrays import read_plain_npz
 
 IMAGE_CACHE_BYTES = 512 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
@@ -45,6 +48,13 @@ class CaptureReader:
         """The same recording with all frames for training, and so none for a test."""
         frames = tuple(replace(frame, split="train") for frame in self.frames)
         return type(self)(replace(self._metadata, frames=frames))
+
+    def with_focal(self, focal_px: float) -> Self:
+        """The same recording by cameras of another focal length, but for those of novel views."""
+        cameras = dict(self.cameras)
+        for name in {frame.camera for frame in self.frames}:
+            cameras[name] = cameras[name].with_focal(focal_px)
+        return type(self)(replace(self._metadata, cameras=cameras))
 
     @property
     def metadata(self) -> Metadata:
@@ -78,6 +88,10 @@ class CaptureReader:
     def transfer(self, frame: Frame | str) -> Transfer:
         """From the values of a frame's pictures to light; the power curve where nothing is said."""
         return self._metadata.transfers.get(self._frame(frame).camera, "power")
+
+    def shown(self, values: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Values of the frames' pictures, or of drawings of them, coded for a display."""
+        return shown(values, self.transfer(self.frames[0]))
 
     def is_distorted(self, camera: str) -> bool:
         """True where the lens of a camera distorts, which reading pictures and events undoes."""
@@ -143,6 +157,31 @@ class CaptureReader:
         """True where body and poses are given."""
         return bool(self._metadata.body_model)
 
+    @property
+    def poses_found(self) -> str | None:
+        """A sentence on how `evsplat poses` found the poses; None where they were given."""
+        found = self.provenance.get("poses")
+        policy = found.get("policy") if isinstance(found, dict) else None
+        if not isinstance(found, dict) or not isinstance(policy, dict):
+            return None
+        seen = "training frames alone"
+        if policy.get("use") == "everything":
+            seen = "all frames, the held-out ones among them"
+        elif policy.get("held_out_events"):
+            seen = "training frames and the events of held-out intervals"
+        refinement = found.get("refinement")
+        drawn = isinstance(refinement, dict) and refinement.get("taken")
+        return (
+            f"Body poses were found by evsplat ({found.get('from')}"
+            f"{', corrected by drawing the person' if drawn else ''}) from {seen}."
+        )
+
+    @property
+    def poses_refined(self) -> bool:
+        """Whether `evsplat poses` tried to correct what it had found by drawing the person."""
+        found = self.provenance.get("poses")
+        return isinstance(found, dict) and isinstance(found.get("refinement"), dict)
+
     @functools.cached_property
     def body_file(self) -> BodyFile:
         """The body and its key poses as stored; a `DataError` where there are none."""
@@ -154,7 +193,7 @@ class CaptureReader:
             )
         path = self._metadata.body_file
         metadata = self._metadata
-        arrays = read_arrays(path)
+        arrays = read_plain_npz(path)
         return body_from_arrays(path, arrays, metadata.body_model, metadata.body_source)
 
     @functools.cached_property
@@ -163,7 +202,13 @@ class CaptureReader:
         path = self.path / "body_dense.npz"
         if not self.has_body or not path.exists():
             return None
-        return body_from_arrays(path, read_arrays(path), self._metadata.body_model)
+        arrays, findings = read_plain_npz(path), Findings()
+        check_dense(path, arrays, self.body_file.poses.shape[1], findings)
+        if findings.items:
+            raise DataError(str(findings.items[0]))
+        # Poses alone: what else there may be is the body's, which body.npz describes.
+        keyed = {key: arrays[key] for key in ("times_us", "poses", "transl")}
+        return body_from_arrays(path, keyed, self._metadata.body_model)
 
     def median_background(self) -> Float[Tensor, "H W 3"]:
         """Per-pixel temporal median of the train frames (at most 255, evenly spread)."""

@@ -158,6 +158,11 @@ class TrainingCapture:
         """True where body and poses are given."""
         return self._source.has_body
 
+    @property
+    def poses_refined(self) -> bool:
+        """Whether `evsplat poses` tried to correct what it had found by drawing the person."""
+        return self._source.poses_refined
+
     @functools.cached_property
     def body_file(self) -> BodyFile:
         """The body with the key poses that are seen.

@@ -10,7 +10,8 @@ from evsplat.capture.finding import Finding, Findings, reason_and_remedy
 from evsplat.capture.metadata import Metadata
 from evsplat.capture.parse import read_metadata
 from evsplat.errors import DataError
-from evsplat.pictures.files import image_size, read_image
+from evsplat.pictures.files import read_image
+from evsplat.untrusted.pictures import image_size
 
 _KIND_NAMES = {"image": "blurry picture", "sharp": "sharp picture", "mask": "person mask"}
 

@@ -1,9 +1,7 @@
 """Writing a capture as a whole, piece by piece, and reading a camera for it."""
 
 import dataclasses
-import os
-import shutil
-import tempfile
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -13,16 +11,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import PoseSource
-from evsplat.capture.body_file import RIG_ARRAYS
+from evsplat.capture.body_file import key_poses, save_arrays, write_body
 from evsplat.capture.parse import FORMAT, VERSION, default_split
 from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
-from evsplat.files import read_json, write_json
+from evsplat.files import (
+    copy_file,
+    make_folder,
+    new_folder,
+    remove_file,
+    try_target,
+    write_json,
+)
 from evsplat.names import checked_name
-from evsplat.pictures.files import image_size, write_image
+from evsplat.pictures.files import read_image, write_image
 from evsplat.pictures.light import Transfer
+from evsplat.untrusted.text import read_json
 
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
@@ -61,11 +67,11 @@ class CaptureWriter:
         self._events: dict[str, Any] | None = None
         self._folder: Path | None = None
         self._overwrite = overwrite
+        self._making = new_folder(self.path, replace=overwrite)
         self._check_target()
 
     def __enter__(self) -> Self:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._folder = Path(tempfile.mkdtemp(dir=self.path.parent, prefix=f".{self.path.name}-"))
+        self._folder = self._making.__enter__()
         return self
 
     def __exit__(
@@ -77,8 +83,12 @@ class CaptureWriter:
         try:
             if kind is None:
                 self._finish()
+        except BaseException:
+            self._making.__exit__(*sys.exc_info())
+            raise
+        else:
+            self._making.__exit__(kind, error, trace)
         finally:
-            shutil.rmtree(self._root, ignore_errors=True)
             self._folder = None
 
     def add_camera(
@@ -177,22 +187,21 @@ class CaptureWriter:
         truth between key poses, for evaluation only. ``source`` says where the key poses come from;
         ``pose_std_rad`` (P, J) and ``transl_std_m`` (P, 3), how far they err (`PoseErrors`).
         """
-        arrays: dict[str, Any] = {"model": model, **_poses(times_us, poses, transl)}
-        if rig is not None:
-            arrays |= {key: np.asarray(rig[key]) for key in RIG_ARRAYS}
-        if betas is not None:
-            arrays["betas"] = np.asarray(betas, dtype=np.float64).ravel()
-        if gender is not None:
-            arrays["gender"] = gender
-        for key, value in (("pose_std_rad", pose_std_rad), ("transl_std_m", transl_std_m)):
-            if value is not None:
-                arrays[key] = np.asarray(value, dtype=np.float32)
-        _save_arrays(self._root / "body.npz", arrays)
-        self._body = {"file": "body.npz", "model": model}
-        if source is not None:
-            self._body["source"] = source
+        self._body = write_body(
+            self._root,
+            model,
+            times_us,
+            poses,
+            transl,
+            rig=rig,
+            betas=betas,
+            gender=gender,
+            source=source,
+            pose_std_rad=pose_std_rad,
+            transl_std_m=transl_std_m,
+        )
         if dense is not None:
-            _save_arrays(self._root / "body_dense.npz", _poses(*dense))
+            save_arrays(self._root / "body_dense.npz", key_poses(*dense))
 
     def leave_out_body(self) -> None:
         """Say that nobody has posed the person yet; without this a capture needs `set_body`.
@@ -200,7 +209,7 @@ class CaptureWriter:
         What `set_body` was given before is taken back.
         """
         for name in ("body.npz", "body_dense.npz"):
-            (self._root / name).unlink(missing_ok=True)
+            remove_file(self._root / name)
         self._body = None
         self._without_body = True
 
@@ -252,6 +261,7 @@ class CaptureWriter:
         return self._folder
 
     def _check_target(self) -> None:
+        try_target(self.path)
         if not self.path.exists():
             return
         if not self._overwrite:
@@ -272,7 +282,9 @@ class CaptureWriter:
         if isinstance(image, np.ndarray):
             source, suffix, size = f"{self.path}: {stem}", ".png", image.shape[1::-1]
         else:
-            source, suffix, size = str(image), Path(image).suffix.lower(), image_size(Path(image))
+            # Decoded whole: a copy of a picture that ends too early would be found much later.
+            source, suffix = str(image), Path(image).suffix.lower()
+            size = read_image(Path(image)).shape[1::-1]
         if suffix not in _PICTURE_SUFFIXES:
             raise DataError(f"{source}: expected a PNG, JPEG or WebP picture; save it as PNG.")
         if size != expected:
@@ -281,11 +293,11 @@ class CaptureWriter:
                 f"{expected[0]}x{expected[1]} of camera {camera!r}."
             )
         target = self._root / (stem + suffix)
-        target.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(image, np.ndarray):
+            make_folder(target.parent)
             write_image(target, image, source=source)
         else:
-            shutil.copyfile(image, target)
+            copy_file(Path(image), target)
         return stem + suffix
 
     def _finish(self) -> None:
@@ -308,16 +320,6 @@ class CaptureWriter:
                 place = self.path / finding.file.relative_to(self._root)
                 raise DataError(f"{dataclasses.replace(finding, file=place)}")
         self._check_target()
-        umask = os.umask(0)
-        os.umask(umask)
-        self._root.chmod(0o777 & ~umask)
-        if self.path.exists():
-            replaced = self._root.with_name(f"{self._root.name}-replaced")
-            self.path.rename(replaced)
-            self._root.rename(self.path)
-            shutil.rmtree(replaced)
-        else:
-            self._root.rename(self.path)
 
 
 def read_camera(
@@ -360,17 +362,5 @@ def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarra
     return matrix
 
 
-def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    np.savez_compressed(path, allow_pickle=False, **arrays)
-
-
 def _numbers(matrix: ArrayLike) -> list[Any]:
     return np.asarray(matrix, dtype=np.float64).tolist()
-
-
-def _poses(times_us: ArrayLike, poses: ArrayLike, transl: ArrayLike) -> dict[str, np.ndarray]:
-    return {
-        "times_us": np.asarray(times_us, dtype=np.int64),
-        "poses": np.asarray(poses, dtype=np.float32),
-        "transl": np.asarray(transl, dtype=np.float32),
-    }

@@ -2,38 +2,118 @@
 
 import logging
 import os
+import signal
 import sys
-from collections.abc import Callable
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
-from evsplat.errors import EvsplatError
+from evsplat.errors import EvsplatError, MachineError, machine_error
+from evsplat.files import write_text
 
 _BAD_INPUT = 2
 _INTERRUPTED = 130
 _NOBODY_READS = 141
+_AGAIN_S = 0.02
 
 
 def exit_code(work: Callable[[], object]) -> int:
     """Do what the command line asks for, with its messages; gives the exit code.
 
     0: done; 2: the input, the machine or an option is at fault (one message on stderr);
-    130: stopped by Ctrl-C; 141: the reader of a pipe went away.
+    130: stopped by Ctrl-C or SIGTERM; 141: the reader of a pipe went away. Where memory, disk or
+    system fail unforeseen, the message names a file with the traceback.
     """
     logging.basicConfig(format="%(message)s")
     logging.getLogger("evsplat").setLevel(logging.INFO)
     try:
-        try:
-            work()
-        finally:
-            # A reader that went away is noticed here, not at the interpreter's end.
-            sys.stdout.flush()
+        with _stopped_by_sigterm(), _dropped_interrupts_again():
+            try:
+                work()
+            finally:
+                # A reader that went away is noticed here, not at the interpreter's end.
+                sys.stdout.flush()
     except EvsplatError as error:
-        print(f"evsplat: {error}", file=sys.stderr)
-        return _BAD_INPUT
+        return _said(error)
     except KeyboardInterrupt as stop:
-        print(f"\nevsplat: {str(stop) or 'Stopped.'}", file=sys.stderr)
+        _tell(f"\nevsplat: {str(stop) or 'Stopped.'}")
         return _INTERRUPTED
     except BrokenPipeError:
         # Whoever reads, such as head, has enough. What is still buffered goes nowhere, quietly.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _NOBODY_READS
+    except Exception as error:
+        fault = machine_error(error)
+        if fault is None:
+            raise
+        fault.__cause__ = error
+        return _said(fault)
     return 0
+
+
+def end_quietly() -> None:
+    """From here on, when nothing is left to be saved, Ctrl-C has no words."""
+    with suppress(ValueError, KeyboardInterrupt):
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _said(error: EvsplatError) -> int:
+    _tell(f"evsplat: {error}{_kept_traceback(error)}")
+    return _BAD_INPUT
+
+
+def _tell(text: str) -> None:
+    """Say it where somebody may read it: messages may go to the disk that is full."""
+    with suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
+
+
+def _kept_traceback(error: EvsplatError) -> str:
+    """Write what nobody expected to a file and give the words that name it; else nothing."""
+    if not isinstance(error, MachineError) or error.__cause__ is None:
+        return ""
+    text = "".join(traceback.format_exception(error.__cause__))
+    name = f"evsplat-traceback-{os.getpid()}.txt"
+    for folder in (error.folder, Path(tempfile.gettempdir())):
+        with suppress(EvsplatError, OSError, MemoryError):
+            if folder is not None and folder.is_dir():
+                write_text(folder / name, text)
+                return f" The traceback is in {folder / name}."
+    return ""
+
+
+@contextmanager
+def _stopped_by_sigterm() -> Iterator[None]:
+    """The end that docker stop or a batch system asks for is that of Ctrl-C."""
+    try:
+        previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+@contextmanager
+def _dropped_interrupts_again() -> Iterator[None]:
+    """Ctrl-C that comes while an object is given back, which Python then drops, comes once more."""
+    before = sys.unraisablehook
+
+    def hook(dropped: "sys.UnraisableHookArgs") -> None:
+        if not issubclass(dropped.exc_type, KeyboardInterrupt):
+            before(dropped)
+            return
+        again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), signal.SIGINT))
+        again.daemon = True
+        again.start()
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before

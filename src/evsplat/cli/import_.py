@@ -7,7 +7,9 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
-from evsplat.options.declare import FLAT, Flag, option
+from evsplat.errors import ConfigError
+from evsplat.options import PoseOptions
+from evsplat.options.declare import FLAT, CaptureFolder, Flag, option
 
 
 def import_() -> None:
@@ -41,13 +43,34 @@ class _Import:
             self.out,
             smpl=self.smpl,
             overwrite=self.overwrite,
-            blur=self.going_on(),
+            **self.going_on(),
         )
         print(f"written: {path}\nlook at it with: evsplat inspect {path}")
+        if (path / "poses.html").is_file():
+            print(f"and at its poses: {path / 'poses.html'}\nthen: evsplat train {path}")
 
-    def going_on(self) -> Any:
-        """The `Blur` that follows; None: the capture stays sharp."""
-        return None
+    def going_on(self) -> dict[str, Any]:
+        """What follows the import, as arguments of `run_importer`."""
+        return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ImportToPose(_Import):
+    """The import of a recording whose poses may have to be found."""
+
+    find_poses: Flag = False
+    """Go on to find the person's poses: evsplat poses, whose options stand last."""
+    search: Annotated[PoseOptions, FLAT]
+
+    def going_on(self) -> dict[str, Any]:
+        if self.find_poses:
+            return {"poses": self.search}
+        if self.search != PoseOptions():
+            raise ConfigError(
+                "--body, --height, --refine, --use and --held-out-events belong to --find-poses; "
+                "leave them out, or give it as well."
+            )
+        return {}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,10 +87,46 @@ class _ImportToBlur(_Import):
     weights: Annotated[Path | None, option("FILE", default="in torch's hub folder")] = None
     """Checkpoint of Super SloMo for --blur."""
 
-    def going_on(self) -> Any:
+    def going_on(self) -> dict[str, Any]:
         from evsplat.importers import Blur
 
-        return Blur(self.interpolation, self.weights) if self.blur else None
+        return {"blur": Blur(self.interpolation, self.weights)} if self.blur else {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Poses:
+    """Give a capture the poses of a tool's file, or of another capture's body.npz."""
+
+    capture: CaptureFolder
+    file: Annotated[tyro.conf.Positional[Path], option("FILE")]
+    """Pose file or folder (docs/poses.md); its poses belong to the frames by index."""
+    out: Annotated[Path, option("CAPTURE")]
+    """The new capture; its cameras are those of the old one."""
+    person: Annotated[str | None, option("NAME", default="the only one")] = None
+    """Choice among several people in the file."""
+    pose_source: Annotated[
+        Literal["exact", "markers", "estimated"] | None,
+        option("SOURCE", default="what the tool is known for"),
+    ] = None
+    """Where the poses come from: exact, markers or estimated."""
+    smpl: Annotated[Path | None, option("PATH", default="EVSPLAT_BODY_MODELS")] = None
+    """Your SMPL model file, or the folder that holds it."""
+    overwrite: Flag = False
+    """Replace a capture that is there."""
+
+    def __call__(self) -> None:
+        from evsplat.importers import attach_poses
+
+        path = attach_poses(
+            self.capture,
+            self.file,
+            self.out,
+            person=self.person,
+            pose_source=self.pose_source,
+            smpl=self.smpl,
+            overwrite=self.overwrite,
+        )
+        print(f"written: {path}\nlook at it with: evsplat inspect {path}")
 
 
 def import_with_kinds() -> Callable[..., Any]:
@@ -76,11 +135,12 @@ def import_with_kinds() -> Callable[..., Any]:
 
     verbs = []
     for name, kind in KINDS.items():
-        base = _ImportToBlur if kind.blur_recipe else _Import
+        base = _ImportToBlur if kind.blur_recipe else _ImportToPose
         options = ("options", Annotated[kind, FLAT])
         verb = make_dataclass(kind.__name__, [options], bases=(base,), frozen=True, kw_only=True)
         verb.__doc__ = kind.__doc__
         verbs.append(Annotated[verb, tyro.conf.subcommand(name)])
+    verbs.append(Annotated[_Poses, tyro.conf.subcommand("poses")])
 
     def import_kind(*, kind: Any) -> None:
         kind()

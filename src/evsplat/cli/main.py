@@ -1,5 +1,6 @@
 """Reading the command line: which verb, with which options."""
 
+import io
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,7 +10,7 @@ import tyro
 import evsplat
 from evsplat.cli import captures, runs
 from evsplat.cli.doctor import doctor
-from evsplat.cli.exits import exit_code
+from evsplat.cli.exits import end_quietly, exit_code
 from evsplat.cli.import_ import import_, import_with_kinds
 
 _VERBS: dict[str, Callable[..., Any]] = {
@@ -42,6 +43,11 @@ _DESCRIPTION = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code, see `exit_code`."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # A terminal of the C locale cannot show every name that a capture may have.
+            stream.reconfigure(errors="backslashreplace")
+    is_process = arguments is None
     arguments = _gathered(sys.argv[1:] if arguments is None else arguments)
     if arguments == ["--version"]:
         print(f"evsplat {evsplat.__version__}")
@@ -63,7 +69,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if callable(asked):
             asked()
 
-    return exit_code(work)
+    code = exit_code(work)
+    if is_process:
+        end_quietly()
+    return code
 
 
 def _gathered(arguments: Sequence[str]) -> list[str]:

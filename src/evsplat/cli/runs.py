@@ -3,12 +3,14 @@
 import shlex
 import sys
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from evsplat.options import BenchOptions, ExportOptions, Film, TrainOptions
+from evsplat.cli.captures import Poses
+from evsplat.options import BenchOptions, ExportOptions, Film, PoseSearch, TrainOptions
 from evsplat.options.declare import (
     FLAT,
     CaptureFolder,
@@ -32,6 +34,9 @@ def demo(
     max_minutes: Annotated[
         float, option("M", "Minutes of training; evaluation and report come on top.")
     ] = 6.0,
+    find_poses: Annotated[
+        Flag, option(help="Take its poses away and find them again, in captures/.")
+    ] = False,
     device: Annotated[Device, option(help="Device that computes.")] = "auto",
     threads: Threads = None,
 ) -> None:
@@ -39,8 +44,12 @@ def demo(
 
     A synthetic dancer, 72 ms of blur per frame, with events and ground truth.
     """
+    capture = demo_capture()
     options = TrainOptions(out=out, max_minutes=max_minutes, device=device, threads=threads)
-    Train(capture=demo_capture(), options=options)()
+    if find_poses:
+        capture, given = Path("captures") / f"demo_{datetime.now():%Y-%m-%d_%H-%M-%S}", capture
+        Poses(capture=given, out=capture, search=PoseSearch(), threads=threads)()
+    Train(capture=capture, options=options)()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -266,9 +266,10 @@ class _MeasuredFrames:
 
     def _save(self, frame: Frame, ours: Tensor, truth: Tensor | None) -> dict[str, str]:
         stem = file_stem(self.split, frame.name)
-        pictures = {"render": to_bytes(ours)}
+        shown = self.capture.shown(ours)
+        pictures = {"render": to_bytes(shown)}
         if truth is not None:
-            pictures["error"] = error_map(ours, truth)
+            pictures["error"] = error_map(shown, self.capture.shown(truth))
         for kind, picture in pictures.items():
             save_png(self.out_dir / "pictures" / f"{stem}_{kind}.png", picture)
         return {kind: f"pictures/{stem}_{kind}.png" for kind in pictures}
@@ -319,7 +320,7 @@ def _novel_views(
         }
         if ours is not None:
             path = f"pictures/{file_stem('novel', view.camera, f'{view.index:04d}')}_render.png"
-            save_png(out_dir / path, to_bytes(ours))
+            save_png(out_dir / path, to_bytes(capture.shown(ours)))
             entry["pictures"] = {"render": path}
         per_view.setdefault(view.camera, []).append(entry)
     result = {}

@@ -10,10 +10,11 @@ from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import name_of
 from evsplat.evaluation.tables import write_tables
-from evsplat.files import write_json, write_text
+from evsplat.files import try_target, write_json, write_text
 from evsplat.options.runs import Split
 from evsplat.render import choose_device
 from evsplat.training.run import load_run
+from evsplat.untrusted.faults import MISFITS, broken_as
 
 
 def evaluate_run(
@@ -32,6 +33,7 @@ def evaluate_run(
     start = time.monotonic()
     device = choose_device(device)
     run = load_run(Path(run_dir), device=device)
+    try_target(run.path)
     measured = evaluate(
         run.capture,
         run.reconstruction,
@@ -50,6 +52,7 @@ def evaluate_run(
         "gaussians": run.gaussians,
         "evaluate_seconds": round(time.monotonic() - start, 1),
         "policy": to_dict(run.policy),
+        "poses": run.capture.poses_found,
         **measured,
     }
     write_json(Path(run.path) / name_of("metrics", split, ".json"), metrics)
@@ -65,5 +68,12 @@ def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
     run = load_run(Path(run_dir))
     path = Path(run_dir) / name_of("report", split, ".html")
     source = Source.read(Path(run_dir), run.capture, run.reconstruction, split)
-    write_text(path, page(source))
+    with broken_as(
+        Path(run_dir),
+        "its figures are not as evsplat evaluate writes them",
+        "evaluate the run again",
+        kinds=MISFITS,
+    ):
+        html = page(source)
+    write_text(path, html)
     return path

@@ -164,9 +164,10 @@ def composited(metrics: dict[str, Any]) -> dict[str, Any]:
 
 
 def terms(metrics: dict[str, Any]) -> str:
-    """Terms of the run: one sentence on what training saw."""
+    """Terms of the run: a sentence on what training saw, and one on poses that were not given."""
     policy = policy_of(metrics)
-    return "The run does not tell what training saw." if policy is None else policy.sentence
+    seen = "The run does not tell what training saw." if policy is None else policy.sentence
+    return " ".join(filter(None, (seen, metrics.get("poses"))))
 
 
 def missing_networks(metrics: dict[str, Any]) -> list[str]:
@@ -193,9 +194,9 @@ def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
 
 def markdown(title: str, intro: str, tables: Iterable[Table], notes: Sequence[str] = ()) -> str:
     """All tables as one Markdown page, with ``notes`` at its end."""
-    lines = [f"# {title}", "", intro, ""]
+    lines = [f"# {_markdown_text(title)}", "", intro, ""]
     for table in tables:
-        lines += [f"## {table.title}", "", table.note, ""]
+        lines += [f"## {_markdown_text(table.title)}", "", table.note, ""]
         head = [
             _markdown_text(f"{h.group} {h.title} {_ARROWS[h.higher_is_better]}")
             for h in table.headings
@@ -213,7 +214,7 @@ def _markdown_list(items: Sequence[str]) -> list[str]:
 
 
 def _markdown_text(text: str) -> str:
-    escaped = "".join("\\" + c if c in "|*_`<" else c for c in text)
+    escaped = "".join("\\" + c if c in "|*_`<[" else c for c in text)
     return " ".join(escaped.split())
 
 

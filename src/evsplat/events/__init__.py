@@ -2,7 +2,14 @@
 
 from evsplat.events.edi import deblur
 from evsplat.events.formats.base import RecordedFrame
-from evsplat.events.maps import begun_counts, count_map, polarity_counts, time_surface, voxel_grid
+from evsplat.events.maps import (
+    begun_counts,
+    count_map,
+    polarity_counts,
+    time_surface,
+    voxel_grid,
+    window_counts,
+)
 from evsplat.events.recording import EventRecording, open_recording, read_events
 from evsplat.events.simulator import (
     PRESETS,
@@ -35,5 +42,6 @@ __all__ = [
     "simulate_events",
     "time_surface",
     "voxel_grid",
+    "window_counts",
     "write_events",
 ]

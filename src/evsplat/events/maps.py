@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from evsplat.compiled import native
 from evsplat.errors import DataError
 from evsplat.events.stream import EventStream
 
@@ -63,6 +64,28 @@ def begun_counts(
         channel = (sign[known] < 0) * pixels
         shares[row, between[known] + channel] = (time - stream.t[before[known]]) / gap[known]
     return torch.from_numpy(shares.reshape(-1, 2, height, width))
+
+
+def window_counts(
+    stream: EventStream, times_us: Sequence[int], height: int, width: int, *, reach_us: int = 0
+) -> Float[Tensor, "T-1 2 H W"]:
+    """Number of ON and of OFF events between neighbouring times, which ascend.
+
+    With ``reach_us`` above 0 the share of a next event that has come about by a time
+    (`begun_counts`) counts before it instead of after. ``stream`` then holds the events around.
+    """
+    event_pixels(stream, height, width)
+    if native is not None:
+        maps = torch.zeros(len(times_us) - 1, 2, height, width)
+        columns = (np.ascontiguousarray(v) for v in (stream.t, stream.x, stream.y, stream.p))
+        native.window_counts(*columns, np.asarray(times_us, np.int64), reach_us, maps)
+        return maps
+    windows = zip(times_us, times_us[1:], strict=False)
+    counts = [polarity_counts(stream.between(*ends), height, width) for ends in windows]
+    if reach_us <= 0:
+        return torch.stack(counts)
+    begun = begun_counts(stream, times_us, height, width, reach_us=reach_us)
+    return torch.stack(counts) + begun[1:] - begun[:-1]
 
 
 def voxel_grid(

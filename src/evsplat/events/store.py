@@ -5,10 +5,13 @@ t >= 1000 m; `t_offset` is added to every t. Times that leave this module are on
 ``t + t_offset + clock_offset_us``.
 """
 
+import copy
 import functools
 import os
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,8 @@ from jaxtyping import Float, Int64
 
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events.stream import EventStream
+from evsplat.untrusted.faults import broken_as
+from evsplat.untrusted.hdf5 import data_set, open_hdf5
 
 Span = tuple[int, int]
 """Start and end of a stretch of time, microseconds, the end exclusive."""
@@ -26,7 +31,14 @@ ALWAYS: Span = (-(1 << 62), 1 << 62)
 
 # HDF5 keeps decoded chunks per dataset; 4 MiB hold eight chunks of int64 times.
 _CHUNK_CACHE_BYTES = 4 << 20
+_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
 _POLARITY_BLOCK = 1 << 16
+_KEPT_BLOCK = 1 << 16
+"""Rows that are decoded and kept together."""
+_CHECKED_ROWS = 1 << 16
+"""Entries of the index that are remembered as right."""
+_EVENT_BYTES = 13
+"""Of an `EventStream`."""
 _HIDDEN = (
     ", which this training's policy hides; with --set policy.held_out_events=true it is seen, and "
     "figures are those of interpolation."
@@ -59,13 +71,16 @@ class EventStore:
         self.clock_offset_us = clock_offset_us
         self._pixel_lookup = pixel_lookup
         self._readable_us = tuple(readable_us)
+        self._keep_bytes = 0
+        self._kept: OrderedDict[int, EventStream] = OrderedDict()
+        self._checked_rows: dict[int, int] = {}
         self._file: h5py.File | None = None
         self._owner_pid = -1
         self._shift_us = 0
         self._has_polarity: bool | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None, "_owner_pid": -1}
+        return {**self.__dict__, "_file": None, "_owner_pid": -1, "_kept": OrderedDict()}
 
     def __len__(self) -> int:
         """Count of events, without held-out ones."""
@@ -78,11 +93,11 @@ class EventStore:
 
         (0, 0) where there are no events.
         """
-        t: h5py.Dataset = self._open()["events/t"]
         rows = [pair for pair in self._readable_rows if pair[0] < pair[1]]
         if not rows:
             return 0, 0
-        return int(t[rows[0][0]]) + self._shift_us, int(t[rows[-1][1] - 1]) + self._shift_us + 1
+        first, last = (self._time_of(row) for row in (rows[0][0], rows[-1][1] - 1))
+        return first + self._shift_us, last + self._shift_us + 1
 
     @property
     def stretches_us(self) -> tuple[Span, ...]:
@@ -103,48 +118,91 @@ class EventStore:
         size, lookup = (self.width, self.height), self._pixel_lookup
         return EventStore(self.path, *size, self.clock_offset_us, lookup, readable_us)
 
+    def keeping(self, limit_bytes: int) -> "EventStore":
+        """The same recording, for slices that overlap: up to so many bytes of it stay decoded."""
+        kept = copy.copy(self)
+        kept._keep_bytes, kept._kept = limit_bytes, OrderedDict()
+        kept._file = None
+        return kept
+
     @property
     def has_polarity(self) -> bool:
         """False where every stored polarity is 0: the sensor did not say, and slices have p = 0."""
         if self._has_polarity is None:
-            stored: h5py.Dataset = self._open()["events/p"]
+            file = self._open()
             blocks = [
                 (start, min(start + _POLARITY_BLOCK, last))
                 for first, last in self._readable_rows
                 for start in range(first, last, _POLARITY_BLOCK)
             ]
             self._has_polarity = not blocks or any(
-                bool(stored[start:end].any()) for start, end in blocks
+                bool(self._read(file, "events/p", *block).any()) for block in blocks
             )
         return self._has_polarity
 
     def between(self, start_us: int, end_us: int) -> EventStream:
-        """Events with ``start_us <= t < end_us``, read from disk.
+        """Events with ``start_us <= t < end_us``, read from disk where they are not kept.
 
-        Only the milliseconds that the window touches are read. Raises `DataError` where what was
-        read is out of order or outside of the sensor, so that a bad file is never used silently,
-        and `HeldOutError` where the window reaches into a held-out interval.
+        Only the milliseconds that the window touches are read, or the blocks of what is kept.
+        Raises `DataError` where what was read is out of order or outside of the sensor, so that a
+        bad file is never used silently, and `HeldOutError` where the window reaches into a held-out
+        interval.
         """
         self._check_readable(start_us, end_us)
         file = self._open()
         start, end = start_us - self._shift_us, end_us - self._shift_us
-        first = self._index_at_ms(start // 1000)
-        last = max(first, self._index_at_ms(-(-end // 1000)))
-        t = self._read(file, "events/t", first, last).astype(np.int64)
+        if not self._keep_bytes:
+            return self._decoded(
+                *self._times_around(file, start, max(start, end)), start_us, end_us
+            )
+        first = self._checked_index_at_ms(start // 1000)
+        last = self._checked_index_at_ms(-(-max(start, end) // 1000))
+        blocks = (self._block(*rows) for rows in self._block_rows(first, last))
+        parts = [block.between(start_us, end_us) for block in blocks]
+        ends = [(a.t[-1], b.t[0]) for a, b in pairwise(part for part in parts if len(part))]
+        if any(before > after for before, after in ends):
+            raise DataError(
+                f"{self.path}: events/t is not ascending between rows {first} and {last}; sort the "
+                "events by t and rebuild ms_to_idx."
+            )
+        return parts[0] if len(parts) == 1 else EventStream.joined(parts)
+
+    def _block_rows(self, first: int, last: int) -> Iterator[tuple[int, int]]:
+        """Rows of the blocks that hold readable ones of [first, last)."""
+        for low, high in self._readable_rows:
+            start, end = max(first, low), min(last, high)
+            if start >= end:
+                continue
+            for row in range(start - (start - low) % _KEPT_BLOCK, end, _KEPT_BLOCK):
+                yield row, min(row + _KEPT_BLOCK, high)
+
+    def _block(self, first: int, last: int) -> EventStream:
+        if first not in self._kept:
+            t = self._read(self._open(), "events/t", first, last).astype(np.int64)
+            self._kept[first] = self._decoded(first, t, *ALWAYS)
+            most = max(1, self._keep_bytes // (_KEPT_BLOCK * _EVENT_BYTES))
+            while len(self._kept) > most:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(first)
+        return self._kept[first]
+
+    def _decoded(self, first: int, t: np.ndarray, start_us: int, end_us: int) -> EventStream:
+        """The events within two times, of the rows from ``first`` on whose times are ``t``."""
+        file = self._open()
         if len(t) and (np.diff(t) < 0).any():
             index = first + int(np.argmax(np.diff(t) < 0)) + 1
             raise DataError(
                 f"{self.path}: events/t[{index}] is earlier than the event before it, expected "
                 "ascending times; sort the events by t and rebuild ms_to_idx."
             )
+        start, end = start_us - self._shift_us, end_us - self._shift_us
         low, high = np.searchsorted(t, [start, end], side="left")
         high = max(low, high)
-        x = self._read(file, "events/x", first + low, first + high).astype(np.uint16)
-        y = self._read(file, "events/y", first + low, first + high).astype(np.uint16)
-        p = self._read(file, "events/p", first + low, first + high)
-        self._check_pixels(x, y, first + low)
+        x, y, p = (self._read(file, f"events/{name}", first + low, first + high) for name in "xyp")
+        self._check(x, y, p, first + low)
         signs = np.where(p > 0, np.int8(1), np.int8(-1)) if self.has_polarity else 0 * p
-        stream = EventStream(t[low:high] + self._shift_us, x, y, signs.astype(np.int8))
+        pixels = x.astype(np.uint16), y.astype(np.uint16)
+        stream = EventStream(t[low:high] + self._shift_us, *pixels, signs.astype(np.int8))
         return stream if self._pixel_lookup is None else self._undistort(stream)
 
     def rate(self, bins: int) -> tuple[Int64[np.ndarray, "bins+1"], Float[np.ndarray, "bins"]]:
@@ -170,19 +228,31 @@ class EventStore:
 
     def _open(self) -> h5py.File:
         if self._file is None or self._owner_pid != os.getpid():
-            try:
-                self._file = h5py.File(self.path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
-                self._owner_pid = os.getpid()
-                self._shift_us = self.clock_offset_us + int(self._file["t_offset"][()])
-            except FileNotFoundError:
-                raise DataError(f"{self.path}: file not found.") from None
-            except (OSError, KeyError) as error:
-                self._file = None
-                raise DataError(
-                    f"{self.path}: not a readable event file ({error}); copy it again or write it "
-                    "anew."
-                ) from error
+            file = open_hdf5(self.path, rdcc_nbytes=_CHUNK_CACHE_BYTES)
+            self._check_layout(file)
+            self._shift_us = self.clock_offset_us + int(file["t_offset"][()])
+            self._file, self._owner_pid = file, os.getpid()
         return self._file
+
+    def _check_layout(self, file: h5py.File) -> None:
+        found = {name: data_set(file, name) for name in (*_COLUMNS, "ms_to_idx", "t_offset")}
+        wrong = [
+            name
+            for name, data in found.items()
+            if data.dtype.kind not in "iu" or data.ndim != (name != "t_offset")
+        ]
+        if wrong:
+            data = found[wrong[0]]
+            raise DataError(
+                f"{self.path}: {wrong[0]} has shape {data.shape} of {data.dtype}, expected whole "
+                "numbers, a column of them or, for t_offset, one; write the file anew."
+            )
+        lengths = {name: len(found[name]) for name in _COLUMNS}
+        if len(set(lengths.values())) > 1:
+            raise DataError(
+                f"{self.path}: its columns differ in length ({lengths}), expected one number per "
+                "event in each; write the file anew."
+            )
 
     @functools.cached_property
     def _readable_rows(self) -> list[tuple[int, int]]:
@@ -215,23 +285,70 @@ class EventStore:
 
     def _index_at_ms(self, millisecond: int) -> int:
         """Index of the first event at or after a millisecond of the file's clock."""
-        index: h5py.Dataset = self._open()["ms_to_idx"]
+        file = self._open()
+        count = int(file["events/t"].shape[0])
         if millisecond < 0:
             return 0
-        if millisecond < len(index):
-            return int(index[millisecond])
-        return int(self._open()["events/t"].shape[0])
+        if millisecond >= file["ms_to_idx"].shape[0]:
+            return count
+        row = int(self._read(file, "ms_to_idx", millisecond, millisecond + 1)[0])
+        if not 0 <= row <= count:
+            raise self._wrong_index(millisecond)
+        return row
+
+    def _checked_index_at_ms(self, millisecond: int) -> int:
+        """`_index_at_ms`, compared with the times of the event there and the one before, once."""
+        if millisecond not in self._checked_rows:
+            row = self._index_at_ms(millisecond)
+            t = self._read(self._open(), "events/t", max(row - 1, 0), row + 1)
+            before = min(row, 1)
+            if (t[:before] >= 1000 * millisecond).any() or (t[before:] < 1000 * millisecond).any():
+                raise self._wrong_index(millisecond)
+            if len(self._checked_rows) >= _CHECKED_ROWS:
+                self._checked_rows.clear()
+            self._checked_rows[millisecond] = row
+        return self._checked_rows[millisecond]
+
+    def _times_around(self, file: h5py.File, start: int, end: int) -> tuple[int, np.ndarray]:
+        """Times of the milliseconds from ``start`` to ``end``, and the row of the first of them.
+
+        With the event before and the one after: they show whether the index leads where it should.
+        """
+        first_ms, last_ms = start // 1000, -(-end // 1000)
+        first, last = self._index_at_ms(first_ms), self._index_at_ms(last_ms)
+        if last < first:
+            raise self._wrong_index(last_ms)
+        row = max(first - 1, 0)
+        t = self._read(file, "events/t", row, last + 1).astype(np.int64)
+        if first > 0 and t[0] >= 1000 * first_ms:
+            raise self._wrong_index(first_ms)
+        if len(t) > last - row and t[-1] < 1000 * last_ms:
+            raise self._wrong_index(last_ms)
+        return row, t
+
+    def _wrong_index(self, millisecond: int) -> DataError:
+        return DataError(
+            f"{self.path}: ms_to_idx[{millisecond}] is not the first event with t >= "
+            f"{1000 * millisecond}; rebuild ms_to_idx, or write the recording anew with evsplat "
+            "convert."
+        )
+
+    def _time_of(self, row: int) -> int:
+        return int(self._read(self._open(), "events/t", row, row + 1)[0])
 
     def _read(self, file: h5py.File, key: str, first: int, last: int) -> np.ndarray:
-        try:
+        with broken_as(self.path, f"{key}[{first}:{last}] cannot be read", "copy the file again"):
             return file[key][first:last]
-        except OSError as error:
-            raise DataError(
-                f"{self.path}: {key}[{first}:{last}] cannot be read ({error}); copy the file again."
-            ) from error
 
-    def _check_pixels(self, x: np.ndarray, y: np.ndarray, first: int) -> None:
-        outside = (x >= self.width) | (y >= self.height)
+    def _check(self, x: np.ndarray, y: np.ndarray, p: np.ndarray, first: int) -> None:
+        neither = (p != 0) & (p != 1)
+        if neither.any():
+            at = int(np.argmax(neither))
+            raise DataError(
+                f"{self.path}: event {first + at} has polarity {p[at]}, expected 0 (darker) or 1 "
+                "(brighter); convert the polarities."
+            )
+        outside = (x < 0) | (x >= self.width) | (y < 0) | (y >= self.height)
         if outside.any():
             at = int(np.argmax(outside))
             raise DataError(

@@ -6,15 +6,16 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from shutil import copyfileobj
-from tempfile import TemporaryFile
 from typing import IO, Any
 
 import h5py
 import numpy as np
 
+from evsplat.disk import uninterrupted
 from evsplat.errors import ConfigError, DataError
+from evsplat.events.hdf5_output import Hdf5Output
 from evsplat.events.stream import EventStream
-from evsplat.files import atomic_path
+from evsplat.files import atomic_path, open_output, try_target, unnamed_file
 
 CHUNK_EVENTS = 65_536
 _COPY_BYTES = 1 << 20
@@ -74,6 +75,9 @@ def write_events(
     format = format or _SUFFIXES[path.suffix.lower()]
     if format not in WRITTEN_FORMATS:
         raise ConfigError(f"format is {format!r}, expected one of {', '.join(WRITTEN_FORMATS)}.")
+    if format == "hdf5" and path.exists() and not path.is_file() and not path.is_dir():
+        raise DataError(f"{path}: is a device, which HDF5 cannot be written to; write csv or evt2.")
+    try_target(path)
     size = None if width is None or height is None else (width, height)
     stored = {**(attributes or {}), **dict(zip(("width", "height"), size or (), strict=False))}
     makers: dict[str, Callable[[Path], Writer]] = {
@@ -84,7 +88,9 @@ def write_events(
     }
     last_us: int | None = None
     count = 0
-    with atomic_path(path) as temporary, makers[format](temporary) as writer:
+    with atomic_path(path) as temporary, ExitStack() as stack:
+        with uninterrupted():
+            writer = stack.enter_context(makers[format](temporary))
         for piece in (events,) if isinstance(events, EventStream) else events:
             if not len(piece):
                 continue
@@ -120,7 +126,10 @@ class Hdf5Writer(Writer):
         self, path: Path, attributes: Mapping[str, object], compression_level: int
     ) -> None:
         super().__init__()
-        self._file = self.enter_context(h5py.File(path, "w"))
+        # In this order, as the last one is closed first.
+        self._output = self.enter_context(Hdf5Output(path))
+        self._file = h5py.File(self._output, "w")
+        self.callback(self._close)
         self._count = self._offset = self._next_ms = 0
         self._index: list[np.ndarray] = []
         packing: dict[str, Any] = {
@@ -136,6 +145,11 @@ class Hdf5Writer(Writer):
 
     def append(self, piece: EventStream) -> None:
         """Add rows to the columns and to the index of milliseconds."""
+        with uninterrupted():
+            self._append(piece)
+        self._output.raise_error()
+
+    def _append(self, piece: EventStream) -> None:
         if self._count == 0:
             self._offset = int(piece.t[0]) // 1000 * 1000
         t = piece.t.astype(np.int64) - self._offset
@@ -153,8 +167,15 @@ class Hdf5Writer(Writer):
         """Add the index: entry m is the first event with t >= 1000 m, the last one the count."""
         # an empty recording has the millisecond 0 as any other
         tail = np.full(1 if self._count else 2, self._count)
-        self._file["ms_to_idx"] = np.concatenate([*self._index, tail]).astype(np.uint64)
-        self._file["t_offset"] = np.int64(self._offset)
+        with uninterrupted():
+            self._file["ms_to_idx"] = np.concatenate([*self._index, tail]).astype(np.uint64)
+            self._file["t_offset"] = np.int64(self._offset)
+        self._close()
+        self._output.raise_error()
+
+    def _close(self) -> None:
+        with uninterrupted():
+            self._file.close()
 
 
 class NpzWriter(Writer):
@@ -166,7 +187,7 @@ class NpzWriter(Writer):
         self._count = 0
         # the header of an array says its length, which is known at the end
         self._columns: dict[str, tuple[IO[bytes], np.dtype]] = {
-            name: (self.enter_context(TemporaryFile(dir=path.parent)), np.dtype(kind))
+            name: (self.enter_context(unnamed_file(path.parent)), np.dtype(kind))
             for name, kind in (("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1"))
         }
 
@@ -196,7 +217,7 @@ class CsvWriter(Writer):
 
     def __init__(self, path: Path, size: Size) -> None:
         super().__init__()
-        self._file = self.enter_context(open(path, "w", encoding="ascii", newline="\n"))
+        self._file = self.enter_context(open_output(path))
         self._names = ["t", "x", "y"] if size is None else ["t", f"x@{size[0]}", f"y@{size[1]}"]
         self._has_polarity: bool | None = None
 
@@ -208,7 +229,7 @@ class CsvWriter(Writer):
         if self._has_polarity:
             columns.append((piece.p > 0).astype(np.uint8).tolist())
         line = ",".join(["%d"] * len(columns)) + "\n"
-        self._file.write("".join(map(line.__mod__, zip(*columns, strict=True))))
+        self._write("".join(map(line.__mod__, zip(*columns, strict=True))))
 
     def finish(self) -> None:
         """An empty recording has its header."""
@@ -217,7 +238,10 @@ class CsvWriter(Writer):
 
     def _write_header(self, has_polarity: bool) -> None:
         self._has_polarity = has_polarity
-        self._file.write(",".join([*self._names, *(["on"] if has_polarity else [])]) + "\n")
+        self._write(",".join([*self._names, *(["on"] if has_polarity else [])]) + "\n")
+
+    def _write(self, text: str) -> None:
+        self._file.write(text.encode("ascii"))
 
 
 class Evt2Writer(Writer):
@@ -226,7 +250,7 @@ class Evt2Writer(Writer):
     def __init__(self, path: Path, size: Size, name: Path) -> None:
         super().__init__()
         self._name = name
-        self._file = self.enter_context(open(path, "wb"))
+        self._file = self.enter_context(open_output(path))
         self._high = -1
         lines = ["evt 2.0", "format EVT2" + (f";height={size[1]};width={size[0]}" if size else "")]
         lines += [f"geometry {size[0]}x{size[1]}"] if size else []

@@ -208,8 +208,8 @@ def _page(document: Mapping[str, Any], person: SplatCloud, scene: SplatCloud | N
     page = _asset("page.html")
     parts = {
         "STYLE": _asset("player.css"),
-        # A closing tag inside a script would end it.
-        "DATA": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"),
+        # Inside a script "</script" would end it, and "<!--<script" keep it from ending.
+        "DATA": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         "SCRIPT": "\n".join(_asset(name) for name in _SCRIPTS),
     }
     return re.sub(r"/\*(STYLE|DATA|SCRIPT)\*/", lambda match: parts[match[1]], page)

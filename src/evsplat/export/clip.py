@@ -39,6 +39,7 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
         ) from None
     capture, source = run.capture, run.reconstruction
     track = load_body_track(capture)
+    transfer = capture.transfer(capture.frames[0])
     middle = instant_of(capture, time_s=None, frame=None, camera=camera)
     mids = sorted(frame.mid_us for frame in capture.frames)
     count = 1 + int((mids[-1] - mids[0]) * fps / 1e6)
@@ -56,13 +57,14 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
         server.initial_camera.fov = 2 * math.atan(view.height / 2 / float(view.K[1, 1]))
         if parts != "human":
             layers = source.splats(middle.camera, [middle.time_us], parts=parts)
-            _show(server, "/scene", cloud_of(layers[-1]))
+            _show(server, "/scene", cloud_of(layers[-1]).shown(transfer))
         serializer = server.get_scene_serializer()
         handle = None
         for time in tqdm(times if parts != "scene" else times[:1], desc="clip", unit="picture"):
             if parts != "scene":
                 layers = source.splats(middle.camera, [time], parts="human")
-                handle = _show(server, "/person", cloud_of(layers[0]), handle)
+                person = cloud_of(layers[0]).shown(transfer)
+                handle = _show(server, "/person", person, handle)
             serializer.insert_sleep(1 / fps)
         page = serializer.as_html(dark_mode=True)
     finally:

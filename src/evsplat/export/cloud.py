@@ -9,6 +9,7 @@ from torch import Tensor
 
 from evsplat.body.rotations import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
 from evsplat.errors import DataError
+from evsplat.pictures import Transfer, shown
 from evsplat.render import Splats
 
 CHANNELS = 4
@@ -44,6 +45,11 @@ class SplatCloud:
         )
         means = self.means.astype(np.float64) @ turn.numpy().T
         return replace(self, means=_float32(means), quaternions=_positive(quaternions))
+
+    def shown(self, transfer: Transfer) -> "SplatCloud":
+        """The same Gaussians with colours coded as sRGB where they were light."""
+        rgb = shown(torch.from_numpy(self.rgb), transfer)
+        return replace(self, rgb=_float32(rgb))
 
 
 def cloud_of(splats: Splats, time: int = 0) -> SplatCloud:

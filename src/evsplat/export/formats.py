@@ -13,7 +13,7 @@ from jaxtyping import Float32, UInt8
 
 from evsplat.errors import DataError
 from evsplat.export.cloud import SplatCloud
-from evsplat.files import atomic_path
+from evsplat.files import write_bytes
 from evsplat.pictures.light import decode
 
 SH_C0 = 0.28209479177387814
@@ -56,8 +56,7 @@ def write_ply(path: Path | str, cloud: SplatCloud, *, comments: Sequence[str] = 
         *(f"property float {name}" for name in columns),
         "end_header\n",
     ]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode("ascii") + table.astype("<f4").tobytes())
+    write_bytes(path, "\n".join(header).encode("ascii") + table.astype("<f4").tobytes())
 
 
 def write_splat(path: Path | str, cloud: SplatCloud) -> None:
@@ -73,8 +72,7 @@ def write_splat(path: Path | str, cloud: SplatCloud) -> None:
     rows["rgba"] = np.rint(rgba.clip(0, 1) * 255)
     rows["rotation"] = np.rint(cloud.quaternions * 128 + 128).clip(0, 255)
     weight = cloud.opacities * cloud.scales.astype(np.float64).prod(1)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(rows[np.argsort(-weight, kind="stable")].tobytes())
+    write_bytes(path, rows[np.argsort(-weight, kind="stable")].tobytes())
 
 
 def write_spz(path: Path | str, cloud: SplatCloud) -> None:
@@ -102,8 +100,7 @@ def write_spz(path: Path | str, cloud: SplatCloud) -> None:
     )
     header = struct.pack("<IIIBBBB", _SPZ_MAGIC, _SPZ_VERSION, len(cloud), 0, bits, 0, 0)
     content = header + b"".join(part.tobytes() for part in parts)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(gzip.compress(content, mtime=0))
+    write_bytes(path, gzip.compress(content, mtime=0))
 
 
 def _fractional_bits(reach: float) -> int:
@@ -208,8 +205,7 @@ def write_gltf(
     }
     text = json.dumps(document, separators=(",", ":")).encode()
     chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
 def _chunk(kind: bytes, data: bytes, padding: bytes) -> bytes:

@@ -18,6 +18,7 @@ from evsplat.events import (
     simulate_events,
     write_events,
 )
+from evsplat.files import try_target
 from evsplat.film.camera_path import check_camera
 from evsplat.film.frame_cache import FilmFrame, FrameCache, film_digest
 from evsplat.film.looks import Look, depth_colours, linear_luma
@@ -63,6 +64,9 @@ def render_run(
     out = Path(run) / "renders" / film.file_name() if out is None else Path(out)
     ours = out.parent == Path(run) / "renders"
     _check_output(film, out, events_out, ours=ours)
+    for target in (out, events_out):
+        if target is not None:
+            try_target(target)
     loaded = load_run(Path(run), device=device)
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)
@@ -177,7 +181,7 @@ def _beside(
     else:
         frames_recorded = recorded_by(capture, film.camera)
         nearest = (nearest_in_time(frames_recorded, frame.time_us) for frame in frames)
-        recorded = (to_bytes(capture.image(frame)) for frame in nearest)
+        recorded = (to_bytes(capture.shown(capture.image(frame))) for frame in nearest)
     for left, right in zip(recorded, pictures, strict=True):
         yield _side_by_side(left, right)
 

@@ -18,6 +18,7 @@ from evsplat.export.gaussians import (
     rest_track,
     write_file,
 )
+from evsplat.files import try_target
 from evsplat.options import ExportOptions
 from evsplat.options.declare import given
 from evsplat.options.runs import FileKind, Kind
@@ -61,6 +62,7 @@ def export_run(
     parts, camera = options.parts, options.camera
     _check_use(kind, options)
     target = _checked(options.out, kind)
+    try_target(target or Path(run) / "exports")
     loaded = load_run(Path(run), device=options.device)
     folder = loaded.path / "exports"
     if kind == "avatar":
@@ -96,6 +98,7 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
         facts |= {"time_us": instant.time_us, "colours_seen_by": instant.camera_name}
     if target is None:
         target = run.path / "exports" / f"{label}{_SUFFIXES[kind][0]}"
+    cloud = cloud.shown(capture.transfer(capture.frames[0]))
     write_file(target, kind, cloud, rotation, facts)
     human = int((cloud.semantic > 0.5).sum())
     upright = "y" if kind in ALWAYS_Y_UP else options.up

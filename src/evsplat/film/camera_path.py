@@ -28,12 +28,16 @@ from torch import Tensor
 
 from evsplat.capture import Camera, Capture, Frame
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import read_json
+from evsplat.untrusted.faults import brief
+from evsplat.untrusted.text import read_json
 
 CameraPath = Callable[[float], Camera]
 """The camera at a share of the film, 0 to 1."""
 
 _SWING_DEG = 25.0
+_LARGEST = 1e6
+"""Of the numbers of a key: metres, pixels or degrees."""
+_LEAST_STEP = 1e-6
 
 
 def check_camera(capture: Capture, name: str) -> None:
@@ -149,8 +153,11 @@ def read_camera_path(path: Path | str) -> CameraPath:
         raise DataError(f"{path}: keys is empty or no list of objects, expected one or more keys.")
     width, height = (int(value) for value in size if value is not None)
     shares = [float(_numbers(path, i, key, "at", ())) for i, key in enumerate(keys)]
-    if any(not 0 <= share <= 1 for share in shares) or any(np.diff(shares) <= 0):
-        raise DataError(f"{path}: at is {shares}, expected rising shares of the film, 0 to 1.")
+    if any(not 0 <= share <= 1 for share in shares) or any(np.diff(shares) < _LEAST_STEP):
+        raise DataError(
+            f"{path}: at is {brief(shares)}, expected shares of the film, 0 to 1, each at least "
+            f"{_LEAST_STEP:g} above the one before."
+        )
     cameras = [
         Camera(width, height, _key_intrinsics(path, i, key, width, height), _key_pose(path, i, key))
         for i, key in enumerate(keys)
@@ -188,15 +195,17 @@ def _key_intrinsics(
 ) -> Float[Tensor, "3 3"]:
     if "K" in key:
         K = _numbers(path, index, key, "K", (3, 3))
-        if K[0, 1] or K[1, 0] or K[0, 0] <= 0 or K[1, 1] <= 0 or K[2].tolist() != [0, 0, 1]:
+        if K[0, 1] or K[1, 0] or np.diag(K)[:2].min() < 1e-3 or K[2].tolist() != [0, 0, 1]:
             raise DataError(
                 f"{path}: keys[{index}].K is {K.tolist()}, expected "
                 "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths."
             )
         return torch.from_numpy(K).float()
     angle = float(_numbers(path, index, key, "fov_y_deg", ()))
-    if not 0 < angle < 180:
-        raise DataError(f"{path}: keys[{index}].fov_y_deg is {angle:g}, expected 0 to 180 degrees.")
+    if not 0.01 <= angle < 180:
+        raise DataError(
+            f"{path}: keys[{index}].fov_y_deg is {angle:g}, expected 0.01 to 180 degrees."
+        )
     focal = height / 2 / math.tan(math.radians(angle) / 2)
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
@@ -204,15 +213,16 @@ def _key_intrinsics(
 def _numbers(
     path: Path, index: int, key: dict[str, Any], name: str, shape: tuple[int, ...]
 ) -> np.ndarray:
-    expected = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
+    expected = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+    expected += f" of at most {_LARGEST:g}"
     try:
         values = np.array(key[name], dtype=np.float64)
     except KeyError:
         raise DataError(f"{path}: keys[{index}].{name} is missing, expected {expected}.") from None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         values = np.array(math.nan)
-    if values.shape != shape or not np.isfinite(values).all():
-        raise DataError(f"{path}: keys[{index}].{name} is {key[name]!r}, expected {expected}.")
+    if values.shape != shape or not (np.abs(values) <= _LARGEST).all():
+        raise DataError(f"{path}: keys[{index}].{name} is {brief(key[name])}, expected {expected}.")
     return values
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice
@@ -15,10 +14,12 @@ from tqdm import tqdm
 
 from evsplat.camera import Camera
 from evsplat.errors import DataError
-from evsplat.files import atomic_path, read_json, write_json
+from evsplat.files import atomic_path, make_folder, remove_folder, write_json
 from evsplat.film.looks import Exposure, Look
 from evsplat.names import checked_name
 from evsplat.training.run import GaussianReconstruction
+from evsplat.untrusted.pictures import read_picture
+from evsplat.untrusted.text import read_json
 
 logger = logging.getLogger(__name__)
 
@@ -50,12 +51,12 @@ class FrameCache:
     def __init__(self, path: Path, digest: str) -> None:
         self.path = path
         plan = path / _PLAN
-        if path.exists() and not plan.is_file():
+        if path.exists() and not plan.is_file() and (path.is_file() or any(path.iterdir())):
             raise DataError(f"{path}: is in the way of pictures to be kept; move it elsewhere.")
         if plan.is_file() and read_json(plan) != {"plan": digest}:
             logger.info("%s: kept pictures belong to other options; starting over.", path)
-            shutil.rmtree(path)
-        path.mkdir(parents=True, exist_ok=True)
+            remove_folder(path)
+        make_folder(path)
         write_json(plan, {"plan": digest})
 
     def __len__(self) -> int:
@@ -68,19 +69,21 @@ class FrameCache:
 
     def read(self, frame: FilmFrame) -> Exposure:
         """The picture of a frame that was drawn."""
-        with Image.open(self.file(frame)) as image:
-            return np.asarray(image)
+        return read_picture(self.file(frame), np.asarray, remedy="remove it")
 
     def remove(self) -> None:
         """Delete the folder with all frames."""
-        shutil.rmtree(self.path)
+        remove_folder(self.path)
 
     @torch.no_grad()
     def fill(
         self, reconstruction: GaussianReconstruction, look: Look, frames: Sequence[FilmFrame]
     ) -> None:
-        """Draw what is missing, several times at once where the camera stands still."""
-        missing = [frame for frame in frames if not self.file(frame).is_file()]
+        """Draw what is missing, several times at once where the camera stands still.
+
+        A film that goes on is, bit for bit, the one that was never stopped.
+        """
+        missing = {frame for frame in frames if not self.file(frame).is_file()}
         try:
             with tqdm(
                 total=len(frames),
@@ -89,10 +92,15 @@ class FrameCache:
                 desc="render",
                 dynamic_ncols=True,
             ) as progress:
-                for batch in _of_one_camera(missing):
+                for batch in _of_one_camera(frames):
+                    if not any(frame in missing for frame in batch):
+                        continue
+                    # All of them: one drawn beside fewer others differs in its last bits.
                     times = [frame.time_us for frame in batch]
                     exposures = look.expose(reconstruction, batch[0].camera, times)
                     for frame, exposure in zip(batch, exposures, strict=True):
+                        if frame not in missing:
+                            continue
                         with atomic_path(self.file(frame)) as temporary:
                             Image.fromarray(exposure).save(temporary, compress_level=1)
                         progress.update()

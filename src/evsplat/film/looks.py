@@ -11,7 +11,7 @@ from evsplat.camera import Camera
 from evsplat.errors import ConfigError
 from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import Shown
-from evsplat.pictures import Transfer, decode, encode, luminance
+from evsplat.pictures import Transfer, decode, encode, luminance, shown
 from evsplat.pictures.colours import colours
 from evsplat.training.run import GaussianReconstruction
 
@@ -32,7 +32,7 @@ class Look:
     transparent: bool = False
     """RGBA instead of black where nothing is; for ``rgb`` and ``semantic``."""
     transfer: Transfer = "power"
-    """From the values that are drawn to light; read by ``events``."""
+    """From the values that are drawn to light."""
 
     def __post_init__(self) -> None:
         if self.transparent and self.shown not in ("rgb", "semantic"):
@@ -53,15 +53,19 @@ class Look:
         if self.shown == "events":
             coded = encode(luminance(decode(rgb, self.transfer)))
             return list((coded * 65_535).round().clamp(0, 65_535).numpy().astype(np.uint16))
+        solid = alpha[..., None]
+        if self.transparent:
+            # Over black the colour is multiplied with alpha already.
+            rgb = (rgb / solid.clamp_min(1e-4)).clamp(0, 1)
+            solid = torch.ones_like(solid)
+        rgb = shown(rgb, self.transfer)
         if self.shown == "semantic":
             human = drawn.human.cpu().clamp(0, 1)[..., None]
             tint = human * torch.tensor(_HUMAN) + (1 - human) * torch.tensor(_SCENE)
             grey = rgb.mean(-1, keepdim=True)
-            rgb = (0.3 * alpha[..., None] + 0.7 * grey) * tint
+            rgb = (0.3 * solid + 0.7 * grey) * tint
         if self.transparent:
-            # Over black the colour is multiplied with alpha already.
-            straight = (rgb / alpha[..., None].clamp_min(1e-4)).clamp(0, 1)
-            rgb = torch.cat((straight, alpha[..., None]), -1)
+            rgb = torch.cat((rgb, alpha[..., None]), -1)
         return list((rgb * 255).round().to(torch.uint8).numpy())
 
 

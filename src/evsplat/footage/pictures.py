@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from evsplat.errors import DataError
-from evsplat.pictures.files import image_size, read_image
+from evsplat.pictures.files import read_image
+from evsplat.untrusted.pictures import image_size
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 

@@ -1,15 +1,14 @@
 """A video file, decoded by FFmpeg (PyAV)."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 
 from evsplat.errors import DataError
 from evsplat.footage.pictures import TimedPicture, times_of_rate
+from evsplat.untrusted.videos import opened_video
 
 # Transfer characteristics of ITU-T H.273: PQ and HLG code light in ways no other part understands.
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
@@ -62,7 +61,7 @@ class VideoFootage:
 
     def _timestamps(self) -> np.ndarray:
         """Seconds of all pictures, ascending, without decoding them."""
-        with self._opened() as (container, stream):
+        with opened_video(self.path) as (container, stream):
             stamps = [
                 packet.pts
                 for packet in container.demux(stream)
@@ -71,20 +70,9 @@ class VideoFootage:
             return np.sort(np.array(stamps, dtype=np.float64)) * float(stream.time_base)
 
     def _decoded(self) -> Iterator[Any]:
-        with self._opened() as (container, stream):
+        with opened_video(self.path) as (container, stream):
             stream.thread_type = "AUTO"
             yield from container.decode(stream)
-
-    @contextmanager
-    def _opened(self) -> Iterator[tuple[Any, Any]]:
-        """The container and its video stream; what FFmpeg cannot read is a `DataError`."""
-        try:
-            with av.open(str(self.path)) as container:
-                if not container.streams.video:
-                    raise DataError(f"{self.path}: holds no video stream.")
-                yield container, container.streams.video[0]
-        except (av.error.FFmpegError, OSError) as error:
-            raise DataError(f"{self.path}: cannot be decoded as video ({error}).") from error
 
 
 def _pixels(frame: Any) -> np.ndarray:

@@ -1,27 +1,29 @@
 """Turning other people's data sets, and your own recording, into captures."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
+from evsplat.files import remove_folder
 from evsplat.importers.base import Importer
 from evsplat.importers.davis import Davis
 from evsplat.importers.folder import Folder
 from evsplat.importers.mmhpsd import Mmhpsd
 from evsplat.importers.neuman import Neuman
 from evsplat.importers.people_snapshot import PeopleSnapshot
-from evsplat.importers.recorded import without_body
+from evsplat.importers.poses import attach_poses
 from evsplat.importers.video import Video
 from evsplat.importers.zju_mocap import ZjuMocap
 from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
 from evsplat.inspection import warn_of_body
+from evsplat.options import PoseOptions, PoseSearch
 from evsplat.options.declare import given
 
-__all__ = ["KINDS", "Blur", "Importer", "import_capture", "run_importer"]
+__all__ = ["KINDS", "Blur", "Importer", "attach_poses", "import_capture", "run_importer"]
 
 logger = logging.getLogger(__name__)
 
@@ -55,6 +57,7 @@ def import_capture(
     smpl: Path | str | None = None,
     overwrite: bool = False,
     blur: Blur | bool = False,
+    find_poses: PoseOptions | bool = False,
     **options: Any,
 ) -> Path:
     """Turn a data set's sequence into a capture and give its folder (docs/import.md).
@@ -68,6 +71,8 @@ def import_capture(
         overwrite: Replace a capture that is there already.
         blur: Go on to the paper's version of the data set, with blurry frames and simulated events
             (`evsplat.synthesize`); the sharp capture stays beside it as ``<out>_sharp``.
+        find_poses: Find the person's poses (`evsplat.find_poses`), whatever poses there are.
+            Where none are found, a capture without them stays as ``<out>_unposed``.
         options: Fields of the kind's class in `KINDS`.
 
     Raises:
@@ -78,8 +83,11 @@ def import_capture(
         near = get_close_matches(kind, KINDS, 1, cutoff=0.0)[0]
         raise ConfigError(f"{kind!r} is no kind of source; did you mean {near!r}?")
     chosen = (Blur() if blur else None) if isinstance(blur, bool) else blur
+    poses = (PoseOptions() if find_poses else None) if isinstance(find_poses, bool) else find_poses
     importer = given(KINDS[kind], None, options)
-    return run_importer(importer, source, out, smpl=smpl, overwrite=overwrite, blur=chosen)
+    return run_importer(
+        importer, source, out, smpl=smpl, overwrite=overwrite, blur=chosen, poses=poses
+    )
 
 
 def run_importer(
@@ -90,35 +98,87 @@ def run_importer(
     smpl: Path | str | None = None,
     overwrite: bool = False,
     blur: Blur | None = None,
+    poses: PoseOptions | None = None,
 ) -> Path:
     """`import_capture` with the options as a checked object."""
     source, out = Path(source), Path(out)
+    smpl = None if smpl is None else Path(smpl)
     if blur is not None and importer.blur_recipe is None:
         raise ConfigError(
             f"the pictures of {type(importer).__name__} are not made blurry by a recipe of the "
             "paper; import them and use 'evsplat synthesize'."
         )
-    first = out if blur is None else out.with_name(f"{out.name}_sharp")
-    if blur is not None:
-        # an existing target is better found before the long work than after it
-        CaptureWriter(out, overwrite=overwrite)
-    with CaptureWriter(first, overwrite=overwrite) as writer:
-        notes = importer.write(source, writer, None if smpl is None else Path(smpl))
-        if importer.no_poses and writer.has_body:
-            notes = [note for note in notes if not note.startswith("body:")]
-            notes.append(without_body(writer))
-    for note in notes:
-        logger.info("%s", note)
-    if blur is not None:
+    if blur is not None and poses is not None:
+        raise ConfigError(
+            f"{source}: is to be made blurry and its poses are to be found; import it without "
+            "finding them, then use 'evsplat poses'."
+        )
+    # an existing target is better found before the long work than after it
+    CaptureWriter(out, overwrite=overwrite)
+    if poses is not None:
+        importer = replace(importer, no_poses=True)
+        _import_and_pose(importer, source, out, smpl, poses, overwrite=overwrite)
+    elif blur is not None:
         from evsplat.synthesis import synthesize
 
+        sharp = out.with_name(f"{out.name}_sharp")
+        _import(importer, source, CaptureWriter(sharp, overwrite=overwrite), smpl)
         synthesize(
-            first,
+            sharp,
             out,
             recipe=importer.blur_recipe,
             weights=blur.weights,
             overwrite=overwrite,
             interpolation=blur.interpolation,
         )
+    else:
+        _import(importer, source, CaptureWriter(out, overwrite=overwrite), smpl)
     warn_of_body(out)
     return out
+
+
+def _import(
+    importer: Importer,
+    source: Path,
+    target: CaptureWriter,
+    smpl: Path | None,
+    *,
+    going_on: bool = False,
+) -> None:
+    """``going_on``: if there are no poses, they are what is found next."""
+    with target as writer:
+        notes = importer.write(source, writer, smpl)
+        if importer.no_poses and writer.has_body:
+            notes = [note for note in notes if not note.startswith("body:")]
+            writer.leave_out_body()
+        if not writer.has_body and not going_on:
+            ways = f"evsplat poses {writer.path} --out NEW"
+            notes.append(f"body: none; find the person's poses with: {ways}")
+    for note in notes:
+        logger.info("%s", note)
+
+
+def _import_and_pose(
+    importer: Importer,
+    source: Path,
+    out: Path,
+    smpl: Path | None,
+    poses: PoseOptions,
+    *,
+    overwrite: bool,
+) -> None:
+    """By way of a capture without poses beside ``out``, which stays where none are found."""
+    from evsplat.posing import find_poses
+
+    unposed = out.with_name(f"{out.name}_unposed")
+    writer = CaptureWriter(unposed, out.name, overwrite=overwrite)
+    _import(importer, source, writer, smpl, going_on=True)
+    try:
+        find_poses(unposed, out, PoseSearch(**vars(poses)), overwrite=overwrite)
+    except BaseException:
+        logger.info(
+            "without poses it is: %s; find them with: evsplat poses %s --out %s",
+            *(unposed, unposed, out),
+        )
+        raise
+    remove_folder(unposed)

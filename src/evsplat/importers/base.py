@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
-from evsplat.pictures.files import image_size, read_image
+from evsplat.pictures.files import read_image
 from evsplat.pictures.light import Transfer
+from evsplat.untrusted.pictures import image_size
 
 GUIDE = "docs/import.md shows the tree"
 SHARP_EXPOSURE_US = 1_000

@@ -11,7 +11,7 @@ from evsplat.capture.write import CaptureWriter
 from evsplat.errors import DataError
 from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
 from evsplat.importers.base import Importer, chosen_frames, need
-from evsplat.importers.recorded import recorded_camera, without_body
+from evsplat.importers.recorded import recorded_camera
 from evsplat.pictures.light import Transfer
 
 
@@ -104,7 +104,8 @@ class Davis(Importer):
             "started_us": begin,
             "notes": notes,
         }
-        return [*notes, without_body(writer)]
+        writer.leave_out_body()
+        return notes
 
 
 def _span(source: Path, index: int, frame: RecordedFrame) -> tuple[int, int]:

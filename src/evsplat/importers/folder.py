@@ -1,6 +1,6 @@
 """Your own recording: pictures, events, poses of a tool and a camera, put together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +9,7 @@ from jaxtyping import Int64
 from tqdm import tqdm
 
 from evsplat.body.pose_errors import PoseSource
-from evsplat.body.pose_files import PoseSequence, read_poses
-from evsplat.capture.body_file import BodyFile, read_arrays, stated_body
+from evsplat.body.pose_files import PoseSequence
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
 from evsplat.footage import Footage, open_footage
@@ -22,9 +21,11 @@ from evsplat.importers.base import (
     human_mask,
     need,
 )
-from evsplat.importers.recorded import add_recorded_events, recorded_camera, without_body
-from evsplat.importers.smpl import add_body, chosen_poses
+from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_motion
+from evsplat.importers.recorded import add_recorded_events, recorded_camera
+from evsplat.importers.smpl import chosen_poses
 from evsplat.pictures.light import Transfer
+from evsplat.untrusted.arrays import read_table
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -76,12 +77,14 @@ class Folder(Importer):
         middles = exposures.sum(axis=1) // 2
         path = self._poses(source)
         size = footage.width, footage.height
-        motion = None if path is None else self._motion(path, size, smpl)
+        motion: Motion | None = None
+        if path is not None:
+            motion = read_motion(path, self.person, self.pose_source, size, smpl)
         camera, focal, note = self._camera(source, size, motion)
         if self.transfer is not None:
             camera["transfer"] = self.transfer
         writer.add_camera("main", *size, **camera)
-        seen = _frames_with_poses(motion, middles)
+        seen = frames_with_poses(motion, middles)
         views = _camera_poses(motion)
         masks = self.masks or source / "masks"
         for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
@@ -108,25 +111,12 @@ class Folder(Importer):
             notes.append(f"{len(middles) - len(seen)} pictures have no pose and were left out")
         writer.provenance |= {"source": "own recording", "focal": focal, "notes": notes}
         if path is None or motion is None:
-            return [*notes, without_body(writer)]
+            writer.leave_out_body()
+            return notes
         writer.provenance["poses"] = path.name
         if isinstance(motion, PoseSequence):
-            kept = sorted(seen)
-            times = [int(middles[index]) for index in kept]
-            return notes + add_body(writer, times, chosen_poses(motion, kept), smpl)
-        writer.set_body(
-            motion.model,
-            motion.times_us,
-            motion.poses,
-            motion.transl,
-            rig=motion.rig,
-            betas=motion.betas,
-            gender=motion.gender,
-            source=motion.source,
-            pose_std_rad=motion.pose_std_rad,
-            transl_std_m=motion.transl_std_m,
-        )
-        return notes
+            motion = chosen_poses(motion, sorted(seen))
+        return notes + add_motion(writer, motion, [int(middles[i]) for i in sorted(seen)], smpl)
 
     def _images(self, source: Path) -> Path:
         if self.images is not None:
@@ -152,7 +142,7 @@ class Folder(Importer):
         path, count = source / "exposures.txt", len(footage.times_us)
         if path.exists():
             try:
-                rows = np.loadtxt(path, ndmin=2)
+                rows = read_table(path)
             except ValueError as error:
                 raise DataError(f"{path}: not a table of numbers ({error}).") from None
             if rows.shape != (count, 2):
@@ -174,7 +164,9 @@ class Folder(Importer):
         """The poses; None where there are none, or none are wanted."""
         if self.no_poses:
             if self.poses is not None:
-                raise ConfigError(f"--no-poses: contradicts --poses {self.poses}; leave one out.")
+                raise ConfigError(
+                    f"--poses {self.poses}: contradicts --no-poses and --find-poses; leave one out."
+                )
             return None
         if self.poses is not None:
             return need(self.poses, "the poses")
@@ -183,16 +175,8 @@ class Folder(Importer):
         ]
         return found[0] if found else None
 
-    def _motion(
-        self, path: Path, size: tuple[int, int], smpl: Path | None
-    ) -> "PoseSequence | BodyFile":
-        if path.name == "body.npz":
-            return stated_body(path, read_arrays(path), self.pose_source)
-        sequence = read_poses(path, person=self.person, image_size=size, body_models=smpl)
-        return replace(sequence, pose_source=self.pose_source or sequence.pose_source)
-
     def _camera(
-        self, source: Path, size: tuple[int, int], motion: "PoseSequence | BodyFile | None"
+        self, source: Path, size: tuple[int, int], motion: Motion | None
     ) -> tuple[dict[str, Any], str, str]:
         """`recorded_camera` of the file, else of what the tool that made the poses assumed."""
         path = self.camera or source / "camera.json"
@@ -209,18 +193,8 @@ class Folder(Importer):
         return recorded_camera(None, self.focal, size)
 
 
-def _camera_poses(motion: "PoseSequence | BodyFile | None") -> dict[int, np.ndarray]:
+def _camera_poses(motion: Motion | None) -> dict[int, np.ndarray]:
     """Poses of a moving camera by the index of the picture; empty where it stands."""
     if not isinstance(motion, PoseSequence) or motion.world_to_camera is None:
         return {}
     return dict(zip(motion.frames.tolist(), motion.world_to_camera, strict=True))
-
-
-def _frames_with_poses(motion: "PoseSequence | BodyFile | None", middles: np.ndarray) -> set[int]:
-    """Indices of pictures whose moment the poses cover; all where there are no poses."""
-    if motion is None:
-        return set(range(len(middles)))
-    if isinstance(motion, PoseSequence):
-        return set(motion.frames.tolist()) & set(range(len(middles)))
-    first, last = motion.times_us[0], motion.times_us[-1]
-    return set(np.flatnonzero((middles >= first - 1) & (middles <= last + 1)).tolist())

@@ -27,8 +27,9 @@ from evsplat.importers.base import (
     opencv_intrinsics,
 )
 from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
-from evsplat.pictures.files import image_size
-from evsplat.safe_pickle import read_npz, read_pickle
+from evsplat.untrusted.arrays import read_npz
+from evsplat.untrusted.pickles import read_pickle
+from evsplat.untrusted.pictures import image_size
 
 _FOCAL_PX, _CENTRE_PX, _CANVAS_PX = 1679.3, 641.0, 1280
 """Intrinsics of the 800x1280 picture padded to a square; no distortion."""

@@ -25,7 +25,7 @@ from evsplat.importers.base import (
 )
 from evsplat.importers.colmap import read_colmap
 from evsplat.importers.smpl import add_body, chosen_poses
-from evsplat.safe_pickle import read_npz
+from evsplat.untrusted.arrays import read_npz
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +117,10 @@ def _read_poses(
     transl = numbers(arrays, "transl", (count, 3), where, flat=True)
     scales = np.ones(count)
     if "scale" in arrays:
-        scales = scales * numbers(arrays, "scale", (None,), where, flat=True)
+        found = numbers(arrays, "scale", (None,), where, flat=True)
+        if len(found) not in (1, count):
+            raise DataError(f"{path}: holds {len(found)} scales, expected 1 or {count}.")
+        scales = scales * found
     if not (scales > 0).all():
         raise DataError(f"{path}: scale holds values that are not above 0.")
     scale = float(np.median(scales))

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import av
 import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,7 +28,10 @@ from evsplat.importers.base import (
     shrunk,
 )
 from evsplat.importers.smpl import add_body, chosen_poses
-from evsplat.safe_pickle import read_pickle
+from evsplat.untrusted.faults import broken_as
+from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5, wrong_data_set
+from evsplat.untrusted.pickles import read_pickle
+from evsplat.untrusted.videos import opened_video
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,13 +121,9 @@ def _read_camera(path: Path) -> tuple[SourceCamera, int, int]:
 
 def _read_poses(path: Path, consensus: Path, gender: str) -> PoseSequence:
     need(path, "the poses")
-    try:
-        with h5py.File(path, "r") as file:
-            arrays = {
-                key: np.asarray(file[key]) for key in ("pose", "trans", "betas") if key in file
-            }
-    except OSError as error:
-        raise DataError(f"{path}: not a readable HDF5 file ({error}); copy it again.") from error
+    with open_hdf5(path) as file:
+        keys = (key for key in ("pose", "trans", "betas") if holds(file, key))
+        arrays = {key: _whole(path, file, key) for key in keys}
     if "betas" not in arrays and consensus.exists():
         shape = read_pickle(consensus, what="consensus shape")
         arrays["betas"] = numbers(shape, "betas", (10,), str(consensus), flat=True)
@@ -143,13 +141,20 @@ def _read_poses(path: Path, consensus: Path, gender: str) -> PoseSequence:
     )
 
 
+def _whole(path: Path, file: h5py.File, name: str) -> np.ndarray:
+    found = data_set(file, name)
+    with broken_as(path, f"{name} cannot be read", "copy the file again"):
+        return np.asarray(found)
+
+
 class _Masks:
     """Rows of masks.hdf5; none where the file is missing."""
 
     def __init__(self, path: Path, count: int) -> None:
-        self._file = h5py.File(path, "r") if path.exists() else None
+        self._path = path
+        self._file = open_hdf5(path) if path.exists() else None
         if self._file is not None and (
-            "masks" not in self._file or len(self._file["masks"]) != count
+            wrong_data_set(self._file, "masks") or self._file["masks"].shape[:1] != (count,)
         ):
             raise DataError(f"{path}: masks: expected {count} masks as there are poses.")
 
@@ -164,25 +169,23 @@ class _Masks:
         """(H, W) share of the person."""
         if self._file is None:
             return None
-        return shrunk((np.asarray(self._file["masks"][index]) != 0).astype(np.float32), shrink)
+        with broken_as(self._path, f"masks[{index}] cannot be read", "copy the file again"):
+            mask = np.asarray(self._file["masks"][index])
+        return shrunk((mask != 0).astype(np.float32), shrink)
 
 
 def _decode(video: Path, kept: list[int], count: int) -> Iterator[tuple[int, int, np.ndarray]]:
     """Index, time and RGB pixels of the wanted frames, in order."""
     wanted = set(kept)
-    try:
-        with av.open(str(video)) as container:
-            stream = container.streams.video[0]
-            rate = float(stream.average_rate or 30)
-            frames = tqdm(container.decode(stream), "pictures", count, unit="frame", leave=False)
-            for index, frame in enumerate(frames):
-                if index in wanted:
-                    yield index, round(index * 1e6 / rate), frame.to_ndarray(format="rgb24")
-                    wanted.discard(index)
-                if not wanted:
-                    return
-    except av.error.FFmpegError as error:
-        raise DataError(f"{video}: cannot be decoded ({error}); copy it again.") from error
+    with opened_video(video) as (container, stream):
+        rate = float(stream.average_rate or 30)
+        frames = tqdm(container.decode(stream), "pictures", count, unit="frame", leave=False)
+        for index, frame in enumerate(frames):
+            if index in wanted:
+                yield index, round(index * 1e6 / rate), frame.to_ndarray(format="rgb24")
+                wanted.discard(index)
+            if not wanted:
+                return
     raise DataError(
         f"{video}: ends before frame {min(wanted)}, expected {count} frames as there are poses."
     )

@@ -1,4 +1,4 @@
-"""Parts of importers of your own recordings: camera, events, and the lack of poses."""
+"""Parts of importers of your own recordings: camera and events."""
 
 from pathlib import Path
 from typing import Any
@@ -66,9 +66,3 @@ def add_recorded_events(
         clock_offset_us=clock_offset_us,
     )
     return list(recording.notes)
-
-
-def without_body(writer: CaptureWriter) -> str:
-    """Leave the body out and give the note that says how to come by one."""
-    writer.leave_out_body()
-    return f"body: none; find the person's poses with: evsplat poses {writer.path} --out NEW"

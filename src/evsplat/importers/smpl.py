@@ -20,6 +20,7 @@ from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.body.skeleton import find_skeleton
 from evsplat.body.smpl import ENVIRONMENT, find_model_file, read_model_file
 from evsplat.body.tree import world_rotations
+from evsplat.capture.derive import Derivation
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import DataError, WeightsError
 
@@ -30,7 +31,7 @@ _JOINTS = len(smpl_skeleton.NAMES)
 
 
 def add_body(
-    writer: CaptureWriter,
+    writer: CaptureWriter | Derivation,
     times_us: Sequence[int],
     sequence: PoseSequence,
     smpl: Path | None,

@@ -9,7 +9,7 @@ from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
 from evsplat.footage import open_footage
 from evsplat.importers.base import Importer, check_positive, exposure_around
-from evsplat.importers.recorded import add_recorded_events, recorded_camera, without_body
+from evsplat.importers.recorded import add_recorded_events, recorded_camera
 from evsplat.pictures.light import Transfer
 
 
@@ -66,4 +66,5 @@ class Video(Importer):
         )
         notes += [note] if note else []
         writer.provenance |= {"source": f"video {source.name}", "focal": focal, "notes": notes}
-        return [*notes, without_body(writer)]
+        writer.leave_out_body()
+        return notes

@@ -13,7 +13,6 @@ from evsplat.body.pose_files import read_poses
 from evsplat.body.pose_files.fields import numbers
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import read_json
 from evsplat.importers.base import (
     GUIDE,
     PICTURES,
@@ -31,7 +30,8 @@ from evsplat.importers.base import (
     table,
 )
 from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
-from evsplat.safe_pickle import read_npy, read_npz
+from evsplat.untrusted.arrays import read_npy, read_npz
+from evsplat.untrusted.text import read_json
 
 FRAME_RANGES = {"377": (0, 570), "386": (0, 540), "387": (0, 540), "394": (0, 475)}
 """Frames that ARAH and 3DGS-Avatar use; of 392 and 393 they use all (method.md 1.14)."""

@@ -30,8 +30,8 @@ from evsplat.importers.base import (
     table,
 )
 from evsplat.importers.smpl import add_body
-from evsplat.pictures.files import image_size
-from evsplat.safe_pickle import read_pickle
+from evsplat.untrusted.pickles import read_pickle
+from evsplat.untrusted.pictures import image_size
 
 _EVENTS_PER_PIECE = 1 << 20
 

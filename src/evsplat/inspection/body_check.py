@@ -27,6 +27,7 @@ from evsplat.inspection.drawing import (
     to_picture,
 )
 from evsplat.inspection.movement import event_window
+from evsplat.pictures import shown
 
 logger = logging.getLogger(__name__)
 
@@ -97,7 +98,7 @@ def fit_sheet(capture: TrainingCapture, found: Belonging) -> Image.Image:
 
 
 def _moving(capture: TrainingCapture, frame: Frame) -> Float[Tensor, "H W 3"]:
-    image = capture.image(frame)
+    image = shown(capture.image(frame), capture.transfer(frame))
     if capture.events is None:
         return image
     return events_over(image, count_map(event_window(capture.events, frame), *image.shape[:2]))

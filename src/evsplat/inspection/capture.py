@@ -18,6 +18,7 @@ from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
 from evsplat.capture.validate import check_capture
 from evsplat.errors import EvsplatError
+from evsplat.files import try_target
 from evsplat.inspection.belonging import judge_body
 from evsplat.inspection.body_check import FIT_SHEET, body_findings, check_body, fit_sheet
 from evsplat.inspection.drawing import (
@@ -65,6 +66,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     is something to draw.
     """
     path, out_dir = Path(path), Path(out_dir)
+    try_target(out_dir)
     metadata, found = check_capture(path, deep=True)
     report = InspectReport(path, tuple(found), "", ())
     if metadata is None or not report.usable:
@@ -154,6 +156,8 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
         made = capture.provenance.get(verb)
         if isinstance(made, dict) and "with" in made:
             lines.append(f"{verb:10} with {made['with']}")
+    if capture.poses_found is not None:
+        lines.append(f"poses      {capture.poses_found}")
     if "text" in capture.provenance:
         lines.append(f"made       {capture.provenance['text']}")
     return "\n".join(lines)
@@ -227,7 +231,9 @@ def _contact_sheet(capture: Capture) -> Image.Image:
     tiles = []
     for frame in chosen:
         camera = capture.camera(frame)
-        picture = to_picture(capture.image(frame), fit(camera.width, camera.height, 170))
+        picture = to_picture(
+            capture.shown(capture.image(frame)), fit(camera.width, camera.height, 170)
+        )
         tiles.append(Tile(picture, _label(frame), frame.split))
     some = "" if len(chosen) == len(capture.frames) else f"{len(chosen)} of "
     subtitle = f"{some}{len(capture.frames)} frames as the camera saw them"
@@ -238,7 +244,13 @@ def _events_sheet(capture: Capture) -> Image.Image:
     """Events in the middle of the exposure over the greyed picture."""
     assert capture.events is not None
     tiles = [
-        event_tile(capture.events, capture.image(frame), frame.mid_us, _label(frame), frame.split)
+        event_tile(
+            capture.events,
+            capture.shown(capture.image(frame)),
+            frame.mid_us,
+            _label(frame),
+            frame.split,
+        )
         for frame in _spread(capture.frames, DETAIL_FRAMES)
     ]
     subtitle = f"{EVENT_WINDOW_US / 1000:g} ms about mid-exposure; red: brighter, blue: darker"
@@ -251,7 +263,7 @@ def _body_sheet(capture: Capture, track: BodyTrack) -> Image.Image:
     for frame in _spread(capture.frames, DETAIL_FRAMES):
         camera = capture.camera(frame)
         size = fit(camera.width, camera.height, DETAIL_PX)
-        picture = to_picture(capture.image(frame), size)
+        picture = to_picture(capture.shown(capture.image(frame)), size)
         large = _resized(camera, size)
         for time_us in frame.exposure_us:
             draw_outline(picture, _silhouette(track, time_us, large), _OUTLINE_ENDS, halo=False)

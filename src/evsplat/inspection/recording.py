@@ -20,6 +20,7 @@ from evsplat.calibration import (
 )
 from evsplat.errors import DataError
 from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
+from evsplat.files import try_target
 from evsplat.inspection.capture import InspectReport, inspect_capture
 from evsplat.inspection.drawing import (
     EVENT_WINDOW_US,
@@ -60,6 +61,7 @@ def inspect_recording(
         DataError: not a recording, or one without events.
     """
     path, out_dir = Path(path), Path(out_dir)
+    try_target(out_dir)
     recording = open_recording(path, repair=repair)
     totals = _Totals.of(recording)
     spans = [frame.exposure_us for frame in recording.frames()]

@@ -16,8 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from evsplat.errors import DataError
-from evsplat.files import read_json
 from evsplat.landmarks.landmarks import SETS
+from evsplat.untrusted.arrays import read_plain_arrays
+from evsplat.untrusted.faults import brief, ordinary_file, reason
+from evsplat.untrusted.text import read_json
 
 _KEYS = ("keypoints", "poses", "places", "joints", "landmarks", "arr_0")
 _FORMS = "OpenPose or COCO-style JSON, .npz, .npy or .csv with frames x points x 2 or 3"
@@ -69,7 +71,7 @@ def _from_json(path: Path, content: Any) -> Float[np.ndarray, "N L D"]:
             raise DataError(f"{path}: entry {index}: instances is no list.")
         frames.setdefault(json.dumps(frame), []).extend(found)
     order = sorted(frames, key=_natural)
-    return _stack(path, [_one_person(path, f"frame {key}", frames[key]) for key in order])
+    return _stack(path, [_one_person(path, f"frame {key[:80]}", frames[key]) for key in order])
 
 
 def _natural(key: str) -> tuple[tuple[int, ...], str]:
@@ -146,7 +148,9 @@ def _stack(path: Path, frames: Sequence[np.ndarray | None]) -> Float[np.ndarray,
     if not shapes:
         raise DataError(f"{path}: shows nobody in any of {len(frames)} frames.")
     if len(shapes) > 1:
-        raise DataError(f"{path}: frames have points of shapes {sorted(shapes)}, expected one.")
+        raise DataError(
+            f"{path}: frames have points of shapes {brief(sorted(shapes))}, expected one."
+        )
     (shape,) = shapes
     if len(shape) != 2 or shape[1] not in (2, 3):
         raise DataError(f"{path}: points of a frame have shape {shape}, expected (points, 2 or 3).")
@@ -155,28 +159,19 @@ def _stack(path: Path, frames: Sequence[np.ndarray | None]) -> Float[np.ndarray,
 
 
 def _from_arrays(path: Path) -> Float[np.ndarray, "N L D"]:
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            array = loaded
-        else:
-            with loaded:
-                key = next((key for key in _KEYS if key in loaded), None)
-                if key is None:
-                    raise DataError(
-                        f"{path}: holds {', '.join(loaded.files) or 'nothing'}, expected an array "
-                        f"{' or '.join(_KEYS)}."
-                    )
-                array = loaded[key]
-    except DataError:
-        raise
-    except Exception as error:  # NumPy and zipfile raise many kinds for files that are not theirs
-        raise DataError(f"{path}: not a readable NumPy file ({error}); write it anew.") from error
+    arrays = read_plain_arrays(path)
+    array = next((arrays[key] for key in ("", *_KEYS) if key in arrays), None)
+    if array is None:
+        raise DataError(
+            f"{path}: holds {', '.join(arrays)[:300] or 'nothing'}, expected an array "
+            f"{' or '.join(_KEYS)}."
+        )
     return _checked(path, array)
 
 
 def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
     """Rows of frames; x, y and perhaps confidence of each point one after the other."""
+    ordinary_file(path)
     try:
         with path.open(newline="", encoding="utf-8") as stream:
             rows = [row for row in csv.reader(stream) if row]
@@ -184,8 +179,8 @@ def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
         array = np.array([[float(cell or "nan") for cell in row] for row in rows[first:]])
     except (ValueError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(
-            f"{path}: not a table of numbers ({error}), expected a row per frame with x, y (and "
-            "confidence) of each point, after at most one line of names."
+            f"{path}: not a table of numbers ({reason(error)}), expected a row per frame with x, y "
+            "(and confidence) of each point, after at most one line of names."
         ) from error
     if array.ndim != 2 or not array.size:
         raise DataError(f"{path}: holds no rows of numbers.")

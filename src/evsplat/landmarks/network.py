@@ -9,7 +9,6 @@ written by `tools/convert_blazepose.py`, is in safetensors with the graph as JSO
 Kinds, paddings and activations are TensorFlow Lite's; weights are laid out as torch takes them.
 """
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -19,10 +18,11 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from evsplat.errors import WeightsError
+from evsplat.untrusted.tensors import read_safetensors
+from evsplat.untrusted.text import parse_json
 
 SIDE = 256
 """Width and height of the pictures that the network takes."""
@@ -116,17 +116,16 @@ class LandmarkNetwork:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Graph and weights of a file."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            graph = json.loads((file.metadata() or {})["graph"])
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        kinds = {node["kind"] for node in graph["nodes"]}
-        graph["input"], graph["outputs"]
-    except FileNotFoundError:
+    if not path.is_file():
         raise WeightsError(
             f"{path}: file not found; give a network that tools/convert_blazepose.py has written."
-        ) from None
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        )
+    try:
+        weights, texts = read_safetensors(path)
+        graph = parse_json(texts["graph"])
+        kinds = {node["kind"] for node in graph["nodes"]}
+        graph["input"], graph["outputs"]
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise WeightsError(
             f"{path}: not a network that tools/convert_blazepose.py has written "
             f"({type(error).__name__}: {error})."

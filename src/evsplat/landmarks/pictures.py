@@ -18,6 +18,8 @@ from torch import Tensor
 from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import HeldOutError
 from evsplat.events import EventStream, deblur, polarity_counts
+from evsplat.pictures import shown
+from evsplat.pictures.light import Transfer, decode, encode, luminance, transfer_shown
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +42,9 @@ class SharpPicture:
     sigma: float
     """Factor on the expected error of landmarks: 1 within an exposure, `CARRIED_SIGMA` where there
     is no picture of that time, `BLURRY_SIGMA` where the picture is as blurry as it was recorded."""
+    doubt: Float[Tensor, "H W"] | None = None
+    """Expected squared error of coded luminance where two exposures were carried there: what they
+    differ by, weighted as in their blend."""
 
 
 def sharp_pictures(
@@ -55,7 +60,12 @@ def sharp_pictures(
     thresholds = _thresholds(capture)
     if thresholds is None:
         return [
-            SharpPicture(frame.mid_us, capture.image(frame), frame, BLURRY_SIGMA)
+            SharpPicture(
+                frame.mid_us,
+                shown(capture.image(frame), capture.transfer(frame)),
+                frame,
+                BLURRY_SIGMA,
+            )
             for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us)
         ]
     pictures = [
@@ -111,7 +121,7 @@ def _in_exposure(
         transfer=capture.transfer(frame),
     )
     for time, image in zip(times, images, strict=True):
-        yield SharpPicture(time, image, frame, 1.0)
+        yield SharpPicture(time, shown(image, capture.transfer(frame)), frame, 1.0)
 
 
 def _carried(
@@ -128,7 +138,8 @@ def _carried(
             if (source := _carry(capture, side, time, thresholds)) is not None
         ]
         if sources:
-            yield SharpPicture(time, _blend(sources), frame, CARRIED_SIGMA)
+            image, doubt = _blend(sources, capture.transfer(frame))
+            yield SharpPicture(time, image, frame, CARRIED_SIGMA, doubt)
 
 
 def _beside(capture: TrainingCapture, frame: Frame, time_us: int) -> list[Frame]:
@@ -165,15 +176,22 @@ def _carry(
         transfer=capture.transfer(frame),
     )
     counts = polarity_counts(events, *image.shape[:2]).sum(0)
+    carried = shown(carried, capture.transfer(frame))
     return carried, torch.from_numpy(gaussian_filter(counts.numpy(), _SMOOTHING_PX))
 
 
-def _blend(sources: Sequence[_Source]) -> Float[Tensor, "H W 3"]:
+def _blend(sources: Sequence[_Source], transfer: Transfer) -> _Source:
     """The mean weighted per pixel by the inverse square of one and the events passed through.
 
     Each event adds the error of its threshold, and events change brightness but not hue, so that
-    the side on which less happened is the better one by far.
+    the side on which less happened is the better one by far. The second is the variance of coded
+    luminance.
     """
     weights = torch.stack([(1 + passed) ** -2 for _, passed in sources])
     weights /= weights.sum(0)
-    return (torch.stack([image for image, _ in sources]) * weights[..., None]).sum(0)
+    images = torch.stack([image for image, _ in sources])
+    mean = (images * weights[..., None]).sum(0)
+    coded = transfer_shown(transfer)
+    grey = encode(luminance(decode(images, coded)), coded)
+    off = (grey - (grey * weights).sum(0)).square()
+    return mean, (off * weights).sum(0)

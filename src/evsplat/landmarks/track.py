@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.capture import TrainingCapture
+from evsplat.capture import TrainingCapture, coded
 from evsplat.errors import DataError
 from evsplat.landmarks.detect import COPIES, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
@@ -56,11 +56,14 @@ def find_landmarks(
     if not pictures:
         raise DataError(f"{capture.path}: has no picture in which to look for the person.")
     pictures = sorted(pictures, key=lambda picture: picture.time_us)
+    capture = coded(capture)
     motion = Motion(capture)
     tracker = _Tracker(network, motion)
     found = [
         tracker.find(picture)
-        for picture in tqdm(pictures, "landmarks", unit="picture", disable=not progress)
+        for picture in tqdm(
+            pictures, "landmarks", unit="picture", leave=False, disable=not progress
+        )
     ]
     tracker.look_back(pictures, found)
     refuse_nobody(capture, pictures, found)

@@ -13,8 +13,9 @@ from evsplat.capture import Capture, Frame, Policy, load_capture
 from evsplat.capture.derive import derived_capture, training_frames_first, write_picture
 from evsplat.config import to_dict
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import new_folder, read_json, write_json
+from evsplat.files import new_folder, refuse_existing, try_target, write_json
 from evsplat.masks.base import MASKERS, Masker
+from evsplat.untrusted.text import read_json
 
 
 def mask_capture(
@@ -46,6 +47,9 @@ def mask_capture(
     capture = load_capture(path)
     if out is None:
         _check_in_place(capture)
+    else:
+        refuse_existing(Path(out))
+    try_target(capture.path / "masks" if out is None else out)
     seen = capture.for_training(policy or Policy())
     masker = MASKERS[method](seen, **options)
     found = training_frames_first(capture, seen, masker.masks)

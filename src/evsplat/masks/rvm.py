@@ -17,6 +17,7 @@ from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import WeightsError
+from evsplat.pictures import shown
 from evsplat.weights import MissingWeights, home_as_tilde, hub_folder, sha256_of
 
 WEIGHTS_VARIABLE = "EVSPLAT_RVM"
@@ -59,7 +60,8 @@ class RobustVideoMatting:
             if frame.split != "train":
                 states.clear()
                 continue
-            picture = capture.image(frame).permute(2, 0, 1)[None].contiguous().to(self._device)
+            coded = shown(capture.image(frame), capture.transfer(frame))
+            picture = coded.permute(2, 0, 1)[None].contiguous().to(self._device)
             ratio = min(1.0, SIDE_PX / max(picture.shape[2:]))
             before = states.get(frame.camera, [None] * 4)
             alpha, states[frame.camera] = self._step(picture, before, ratio)

@@ -12,6 +12,7 @@ from evsplat.methods.base import Composition, MethodConfig, Purpose
 from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.evsplat import build as build_evsplat
 from evsplat.methods.settings import NOMINAL_ITERATIONS
+from evsplat.untrusted.faults import brief
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,14 @@ DEFAULT_METHOD = "evsplat"
 
 def method_config(method: str, values: dict[str, Any], *, where: str) -> MethodConfig:
     """The configuration of a method with ``values`` over its defaults."""
+    if not isinstance(method, str):
+        raise ConfigError(f"{where}: method is {brief(method)}; expected a name.")
     if method not in TRAINABLE:
         near = difflib.get_close_matches(method, TRAINABLE, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"--method {method}: unknown; methods are {', '.join(TRAINABLE)}.{hint}")
+        raise ConfigError(
+            f"--method {brief(method)[1:-1]}: unknown; methods are {', '.join(TRAINABLE)}.{hint}"
+        )
     config: MethodConfig = from_dict(TRAINABLE[method].config, values, where=where)
     return config
 

@@ -60,6 +60,7 @@ from evsplat.objectives import (
     Objective,
     PosePrior,
     RenderedSemantics,
+    minute_around,
     motion_px,
     renders_for,
 )
@@ -266,7 +267,7 @@ def build(
     elif config.event_weight != 0.0 and config.event_term == "paper":
         objectives.append(EventChange(capture, start=config.event_start))
     elif config.event_weight != 0.0:
-        windows = _windows(config, capture, model, generator, device=device, fit=fit)
+        windows = _windows(config, capture, model, generator, device=device, purpose=purpose)
         objectives.append(windows)
     return Composition(
         model=model,
@@ -362,13 +363,13 @@ def _windows(
     generator: torch.Generator,
     *,
     device: torch.device | str,
-    fit: bool,
+    purpose: Purpose,
 ) -> EventWindows:
     """The event term, and the sensor that the model learns with it."""
     assert capture.events is not None
     # A loaded model brings its own.
     known, late_us = (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD), None
-    if fit:
+    if purpose == "train":
         estimate = None
         if capture.contrast_threshold is None or config.clock != "never":
             estimate = estimate_sensor(capture)
@@ -382,13 +383,17 @@ def _windows(
             )  # fmt: skip
     sensor = EventSensor(*known, late_us=late_us).to(device)
     model.sensor = sensor
+    around_us = minute_around([frame.exposure_us for frame in capture.train_frames])
+    noise = EventNoise(capture.events, during_us=around_us, aware=config.event_noise_aware)
+    if purpose != "draw":
+        noise.measure()
     return EventWindows(
         capture,
         sensor,
         generator,
         start=config.event_start,
         eps=config.event_eps,
-        noise=EventNoise(capture.events, aware=config.event_noise_aware),
+        noise=noise,
         reach=config.event_reach,
         ramp_us=config.event_ramp_us,
     )

@@ -83,7 +83,9 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
             track, most_rad=new * float(joint_rad.max()), most_m=new * float(root_m.max())
         )
         track = smoothed(track, noise)
-    found = _refined(track, capture) if fit and exact is not True else None
+    # Poses that were corrected when they were found need not wait for the same again.
+    tried = source is not None and capture.poses_refined
+    found = _refined(track, capture) if fit and exact is not True and not tried else None
     decided = exact if exact is not None else found is None or not found.disproves
     if exact is not False and decided and fit:
         _refuse_unread(config, capture)
@@ -104,7 +106,7 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
 def _refined(track: BodyTrack, capture: TrainingCapture) -> Refined | None:
     """Other poses, found without any Gaussian; None where a moving camera rules them out."""
     try:
-        found = refine(track, capture)
+        found = refine(track, capture, progress=True)
     except DataError as error:
         logger.info("given poses are not compared with others: %s", error)
         return None

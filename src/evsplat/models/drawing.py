@@ -1,21 +1,22 @@
 """Pictures of posed Gaussians, with the person's shadow on the scene."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from evsplat.camera import Camera
+from evsplat.compiled import native, runs_native
 from evsplat.models.layers import Layers
+from evsplat.models.scene_places import LEAST_SCENE, ScenePlaces
 from evsplat.render import Backdrop, RenderOutput, Splats, render, split_channels
 
 SHADOW_STEP_PX = 2
 """Shadows are soft: they are looked up at every second pixel and interpolated."""
-_LEAST_SCENE = 1e-3
-"""Share of a pixel below which its scene has no place of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ def draw(
     center_gradients: bool = False,
     background: Float[Tensor, "3"] | None = None,
     backdrop: Backdrop | None = None,
+    places: ScenePlaces | None = None,
     shadow_step_px: int = SHADOW_STEP_PX,
 ) -> Drawing:
     """Draw person and scene; ``center_gradients`` makes the projected centres tell theirs.
@@ -54,15 +56,19 @@ def draw(
     ``background`` is the sRGB colour behind all of it, black without. ``backdrop`` is what the
     scene looked like to the picture before, see `render`.
 
-    With a shadow the person's and the scene's share of each pixel are composited as channels of
-    their own, in one pass and in the right order of depth, and the scene's is multiplied.
+    With a shadow the scene's share of each pixel is multiplied by it. It falls on the places that
+    ``places`` tells of the scene without the person; without, they are drawn for this picture.
     """
     human, scene = layers.human, layers.scene
-    if layers.shadow is not None:
-        human, scene = _apart(human, scene, camera)
     if center_gradients:
         human, scene = _with_centers(human), _with_centers(scene)
     layers = replace(layers, human=human, scene=scene)
+    light = None
+    if layers.shadow is not None:
+        if places is None:
+            places = ScenePlaces() if backdrop is None else backdrop.beside(ScenePlaces)
+        factors = layers.shadow(places.of(layers, camera, shadow_step_px))
+        light = _enlarge(factors, camera, shadow_step_px)
     output = render(
         human,
         camera,
@@ -70,26 +76,15 @@ def draw(
         background=None if background is None else _behind(background, human),
         low_pass=layers.low_pass,
         backdrop=backdrop,
+        static_light=light,
     )
-    if layers.shadow is None:
-        rgb, semantic = split_channels(output.image, (3, 1))
-    else:
-        person, room, depth, semantic = split_channels(output.image, (3, 3, 2, 1))
-        # What hides the scene hides its shadow as well: the first picture's depth serves all.
-        factors = layers.shadow(_places(depth[0].detach(), camera, shadow_step_px))
-        light = _enlarge(factors, camera, shadow_step_px)
-        rgb = tuple(
-            a + b * factor[..., None] for a, b, factor in zip(person, room, light, strict=True)
-        )
+    rgb, semantic = split_channels(output.image, (3, 1))
     return Drawing(rgb, tuple(s[..., 0] for s in semantic), output, layers)
 
 
 def _behind(rgb: Float[Tensor, "3"], layer: Splats) -> Float[Tensor, "C"]:
     """A background of all channels: nothing stands there but the scene's colour."""
-    rest = layer.channels.shape[-1] - 3
-    # With layers, the scene's colour comes after the person's.
-    first = 3 if rest > 3 else 0
-    return F.pad(rgb, (first, rest - first))
+    return F.pad(rgb, (0, layer.channels.shape[-1] - 3))
 
 
 def draw_depth(
@@ -104,8 +99,8 @@ def draw_depth(
         output = render(human, camera, static=scene, low_pass=layers.low_pass)
     else:
         output = render(human if parts == "human" else scene, camera, low_pass=layers.low_pass)
-    covered = output.alpha.clamp_min(_LEAST_SCENE)
-    return output.image[..., 0] / covered * (output.alpha > _LEAST_SCENE)
+    covered = output.alpha.clamp_min(LEAST_SCENE)
+    return output.image[..., 0] / covered * (output.alpha > LEAST_SCENE)
 
 
 def _showing_depth(layer: Splats, camera: Camera) -> Splats:
@@ -128,39 +123,31 @@ def shadowed_scene(layers: Layers) -> Splats:
     return replace(scene, channels=torch.cat(channels, -1))
 
 
-def _apart(human: Splats, scene: Splats, camera: Camera) -> tuple[Splats, Splats]:
-    """Channels person's RGB, scene's RGB, scene's depth and share, semantic attribute."""
-    rgb, semantic = human.channels.split((3, 1), -1)
-    nothing = rgb.new_zeros(*rgb.shape[:2], 5)
-    human = replace(human, channels=torch.cat([rgb, nothing, semantic], -1))
-    rgb, semantic = scene.channels.split((3, 1), -1)
-    pose = camera.world_to_camera
-    # Detached: shadows must not be bought by moving the scene.
-    depth = (scene.means.detach() @ pose[2, :3] + pose[2, 3])[..., None]
-    parts = [torch.zeros_like(rgb), rgb, depth, torch.ones_like(depth), semantic]
-    return human, replace(scene, channels=torch.cat(parts, -1))
-
-
-def _places(depth: Float[Tensor, "H W 2"], camera: Camera, step: int) -> Float[Tensor, "h w 3"]:
-    """World places of the scene at every ``step``-th pixel."""
-    sums = F.avg_pool2d(depth.movedim(-1, 0), step, ceil_mode=True, count_include_pad=False)
-    z = sums[0] / sums[1].clamp_min(_LEAST_SCENE)
-    y, x = ((torch.arange(count, device=z.device) + 0.5) * step for count in z.shape)
-    K, pose = camera.K, camera.world_to_camera.detach()
-    rays = torch.stack(
-        [
-            ((x - K[0, 2]) / K[0, 0]).expand(z.shape),
-            ((y - K[1, 2]) / K[1, 1])[:, None].expand(z.shape),
-            torch.ones_like(z),
-        ],
-        -1,
-    )
-    return (rays * z[..., None] - pose[:3, 3]) @ pose[:3, :3]
-
-
 def _enlarge(light: Float[Tensor, "T h w"], camera: Camera, step: int) -> Float[Tensor, "T H W"]:
+    if runs_native(light):
+        large: Tensor = _Enlarge.apply(light, camera.height, camera.width, step)
+        return large
     full = F.interpolate(light[:, None], scale_factor=step, mode="bilinear")
     return full[:, 0, : camera.height, : camera.width]
+
+
+class _Enlarge(torch.autograd.Function):
+    """The same in the compiled module."""
+
+    @staticmethod
+    def forward(ctx: Any, light: Tensor, height: int, width: int, step: int) -> Tensor:
+        ctx.step, ctx.size = step, light.shape
+        large = light.new_empty(len(light), height, width)
+        native.enlarge(light.detach().contiguous(), step, large, False, torch.get_num_threads())
+        return large
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        small = upstream[0].new_empty(ctx.size)
+        above = upstream[0].contiguous()
+        native.enlarge(above, ctx.step, small, True, torch.get_num_threads())
+        return small, None, None, None
 
 
 def _with_centers(layer: Splats) -> Splats:

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from evsplat.render import LOW_PASS, Splats
 
@@ -47,17 +49,31 @@ def human_splats(
     semantics: Float[Tensor, " H"],
     transforms: Float[Tensor, "T H 4 4"],
 ) -> Splats:
-    """The person's layer; what is the same at all times may have an axis of one time."""
+    """The person's layer; what is the same at all times may have an axis of one time.
+
+    Rotations and scales keep it: they are drawn, and their gradients summed, without copies.
+    """
     times = (len(means), -1, -1)
     channels = torch.cat([rgb.expand(times), semantics[None, :, None].expand(times)], -1)
-    return Splats(
-        means,
-        quaternions.expand(times),
-        scales.expand(times),
-        opacities,
-        channels,
-        transforms[..., :3, :3],
-    )
+    return Splats(means, quaternions, scales, opacities, channels, _linear(transforms))
+
+
+def _linear(transforms: Float[Tensor, "T H 4 4"]) -> Float[Tensor, "T H 3 3"]:
+    part: Tensor = _Linear.apply(transforms)
+    return part
+
+
+class _Linear(torch.autograd.Function):
+    """The 3x3 part; its gradient is put into place in one pass."""
+
+    @staticmethod
+    def forward(ctx: Any, transforms: Tensor) -> Tensor:
+        return transforms[..., :3, :3].contiguous()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        return nn.functional.pad(upstream[0], (0, 1, 0, 1))
 
 
 def scene_splats(

@@ -14,7 +14,7 @@ from evsplat.devices import DeviceCache
 from evsplat.models.drawing import Drawing
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
-from evsplat.pictures import decode
+from evsplat.pictures import Transfer, log_luminance
 
 ModelType = TypeVar("ModelType", bound=Model)
 
@@ -53,11 +53,14 @@ class Step(Generic[ModelType]):
         """The Gaussians in the world, as they were drawn."""
         return self.drawing.layers
 
-    @cached_property
-    def linear(self) -> Float[Tensor, "T H W 3"]:
-        """The pictures in linear light, planar in memory; by the curve of the frame's camera."""
-        planes = torch.stack([picture.movedim(-1, 0) for picture in self.rgb])
-        return decode(planes, self.capture.transfer(self.frame)).movedim(1, -1)
+    @property
+    def transfer(self) -> Transfer:
+        """The curve of the frame's camera, by which the pictures are coded."""
+        return self.capture.transfer(self.frame)
+
+    def log_luminance(self, which: slice, eps: float) -> Float[Tensor, "T H W"]:
+        """Natural logarithm of some pictures' luminance in linear light, and ``eps``."""
+        return log_luminance(self.rgb[which], eps, self.transfer)
 
     def index(self, time_us: int) -> int:
         """Place of a time among the pictures."""

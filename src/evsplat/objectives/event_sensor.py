@@ -1,6 +1,7 @@
 """The event camera in training: its noise, learned contrast thresholds, a clock that runs apart."""
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
@@ -9,7 +10,10 @@ from torch import Tensor, nn
 
 from evsplat.calibration import noise_of
 from evsplat.events import EventStore
+from evsplat.events.store import ALWAYS, Span
 
+_LEAST_NOISE_US = 60_000_000
+"""A pixel that is hot fires a few hundred times in it."""
 _OFFSET_UNIT_US = 10_000.0
 """One unit of the offset's parameter, so that all parameters learn well at one rate."""
 
@@ -61,32 +65,48 @@ class EventSensor(nn.Module):
         self, on: Float[Tensor, "*batch H W"], off: Float[Tensor, "*batch H W"]
     ) -> Float[Tensor, "*batch H W"]:
         """Log-brightness change that counts of events of both polarities report."""
-        threshold = self.logs.exp()
+        threshold = self.thresholds
         return threshold[0] * on - threshold[1] * off
+
+    @property
+    def thresholds(self) -> Float[Tensor, "2"]:
+        """Change of log-brightness per event, ON and OFF, above 0."""
+        return self.logs.exp()
 
     def path(self, count: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
         """Size of the log-brightness change that counts of events without polarity report."""
         return self.logs.mean().exp() * count
 
 
+def minute_around(exposures_us: Sequence[Span]) -> Span:
+    """From the first exposure to the last, or at least a minute about their middle."""
+    start, end = min(span[0] for span in exposures_us), max(span[1] for span in exposures_us)
+    missing = max(0, _LEAST_NOISE_US - (end - start))
+    return start - missing // 2, end + missing // 2
+
+
 class EventNoise:
-    """Background activity, and the pixels that fire without cause; measured when first asked for.
+    """Background activity, and the pixels that fire without cause; measured once (`measure`).
 
     With a background rate r an interval T holds r T events per pixel that nothing caused, give or
     take the root: what is compared with its events weighs ``1 / (1 + 2 sqrt(r T))``, as a Laplace
     likelihood does whose width is half a threshold and that noise.
     """
 
-    def __init__(self, events: EventStore, *, aware: bool = True) -> None:
-        """Noise of a whole recording; without ``aware`` every event counts fully."""
-        self.events, self.aware = events, aware
+    def __init__(self, events: EventStore, *, during_us: Span = ALWAYS, aware: bool = True) -> None:
+        """Noise of a recording ``during_us``; without ``aware`` every event counts fully."""
+        self.events, self.during_us, self.aware = events, during_us, aware
+
+    def measure(self) -> None:
+        """Measure now what is else measured when it is first asked for: it takes seconds."""
+        _ = self._measured
 
     @cached_property
     def _measured(self) -> tuple[float, Float[Tensor, "H W"]]:
         sound = torch.ones(self.events.height, self.events.width)
         if not self.aware:
             return 0.0, sound
-        noise = noise_of(self.events)
+        noise = noise_of(self.events, self.during_us)
         sound[noise.hot_pixels[:, 1], noise.hot_pixels[:, 0]] = 0.0
         return noise.background_hz, sound
 

@@ -2,21 +2,26 @@
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import accumulate
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from evsplat.capture import Frame, TrainingCapture
+from evsplat.compiled import native, runs_native
 from evsplat.devices import send
-from evsplat.events import EventStream, begun_counts, polarity_counts
+from evsplat.events import polarity_counts, window_counts
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event_sensor import EventNoise, EventSensor
-from evsplat.pictures import luminance
 
 _RATE_US = 1_000
 """Time before and after an instant in which events are counted for their rate there."""
+_KEPT_BYTES = 256 << 20
+"""Of decoded events, which the next steps ask for again."""
 RENDERS = 3
 """Rendered times around a held-out frame."""
 
@@ -56,7 +61,8 @@ class EventWindows(Objective):
         (`begun_counts`); 0: all at once, when the second one tells.
         """
         assert capture.events is not None
-        self.events, self.sensor, self.generator = capture.events, sensor, generator
+        self.events = capture.events.keeping(_KEPT_BYTES)
+        self.sensor, self.generator = sensor, generator
         self.start, self.eps = start, eps
         mids = [frame.mid_us for frame in capture.frames]
         self.interval_us = _median_gap(mids)
@@ -86,13 +92,17 @@ class EventWindows(Objective):
         times = step.times_us[kept]
         if step.nominal < self.start or len(times) < 2:
             return {}
-        wrong = self.differences(step, kept)
-        event = self.mean(
-            wrong, [end - start for start, end in zip(times, times[1:], strict=False)]
-        )
-        if self.events.has_polarity:
-            # The whole span as well: small errors of one sign in each window add up in it.
-            event = 0.5 * (event + self.mean(wrong.sum(0, keepdim=True), [times[-1] - times[0]]))
+        seen = self._seen(step, kept)
+        lasting = [end - start for start, end in zip(times, times[1:], strict=False)]
+        whole = times[-1] - times[0]
+        if self.events.has_polarity and runs_native(seen.brightness):
+            event = self._compared(seen, lasting, whole)
+        else:
+            wrong = self._differences(seen)
+            event = self.mean(wrong, lasting)
+            if self.events.has_polarity:
+                # The whole span as well: small errors of one sign in each window add up in it.
+                event = 0.5 * (event + self.mean(wrong.sum(0, keepdim=True), [whole]))
         return {"event": event, "contrast": self.sensor.apart()}
 
     def readable(self, step: Step) -> slice:
@@ -112,32 +122,58 @@ class EventWindows(Objective):
 
         Without polarity: of the change's size.
         """
-        offset = self.sensor.offset_us
+        return self._differences(self._seen(step, kept))
+
+    def _seen(self, step: Step, kept: slice) -> "_Seen":
+        """What is compared at the times kept."""
         late = [time + self._late_us for time in step.times_us[kept]]
         low, high = self.events.readable_around(step.frame.mid_us)
         # A sensor compares logarithms of light, before any transfer curve of a camera.
-        brightness = torch.log(luminance(step.linear[kept]) + self.eps)
+        brightness = step.log_luminance(kept, self.eps)
         reach = max(_RATE_US, self.ramp_us)
         stream = self.events.between(max(late[0] - reach, low), min(late[-1] + reach, high))
-        windows = list(zip(late, late[1:], strict=False))
-        counts = self._counts(stream, windows, brightness.device)
-        changes = brightness[1:] - brightness[:-1]
-        # Without polarity a window's events tell how far brightness went, not which way.
-        if not self.events.has_polarity:
-            return changes.abs() - self.sensor.path(counts.sum(1))
-        if self.ramp_us > 0:
-            size = self.events.height, self.events.width
-            begun = begun_counts(stream, late, *size, reach_us=self.ramp_us)
-            counts = counts + send(begun[1:] - begun[:-1], counts.device)
-        reported = self.sensor.change(*counts.unbind(1))
-        if offset is not None:
+        size = self.events.height, self.events.width
+        ramp_us = self.ramp_us if self.events.has_polarity else 0
+        counts = window_counts(stream, late, *size, reach_us=ramp_us)
+        drift = None
+        if self.sensor.offset_us is not None and self.events.has_polarity:
             # Events per microsecond at each instant tell what a later clock would have counted.
             around = [(max(time - _RATE_US, low), min(time + _RATE_US, high)) for time in late]
-            rates = self.sensor.change(*self._counts(stream, around, brightness.device).unbind(1))
-            lasting = torch.tensor([end - start for start, end in around], dtype=rates.dtype)
-            rates = rates.detach() / send(lasting, rates.device)[:, None, None]
-            reported = reported + (offset - offset.detach()) * (rates[1:] - rates[:-1])
+            maps = torch.stack([polarity_counts(stream.between(*ends), *size) for ends in around])
+            lasting = torch.tensor([end - start for start, end in around], dtype=torch.float32)
+            rates = send(maps / lasting[:, None, None, None], brightness.device)
+            with torch.no_grad():
+                rate = self.sensor.change(*rates.unbind(1))
+                drift = rate[1:] - rate[:-1]
+        return _Seen(brightness, send(counts, brightness.device), drift)
+
+    def _differences(self, seen: "_Seen") -> Float[Tensor, "T-1 H W"]:
+        changes = seen.brightness[1:] - seen.brightness[:-1]
+        # Without polarity a window's events tell how far brightness went, not which way.
+        if not self.events.has_polarity:
+            return changes.abs() - self.sensor.path(seen.counts.sum(1))
+        reported = self.sensor.change(*seen.counts.unbind(1))
+        offset = self.sensor.offset_us
+        if offset is not None and seen.drift is not None:
+            reported = reported + (offset - offset.detach()) * seen.drift
         return changes - reported
+
+    def _compared(self, seen: "_Seen", durations_us: Sequence[int], whole_us: int) -> Tensor:
+        """Mean size of the differences and of their sum, in the compiled module."""
+        pixels = seen.brightness[0].numel()
+        each = [self.noise.weight(duration) / len(durations_us) for duration in durations_us]
+        offset = self.sensor.offset_us
+        event: Tensor = _Compared.apply(
+            seen.brightness,
+            self.sensor.thresholds,
+            self.sensor.thresholds.new_zeros(()) if offset is None else offset,
+            seen.counts,
+            seen.drift,
+            self.noise.sound,
+            torch.tensor(each) * (0.5 / pixels),
+            self.noise.weight(whole_us) * (0.5 / pixels),
+        )
+        return event
 
     def mean(
         self, differences: Float[Tensor, "N H W"], durations_us: Sequence[int]
@@ -148,13 +184,55 @@ class EventWindows(Objective):
         weights = send(each.to(sound.dtype), differences.device)
         return (sound * weights[:, None, None] * differences.abs()).mean()
 
-    def _counts(
-        self, stream: EventStream, windows: Sequence[tuple[int, int]], device: torch.device
-    ) -> Float[Tensor, "W 2 H W"]:
-        """Events per window, polarity (brighter first) and pixel."""
-        size = self.events.height, self.events.width
-        maps = [polarity_counts(stream.between(*ends), *size) for ends in windows]
-        return send(torch.stack(maps), device)
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Rendered and recorded brightness at T times."""
+
+    brightness: Float[Tensor, "T H W"]
+    """Natural logarithm."""
+    counts: Float[Tensor, "T-1 2 H W"]
+    """Events between the times, of either polarity."""
+    drift: Float[Tensor, "T-1 H W"] | None
+    """Slope of the reported change by the lag of the events' clock, per microsecond."""
+
+
+class _Compared(torch.autograd.Function):
+    """Weighted size of differences between windows, and of their sum; slopes are found at once."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        brightness: Tensor,
+        thresholds: Tensor,
+        offset: Tensor,
+        counts: Tensor,
+        drift: Tensor | None,
+        sound: Tensor,
+        weights: Tensor,
+        whole: float,
+    ) -> Tensor:
+        slope = torch.empty_like(brightness)
+        value, *by = native.window_difference(
+            brightness.detach().contiguous(),
+            counts,
+            None if drift is None else drift.contiguous(),
+            sound.float().contiguous(),
+            weights.float(),
+            whole,
+            thresholds.tolist(),
+            slope,
+            torch.get_num_threads(),
+        )
+        ctx.save_for_backward(slope, thresholds.new_tensor(by))
+        return brightness.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        slope, by = ctx.saved_tensors
+        by = by * upstream[0]
+        return slope * upstream[0], by[:2], by[2], None, None, None, None, None
 
 
 class HeldOutWindows(Objective):

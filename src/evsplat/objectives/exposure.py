@@ -10,7 +10,7 @@ from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.devices import DeviceCache
 from evsplat.objectives.base import Objective, Step, picture
-from evsplat.pictures import encode
+from evsplat.pictures import encode, mean_light
 from evsplat.similarity.psnr_ssim import l1_and_ssim
 
 DARKEST_LINEAR = 1e-6
@@ -73,9 +73,9 @@ class Exposure(Objective):
         start, end = step.frame.exposure_us
         first, last = (bisect_left(step.times_us, time) for time in (start, end))
         # Times of other objectives lie outside. A shutter adds light up before it is coded.
-        mean = step.linear[first:last].mean(0)
+        mean = mean_light(step.rgb[first:last], step.transfer)
         l1, similarity = l1_and_ssim(
-            encode(mean.clamp_min(DARKEST_LINEAR), step.capture.transfer(step.frame)),
+            encode(mean.clamp_min(DARKEST_LINEAR), step.transfer),
             step.observed(step.frame),
         )
         return {"l1": l1, "dssim": 1 - similarity}

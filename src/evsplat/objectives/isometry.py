@@ -121,8 +121,9 @@ class Isometry(LookedUp):
         every = -(-len(posed.means) // MOST_TIMES)
         moved = (
             posed.means[::every],
-            posed.quaternions[::every],
-            posed.scales[::every],
+            # What is the same at all times may have an axis of one.
+            posed.quaternions.expand(len(posed.means), -1, -1)[::every],
+            posed.scales.expand(len(posed.means), -1, -1)[::every],
             step.layers.transforms[::every],
         )
         centers, covariances = isometry_change(rows, at_rest, moved)

@@ -6,6 +6,7 @@ loads torch, so that ``--help`` is quick.
 
 from evsplat.options.captures import (
     RECIPES,
+    PoseOptions,
     PoseSearch,
     ReadOptions,
     StageSettings,
@@ -18,6 +19,7 @@ __all__ = [
     "BenchOptions",
     "ExportOptions",
     "Film",
+    "PoseOptions",
     "PoseSearch",
     "ReadOptions",
     "StageSettings",

@@ -183,8 +183,8 @@ class StageSettings:
 
 
 @dataclass(frozen=True)
-class PoseSearch:
-    """Body poses to be found in a capture."""
+class PoseOptions:
+    """Body poses to be found in a recording."""
 
     body: Annotated[Literal["default", "smpl"], option("MODEL")] = "default"
     """default (ships with evsplat) or smpl (your licensed file)."""
@@ -192,10 +192,10 @@ class PoseSearch:
         float | None, Within(0.5, 2.5), option("M", default="an adult's", name="height")
     ] = None
     """Stature of the person, metres: it alone tells how far away they are."""
-    focal: Annotated[str | None, option("auto|PX", default="the capture's")] = None
-    """Focal length in pixels, or auto: the one that fits best."""
-    refine: Flag = False
-    """Correct them by drawing the person; taken where it explains unseen pictures better."""
+    refine_s: Annotated[
+        float | None, Within(0, 1e6), option("SECONDS", default="2 per frame", name="refine")
+    ] = None
+    """Time for their correction by drawing the person; 0: none."""
     use: Use = "training"
     """everything: held-out frames are looked at too."""
     held_out_events: Flag = False
@@ -203,13 +203,19 @@ class PoseSearch:
 
     def __post_init__(self) -> None:
         check_options(self)
+
+
+@dataclass(frozen=True)
+class PoseSearch(PoseOptions):
+    """Body poses to be found in a capture, and the focal length with them."""
+
+    focal: Annotated[str | None, option("auto|PX", default="the capture's")] = None
+    """Focal length in pixels, or auto: the one that fits best."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.focal not in (None, "auto") and self.focal_px is None:
             raise ConfigError(f"--focal {self.focal}: expected auto or pixels above 0.")
-        if self.focal is not None and self.refine:
-            raise ConfigError(
-                "--refine draws with the capture's own camera, and --focal gives another; leave "
-                "one of them out."
-            )
 
     @property
     def focal_px(self) -> float | None:

@@ -7,7 +7,11 @@ from evsplat.pictures.light import (
     encode,
     log_brightness,
     log_brightness_change,
+    log_luminance,
     luminance,
+    mean_light,
+    shown,
+    stored,
 )
 
 __all__ = [
@@ -17,7 +21,11 @@ __all__ = [
     "error_map",
     "log_brightness",
     "log_brightness_change",
+    "log_luminance",
     "luminance",
+    "mean_light",
+    "shown",
     "signed_map",
+    "stored",
     "to_bytes",
 ]

@@ -2,8 +2,7 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,45 +11,18 @@ import av
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from evsplat.errors import DataError
-from evsplat.files import atomic_path, why_not_read
-
-
-@contextmanager
-def opened_picture(
-    path: Path, problem: str = "cannot be decoded as a picture"
-) -> Iterator[Image.Image]:
-    """A picture file to decode in the block; what goes wrong there is a `DataError`."""
-    try:
-        with Image.open(path) as image:
-            yield image
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise DataError(f"{path}: {why_not_read(error)}.") from error
-    except Image.DecompressionBombError as error:
-        raise DataError(f"{path}: {problem} ({error}); make it smaller.") from error
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        raise DataError(f"{path}: {problem} ({error}); save it again as PNG.") from error
+from evsplat.files import atomic_path, open_output
+from evsplat.untrusted.pictures import read_16_bit_colour, read_picture
 
 
 def read_image(path: Path) -> np.ndarray:
     """The stored pixels: (H, W) or (H, W, 3), uint8 or uint16; transparency is dropped."""
-    with opened_picture(path) as image:
-        if image.mode in ("RGB", "RGBA") and _has_16_bits(image):
-            return _read_16_bit_colour(path)
-        if image.mode in ("L", "RGB", "I;16"):
-            return np.array(image)
-        if image.mode == "I;16B":
-            return np.array(image).astype(np.uint16)
-        return np.array(image.convert("L" if image.mode in ("1", "LA") else "RGB"))
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header, without decoding the pixels."""
-    with opened_picture(path, "not a readable picture") as image:
-        return image.size
+    pixels = read_picture(path, _pixels)
+    return read_16_bit_colour(path) if pixels is None else pixels
 
 
 def to_unit_range(pixels: np.ndarray) -> Float[Tensor, "..."]:
@@ -121,7 +93,8 @@ def write_image(path: Path, pixels: np.ndarray, *, source: str = "") -> None:
     if pixels.dtype.kind in "fb":
         pixels = _eight_bits(pixels, source)
     if pixels.dtype == np.uint16 and pixels.ndim == 3:
-        path.write_bytes(_encode_16_bit_colour(pixels))
+        with open_output(path) as file:
+            file.write(_encode_16_bit_colour(pixels))
     elif pixels.dtype in (np.uint8, np.uint16):
         Image.fromarray(np.ascontiguousarray(pixels)).save(path)
     else:
@@ -134,22 +107,22 @@ def save_png(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
         Image.fromarray(picture).save(temporary)
 
 
+def _pixels(image: Image.Image) -> np.ndarray | None:
+    """None for 16 bits per colour, which Pillow would cut to 8."""
+    if image.mode in ("RGB", "RGBA") and _has_16_bits(image):
+        return None
+    if image.mode in ("L", "RGB", "I;16"):
+        return np.array(image)
+    if image.mode == "I;16B":
+        return np.array(image).astype(np.uint16)
+    return np.array(image.convert("L" if image.mode in ("1", "LA") else "RGB"))
+
+
 def _has_16_bits(image: Image.Image) -> bool:
-    """True for 16 bits per channel, which Pillow would cut to 8."""
     return any(
         "16" in str(tile[3][0] if isinstance(tile[3], tuple) else tile[3])
         for tile in getattr(image, "tile", [])
     )
-
-
-def _read_16_bit_colour(path: Path) -> np.ndarray:
-    try:
-        with av.open(str(path)) as container:
-            return next(container.decode(video=0)).to_ndarray(format="rgb48le")
-    except (av.error.FFmpegError, StopIteration) as error:
-        raise DataError(
-            f"{path}: cannot be decoded as a 16-bit picture ({error}); save it again as PNG."
-        ) from error
 
 
 def _eight_bits(pixels: np.ndarray, source: str) -> np.ndarray:

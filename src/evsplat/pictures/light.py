@@ -1,5 +1,6 @@
 """Coded values of pictures, linear light, luminance and its logarithm, which events report."""
 
+from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -18,6 +19,10 @@ GAMMA = 2.2
 REC709 = (0.2126, 0.7152, 0.0722)
 DARKEST = 1.0 / 255.0
 """Coded values are clamped here first: below one 8-bit level the logarithm only sees rounding."""
+_BLACK = 1e-6
+"""Coded values below are no light, and have no slope."""
+_MOST_PICTURES = 256
+"""That the compiled module takes together."""
 
 
 def decode(coded: Float[Tensor, "*shape"], transfer: Transfer = "power") -> Float[Tensor, "*shape"]:
@@ -39,7 +44,8 @@ def encode(
     """Coded values in [0, 1] of linear light in [0, 1]; values below 0 count as 0."""
     linear = linear.clamp_min(0.0)
     if transfer == "power":
-        return linear ** (1 / GAMMA)
+        coded: Tensor = _PowerEncode.apply(linear)
+        return coded
     if transfer == "linear":
         return linear
     return torch.where(
@@ -47,10 +53,57 @@ def encode(
     )
 
 
+def shown(values: Float[Tensor, "*shape"], transfer: Transfer) -> Float[Tensor, "*shape"]:
+    """Values of pictures as screens, people and pretrained networks take them.
+
+    Light as it stands (``linear``) is coded as sRGB, values that are coded stay as they are.
+    """
+    return encode(values, "srgb") if transfer == "linear" else values
+
+
+def transfer_shown(transfer: Transfer) -> Transfer:
+    """Transfer of pictures that are `shown`."""
+    return "srgb" if transfer == "linear" else transfer
+
+
+def stored(coded: Float[Tensor, "*shape"], transfer: Transfer) -> Float[Tensor, "*shape"]:
+    """The opposite of `shown`: values of a picture with that ``transfer``."""
+    return decode(coded, "srgb") if transfer == "linear" else coded
+
+
 def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
     """Rec. 709 luminance of linear RGB, the quantity that an event pixel sees."""
     red, green, blue = linear_rgb.unbind(-1)
     return REC709[0] * red + REC709[1] * green + REC709[2] * blue
+
+
+def mean_light(
+    coded: Sequence[Float[Tensor, "H W 3"]], transfer: Transfer = "power"
+) -> Float[Tensor, "H W 3"]:
+    """Mean of coded pictures in linear light."""
+    if transfer == "power" and all(map(runs_native, coded)) and len(coded) <= _MOST_PICTURES:
+        mean: Tensor = _NativeMeanLight.apply(*coded)
+        return mean
+    return decode(_planes(coded), transfer).mean(0).movedim(0, -1)
+
+
+def log_luminance(
+    coded: Sequence[Float[Tensor, "H W 3"]], eps: float, transfer: Transfer = "power"
+) -> Float[Tensor, "T H W"]:
+    """Natural logarithm of coded pictures' luminance in linear light, and ``eps``."""
+    if transfer == "power" and all(map(runs_native, coded)):
+        result: Tensor = _NativeLogLuminance.apply(eps, *coded)
+        return result
+    return torch.log(luminance(decode(_planes(coded), transfer).movedim(1, -1)) + eps)
+
+
+def _planes(pictures: Sequence[Float[Tensor, "H W 3"]]) -> Float[Tensor, "T 3 H W"]:
+    return torch.stack([picture.movedim(-1, 0) for picture in pictures])
+
+
+def _planar(picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """Without gradient, its channels one after the other in memory."""
+    return picture.detach().movedim(-1, 0).contiguous().movedim(0, -1)
 
 
 def log_brightness(
@@ -93,6 +146,67 @@ class _NativePower(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> Tensor:
         (slope,) = ctx.saved_tensors
         return slope * upstream[0]
+
+
+class _NativeMeanLight(torch.autograd.Function):
+    """`mean_light` for the power curve in the compiled module."""
+
+    @staticmethod
+    def forward(ctx: Any, *coded: Tensor) -> Float[Tensor, "H W 3"]:
+        height, width, channels = coded[0].shape
+        mean = coded[0].new_empty(channels, height, width)
+        native.power_mean([_planar(p) for p in coded], GAMMA, mean, torch.get_num_threads())
+        ctx.save_for_backward(*coded)
+        return mean.movedim(0, -1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, ...]:
+        coded = ctx.saved_tensors
+        above = upstream[0].movedim(-1, 0).contiguous()
+        grads = above.new_empty(len(coded), *above.shape)
+        pictures = [_planar(picture) for picture in coded]
+        native.power_mean_backward(pictures, GAMMA, above, grads, torch.get_num_threads())
+        return grads.movedim(1, -1).unbind(0)
+
+
+class _NativeLogLuminance(torch.autograd.Function):
+    """`log_luminance` for the power curve in the compiled module; slopes are found at once."""
+
+    @staticmethod
+    def forward(ctx: Any, eps: float, *coded: Tensor) -> Float[Tensor, "T H W"]:
+        height, width, channels = coded[0].shape
+        value = coded[0].new_empty(len(coded), height, width)
+        slopes = value.new_empty(len(coded), channels, height, width)
+        for picture, at, slope in zip(coded, value, slopes, strict=True):
+            planes = _planar(picture).movedim(-1, 0)
+            native.log_brightness(
+                planes, REC709, GAMMA, _BLACK, eps, at, slope, torch.get_num_threads()
+            )
+        ctx.save_for_backward(slopes)
+        return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (slopes,) = ctx.saved_tensors
+        return None, *(slopes * upstream[0][:, None]).movedim(1, -1).unbind(0)
+
+
+class _PowerEncode(torch.autograd.Function):
+    """The inverse of the power curve; its slope, none at 0, is taken from the result."""
+
+    @staticmethod
+    def forward(ctx: Any, linear: Tensor) -> Tensor:
+        coded = linear ** (1 / GAMMA)
+        ctx.save_for_backward(linear, coded)
+        return coded
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        linear, coded = ctx.saved_tensors
+        return upstream[0] * (coded / linear.clamp_min(1e-30)) * (1 / GAMMA)
 
 
 class _PowerLogBrightness(torch.autograd.Function):

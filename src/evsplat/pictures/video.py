@@ -1,7 +1,5 @@
 """Writing pictures as H.264 video, WebP or GIF animation or PNG files, whole or not at all."""
 
-import shutil
-import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -12,7 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from evsplat.errors import BackendError, ConfigError, DataError
-from evsplat.files import atomic_path
+from evsplat.files import atomic_path, new_folder
 from evsplat.names import checked_name
 
 _BT709 = 1
@@ -158,19 +156,13 @@ def write_pictures(
         raise DataError(f"{folder}: is a file; give a folder for PNG pictures or a name in .mp4.")
     if not replace and folder.is_dir() and any(folder.iterdir()):
         raise DataError(f"{folder}: the folder is not empty; give a new one to --out.")
-    folder.parent.mkdir(parents=True, exist_ok=True)
     count = 0
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
-        made = Path(temporary) / folder.name
-        made.mkdir()
+    with new_folder(folder, replace=True) as made:
         for name, picture in pictures:
             Image.fromarray(picture).save(made / f"{checked_name(name, 'a picture')}.png")
             count += 1
         if not count:
             raise DataError(f"{folder}: there is no picture to write.")
-        if folder.exists():
-            shutil.rmtree(folder)
-        made.rename(folder)
     return count
 
 

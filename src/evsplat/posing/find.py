@@ -15,10 +15,11 @@ import evsplat
 from evsplat.body import BodyTrack
 from evsplat.body.smpl import smpl_body
 from evsplat.camera import Camera
-from evsplat.capture import Policy, TrainingCapture, load_capture
+from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.config import to_dict
-from evsplat.files import refuse_existing, write_text
+from evsplat.errors import ConfigError
+from evsplat.files import refuse_existing, try_target, write_text
 from evsplat.landmarks import (
     LandmarkNetwork,
     Landmarks,
@@ -37,8 +38,11 @@ from evsplat.posing.rig import Rig, default_rig, make_rig
 
 logger = logging.getLogger(__name__)
 
+_FIRST_FOCAL = 1.2
 _FOCALS = np.geomspace(0.6, 2.4, 7)
-"""Focal lengths that `--focal auto` begins with, in widths of the picture."""
+"""Focal lengths of which `--focal auto` seeks the best, beginning at the first; in widths."""
+_FRAME_S = 2.0
+"""Time for the refinement, per frame."""
 _BETAS = 10
 _QUARTERS = (0.25, 0.5, 0.75)
 
@@ -82,17 +86,18 @@ def find_poses(
     *,
     keypoints: Path | str | None = None,
     policy: Policy | None = None,
+    overwrite: bool = False,
     **changes: Any,
 ) -> FoundPoses:
     """Find the person's poses in a capture and write a new one with them, whole or not at all.
 
     Landmarks on sharpened pictures (`evsplat.landmarks`; or the key points of a file), and a motion
-    fitted to them (`fit_landmarks`), on wish corrected by drawing the person (`refine`), which is
-    taken where it explains pictures better that it has not seen. Of the capture is
-    seen what its policy shows: by default no picture, mask or event of a held-out interval. Poses
-    that the capture has are ignored; its true poses between keys, of another body, are left out of
-    the new one. ``changes`` are options of `PoseSearch`. ``poses.html`` in the new capture shows
-    what was found.
+    fitted to them (`fit_landmarks`), corrected by drawing the person (`refine`), which is taken
+    where it explains pictures better that it has not seen. Of the capture is seen what its policy
+    shows: by default no picture, mask or event of a held-out interval. Poses that the capture has
+    are ignored; its true poses between keys, of another body, are left out of the new one.
+    ``poses.html`` in the new capture shows what was found. ``overwrite`` replaces a folder that is
+    at ``out``; ``changes`` are options of `PoseSearch`.
 
     Raises:
         ConfigError: An option is out of range.
@@ -101,24 +106,33 @@ def find_poses(
     """
     search = given(PoseSearch, search, changes)
     out = Path(out)
-    refuse_existing(out)
+    if not overwrite:
+        refuse_existing(out)
+    try_target(out)
     rig = _rig(search.body)
-    capture = load_capture(path)
+    capture = load_capture(path, needs_body=False)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
-    seen = capture.for_training(policy)
+    focal_px = search.focal_px
+    if search.focal == "auto":
+        focal_px = _FIRST_FOCAL * capture.camera(capture.frames[0]).width
+    seen = _seen(capture, policy, focal_px)
+    limit_s = _refinement_s(seen, search)
     stages = _Stages()
-    with tqdm(total=3 + search.refine, desc="poses", unit="stage") as bar:
+    with tqdm(total=3 + (limit_s > 0), desc="poses", unit="stage") as bar:
         with stages(bar, "pictures"):
             pictures = sharp_pictures(seen)
         with stages(bar, "landmarks"):
             landmarks = _landmarks(seen, pictures, keypoints)
         with stages(bar, "fit"):
-            fitted, focal_px = _fit(seen, landmarks, rig, search)
+            fitted = _fit(seen, landmarks, rig, search)
+            if search.focal == "auto":
+                focal_px, fitted = _best_focal(fitted, seen.camera(seen.frames[0]).width)
+                seen = _seen(capture, policy, focal_px)
         track = fitted.track(key_times(seen))
         refined: Refined | None = None
-        if search.refine:
+        if limit_s > 0:
             with stages(bar, "refinement"):
-                refined = refine(track, seen)
+                refined = refine(track, seen, seconds=limit_s, progress=True)
             track = refined.track if refined.better else track
     made = {
         "from": "key points of a file" if keypoints else "landmarks of BlazePose",
@@ -127,13 +141,12 @@ def find_poses(
         "in_doubt": [doubt.part for doubt in fitted.doubts],
         "evsplat": evsplat.__version__,
         "policy": to_dict(seen.policy),
+        **_refinement_made(refined),
     }
-    if refined is not None:
-        made["refinement"] = {"gain": round(refined.gain, 4), "taken": refined.better}
-    with derived_capture(capture, out) as making:
+    with derived_capture(capture, out, replace=overwrite) as making:
         _write_body(making, track, fitted)
         if focal_px is not None:
-            _set_focal(making, seen, focal_px)
+            _set_focal(making, focal_px)
             made["focal_px"] = round(focal_px, 2)
         making.document["provenance"] = {**capture.provenance, "poses": made}
         page = poses_page(capture.name, seen, pictures, landmarks, track, fitted, made)
@@ -153,7 +166,7 @@ def _landmarks(
 ) -> Landmarks:
     """Of the network; or those of a file, which has a row for each frame, at training frames."""
     if keypoints is None:
-        return find_landmarks(capture, pictures, network=LandmarkNetwork(), progress=False)
+        return find_landmarks(capture, pictures, network=LandmarkNetwork())
     frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
     points = read_keypoints(keypoints, [frame.mid_us for frame in frames])
     # Those of held-out frames were found in pictures that are not to be seen.
@@ -186,31 +199,42 @@ def _rig(model: str) -> Rig:
     return make_rig(lambda betas: smpl_body("smpl", betas), "smpl", _BETAS)
 
 
-def _fit(
-    capture: TrainingCapture, landmarks: Landmarks, rig: Rig, search: PoseSearch
-) -> tuple[PoseFit, float | None]:
-    """The motion, and the focal length where it is not the capture's."""
+def _seen(capture: Capture, policy: Policy, focal_px: float | None) -> TrainingCapture:
+    """What a policy shows of a capture; with a focal length where one is given."""
+    return (capture if focal_px is None else capture.with_focal(focal_px)).for_training(policy)
+
+
+def _refinement_made(refined: Refined | None) -> dict[str, Any]:
+    """What the provenance says of it; nothing where there was none."""
+    if refined is None:
+        return {}
+    gain, seconds = round(refined.gain, 4), round(refined.seconds, 1)
+    return {"refinement": {"gain": gain, "taken": refined.better, "seconds": seconds}}
+
+
+def _refinement_s(capture: TrainingCapture, search: PoseSearch) -> float:
+    """Time for the refinement, 0 for none; a moving camera has none, as it needs a background."""
+    if capture.is_static_camera:
+        return _FRAME_S * len(capture.frames) if search.refine_s is None else search.refine_s
+    if search.refine_s:
+        raise ConfigError(
+            f"--refine {search.refine_s:g}: {capture.path} has a moving camera or several, and "
+            "poses are corrected by what differs from a background that stands still; leave it out."
+        )
+    return 0.0
+
+
+def _fit(capture: TrainingCapture, landmarks: Landmarks, rig: Rig, search: PoseSearch) -> PoseFit:
     cameras = _cameras(capture, landmarks.times_us.tolist())
-    focal_px = search.focal_px
-    width = cameras[0].width
-    if search.focal == "auto":
-        focal_px = width * 1.2
-    if focal_px is not None:
-        cameras = [with_focal(camera, focal_px) for camera in cameras]
     settings = FitSettings(height_m=search.height_m)
-    fitted = fit_landmarks(landmarks, cameras, _span(capture), rig=rig, settings=settings)
-    if search.focal == "auto":
-        coarse, _ = fit_focal(fitted, [width * share for share in _FOCALS])
-        step = float(_FOCALS[1] / _FOCALS[0]) ** 0.4
-        focal_px, fitted = fit_focal(fitted, [coarse / step, coarse, coarse * step])
-    return fitted, focal_px
+    return fit_landmarks(landmarks, cameras, _span(capture), rig=rig, settings=settings)
 
 
-def with_focal(camera: Camera, focal_px: float) -> Camera:
-    """The camera with another focal length, pixels being square."""
-    K = camera.K.clone()
-    K[0, 0] = K[1, 1] = focal_px
-    return replace(camera, K=K)
+def _best_focal(fitted: PoseFit, width: int) -> tuple[float, PoseFit]:
+    """The focal length in pixels at which the landmarks are fitted best, and that fit."""
+    coarse, _ = fit_focal(fitted, [width * share for share in _FOCALS])
+    step = float(_FOCALS[1] / _FOCALS[0]) ** 0.4
+    return fit_focal(fitted, [coarse / step, coarse, coarse * step])
 
 
 def _cameras(capture: TrainingCapture, times_us: Sequence[int]) -> list[Camera]:
@@ -222,29 +246,21 @@ def _cameras(capture: TrainingCapture, times_us: Sequence[int]) -> list[Camera]:
 
 def _write_body(making: Derivation, track: BodyTrack, fitted: PoseFit) -> None:
     assert track.errors is not None
-    old = making.document.get("body")
-    for name in {"body.npz", "body_dense.npz", *([old["file"]] if old else [])}:
-        # It may be a hard link, and what it is linked to must stay.
-        (making.folder / name).unlink(missing_ok=True)
-    gender = {"gender": "neutral"} if fitted.rig.model == "smpl" else {}
-    np.savez_compressed(
-        making.folder / "body.npz",
-        allow_pickle=False,
-        model=fitted.rig.model,
-        times_us=track.times_us,
-        poses=track.poses.astype(np.float32),
-        transl=track.transl.astype(np.float32),
-        betas=fitted.betas.astype(np.float32),
-        pose_std_rad=np.asarray(track.errors.joint_rad, np.float32),
-        transl_std_m=np.asarray(track.errors.root_m, np.float32),
-        **gender,
+    making.set_body(
+        fitted.rig.model,
+        track.times_us,
+        track.poses,
+        track.transl,
+        betas=fitted.betas,
+        gender="neutral" if fitted.rig.model == "smpl" else None,
+        source="estimated",
+        pose_std_rad=track.errors.joint_rad,
+        transl_std_m=track.errors.root_m,
     )
-    model = fitted.rig.model
-    making.document["body"] = {"file": "body.npz", "model": model, "source": "estimated"}
 
 
-def _set_focal(making: Derivation, capture: TrainingCapture, focal_px: float) -> None:
-    for name in {frame.camera for frame in capture.frames}:
+def _set_focal(making: Derivation, focal_px: float) -> None:
+    for name in {frame.camera for frame in making.source.frames}:
         K = making.document["cameras"][name]["K"]
         K[0][0] = K[1][1] = focal_px
 

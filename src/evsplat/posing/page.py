@@ -66,13 +66,15 @@ def poses_page(
         + section(
             "Over the pictures",
             "Outline of the posed body (green) over the sharpened pictures; landmarks that are "
-            "seen (yellow) and guessed (red). σ: how far landmarks lie from the pose, in their "
-            "standard deviations.",
+            "seen (yellow) and guessed (red). σ: how far landmarks lie from the pose fitted to "
+            "them, in their standard deviations.",
             grid(first) + folded(f"{len(rest)} more pictures", grid(rest) if rest else ""),
         )
         + section("How sure", _SURE, _limb_table(track, fitted.rig))
         + section("In doubt", _DOUBT, _doubts(fitted) + (grid(worst) if worst else ""))
-        + section("Made with", "", f"<p class='note'>{escape(str(dict(made)))}</p>")
+        + section(
+            "Made with", "", _table(_lines({name: made[name] for name in made if name != "policy"}))
+        )
         + "</main>"
     )
     return document(f"{name}: poses", body, style="poses.css")
@@ -130,10 +132,31 @@ def _limb_table(track: BodyTrack, rig: Rig) -> str:
         rows.append((limb.replace("_", " "), f"{worst.mean():.0f}°", f"{worst.max():.0f}°"))
     along = np.sqrt((place**2).sum(1)) * 100
     rows.append(("place", f"{along.mean():.1f} cm", f"{along.max():.1f} cm"))
-    cells = "".join(
-        f"<tr><td>{limb}</td><td>{mean}</td><td>{most}</td></tr>" for limb, mean, most in rows
+    return _table(rows, head=("", "mean", "most"))
+
+
+def _lines(made: Mapping[str, Any], under: str = "") -> list[tuple[str, str]]:
+    """What has a value, by name."""
+    lines: list[tuple[str, str]] = []
+    for name, value in made.items():
+        if isinstance(value, Mapping):
+            lines += _lines(value, f"{under}{name}: ")
+        elif value is not None and value != []:
+            shown = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            lines.append((f"{under}{name}".replace("_", " "), shown))
+    return lines
+
+
+def _table(rows: Sequence[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
+    """A table whose rows begin with a name."""
+    tags = [("th", head)] if head else []
+    lines = "".join(
+        f"<tr><th>{escape(first)}</th>"
+        + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells)
+        + "</tr>"
+        for tag, (first, *cells) in [*tags, *(("td", row) for row in rows)]
     )
-    return f"<table><tr><th></th><th>mean</th><th>most</th></tr>{cells}</table>"
+    return f"<table>{lines}</table>"
 
 
 def _doubts(fitted: PoseFit) -> str:

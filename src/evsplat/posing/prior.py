@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from evsplat.errors import DataError
 from evsplat.posing.rig import ROWS
+from evsplat.untrusted.arrays import read_plain_npz
 
 _FLOOR_RAD = 0.12
 """Spread of every direction that no motion shows: mocap of few people leaves out much."""
@@ -95,5 +97,4 @@ def mirrored(rows: Float[np.ndarray, "T R 3"]) -> Float[np.ndarray, "T R 3"]:
 @cache
 def _table() -> dict[str, np.ndarray]:
     resource = files("evsplat") / "data" / "posing" / "prior.npz"
-    with resource.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-        return {key: archive[key] for key in archive.files}
+    return read_plain_npz(Path(str(resource)))

@@ -4,11 +4,11 @@ The joints of any body are turned as those of the body that ships would be (`Rig
 the pose prior and the offsets of landmarks, which were learned on that body, serve all bodies.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from evsplat.body.retarget import alignments, rest_from_zero
 from evsplat.body.rotations import axis_angle_to_matrix, nearest_axis_angle
 from evsplat.body.skeleton import Skeleton, find_skeleton
 from evsplat.errors import DataError
+from evsplat.untrusted.text import read_json
 
 _SIDED = ("thigh", "shin", "foot", "collar", "upper_arm", "forearm", "hand")
 ROWS = tuple(f"{s}_{part}" for part in _SIDED for s in ("left", "right")) + ("spine", "neck")
@@ -219,7 +220,7 @@ def blazepose_offsets() -> dict[str, tuple[str, str, tuple[float, float, float]]
     Learned by tools/learn_posing.py, which says from what.
     """
     resource = files("evsplat") / "data" / "posing" / "blazepose.json"
-    rows = json.loads(resource.read_text(encoding="utf-8"))["offsets"]
+    rows = read_json(Path(str(resource)))["offsets"]
     return {name: (row[0], row[1], tuple(row[2])) for name, row in rows.items()}
 
 

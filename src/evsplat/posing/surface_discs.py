@@ -8,7 +8,7 @@ from evsplat.body import Body
 from evsplat.body.body import skin
 from evsplat.body.surface import SurfaceSamples
 from evsplat.camera import Camera
-from evsplat.render import Splats, render
+from evsplat.render import RenderOutput, Splats, render
 
 _OVERSAMPLED = 5
 """Surface points drawn per disc; the discs lie at those farthest from each other."""
@@ -18,6 +18,19 @@ _FLATNESS = 0.1
 _OPACITY = 0.95
 _OFFSET_M = 0.01
 """How far clothes and hair typically lie from the bare body."""
+_LAYER_M, _LAYER_REACH_M = 0.015, 0.05
+"""Thickness of clothes, hair and shoes that neighbours share, and how far it is about the same."""
+_ANCHORS = 300
+_SIZE = 0.015
+"""Share by which clothes, hair and shoes make a person look larger or smaller as a whole. Such a
+person is drawn nearer or farther off, so that its motion keeps the distance that it had."""
+_INSET = 0.3
+"""What is left to learn of how far discs must be set back, in units of `_OFFSET_M`."""
+_BEYOND = 0.3, 0.55
+"""How far discs reach beyond an outline, in their widths and in pixels: with it the body that ships
+covers as much of pictures of 128 to 384 pixels as its mesh does, to 4 %."""
+_LOW_PASS = 0.1
+"""Variance of the low-pass, px^2: about that of a square pixel."""
 
 
 class SurfaceDiscs(nn.Module):
@@ -28,6 +41,7 @@ class SurfaceDiscs(nn.Module):
     spherical harmonics of the normal in the world add to the colours.
     """
 
+    near: Tensor
     quaternions: Tensor
     scales: Tensor
 
@@ -45,26 +59,43 @@ class SurfaceDiscs(nn.Module):
         self.register_buffer("quaternions", _turned_to(self.samples.normals))
         self.register_buffer("scales", scales)
         self.colours = nn.Parameter(torch.full((count, 3), 0.5))
-        # A disc at an outline reaches beyond it by about its width.
-        self.inset = nn.Parameter(torch.tensor(-width / _OFFSET_M))
+        self.inset = nn.Parameter(torch.tensor(0.0))
         self.offsets = nn.Parameter(torch.zeros(count))
+        self.register_buffer("near", _nearness(self.samples.points, _ANCHORS))
+        self.layer = nn.Parameter(torch.zeros(self.near.shape[1]))
         self.bone_offsets = nn.Parameter(torch.zeros(len(body.parents), 3))
         self.light = nn.Parameter(torch.zeros(8))
+        self.nearer = nn.Parameter(torch.tensor(0.0))
 
-    def splats(self, rotations: Float[Tensor, "T J 3 3"], transl: Float[Tensor, "T 3"]) -> Splats:
-        """The discs in a pose per time."""
-        normals = self.samples.normals
-        offsets = normals * (self.inset + self.offsets)[:, None]
-        offsets = offsets + self.samples.weights @ self.bone_offsets
-        points = self.samples.points + _OFFSET_M * offsets
+    def splats(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        transl: Float[Tensor, "T 3"],
+        count: int | None = None,
+        pixel_m: float = 0.0,
+    ) -> Splats:
+        """The discs in a pose per time; with ``count`` that many, as much wider.
+
+        They are set back by as much as they reach beyond an outline, by their width and by the
+        low-pass of pixels of ``pixel_m``.
+        """
+        n = len(self.samples.points) if count is None else min(count, len(self.samples.points))
+        normals, weights = self.samples.normals[:n], self.samples.weights[:n]
+        wider = (len(self.samples.points) / n) ** 0.5
+        sizes = self.scales[:n] * wider
+        reach = (_BEYOND[0] * sizes[0, 0] + _BEYOND[1] * pixel_m) / _OFFSET_M
+        layer = _LAYER_M / _OFFSET_M * (self.near[:n] @ self.layer)
+        offsets = normals * (self.inset + self.offsets[:n] + layer - reach)[:, None]
+        offsets = offsets + weights @ self.bone_offsets
+        points = self.samples.points[:n] + _OFFSET_M * offsets
         bones = self.body.canonical_to_world(rotations, transl)
-        means, blended = skin(points, self.samples.weights, bones)
+        means, blended = skin(points, weights, bones)
         linear = blended[..., :3, :3]
         turned = (linear @ normals[:, :, None]).squeeze(-1)
         shade = 1 + _harmonics(nn.functional.normalize(turned, dim=-1)) @ self.light
         opacities = torch.full((len(points),), _OPACITY)
-        colours = self.colours * shade[..., None]
-        return Splats(means, self.quaternions, self.scales, opacities, colours, linear=linear)
+        colours = self.colours[:n] * shade[..., None]
+        return Splats(means, self.quaternions[:n], sizes, opacities, colours, linear=linear)
 
     def draw(
         self,
@@ -72,9 +103,10 @@ class SurfaceDiscs(nn.Module):
         transl: Float[Tensor, "T 3"],
         camera: Camera,
         behind: Float[Tensor, "T H W 3"],
+        count: int | None = None,
     ) -> Float[Tensor, "T H W 3"]:
-        """Pictures of the discs before the scene."""
-        drawn = render(self.splats(rotations, transl), camera)
+        """Pictures of the discs before the scene; ``count`` as in `splats`."""
+        drawn = self._drawn(rotations, transl, camera, count)
         return drawn.image + (1 - drawn.alpha[..., None]) * behind
 
     def colour_from(
@@ -83,10 +115,16 @@ class SurfaceDiscs(nn.Module):
         transl: Float[Tensor, "T 3"],
         camera: Camera,
         images: Float[Tensor, "T H W 3"],
+        *,
+        first: int = 0,
+        count: int | None = None,
     ) -> None:
-        """Set each colour to the mean of the pixels that show the disc, by how much they do."""
+        """Set each colour to the mean of the pixels that show the disc, by how much they do.
+
+        Those before ``first`` stay; ``count`` as in `splats`.
+        """
         with torch.enable_grad():
-            drawn = render(self.splats(rotations, transl), camera).image
+            drawn = self._drawn(rotations, transl, camera, count).image
             shares = [
                 torch.autograd.grad((drawn * of).sum(), self.colours, retain_graph=True)[0]
                 for of in (images, torch.ones_like(images))
@@ -94,11 +132,27 @@ class SurfaceDiscs(nn.Module):
         shown, total = shares
         with torch.no_grad():
             mean = shown.sum(0) / total.sum(0).clamp_min(1e-6)
-            self.colours.copy_((shown + 0.1 * mean) / (total + 0.1))
+            self.colours[first:] = ((shown + 0.1 * mean) / (total + 0.1))[first:]
+
+    def _drawn(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        transl: Float[Tensor, "T 3"],
+        camera: Camera,
+        count: int | None,
+    ) -> RenderOutput:
+        away = transl + self.body.rest_joints[0] - camera.center()
+        moved = transl - _SIZE * self.nearer * away
+        depth = camera.project(transl.detach() + self.body.rest_joints[0])[1]
+        pixel_m = float(depth.clamp_min(0.1).mean() / camera.K[0, 0])
+        splats = self.splats(rotations, moved, count, pixel_m)
+        return render(splats, camera, low_pass=_LOW_PASS)
 
     def price(self) -> Float[Tensor, ""]:
         """What offsets and light cost, as minus the logarithm of a prior."""
         offsets = self.offsets.square().sum() + self.bone_offsets.square().sum()
+        offsets = offsets + self.layer.square().sum() + (self.inset / _INSET).square()
+        offsets = offsets + self.nearer.square()
         return 0.5 * offsets + 2 * self.light.square().sum()
 
 
@@ -106,6 +160,13 @@ def _harmonics(normals: Float[Tensor, "*T N 3"]) -> Float[Tensor, "*T N 8"]:
     """Spherical harmonics of first and second order, up to factors."""
     x, y, z = normals.unbind(-1)
     return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], -1)
+
+
+def _nearness(points: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "N A"]:
+    """Shares of A of the points, spread out, in each: rows of unit length."""
+    apart = torch.cdist(points, points[: min(count, len(points))])
+    near = torch.exp(-0.5 * (apart / _LAYER_REACH_M).square())
+    return torch.nn.functional.normalize(near, dim=1)
 
 
 def _far_apart(points: Float[Tensor, "M 3"], count: int) -> Int[Tensor, "N"]:

@@ -1,11 +1,11 @@
 """What a motion is corrected by: sharp pictures, and the scene behind the person in them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
@@ -14,7 +14,8 @@ from evsplat.body.silhouette import silhouette
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
-from evsplat.landmarks.pictures import sharp_pictures
+from evsplat.landmarks.pictures import SharpPicture, sharp_pictures
+from evsplat.pictures.light import DARKEST, Transfer, decode, encode, luminance, transfer_shown
 
 _REACH = 0.08
 """The person is within this share of its height from the posed body."""
@@ -24,6 +25,9 @@ _DARKEST, _BRIGHTEST = 0.3, 1.1
 _LIGHT_BLUR = 0.02
 """Smoothing of shadows, share of the height."""
 _FAR_PX = 1e6
+_BY_PICTURE = ("coloured", "image", "behind", "weight", "trust")
+_DOUBTFUL = 0.06
+"""Expected error of coded colours from which on a carried pixel counts little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,20 +37,48 @@ class Targets:
     times_us: list[int]
     frames: list[Frame]
     """The frame in whose exposure each lies."""
+    coloured: Bool[Tensor, "P"]
+    """False where events carried the picture there: they tell brightness but no hue."""
     image: Float[Tensor, "P H W 3"]
+    """Coded; where not coloured, luminance thrice."""
     behind: Float[Tensor, "P H W 3"]
     """The scene without the person, in the person's shadow."""
     weight: Float[Tensor, "P H W"]
     """Trust in each pixel; 0 away from the person."""
+    trust: Float[Tensor, "P H W"]
+    """Trust in each pixel, wherever the person is."""
     camera: Camera
+    transfer: Transfer
+
+    def as_seen(self, drawn: Float[Tensor, "P H W 3"]) -> Float[Tensor, "P H W 3"]:
+        """Drawings of these pictures, grey where the pictures are."""
+        rows = torch.nonzero(~self.coloured)[:, 0]
+        return drawn.index_copy(0, rows, _grey(drawn[rows], self.transfer)) if len(rows) else drawn
+
+    def around(self, track: BodyTrack, nearness: float = 1.0) -> "Targets":
+        """The same pictures; what is behind the person, and where it is, by another motion.
+
+        ``nearness`` multiplies how far from the posed body the background is taken for sure.
+        """
+        away, tall = _distances(track, self.times_us, self.camera)
+        known = self.coloured
+        plain = _background(self.image[known], away[known], nearness * _CLEAR * tall)
+        usual = self.as_seen(plain.expand_as(self.image))
+        light = [_light(*one, nearness * tall) for one in zip(self.image, usual, away, strict=True)]
+        return replace(
+            self,
+            behind=plain * torch.stack(light),
+            weight=(away < _REACH * tall) * self.trust,
+        )
 
     def rows(self, chosen: Sequence[int]) -> "Targets":
         """Some of the pictures."""
         index = list(chosen)
-        times = [self.times_us[k] for k in index]
-        frames = [self.frames[k] for k in index]
-        return Targets(
-            times, frames, self.image[index], self.behind[index], self.weight[index], self.camera
+        return replace(
+            self,
+            times_us=[self.times_us[k] for k in index],
+            frames=[self.frames[k] for k in index],
+            **{name: getattr(self, name)[index] for name in _BY_PICTURE},
         )
 
     def smaller(self, times: int) -> "Targets":
@@ -61,9 +93,14 @@ class Targets:
             planar = images.permute(0, 3, 1, 2)
             return torch.nn.functional.avg_pool2d(planar, times).permute(0, 2, 3, 1).contiguous()
 
-        weight = pooled(self.weight[..., None])[..., 0]
-        return Targets(
-            self.times_us, self.frames, pooled(self.image), pooled(self.behind), weight, small
+        weight, trust = (pooled(one[..., None])[..., 0] for one in (self.weight, self.trust))
+        return replace(
+            self,
+            image=pooled(self.image),
+            behind=pooled(self.behind),
+            weight=weight,
+            trust=trust,
+            camera=small,
         )
 
 
@@ -79,10 +116,46 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
             "differs from a static background; leave the poses as they are."
         )
     pictures = sharp_pictures(capture)
-    camera = capture.camera(pictures[0].frame)
+    image = torch.stack([picture.image for picture in pictures]).float()
+    transfer = transfer_shown(capture.transfer(pictures[0].frame))
+    coloured = torch.tensor([picture.frame.split == "train" for picture in pictures])
+    image[~coloured] = _grey(image[~coloured], transfer)
+    found = Targets(
+        [picture.time_us for picture in pictures],
+        [picture.frame for picture in pictures],
+        coloured,
+        image,
+        image,
+        torch.ones(image.shape[:3]),
+        torch.stack([_trust(picture) for picture in pictures]),
+        capture.camera(pictures[0].frame),
+        transfer,
+    )
+    try:
+        return found.around(track)
+    except DataError as error:
+        raise DataError(f"{capture.path}: {error}") from None
+
+
+def _grey(coded: Float[Tensor, "P H W 3"], transfer: Transfer) -> Float[Tensor, "P H W 3"]:
+    """Coded luminance, thrice."""
+    light = luminance(decode(coded.clamp_min(DARKEST), transfer))
+    return encode(light, transfer)[..., None].expand(*coded.shape)
+
+
+def _trust(picture: SharpPicture) -> Float[Tensor, "H W"]:
+    """Less where the two exposures that were carried to the picture's time differ."""
+    doubt = picture.doubt if picture.doubt is not None else torch.zeros(picture.image.shape[:2])
+    return picture.sigma**-2 / (1 + doubt / _DOUBTFUL**2)
+
+
+def _distances(
+    track: BodyTrack, times_us: Sequence[int], camera: Camera
+) -> tuple[Float[Tensor, "P H W"], float]:
+    """Pixels to the posed body at each time, and its median height in pixels."""
     found, heights = [], []
-    for picture in pictures:
-        inside = silhouette(track.vertices(picture.time_us), track.body.faces, camera).numpy()
+    for time_us in times_us:
+        inside = silhouette(track.vertices(time_us), track.body.faces, camera).numpy()
         rows = np.flatnonzero(inside.any(1))
         heights.append(rows[-1] - rows[0] + 1 if len(rows) else 0)
         far = np.full(inside.shape, _FAR_PX)
@@ -90,22 +163,10 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
     tall = float(np.median(heights))
     if tall == 0:
         raise DataError(
-            f"{capture.path}: the posed body is in few of the pictures or in none, so that they "
-            "tell nothing of its motion; check camera and poses."
+            "the posed body is in few of the pictures or in none, so that they tell nothing of "
+            "its motion; check camera and poses."
         )
-    away = torch.from_numpy(np.stack(found)).float()
-    image = torch.stack([picture.image for picture in pictures]).float()
-    plain = _background(image, away, _CLEAR * tall)
-    light = [_light(one, plain, distance, tall) for one, distance in zip(image, away, strict=True)]
-    trust = torch.tensor([picture.sigma**-2 for picture in pictures])
-    return Targets(
-        [picture.time_us for picture in pictures],
-        [picture.frame for picture in pictures],
-        image,
-        plain * torch.stack(light),
-        (away < _REACH * tall) * trust[:, None, None],
-        camera,
-    )
+    return torch.from_numpy(np.stack(found)).float(), tall
 
 
 def _background(

@@ -12,6 +12,7 @@ from evsplat.cuda_support import needs, what_is_missing
 from evsplat.errors import BackendError, ConfigError
 from evsplat.render import cuda, native, reference
 from evsplat.render.job import Backdrop, RenderJob
+from evsplat.render.light import LIT_CHANNELS, MOST_LIT, lit_apart
 from evsplat.render.splats import LOW_PASS, RenderOutput, Splats
 
 logger = logging.getLogger(__name__)
@@ -32,6 +33,7 @@ def render(
     near: float = 0.01,
     low_pass: float = LOW_PASS,
     backdrop: Backdrop | None = None,
+    static_light: Float[Tensor, "T H W"] | None = None,
 ) -> RenderOutput:
     """Composite the Gaussians front to back, by the rules of gsplat 1.5 ("classic" mode).
 
@@ -46,6 +48,9 @@ def render(
 
     ``backdrop`` keeps what the native backend finds of ``static`` for the next render with the same
     one, where neither ``static`` nor the camera has changed; no gradients then.
+
+    ``static_light`` is a factor on the first three channels of what ``static`` and the background
+    add to each pixel.
 
     ``auto`` takes ``native`` for tensors on the CPU and ``gsplat`` for those on a CUDA device. A
     backend that cannot run is a `BackendError` with the reason, never another one's work.
@@ -62,6 +67,10 @@ def render(
             raise BackendError("render: static Gaussians have no axis of times but 1.")
         _check_alike(splats, static)
     _check_camera(splats, camera, background)
+    if static_light is not None:
+        if static is None:
+            raise BackendError("render: static_light falls on static Gaussians; there are none.")
+        _check_light(static_light, splats, camera, times)
     if not low_pass > 0:
         raise BackendError(f"render: low_pass is {low_pass}, expected px^2 above 0.")
     if backdrop is not None and torch.is_grad_enabled():
@@ -75,8 +84,17 @@ def render(
                 f"No render backend for device {device}; move the tensors to the CPU or a CUDA "
                 "device, or ask for backend='reference', which is slow."
             )
-    job = RenderJob(splats, static, times, camera, background, near, low_pass, backdrop)
-    return _BACKENDS[chosen](job)
+    job = RenderJob(
+        splats, static, times, camera, background, near, low_pass, backdrop, static_light
+    )
+    draw = _BACKENDS[chosen]
+    if static_light is None or (chosen == "native" and not _needs_gradient(background)):
+        return draw(job)
+    return lit_apart(job, draw)
+
+
+def _needs_gradient(tensor: Tensor | None) -> bool:
+    return tensor is not None and tensor.requires_grad and torch.is_grad_enabled()
 
 
 def _check_splats(splats: Splats, prefix: str) -> int:
@@ -144,6 +162,20 @@ def _check_camera(splats: Splats, camera: Camera, background: Tensor | None) -> 
         raise BackendError(f"render: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], not {rows}.")
     if not (rows[0][0] > 0 and rows[1][1] > 0):
         raise BackendError(f"render: the focal lengths in K must be positive, not {rows}.")
+
+
+def _check_light(light: Tensor, splats: Splats, camera: Camera, times: int) -> None:
+    shape = (times, camera.height, camera.width)
+    if tuple(light.shape) != shape:
+        raise BackendError(
+            f"render: static_light has shape {tuple(light.shape)}, expected {shape}."
+        )
+    _check_type("static_light", light, splats.means)
+    if not LIT_CHANNELS <= splats.channels.shape[-1] <= MOST_LIT:
+        raise BackendError(
+            f"render: static_light needs {LIT_CHANNELS} to {MOST_LIT} channels, not "
+            f"{splats.channels.shape[-1]}."
+        )
 
 
 def choose_device(asked: str) -> str:

@@ -1,13 +1,16 @@
 """One render as backends take it, and the static layer kept from one to the next."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.render.splats import Splats
+
+Kept = TypeVar("Kept")
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class RenderJob:
     low_pass: float
     """Added to the projected covariances, px^2."""
     backdrop: "Backdrop | None" = None
+    static_light: Tensor | None = None
 
 
 class Backdrop:
@@ -40,6 +44,14 @@ class Backdrop:
         """The native render that kept the layer; None: it is to be drawn anew."""
         self._seen: list[Any] = []
         self._versions: list[int | None] = []
+        self._beside: Any = None
+
+    def beside(self, make: Callable[[], Kept]) -> Kept:
+        """What a caller keeps of the same static layer beside this, made once by ``make``."""
+        if self._beside is None:
+            self._beside = make()
+        kept: Kept = self._beside
+        return kept
 
     def show(self, job: RenderJob) -> None:
         """Forget what does not fit the render that comes next."""

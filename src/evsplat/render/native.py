@@ -31,7 +31,8 @@ def render(job: RenderJob) -> RenderOutput:
     if job.backdrop is not None and job.static is not None:
         job.backdrop.show(job)
     layers = (*_fields(job.splats), *_fields(job.static))
-    drawn = _Rasterize.apply(job, job.camera.world_to_camera, job.background, *layers)
+    behind = job.background, job.static_light
+    drawn = _Rasterize.apply(job, job.camera.world_to_camera, *behind, *layers)
     return RenderOutput(*drawn)
 
 
@@ -78,7 +79,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         camera, times = job.camera, job.times
         backdrop = None if job.static is None else job.backdrop
-        pose, background, *layers = map(_plain, inputs)
+        pose, background, light, *layers = map(_plain, inputs)
         moving, static = layers[:_FIELDS], layers[_FIELDS:]
         means, channels = moving[0], moving[4]
         assert means is not None and channels is not None
@@ -86,7 +87,8 @@ class _Rasterize(torch.autograd.Function):
         try:
             kept = native.Render(
                 camera.width, camera.height, _plain(camera.K), pose, job.near, job.low_pass, moving,
-                static if static_count else [], background, times, torch.get_num_threads(),
+                static if static_count else [], background, light, times,
+                torch.get_num_threads(),
             )  # fmt: skip
             image = torch.empty(times, channels.shape[2], camera.height, camera.width)
             alpha = torch.empty(times, camera.height, camera.width)
@@ -114,17 +116,17 @@ class _Rasterize(torch.autograd.Function):
         image_grad, alpha_grad, *_ = upstream
         if image_grad is None and alpha_grad is None:
             return (None,) * (1 + len(inputs))
-        _, background, *layers = [
+        _, background, light, *layers = [
             torch.zeros(tensor.shape) if tensor is not None and need else None
             for tensor, need in zip(inputs, needed, strict=True)
         ]
         view = torch.zeros(12) if needed[0] else None
         moving, static = layers[:_FIELDS], layers[_FIELDS:]
-        ctx.kept.backward(image_grad, alpha_grad, moving, static, view, background)
+        ctx.kept.backward(image_grad, alpha_grad, moving, static, view, background, light)
         pose = None
         if view is not None:
             pose = torch.zeros(4, 4)
             pose[:3, :3] = view[:9].view(3, 3)
             pose[:3, 3] = view[9:]
             pose = pose.to(inputs[0].dtype)
-        return None, pose, background, *layers
+        return None, pose, background, light, *layers

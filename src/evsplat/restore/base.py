@@ -26,7 +26,7 @@ class Restorer(Protocol):
         self, capture: TrainingCapture, frames: Sequence[Frame]
     ) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
         """Each of ``frames``, training frames of ``capture``, with its sharp picture at
-        mid-exposure, sRGB-coded in [0, 1].
+        mid-exposure, in [0, 1] and coded as they are.
         """
         ...
 

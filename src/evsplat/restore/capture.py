@@ -10,6 +10,7 @@ from evsplat.capture import Policy, load_capture
 from evsplat.capture.derive import derived_capture, training_frames_first
 from evsplat.config import to_dict
 from evsplat.errors import ConfigError
+from evsplat.files import refuse_existing, try_target
 from evsplat.restore.base import RESTORERS
 
 
@@ -37,6 +38,8 @@ def restore_capture(
     """
     if method not in RESTORERS:
         raise ConfigError(f"no restorer is named {method!r}, expected {' or '.join(RESTORERS)}.")
+    refuse_existing(Path(out))
+    try_target(out)
     capture = load_capture(path)
     seen = capture.for_training(policy or Policy())
     restorer = RESTORERS[method](seen, **options)

@@ -14,10 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from evsplat.capture import Frame, TrainingCapture
+from evsplat.capture import Frame, TrainingCapture, coded
 from evsplat.events import EventStream
 from evsplat.events.maps import polarity_counts
-from evsplat.pictures.light import REC709
+from evsplat.pictures.light import REC709, stored
 from evsplat.restore.network import Pretrained
 
 MATCHED_OVER = 0.02
@@ -47,6 +47,7 @@ class FromEvents(Pretrained):
     ) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
         """See `Restorer`."""
         assert capture.events is not None
+        seen = coded(capture)
         asked = {frame.name for frame in frames}
         times = sorted(frame.mid_us for frame in capture.frames)
         interval = times[1] - times[0] if len(times) > 1 else times[0]
@@ -62,7 +63,8 @@ class FromEvents(Pretrained):
             before = frame.mid_us
             if frame.name in asked:
                 moved = polarity_counts(capture.events.between(*frame.exposure_us), height, width)
-                yield frame, with_brightness(capture.image(frame), intensity, moved.sum(0) > 0)
+                bright = with_brightness(seen.image(frame), intensity, moved.sum(0) > 0)
+                yield frame, stored(bright, capture.transfer(frame))
 
     def provenance(self) -> dict[str, Any]:
         """The network's, and how its pictures became frames."""

@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import Frame, TrainingCapture
+from evsplat.capture import Frame, TrainingCapture, coded
 from evsplat.devices import network_device
 from evsplat.errors import BackendError, DataError
+from evsplat.pictures import stored
 from evsplat.weights import WeightFile, sha256_of
 
 SIDE_PX = 512
@@ -72,12 +73,14 @@ class NetworkRestorer(Pretrained):
         self, capture: TrainingCapture, frames: Sequence[Frame]
     ) -> Iterator[tuple[Frame, Float[Tensor, "H W 3"]]]:
         """See `Restorer`."""
+        seen = coded(capture)
         for frame in frames:
-            inputs = [part.to(self.device) for part in self.inputs(capture, frame)]
+            inputs = [part.to(self.device) for part in self.inputs(seen, frame)]
             height, width = inputs[0].shape[-2:]
             with torch.inference_mode(), enough_memory(self.name, height, width, self.device):
                 picture = in_tiles(self.network, inputs, multiple=self.multiple)
-            yield frame, picture[0].permute(1, 2, 0).clamp(0, 1).cpu().contiguous()
+            picture = picture[0].permute(1, 2, 0).clamp(0, 1).cpu().contiguous()
+            yield frame, stored(picture, capture.transfer(frame))
 
     def provenance(self) -> dict[str, Any]:
         """The weights and how large pictures were cut."""

@@ -6,12 +6,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from evsplat.errors import WeightsError
 from evsplat.similarity.perceptual import Network, PerceptualMetric, numbered
+from evsplat.untrusted.arrays import read_plain_npz
 from evsplat.weights import MissingWeights, home_as_tilde, hub_folder, read_state, sha256_of
 
 LpipsName = Literal["alex", "vgg"]
@@ -55,8 +55,8 @@ HUB_FILES: dict[LpipsName, str] = {
 def lpips_heads(name: LpipsName) -> list[Tensor]:
     """The five linear heads, version 0.1, each (C,) and not negative."""
     file = resources.files("evsplat") / "data" / "lpips_heads.npz"
-    with file.open("rb") as stream, np.load(stream) as arrays:
-        return [torch.from_numpy(arrays[f"{name}_{stage}"]) for stage in range(5)]
+    arrays = read_plain_npz(Path(str(file)))
+    return [torch.from_numpy(arrays[f"{name}_{stage}"]) for stage in range(5)]
 
 
 def load_lpips(

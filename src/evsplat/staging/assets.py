@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from evsplat.errors import DataError
-from evsplat.pictures.files import opened_picture
+from evsplat.untrusted.pictures import read_picture
 
 
 def characters() -> tuple[str, ...]:
@@ -50,5 +50,4 @@ def _find(kind: str, name: str, known: tuple[str, ...], shipped: Path) -> Path:
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
     """A picture with its transparency (opaque where it has none)."""
-    with opened_picture(path) as image:
-        return np.array(image.convert("RGBA"))
+    return read_picture(path, lambda image: np.array(image.convert("RGBA")))

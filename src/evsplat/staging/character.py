@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from evsplat.body import Body, default_body, make_body
-from evsplat.capture.body_file import read_arrays
 from evsplat.errors import DataError
 from evsplat.staging.assets import read_rgba
+from evsplat.untrusted.arrays import read_plain_npz
 
 _ARRAYS = {
     "vertices": ("V", 3),
@@ -58,7 +58,7 @@ def load_character(path: Path | str) -> Character:
         DataError: a file is missing or an array does not fit.
     """
     path = Path(path)
-    arrays = read_arrays(path)
+    arrays = read_plain_npz(path)
     _check(path, arrays)
     names = tuple(str(name) for name in arrays["joint_names"])
     rig = (arrays["parents"], arrays["rest_joints"], names)

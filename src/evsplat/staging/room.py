@@ -6,10 +6,10 @@ from importlib.resources import as_file, files
 import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 
-from evsplat.capture.body_file import read_arrays
 from evsplat.compiled import native
 from evsplat.staging.assets import read_rgba
 from evsplat.staging.camera import look_at
+from evsplat.untrusted.arrays import read_plain_npz
 
 _SHADOW_TEXELS = 640
 _SHADOW_FOCAL = 1 / 2.9
@@ -86,7 +86,7 @@ def load_room() -> Room:
     """The room that ships with evsplat."""
     folder = files("evsplat") / "data" / "stage"
     with as_file(folder / "room.npz") as path:
-        arrays = read_arrays(path)
+        arrays = read_plain_npz(path)
     with as_file(folder / "room.webp") as path:
         strip = read_rgba(path)[..., :3]
     side = strip.shape[1]

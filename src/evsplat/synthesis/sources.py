@@ -12,13 +12,14 @@ from jaxtyping import Int64
 
 from evsplat.body import PoseSource
 from evsplat.capture import BodyFile, Capture, CaptureWriter, Frame, load_capture
-from evsplat.capture.body_file import RIG_ARRAYS, read_arrays, stated_body
+from evsplat.capture.body_file import RIG_ARRAYS, stated_body
 from evsplat.capture.write import read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture
 from evsplat.pictures.files import read_image
 from evsplat.pictures.light import Transfer
+from evsplat.untrusted.arrays import read_plain_npz
 
 logger = logging.getLogger(__name__)
 
@@ -284,7 +285,7 @@ class FootageSource(Source):
 
 
 def _read_body(path: Path, source: PoseSource | None) -> BodyFile:
-    arrays = read_arrays(path)
+    arrays = read_plain_npz(path)
     needed: tuple[str, ...] = ("model", "times_us", "poses", "transl")
     if "model" in arrays and str(arrays["model"]) == "rig":
         needed += RIG_ARRAYS

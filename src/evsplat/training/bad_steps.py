@@ -64,6 +64,11 @@ class BadSteps:
             self._stop_if_it_goes_on("loss or gradient")
         return self.skipped
 
+    def in_a_row(self) -> int:
+        """Bad steps since the last sound one."""
+        self.settle()
+        return self._in_a_row
+
     def _stop_if_it_goes_on(self, culprit: str) -> None:
         if self._in_a_row >= MAX_BAD_STEPS:
             raise DataError(

@@ -1,17 +1,25 @@
 """Checkpoints: every tensor and number of a training run in one safetensors file."""
 
 import json
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
-from evsplat.errors import DataError
-from evsplat.files import atomic_path
+from evsplat.errors import DataError, OutputError
+from evsplat.files import remove_file, write_bytes
 from evsplat.models.model import Model
+from evsplat.untrusted.faults import MISFITS, broken_as
+from evsplat.untrusted.records import misfit
+from evsplat.untrusted.tensors import read_safetensors
+from evsplat.untrusted.text import parse_json
+
+logger = logging.getLogger(__name__)
 
 KEEP = 2
 """Checkpoints kept in a run; the one before the last survives a disk that fills up."""
@@ -20,38 +28,115 @@ KEEP = 2
 def save_checkpoint(
     folder: Path, iteration: int, tensors: dict[str, Tensor], state: dict[str, Any]
 ) -> Path:
-    """Write one checkpoint atomically and drop all but the newest `KEEP`."""
+    """Write one checkpoint atomically and drop all but the newest `KEEP`.
+
+    Where the disk is full the oldest gives way, if another one stays. Later ones, which the
+    training went on from before, being damaged, go as well.
+
+    Raises:
+        OutputError: No room, or no permission; the message says what is kept.
+    """
     path = folder / f"{iteration:06d}.safetensors"
-    write_state(path, tensors, state)
-    for old in sorted(folder.glob("[0-9]*.safetensors"))[:-KEEP]:
-        old.unlink()
+    older = [old for old in checkpoints(folder) if old.name < path.name]
+    try:
+        write_state(path, tensors, state)
+    except OutputError as error:
+        if not error.no_room or len(older) < 2:
+            raise OutputError(f"{error} {kept_sentence(folder)}", no_room=error.no_room) from error
+        logger.warning("%s Trying again without %s.", error, older[0].name)
+        remove_file(older.pop(0))
+        return save_checkpoint(folder, iteration, tensors, state)
+    kept = [*older, path][-KEEP:]
+    for other in checkpoints(folder):
+        if other not in kept:
+            remove_file(other)
     return path
+
+
+def kept_sentence(folder: Path) -> str:
+    """What a training that cannot go on leaves in its folder of checkpoints, and what to do."""
+    newest = latest_checkpoint(folder)
+    if newest is None:
+        return "No checkpoint is kept: once that is mended, train again."
+    return (
+        f"The checkpoint of step {int(newest.stem)} is kept: once that is mended, go on with "
+        f"'evsplat train CAPTURE --out {folder.parent} --resume'."
+    )
 
 
 def write_state(path: Path, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:
     """Write tensors and state as `load_checkpoint` reads them, whole or not at all."""
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with atomic_path(path) as temporary:
-        save_file(kept, temporary, metadata={"state": json.dumps(state)})
+    # Not save_file, which writes to a file of its own and leaves it behind where it is killed.
+    write_bytes(path, save(kept, metadata={"state": json.dumps(state)}))
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints of a run, the newest last."""
+    return sorted(folder.glob("[0-9]*.safetensors"))
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
     """The newest checkpoint of a run, None where there is none."""
-    found = sorted(folder.glob("[0-9]*.safetensors"))
+    found = checkpoints(folder)
     return found[-1] if found else None
+
+
+def load_latest(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Any]] | None:
+    """The newest checkpoint that can be read, its tensors and its state; None where none is.
+
+    One that cannot be read gives way to the one before, which is said.
+
+    Raises:
+        DataError: There are some, and none of them can be read.
+    """
+    found = checkpoints(folder)
+    for path in reversed(found):
+        try:
+            return path, *load_checkpoint(path)
+        except DataError as error:
+            if path == found[0]:
+                raise
+            logger.warning("%s Taking the one before it.", error)
+    return None
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and state of a checkpoint; a damaged file is a `DataError`."""
     try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            state = json.loads(file.metadata()["state"])
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError, OSError) as error:
+        tensors, texts = read_safetensors(path)
+        state = parse_json(texts["state"])
+    except (OSError, KeyError, ValueError) as error:
         raise DataError(
-            f"{path}: not a readable checkpoint ({error}); remove it to go on from the one before."
+            f"{path}: not a readable checkpoint ({error}); train again where there is no other."
         ) from None
+    wrong = misfit(state, _STATE, "state")
+    if wrong:
+        raise DataError(f"{path}: {wrong}; train again where there is no other.")
     return tensors, state
+
+
+_STATE = {
+    "clock": {
+        **{"iteration": int, "iterations": int},
+        **{"fraction": float, "seconds": float, "step_seconds": float},
+    },
+    "human_count": int,
+}
+RESUMED = {"queue": [int], "skipped": int, "previous_nominal": float}
+"""What the state of a checkpoint holds besides, for a training that goes on."""
+
+
+@contextmanager
+def misfits_of(path: Path) -> Iterator[None]:
+    """A `DataError` of what goes wrong where a checkpoint's tensors are not the model's."""
+    with broken_as(
+        path,
+        "does not fit the capture and settings of its run",
+        "restore both as they were, or train again",
+        kinds=MISFITS,
+    ):
+        yield
 
 
 def check_fits(model: Model, tensors: dict[str, Tensor], path: Path) -> None:
@@ -73,6 +158,8 @@ def load_model(model: Model, tensors: dict[str, Tensor], human_count: int) -> No
     for name, rows in model.sets.items():
         device = rows.means.device
         values = {key: entries[f"{name}.{key}"].to(device) for key in rows.attributes}
+        if not 0 <= human_count <= len(values["means"]):
+            raise ValueError(f"{human_count} Gaussians of the person, of {len(values['means'])}")
         rows.set_rows(values, human_count)
     model.load_state_dict(entries)
 

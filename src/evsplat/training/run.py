@@ -1,6 +1,5 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
-import json
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from evsplat.capture.masked import MaskedCapture
 from evsplat.config import load_yaml
 from evsplat.devices import hardware
 from evsplat.errors import ConfigError, DataError
-from evsplat.files import read_json, write_json, write_text
+from evsplat.files import write_json, write_text
 from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Rendering
@@ -31,13 +30,17 @@ from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
     check_fits,
     counts,
-    latest_checkpoint,
     load_checkpoint,
+    load_latest,
     load_model,
+    misfits_of,
 )
+from evsplat.untrusted.records import read_record
+from evsplat.untrusted.text import parse_json, read_text
 
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
+_FACTS = {"capture": str, "capture_name": str, "device": str, "seed": int}
 _NAMED_RUNS = 5
 """Runs that an error about the folder above them names, at most."""
 
@@ -61,11 +64,11 @@ class RunFolder:
         if not self.log.exists():
             return
         kept = []
-        for line in self.log.read_text(encoding="utf-8").splitlines():
+        for line in read_text(self.log).splitlines():
             try:
-                if json.loads(line)["iteration"] <= iteration:
+                if parse_json(line)["iteration"] <= iteration:
                     kept.append(line)
-            except (json.JSONDecodeError, KeyError):
+            except (ValueError, KeyError, TypeError):
                 continue  # the last line of a killed process may be half written
         write_text(self.log, "".join(line + "\n" for line in kept))
 
@@ -241,7 +244,8 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
             f"{error}\nIf another version of evsplat wrote this run (versions.json beside it names "
             "it), open it with that one, or train again."
         ) from None
-    return method, config, read_json(folder.facts)
+    facts = read_record(folder.facts, _FACTS, "restore the file, or train again")
+    return method, config, facts
 
 
 def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:
@@ -257,10 +261,10 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     device = choose_device(device)
     folder = RunFolder(Path(run_dir))
     method, config, facts = read_config(folder)
-    path = state or latest_checkpoint(folder.checkpoints)
-    if path is None:
+    loaded = (state, *load_checkpoint(state)) if state else load_latest(folder.checkpoints)
+    if loaded is None:
         raise DataError(f"{folder.checkpoints}: no checkpoint; train the run first.")
-    tensors, progress = load_checkpoint(path)
+    path, tensors, progress = loaded
     capture = load_capture(Path(facts["capture"]))
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
@@ -269,7 +273,8 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         config, seen, facts["seed"], device=device, purpose="draw"
     )
     check_fits(composition.model, tensors, path)
-    load_model(composition.model, tensors, progress["human_count"])
+    with misfits_of(path):
+        load_model(composition.model, tensors, progress["human_count"])
     return Run(
         path=folder.path,
         config=config,
@@ -287,7 +292,8 @@ def reload_run(run: Run, state: Path) -> Run:
     """The run at another checkpoint or snapshot of it; its model gets other parameters in place."""
     model = run.reconstruction.model
     tensors, progress = load_checkpoint(state)
-    load_model(model, tensors, progress["human_count"])
+    with misfits_of(state):
+        load_model(model, tensors, progress["human_count"])
     return replace(run, **_progress(model, progress))
 
 

@@ -18,7 +18,8 @@ from tqdm import tqdm
 from evsplat.capture import Capture, load_capture
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
-from evsplat.errors import ConfigError, DataError
+from evsplat.errors import ConfigError, DataError, machine_error
+from evsplat.files import open_output, try_target
 from evsplat.inspection import check_body, save_fit_sheet
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, Purpose, method_config
 from evsplat.methods.settings import Weight
@@ -26,9 +27,12 @@ from evsplat.options import TrainOptions
 from evsplat.options.declare import given
 from evsplat.render import choose_device
 from evsplat.training.checkpoint import (
+    KEEP,
+    RESUMED,
     check_fits,
-    latest_checkpoint,
-    load_checkpoint,
+    kept_sentence,
+    load_latest,
+    misfits_of,
     save_checkpoint,
 )
 from evsplat.training.clock import Clock
@@ -39,14 +43,21 @@ from evsplat.training.run import (
     seen_by_training,
     write_facts,
 )
+from evsplat.training.sound import check_events_reach, check_learned
 from evsplat.training.trainer import StepReport, Trainer
-from evsplat.training.watching import Showcase
+from evsplat.training.watching import Showcase, is_unused, training_in
+from evsplat.untrusted.records import misfit
 
 logger = logging.getLogger(__name__)
 
 CHECKPOINT_SECONDS = 30.0
 """Time between checkpoints; writing one changes nothing in the training."""
 LOG_EVERY = 10
+_LEAST_BYTES = 1 << 20
+"""A checkpoint of the smallest model, more or less; how large one is comes out after the start."""
+_KEPT_AND_NEW = KEEP + 1
+_WITH_OPTIMISER = 3
+"""Of a checkpoint and its parameters, which have two moments each."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -65,8 +76,6 @@ class _Start:
     method: str
     settings: MethodConfig
     seed: int
-    checkpoint: Path | None
-    """Last checkpoint of a training that goes on."""
 
 
 def train(
@@ -94,14 +103,34 @@ def train(
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     capture = load_capture(Path(capture_path))
-    start = _resumed(options) if options.resume else _new(capture, options)
+    start = _resumed(capture, options) if options.resume else _new(capture, options)
+    folder = start.folder
+    try_target(folder.path, _KEPT_AND_NEW * _LEAST_BYTES)
+    with training_in(folder.path), _faults_said(folder):
+        if not options.resume and not is_unused(folder.path):
+            raise ConfigError(
+                f"{folder.path}: the folder is not empty; pass --resume to go on with that run, or "
+                "another --out."
+            )
+        trainer = _trainer(capture, start, options, device)
+        if on_start is not None:
+            on_start(folder.path)
+        _loop(trainer, folder)
+    return folder.path
+
+
+def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str) -> Trainer:
+    """All that steps need, at its beginning or where the last checkpoint was; the run's files."""
     iterations, max_minutes = options.iterations, options.max_minutes
     started = time.perf_counter()
     seen = seen_by_training(capture, start.settings)
-    purpose: Purpose = "train" if start.checkpoint is None else "resume"
+    loaded = load_latest(start.folder.checkpoints) if options.resume else None
+    purpose: Purpose = "train" if loaded is None else "resume"
     fitting = None
     if purpose == "train" and seen.has_body:
         fitting = check_body(seen, refuse=not options.any_body)
+    if purpose == "train" and getattr(start.settings, "event_weight", 0.0) != 0.0:
+        check_events_reach(seen)
     composition = TRAINABLE[start.method].build(
         start.settings, seen, start.seed, device=device, purpose=purpose
     )
@@ -115,34 +144,54 @@ def train(
     cache_bytes = None if cache_gb is None else int(1e9 * cache_gb)
     trainer = Trainer(composition, composition.capture or seen, clock, cache_bytes=cache_bytes)
     folder = start.folder
-    if start.checkpoint is not None:
-        tensors, state = load_checkpoint(start.checkpoint)
-        check_fits(trainer.model, tensors, start.checkpoint)
-        trainer.load_state(tensors, state)
+    if loaded is not None:
+        checkpoint, tensors, state = loaded
+        check_fits(trainer.model, tensors, checkpoint)
+        wrong = misfit(state, RESUMED, "state")
+        if wrong:
+            raise DataError(f"{checkpoint}: {wrong}; train again, without --resume.")
+        with misfits_of(checkpoint):
+            trainer.load_state(tensors, state)
         if iterations is None and max_minutes is None:
             clock.iterations = state["clock"]["iterations"]
-        folder.truncate_log(clock.iteration)
-    else:
-        folder.path.mkdir(parents=True, exist_ok=True)
-        save_yaml(folder.config, start.settings, method=start.method)
-        write_facts(folder, capture, start.method, device, start.seed)
+    folder.truncate_log(clock.iteration)
+    state_bytes = sum(value.nbytes for value in trainer.model.state_dict().values())
+    try_target(folder.path, _KEPT_AND_NEW * _WITH_OPTIMISER * state_bytes)
+    if loaded is None:
+        if not options.resume:
+            write_facts(folder, capture, start.method, device, start.seed)
+            # The last of what resuming needs.
+            save_yaml(folder.config, start.settings, method=start.method)
         if fitting is not None and fitting.verdict != "belongs":
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
         logger.info("%s", schedule_table(start.settings, composition.weights))
         logger.info("%s", seen.terms.sentence)
-    if on_start is not None:
-        on_start(folder.path)
-    _loop(trainer, folder)
-    return folder.path
+    return trainer
 
 
-def _resumed(options: TrainOptions) -> _Start:
-    """The run of ``options.out`` at its last checkpoint, with its own settings."""
+@contextmanager
+def _faults_said(folder: RunFolder) -> Iterator[None]:
+    """Failures of memory, disk or system say what is kept of the run."""
+    try:
+        yield
+    except Exception as error:
+        fault = machine_error(error, kept_sentence(folder.checkpoints), folder.path)
+        if fault is None:
+            raise
+        raise fault from error
+
+
+def _resumed(capture: Capture, options: TrainOptions) -> _Start:
+    """The run of ``options.out``, with its own settings."""
     assert options.out is not None
     folder = RunFolder(Path(options.out))
     method, settings, facts = read_config(folder)
-    seed = int(facts["seed"])
-    return _Start(folder, method, settings, seed, latest_checkpoint(folder.checkpoints))
+    if facts["capture_name"] != capture.name:
+        raise ConfigError(
+            f"{folder.path}: was trained on the capture {facts['capture_name']!r}, and is to go on "
+            f"with {capture.name!r}; give the one of {facts['capture']}, or another --out."
+        )
+    return _Start(folder, method, settings, facts["seed"])
 
 
 def _new(capture: Capture, options: TrainOptions) -> _Start:
@@ -153,17 +202,12 @@ def _new(capture: Capture, options: TrainOptions) -> _Start:
     method = options.method or named or DEFAULT_METHOD
     out = options.out
     folder = new_run_folder(capture, method) if out is None else RunFolder(Path(out))
-    if folder.path.exists() and any(folder.path.iterdir()):
-        raise ConfigError(
-            f"{folder.path}: the folder is not empty; pass --resume to go on with that run, or "
-            "another --out."
-        )
     values = override(values, options.overrides)
     if options.use is not None:
         values.setdefault("policy", {})["use"] = options.use
     where = "--set" if config is None else str(config)
     settings = method_config(method, values, where=where)
-    return _Start(folder, method, settings, options.seed or 0, None)
+    return _Start(folder, method, settings, options.seed or 0)
 
 
 def schedule_table(settings: MethodConfig, weights: dict[str, Weight]) -> str:
@@ -186,10 +230,10 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
         tensors, state = trainer.state()
         save_checkpoint(folder.checkpoints, clock.iteration, tensors, state)
 
-    saved_at = time.perf_counter()
+    saved_at, first = time.perf_counter(), clock.iteration
     with (
         _interrupt_flag() as interrupted,
-        folder.log.open("a", encoding="utf-8", buffering=1) as log,
+        open_output(folder.log, "ab", buffered=False) as log,
         _progress_bar() as bar,
         Showcase(folder.path).open() as showcase,
     ):
@@ -201,7 +245,7 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
                 trainer.bad.settle()  # what a GPU has still to do belongs to this step's time
             clock.advance(time.perf_counter() - started)
             if report is not None and (logged or clock.done):
-                log.write(json.dumps(_log_line(trainer, report)) + "\n")
+                log.write(json.dumps(_log_line(trainer, report)).encode() + b"\n")
                 _show(bar, trainer, report)
             if interrupted:
                 save()
@@ -210,7 +254,10 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
                 save()
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
+        check_learned(trainer, clock.iteration - first)
         save()
+        if interrupted:
+            raise Stopped(folder.path)
     if clock.iteration == 0:
         raise DataError(f"{folder.path}: no step was made.")
 
@@ -254,7 +301,7 @@ def _show(bar: "tqdm[Any]", trainer: Trainer, report: StepReport) -> None:
 
 @contextmanager
 def _interrupt_flag() -> Iterator[list[bool]]:
-    """A list that becomes non-empty on Ctrl-C; a second Ctrl-C interrupts at once."""
+    """A list that becomes non-empty on Ctrl-C or SIGTERM; a second one interrupts at once."""
     pressed: list[bool] = []
 
     def handle(number: int, frame: FrameType | None) -> None:
@@ -262,12 +309,14 @@ def _interrupt_flag() -> Iterator[list[bool]]:
             raise KeyboardInterrupt
         pressed.append(True)
 
+    numbers = (signal.SIGINT, signal.SIGTERM)
     try:
-        previous = signal.signal(signal.SIGINT, handle)
+        previous = [signal.signal(number, handle) for number in numbers]
     except ValueError:  # not in the main thread: Ctrl-C goes elsewhere
         yield pressed
         return
     try:
         yield pressed
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in zip(numbers, previous, strict=True):
+            signal.signal(number, handler)

@@ -1,10 +1,12 @@
 """Snapshots of a run that is being trained, written while someone watches.
 
 The only thing that trainer and watcher share is the run folder. While it trains there is a file
-``.watch`` in it. A watcher changes that file's time every second or so; the trainer, seeing this,
-writes the model to ``snapshot.safetensors`` every few seconds. It never waits for a watcher.
+``.watch`` in it, whose lock the trainer holds. A watcher changes that file's time every second or
+so; the trainer, seeing this, writes the model to ``snapshot.safetensors`` every few seconds. It
+never waits for a watcher.
 """
 
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +16,9 @@ from typing import Any
 
 from torch import Tensor
 
+from evsplat.disk import is_held
+from evsplat.errors import OutputError
+from evsplat.files import held_folder, remove_file
 from evsplat.training.checkpoint import latest_checkpoint, write_state
 
 SNAPSHOT_SECONDS = 3.0
@@ -23,13 +28,17 @@ LARGEST_SHARE = 0.01
 _WATCHED_SECONDS = 10.0
 """A watcher that was not seen for so long has gone."""
 _LOOK_SECONDS = 1.0
+_SIGN = ".watch"
+_FACTS = "versions.json"
+
+logger = logging.getLogger(__name__)
 
 
 class Showcase:
     """The trainer's side."""
 
     def __init__(self, run: Path, clock: Callable[[], float] = time.perf_counter) -> None:
-        self.sign, self.file = run / ".watch", run / "snapshot.safetensors"
+        self.sign, self.file = run / _SIGN, run / "snapshot.safetensors"
         self._clock = clock
         self._looked = self._shown = -1e9
         self._seen = 0
@@ -38,14 +47,13 @@ class Showcase:
 
     @contextmanager
     def open(self) -> Iterator["Showcase"]:
-        """Be there to be watched; afterwards neither file is left."""
-        self.sign.touch()
+        """Be there to be watched, in the block of `training_in`; afterwards no snapshot is left."""
         self._seen = self.sign.stat().st_mtime_ns
+        remove_file(self.file)
         try:
             yield self
         finally:
-            self.sign.unlink(missing_ok=True)
-            self.file.unlink(missing_ok=True)
+            remove_file(self.file)
 
     def show(self, snapshot: Callable[[], tuple[dict[str, Tensor], dict[str, Any]]]) -> None:
         """Write a snapshot if someone watches and the last one is old; else nothing."""
@@ -63,20 +71,43 @@ class Showcase:
         if now >= self._watched_until or now - self._shown < self._pause:
             return
         tensors, state = snapshot()
-        write_state(self.file, tensors, state)
+        try:
+            write_state(self.file, tensors, state)
+        except OutputError as error:
+            # The training is worth more than being seen.
+            logger.warning("no more snapshots for the viewer: %s", error)
+            self._pause = float("inf")
+            return
         self._shown = self._clock()
         self._pause = max(SNAPSHOT_SECONDS, (self._shown - now) / LARGEST_SHARE)
 
 
+@contextmanager
+def training_in(run: Path) -> Iterator[None]:
+    """Be the only process that trains in a run folder, which is made where it is missing.
+
+    Raises:
+        ConfigError: Another process does.
+    """
+    busy = "is training in this folder; wait for it or choose another --out."
+    with held_folder(run, _SIGN, busy):
+        yield
+
+
 def is_training(run: Path) -> bool:
-    """Whether a run is being trained, as far as its folder says."""
-    return (run / ".watch").exists()
+    """Whether a process trains in a run folder now: whether it holds the lock."""
+    return is_held(run / _SIGN)
+
+
+def is_unused(run: Path) -> bool:
+    """Whether a folder holds nothing but what a training that never began left in it."""
+    return not run.exists() or {path.name for path in run.iterdir()} <= {_SIGN, _FACTS}
 
 
 def watch(run: Path) -> None:
     """Ask the trainer for snapshots; where that is not allowed its checkpoints have to do."""
     with suppress(OSError):
-        os.utime(run / ".watch")
+        os.utime(run / _SIGN)
 
 
 def newest_state(run: Path) -> Path | None:

@@ -133,8 +133,8 @@ class Compositor:
         frames = [f for f in self.capture.frames if f.camera == request.recording_camera]
         frame = nearest_in_time(frames or self.capture.frames, request.time_us)
         if request.compare == SHARP and frame.sharp is not None:
-            return self.capture.sharp(frame).numpy()
-        return self.capture.image(frame).numpy()
+            return self.capture.shown(self.capture.sharp(frame)).numpy()
+        return self.capture.shown(self.capture.image(frame)).numpy()
 
     def _add_events(self, picture: Picture, request: ViewRequest, box: Box) -> None:
         """Lay the recorded events of the request's window, if it has one, over a picture."""

@@ -234,9 +234,14 @@ class Panel:
         if self._motion is None:
             status = _frame_status(nearest_in_time(self._frames, time_us), time_us)
         else:
-            status = f"Motion {self._motion.replace('_', ' ')}, which was not recorded"
+            status = f"Motion {plain(self._motion.replace('_', ' '))}, which was not recorded"
         if status != self._status:
             self.status.content = self._status = status
+
+
+def plain(text: str) -> str:
+    """Text as Markdown that shows it as it is: HTML in Markdown would run in the page."""
+    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in text)
 
 
 def _frame_status(frame: Frame, time_us: int) -> str:
@@ -247,4 +252,4 @@ def _frame_status(frame: Frame, time_us: int) -> str:
         share = f"{100 * (time_us - start) / max(end - start, 1):.0f} % into its exposure"
     else:
         share = "between exposures"
-    return f"Frame {frame.name} ({split}), {share} of {(end - start) / 1e3:.3g} ms"
+    return f"Frame {plain(frame.name)} ({split}), {share} of {(end - start) / 1e3:.3g} ms"

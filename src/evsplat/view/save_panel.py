@@ -1,14 +1,13 @@
 """The controls that hand what is shown to the browser as a file."""
 
 import io
-import tempfile
-from pathlib import Path
 
 import viser
 from PIL import Image
 
 from evsplat.errors import DataError
 from evsplat.export.gaussians import FileKind, facts_of, file_rotation, write_file
+from evsplat.files import scratch_folder
 from evsplat.view.client import Client
 from evsplat.view.request import ViewRequest
 
@@ -60,8 +59,8 @@ class SavePanel:
         posed = {"motion": motion.name or "recorded", "angles_deg": motion.angles}
         facts = facts_of(viewed.run) | {"time_us": request.time_us, **posed}
         rotation = file_rotation(viewed.track(None), kind, None)
-        with tempfile.TemporaryDirectory(prefix="evsplat-view-") as folder:
-            path = Path(folder) / name
+        with scratch_folder() as folder:
+            path = folder / name
             try:
                 write_file(path, kind, cloud, rotation, facts)
             except DataError:

@@ -22,7 +22,8 @@ from evsplat.training.watching import is_training
 from evsplat.view.camera import forward, vertical_fov
 from evsplat.view.client import Client, view_of
 from evsplat.view.compositor import Compositor
-from evsplat.view.panel import SPEEDS, Panel
+from evsplat.view.own_pages import log_in_a_line, own_pages_alone
+from evsplat.view.panel import SPEEDS, Panel, plain
 from evsplat.view.request import Playback, ViewRequest
 from evsplat.view.scheduler import RenderScheduler
 from evsplat.view.viewed_run import RunFollower, ViewedRun, load_newest, yield_to_training
@@ -55,8 +56,10 @@ class Viewer:
         up = up_axis(track).double().numpy()
         self.scheduler = RenderScheduler()
         self.port = _free_port(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner
+        banner = contextlib.redirect_stdout(io.StringIO())
+        with banner, own_pages_alone(host):
             self.server = _Server(host, self.port, label="evsplat", verbose=False)
+        log_in_a_line(self.server.get_event_loop())
         self.port = self.server.get_port()
         self.address = f"http://{'localhost' if host in _ALL_INTERFACES else host}:{self.port}"
         self._set_scene(up)
@@ -163,12 +166,12 @@ def _names(runs: list[Run]) -> list[str]:
 
 def _summary(viewed_runs: list[ViewedRun]) -> str:
     """Markdown with the capture's name, steps and counts of the runs."""
-    lines = [f"**{viewed_runs[0].capture.name}**"]
+    lines = [f"**{plain(viewed_runs[0].capture.name)}**"]
     for viewed in viewed_runs:
         run = viewed.run
         human, scene = run.gaussians["human"], run.gaussians["scene"]
         lines.append(
-            f"{viewed.name}: step {run.iteration:,}, {human:,} Gaussians of the person, "
+            f"{plain(viewed.name)}: step {run.iteration:,}, {human:,} Gaussians of the person, "
             f"{scene:,} of the scene"
         )
     return "  \n".join(lines)

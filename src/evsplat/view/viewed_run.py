@@ -22,6 +22,7 @@ from evsplat.export.gaussians import cloud_at
 from evsplat.film import Look, load_motion_of
 from evsplat.film.looks import depth_colours
 from evsplat.methods.reconstruction import Parts
+from evsplat.pictures import Transfer
 from evsplat.render import Backdrop
 from evsplat.training.run import GaussianReconstruction, Run, load_run, reload_run
 from evsplat.training.watching import is_training, newest_state, watch
@@ -80,7 +81,9 @@ class ViewedRun:
             drawn = replace(drawn, shadow_step_px=_DRAFT_SHADOW_STEP_PX)
         with torch.no_grad():
             if look.shown == "rgb":
-                return drawn.render(camera, [time_us], parts=look.parts).rgb[0].numpy()
+                rgb = drawn.render(camera, [time_us], parts=look.parts).rgb[0]
+                return self.capture.shown(rgb).numpy()
+            look = replace(look, transfer=self._transfer)
             exposure = look.expose(drawn, camera, [time_us])[0]
         if look.shown == "depth":
             exposure = depth_colours(exposure, self._nearest_m)
@@ -88,7 +91,12 @@ class ViewedRun:
 
     def cloud(self, camera: Camera, time_us: int, motion: Motion, parts: Parts) -> SplatCloud:
         """The Gaussians of one instant in the world, coloured as ``camera`` sees them."""
-        return cloud_at(self._moving(time_us, motion, draft=False), camera, time_us, parts)
+        cloud = cloud_at(self._moving(time_us, motion, draft=False), camera, time_us, parts)
+        return cloud.shown(self._transfer)
+
+    @property
+    def _transfer(self) -> Transfer:
+        return self.capture.transfer(self.capture.frames[0])
 
     @cached_property
     def _nearest_m(self) -> float:
@@ -127,7 +135,10 @@ def load_newest(path: Path, device: str) -> Run:
     while newest_state(path) is None and is_training(path):
         watch(path)
         threading.Event().wait(_POLL_S)
-    return load_run(path, device=device, state=newest_state(path))
+    newest = newest_state(path)
+    # Of checkpoints the newest that can be read.
+    snapshot = newest if newest is not None and newest.parent == path else None
+    return load_run(path, device=device, state=snapshot)
 
 
 class RunFollower:

@@ -19,9 +19,10 @@ from evsplat.body.pose_files.sequence import moved
 from evsplat.body.skeleton import find_skeleton
 from evsplat.body.smpl import ENVIRONMENT, smpl_body
 from evsplat.body.smpl_skeleton import NAMES, PARENTS
-from evsplat.capture.body_file import body_from_arrays, read_arrays
+from evsplat.capture.body_file import body_from_arrays
 from evsplat.capture.body_track import load_body
 from evsplat.errors import DataError
+from evsplat.untrusted.arrays import read_plain_npz
 
 from . import synthetic
 from .synthetic import SIZE, TOOLS, make_motion, write, write_models
@@ -316,14 +317,27 @@ def test_the_documented_code_writes_a_body_file(tmp_path, models, monkeypatch):
         "pose_file": write("wham", tmp_path / "wham").path,
         "mid_exposure_us": 15_000 + 40_000 * np.arange(10),
     }
-    blocks = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
-    for block, model, joints in zip(blocks, ("default", "smpl"), (31, 24), strict=True):
-        exec(block, variables)
-        written = body_from_arrays(Path("body.npz"), read_arrays(Path("body.npz")), "?")
-        assert written.model == model
-        track = BodyTrack(load_body(written)[0], written.times_us, written.poses, written.transl)
-        assert written.poses.shape == (5, joints, 3)
-        assert track.times_us.tolist() == [15_000 + 40_000 * f for f in (2, 3, 4, 7, 8)]
+    (block,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
+    exec(block, variables)
+    check_written("default", 31)
+    # with the person's own shape, as the page says below it
+    sequence = variables["sequence"]
+    kept = ("poses", "transl", "betas", "gender")
+    np.savez(
+        "body.npz",
+        model=sequence.model,
+        times_us=variables["mid_exposure_us"][sequence.frames],
+        **{name: getattr(sequence, name) for name in kept},
+    )
+    check_written("smpl", 24)
+
+
+def check_written(model, joints):
+    written = body_from_arrays(Path("body.npz"), read_plain_npz(Path("body.npz")), "?")
+    assert written.model == model
+    track = BodyTrack(load_body(written)[0], written.times_us, written.poses, written.transl)
+    assert written.poses.shape == (5, joints, 3)
+    assert track.times_us.tolist() == [15_000 + 40_000 * f for f in (2, 3, 4, 7, 8)]
 
 
 def test_between_two_poses_the_body_turns_the_short_way(tmp_path):

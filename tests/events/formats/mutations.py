@@ -1,6 +1,6 @@
 """Damaged recordings of every format, and what reading one may do: be right or be a DataError.
 
-Shared by the tests and by benchmarks/event_fuzz.py, which runs many more.
+Shared by the tests and by benchmarks/fuzz.py, which runs many more.
 """
 
 import gzip

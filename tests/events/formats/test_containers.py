@@ -96,7 +96,7 @@ def test_a_shape_without_content_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "e.h5", "w") as file:
         for name in "txyp":
             file.create_dataset(f"events/{name}", (10**12,), "i8", chunks=(1000,))
-    with pytest.raises(DataError, match="announces 1,000,000,000,000 events but holds 0 bytes"):
+    with pytest.raises(DataError, match="1,000,000,000,000 numbers announced in 0 bytes"):
         open_recording(tmp_path / "e.h5")
 
 

@@ -1,4 +1,4 @@
-"""A share of benchmarks/event_fuzz.py: damaged recordings are read rightly or refused."""
+"""A share of benchmarks/fuzz.py: damaged recordings are read rightly or refused."""
 
 import resource
 from collections import Counter

@@ -274,7 +274,7 @@ def test_random_points_take_their_colours_from_a_network_that_sees_the_direction
         generator = torch.Generator().manual_seed(draw_seed)
         camera = capture.camera(frame)
         step = model.training_drawing(times, frame, camera, generator)
-        scene = step.layers.scene.channels[0, :, 3:6]
+        scene = step.layers.scene.channels[0, :, :3]
         drawn = step.output.static_radii[0] > 0
         assert (scene[drawn] > 0).all()
         black = max(black, int((scene == 0).all(-1).sum()))

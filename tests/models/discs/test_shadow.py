@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from evsplat import _native
 from evsplat.body import SurfaceSamples
 from evsplat.models.discs.shadow import BodyShadow, Lamps
 
@@ -142,3 +143,59 @@ def test_lamps_start_around_the_zenith():
     cosines = (rays / 3) @ up
     assert float(cosines[0]) == pytest.approx(1, abs=1e-6)
     assert torch.allclose(cosines[1:], torch.tensor(1 / 1.49**0.5), atol=1e-5)
+
+
+def wide(lamps: int, times: int) -> tuple[BodyShadow, torch.Tensor, torch.Tensor]:
+    """A shadow of lamps of different widths and shares, bodies that move, and the lamps' places.
+
+    One lamp is inside the body, where rays end that are shorter than the least; one is the sun.
+    """
+    generator = torch.Generator().manual_seed(1)
+    shadow = make(lamps)
+    with torch.no_grad():
+        for parameter in shadow.parameters():
+            parameter += torch.randn(lamps, generator=generator).double()
+    body = torch.cat([column(seed) for seed in range(times)])
+    body = body + 0.3 * torch.arange(times)[:, None, None]
+    around = torch.randn(lamps, 3, generator=generator, dtype=torch.float64)
+    around = 3.0 * torch.nn.functional.normalize(around, dim=-1)
+    around[0] *= 1e3
+    around[1] = torch.tensor([0.05, 0.02, 1.3])
+    return shadow, body, around
+
+
+@pytest.mark.parametrize("level", _native.levels())
+@pytest.mark.parametrize("where", ["scene", "body"])
+def test_the_compiled_shadow_and_its_gradients_are_those_of_the_plain_one(
+    where, level, monkeypatch
+):
+    monkeypatch.setenv("EVSPLAT_ISA", level)
+    shadow, body, lamps = wide(5, 3)
+    own = torch.cat([column(seed + 10) * 1.3 for seed in range(3)])
+    size = (3, 41, 41) if where == "scene" else (5, 3, 200)
+    above = torch.randn(size, generator=torch.Generator().manual_seed(2)).double()
+    results = []
+    for dtype in (torch.float64, torch.float32):
+        shadow.to(dtype).zero_grad()
+        points, lights = (value.to(dtype, copy=True).requires_grad_() for value in (body, lamps))
+        if where == "scene":
+            result = shadow(points, floor(0.1).to(dtype), lights)
+        else:
+            result = shadow.lit(points.detach(), own.to(dtype), lights)
+        (result * above.to(dtype)).sum().backward()
+        gradients = [points.grad, lights.grad, *(p.grad for p in shadow.parameters())]
+        results.append([result, *(value.clone() for value in gradients if value is not None)])
+    exact, compiled = results
+    assert compiled[0].std() > 0.05
+    assert (compiled[0] - exact[0]).abs().max() < 1e-5
+    for one, other in zip(compiled[1:], exact[1:], strict=True):
+        assert other.abs().max() > 0
+        assert (one - other).abs().max() < 2e-5 * other.abs().max()
+
+
+def test_a_body_that_is_no_number_shades_nothing_with_a_number():
+    shadow = make().float()
+    body = column().float()
+    body[0, 5] = torch.nan
+    assert shadow(body, floor().float(), LAMP.float()).isnan().all()
+    assert shadow.lit(body, column(1).float(), LAMP.float()).isnan().all()

@@ -5,6 +5,7 @@ from pathlib import Path
 from evsplat.body.motion.acclaim import read_acclaim
 from evsplat.body.motion.bvh import read_bvh
 from evsplat.body.motion.deepmimic import read_deepmimic
+from evsplat.body.motion.limits import checked_motion
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.errors import DataError
 
@@ -23,11 +24,12 @@ def load_motion(path: Path | str, *, skeleton: Path | str | None = None) -> Skel
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".amc":
-        return read_acclaim(path, _skeleton_beside(path) if skeleton is None else Path(skeleton))
+        beside = _skeleton_beside(path) if skeleton is None else Path(skeleton)
+        return checked_motion(read_acclaim(path, beside))
     if suffix == ".bvh":
-        return read_bvh(path)
+        return checked_motion(read_bvh(path))
     if suffix in (".txt", ".json"):
-        return read_deepmimic(path)
+        return checked_motion(read_deepmimic(path))
     raise DataError(
         f"{path}: motion files end in .bvh, .amc (with an .asf) or .txt (DeepMimic); convert it."
     )

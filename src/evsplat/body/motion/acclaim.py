@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from evsplat.body.motion.limits import check_extent
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
-from evsplat.files import read_text
+from evsplat.untrusted.text import read_text
 
 FRAME_RATE_HZ = 120.0
 """CMU's; the files do not say."""
@@ -38,6 +39,7 @@ def read_acclaim(path: Path, skeleton: Path) -> SkeletonMotion:
     bones, unit = _read_skeleton(skeleton)
     frames = _read_frames(path)
     count = len(frames)
+    check_extent(path, count, len(bones))
     local = np.tile(np.eye(3), (count, len(bones), 1, 1))
     ends, zero = np.zeros((len(bones), 3)), np.zeros((len(bones), 3))
     positions = np.zeros((count, 3))
@@ -113,14 +115,20 @@ def _read_bone_line(bone: _Bone, words: list[str]) -> None:
     if words[0] == "name":
         bone.name = words[1]
     elif words[0] == "direction":
-        bone.direction = np.array([float(word) for word in words[1:4]])
+        bone.direction = np.array(_three(words))
     elif words[0] == "length":
         bone.length = float(words[1])
     elif words[0] == "axis":
-        angles = [float(word) for word in words[1:4]]
-        bone.axis = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        bone.axis = Rotation.from_euler("xyz", _three(words), degrees=True).as_matrix()
     elif words[0] == "dof":
         bone.turns = tuple(word.lower() for word in words[1:] if word.lower() in _TURNS)
+
+
+def _three(words: list[str]) -> list[float]:
+    numbers = [float(word) for word in words[1:4]]
+    if len(numbers) < 3:
+        raise ValueError(f"{len(numbers)} numbers after {words[0]}, expected 3")
+    return numbers
 
 
 def _read_frames(path: Path) -> list[dict[str, list[str]]]:

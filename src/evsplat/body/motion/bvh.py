@@ -9,12 +9,15 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from evsplat.body.make import default_body
+from evsplat.body.motion.limits import check_extent
 from evsplat.body.retarget import SkeletonMotion, rest_from_zero
 from evsplat.body.skeleton import find_skeleton
 from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
-from evsplat.files import read_text
+from evsplat.untrusted.text import read_text
 
+_LARGEST = 1e6
+"""Of an offset, in whatever unit."""
 _CHANNELS = [f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz"]
 
 
@@ -42,6 +45,7 @@ def read_bvh(path: Path) -> SkeletonMotion:
         raise DataError(f"{path}: not a readable BVH file ({error}).") from None
     if not joints or values.size == 0 or not np.isfinite(values).all() or frame_time <= 0:
         raise DataError(f"{path}: holds no joints, no frames or no frame time above zero.")
+    check_extent(path, len(values), len(joints))
     parents = [joint.parent for joint in joints]
     local = np.tile(np.eye(3), (len(values), len(joints), 1, 1))
     zero = np.zeros((len(joints), 3))
@@ -87,7 +91,7 @@ def _read(words: Iterator[str]) -> tuple[list[_Joint], float, np.ndarray]:
         elif word == "End":
             ends += 1
         elif word == "OFFSET":
-            offset = tuple(float(next(words)) for _ in range(3))
+            offset = tuple([_length(next(words)) for _ in range(3)])
             # an end site only says how long the last bone is
             if not ends:
                 joints[-1].offset = offset
@@ -108,6 +112,13 @@ def _read(words: Iterator[str]) -> tuple[list[_Joint], float, np.ndarray]:
     if values.size != count * channels:
         raise ValueError(f"{values.size} numbers, expected {count} frames of {channels}")
     return joints, float(header[4]), values.reshape(count, channels)
+
+
+def _length(word: str) -> float:
+    length = float(word)
+    if not abs(length) <= _LARGEST:
+        raise ValueError(f"an offset of {word[:40]}")
+    return length
 
 
 def _channel(word: str) -> str:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.body.tree import world_rotations
 from evsplat.errors import DataError
-from evsplat.files import parse_json, read_text
+from evsplat.untrusted.text import parse_json, read_text
 
 # name, parent, offset from the parent (metres; x forward, y up, z right), numbers per frame:
 # 4 = quaternion (w, x, y, z), 1 = angle about z, 0 = none.

@@ -13,8 +13,11 @@ import torch
 
 from evsplat.body.smpl_skeleton import rest_pelvis
 from evsplat.errors import DataError
-from evsplat.files import read_json
-from evsplat.safe_pickle import read_npy, read_npz, read_pickle
+from evsplat.untrusted.arrays import read_npy, read_npz
+from evsplat.untrusted.faults import ordinary_file
+from evsplat.untrusted.pickles import read_pickle
+from evsplat.untrusted.tensors import load_torch
+from evsplat.untrusted.text import read_json
 
 _WHAT = "pose file"
 
@@ -92,10 +95,9 @@ def _number(path: Path) -> int:
 
 
 def _read_torch(path: Path) -> Any:
+    ordinary_file(path)
     try:
-        return _arrays(torch.load(path, map_location="cpu", weights_only=True))
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found.") from None
+        return _arrays(load_torch(path))
     except Exception as error:  # torch's readers raise nearly anything on damaged files
         named = re.search(r"GLOBAL (\S+)", str(error))
         if named:
@@ -127,7 +129,7 @@ class _Storage:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             try:
-                stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+                stored = load_torch(io.BytesIO(data))
                 self.flat = torch.tensor([], dtype=stored.dtype).set_(stored.untyped())
             except Exception:  # as above
                 raise ValueError("a damaged tensor") from None

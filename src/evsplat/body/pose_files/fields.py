@@ -46,6 +46,8 @@ def numbers(
     )
     if not fits:
         raise DataError(f"{where}: {key} has shape {array.shape}, expected {_words(shape)}.")
+    if array.size == 0:
+        raise DataError(f"{where}: {key} is empty, expected {_words(shape)}.")
     if not np.isfinite(array).all():
         raise DataError(f"{where}: {key} holds values that are not finite.")
     # A file spoilt on its way holds numbers that would overflow further on.

@@ -1,15 +1,14 @@
 """The looping clip: the blurry video beside the sharp reconstruction, in slow motion."""
 
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
 
 from evsplat.capture import Capture
+from evsplat.files import scratch_folder
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import nearest_in_time
 from evsplat.pictures import to_bytes
@@ -67,10 +66,11 @@ def make_clip(capture: Capture, reconstruction: Reconstruction) -> Clip | None:
             with torch.no_grad():
                 rgb = reconstruction.render(capture.camera(nearest[0]), batch).rgb
             for frame, image in zip(nearest, rgb, strict=True):
-                yield _beside(to_bytes(capture.image(frame)), to_bytes(image))
+                halves = capture.image(frame), image.cpu()
+                yield _beside(*(to_bytes(capture.shown(half)) for half in halves))
 
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "clip.mp4"
+    with scratch_folder() as folder:
+        path = folder / "clip.mp4"
         written = write_video(path, pictures(), fps=played_hz, crf=21)
         mp4 = path.read_bytes()
     return Clip(mp4, written / played_hz / (shown_us / 1e6), first, last, written)

@@ -121,19 +121,20 @@ class FramePictures:
     @classmethod
     def of(cls, source: Source, entry: dict[str, Any]) -> "FramePictures":
         """Collect the pictures that the evaluation wrote and those of the capture."""
-        frame = source.capture.frame(entry["frame"])
+        capture = source.capture
+        frame = capture.frame(entry["frame"])
         pictures = {
-            _INPUT: to_bytes(source.capture.image(frame)),
+            _INPUT: to_bytes(capture.shown(capture.image(frame))),
             _RENDER: source.picture(entry["pictures"]["render"]),
         }
         if frame.sharp is not None:
-            pictures["sharp truth"] = to_bytes(source.capture.sharp(frame))
+            pictures["sharp truth"] = to_bytes(capture.shown(capture.sharp(frame)))
             pictures["error"] = source.picture(entry["pictures"]["error"])
         return cls(
             frame,
             entry["protocols"]["standard"],
             pictures,
-            HumanRegions(source.capture).crop(frame),
+            HumanRegions(capture).crop(frame),
         )
 
     def crops(self, aspect: float) -> Pictures:

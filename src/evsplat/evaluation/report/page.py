@@ -77,6 +77,7 @@ def _header(source: Source) -> str:
         ("trained for", None if seconds is None else duration(seconds)),
         ("iterations", _count(metrics.get("iteration"))),
         ("device", metrics.get("device")),
+        ("body poses", "found by evsplat" if metrics.get("poses") else None),
         ("Gaussians, person", _count(gaussians.get("human"))),
         ("Gaussians, scene", _count(gaussians.get("scene"))),
         ("frames, train", _count(metrics["frames"]["train"])),
@@ -202,7 +203,8 @@ def _novel_views(source: Source) -> str:
         pairs = []
         for entry in spread(drawn, _NOVEL_SHOWN):
             render = source.picture(entry["pictures"]["render"])
-            truth = to_bytes(source.capture.novel_image(views[entry["index"]]))
+            view = views[entry["index"]]
+            truth = to_bytes(source.capture.shown(source.capture.novel_image(view)))
             label = f"{name}, frame {entry['frame']}"
             reached = "" if entry["psnr"] is None else f" · {entry['psnr']:.2f} dB"
             pairs.append(

@@ -12,10 +12,10 @@ from evsplat.capture import Capture
 from evsplat.config import load_yaml
 from evsplat.errors import DataError
 from evsplat.evaluation.splits import name_of
-from evsplat.files import parse_json, read_json, read_text
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.options.runs import Split
-from evsplat.pages import read_picture
+from evsplat.pages import read_rgb
+from evsplat.untrusted.text import parse_json, read_json, read_text
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Source:
 
     def picture(self, path: str) -> UInt8[np.ndarray, "H W 3"]:
         """A picture that the evaluation wrote, by its path inside the run folder."""
-        return read_picture(self.folder / path, "evaluate the run again")
+        return read_rgb(self.folder / path, "evaluate the run again")
 
 
 def _read_object(path: Path) -> dict[str, Any]:

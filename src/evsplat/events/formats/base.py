@@ -2,11 +2,10 @@
 
 import gzip
 import os
-import re
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +14,7 @@ import numpy as np
 
 from evsplat.errors import DataError
 from evsplat.options import ReadOptions
-from evsplat.safe_pickle import BROKEN
+from evsplat.untrusted.faults import ordinary_file
 
 BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
@@ -98,12 +97,8 @@ class ByteReader(ExitStack):
         super().__init__()
         self.path = path
         self.offset = 0
-        try:
-            self._file = self.enter_context(open(path, "rb", buffering=_BUFFER_BYTES))
-        except FileNotFoundError:
-            raise DataError(f"{path}: file not found.") from None
-        except OSError as error:
-            raise DataError(f"{path}: cannot be opened ({error.strerror}).") from None
+        ordinary_file(path)
+        self._file = self.enter_context(open(path, "rb", buffering=_BUFFER_BYTES))
         self._size = os.fstat(self._file.fileno()).st_size
         self.zipped = self._file.read(2) == b"\x1f\x8b"
         self._file.seek(0)
@@ -145,16 +140,6 @@ class ByteReader(ExitStack):
             ) from None
         self.offset += len(data)
         return data
-
-
-@contextmanager
-def broken_as_data_error(path: Path, fault: str) -> Iterator[None]:
-    """Errors that damaged files cause in other libraries as a `DataError` that begins so."""
-    try:
-        yield
-    except BROKEN as error:
-        reason = re.sub(r"\s+", " ", str(error))[:200]
-        raise DataError(f"{path}: {fault} ({reason}).") from None
 
 
 def is_gzipped(path: Path) -> bool:

@@ -17,17 +17,16 @@ from evsplat.events.formats.base import (
     BLOCK_EVENTS,
     RawEvents,
     Source,
-    broken_as_data_error,
 )
 from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
 from evsplat.options import ReadOptions
+from evsplat.untrusted.faults import broken_as
+from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5
 
 _PLACES = ("events", "CD/events", "/")
 _ECF = 36559
 # Filters that HDF5 and h5py bring with them: deflate, shuffle, checksum, scale-offset, lzf
 _BUILT_IN = (1, 2, 3, 4, 5, 6, 32000)
-# More events than this per stored byte of their times are not packed but absent.
-_MAX_EVENTS_PER_BYTE = 4096
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Hdf5(Source):
         with _opened(self.path) as file:
             self._columns = _find_columns(self.path, file, options)
             self._count = self._check_columns(file)
-            self._offset_us = int(file["t_offset"][()]) if "t_offset" in file else 0
+            self._offset_us = int(file["t_offset"][()]) if holds(file, "t_offset") else 0
             if abs(self._offset_us) > 1 << 60:
                 raise DataError(f"{self.path}: t_offset is {self._offset_us} us, which is no time.")
             self.width, self.height = _size(file)
@@ -96,25 +95,19 @@ class Hdf5(Source):
         """The count of events, when all columns have it and can be unpacked."""
         counts = {}
         for key, column in self._columns.items():
-            dataset = file[column.dataset]
+            dataset = data_set(file, column.dataset)
             _check_filters(self.path, dataset)
             counts[key] = len(dataset)
         if len(set(counts.values())) != 1:
             text = ", ".join(f"{key}: {count:,}" for key, count in counts.items())
             raise DataError(f"{self.path}: its components differ in length ({text}).")
-        stored = file[self._columns["t"].dataset].id.get_storage_size()
-        if counts["t"] > _MAX_EVENTS_PER_BYTE * (stored + 1):
-            raise DataError(
-                f"{self.path}: announces {counts['t']:,} events but holds {stored:,} bytes of "
-                "times; copy the file again."
-            )
         return counts["t"]
 
 
 def _find_columns(path: Path, file: h5py.File, options: ReadOptions) -> dict[str, _Column]:
     given = options.columns
     if isinstance(given, Mapping):
-        missing = [name for name in given.values() if name not in file]
+        missing = [name for name in given.values() if not holds(file, name)]
         if missing or not {"t", "x", "y"} <= set(given):
             raise DataError(
                 f"{path}: columns is {dict(given)}, expected datasets for t, x, y and perhaps p"
@@ -122,7 +115,7 @@ def _find_columns(path: Path, file: h5py.File, options: ReadOptions) -> dict[str
             )
         return {key: _Column(name) for key, name in given.items()}
     for place in _PLACES:
-        if place not in file:
+        if not holds(file, place):
             continue
         node = file[place]
         if isinstance(node, h5py.Group):
@@ -176,7 +169,7 @@ def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
 def _size(file: h5py.File) -> tuple[int | None, int | None]:
     """Width and height, where an attribute says."""
     for place in _PLACES:
-        attributes = file[place].attrs if place in file else {}
+        attributes = file[place].attrs if holds(file, place) else {}
         if "width" in attributes and "height" in attributes:
             return int(attributes["width"]), int(attributes["height"])
         if "sensor_resolution" in attributes:  # e2vid: rows first
@@ -191,7 +184,7 @@ def _size(file: h5py.File) -> tuple[int | None, int | None]:
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
     with (
-        broken_as_data_error(path, "its HDF5 content cannot be read"),
-        h5py.File(path, "r") as file,
+        broken_as(path, "its HDF5 content cannot be read"),
+        open_hdf5(path) as file,
     ):
         yield file

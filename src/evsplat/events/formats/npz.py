@@ -1,9 +1,7 @@
 """.npz and .npy files with one array per component, or one table of them; never unpickled."""
 
-import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
@@ -12,14 +10,11 @@ from evsplat.events.formats.base import (
     BLOCK_EVENTS,
     RawEvents,
     Source,
-    broken_as_data_error,
 )
 from evsplat.events.formats.table import Table, match_names, table_order
 from evsplat.options import ReadOptions
+from evsplat.untrusted.arrays import read_plain_arrays
 
-_READ_BYTES = 1 << 22
-# Deflate packs at most 1032 to 1.
-_MAX_RATIO = 1100
 _SIZE_KEYS = (("width", "height"), ("sensor_width", "sensor_height"))
 
 
@@ -28,7 +23,7 @@ class Npz(Source):
 
     def read_header(self, options: ReadOptions) -> None:
         """See `Source`."""
-        arrays = _load(self.path)
+        arrays = read_plain_arrays(self.path)
         named = _components(self.path, arrays, options)
         self._table = Table(self.path, named, options.time_unit)
         self.has_polarity = self._table.has_polarity
@@ -76,40 +71,3 @@ def _components(
         f"{path}: no events found among its arrays ({shapes}); expected t, x, y, p (or xy, t, "
         "p, or one table), or say which is which with columns."
     )
-
-
-def _load(path: Path) -> dict[str, np.ndarray]:
-    with broken_as_data_error(path, "not a readable NumPy file"):
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as archive:
-                arrays = {}
-                for info in archive.infolist():
-                    if info.filename.endswith(".npy"):
-                        if info.file_size > _MAX_RATIO * info.compress_size:
-                            raise ValueError(f"{info.filename} has an impossible size")
-                        with archive.open(info) as member:
-                            arrays[info.filename[:-4]] = _read_array(member, info.file_size)
-                return arrays
-        with open(path, "rb") as file:
-            return {"events": _read_array(file, path.stat().st_size)}
-
-
-def _read_array(file: IO[bytes], size: int) -> np.ndarray:
-    """An array whose header agrees with the bytes that are there; allocates no more than those."""
-    version = np.lib.format.read_magic(file)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version[0]}.{version[1]} of the .npy format")
-    read_header = getattr(np.lib.format, f"read_array_header_{version[0]}_0")
-    shape, fortran, dtype = read_header(file)
-    if dtype.hasobject:
-        raise ValueError("it holds Python objects, which are not read from files of others")
-    expected = dtype.itemsize * int(np.prod([int(n) for n in shape], dtype=object))
-    data = bytearray()
-    while piece := file.read(_READ_BYTES):
-        data += piece
-        if len(data) > expected:
-            break
-    if len(data) != expected:
-        raise ValueError(f"an array of {expected} bytes is announced, {len(data)} are there")
-    array = np.frombuffer(data, dtype=dtype)
-    return array.reshape(shape, order="F" if fortran else "C")

@@ -24,12 +24,15 @@ from evsplat.models.model import PosedModel, RowCache
 from evsplat.models.networks.colour import SceneColour, scene_rgb
 from evsplat.models.networks.non_rigid import PoseDeformation, draw_pose_noise
 from evsplat.models.pose_correction import PoseCorrection
+from evsplat.models.scene_places import ScenePlaces
 from evsplat.render import rows_in_view
 
 NORMAL_SAMPLES = 20_000
 """Points of the body's surface among which a Gaussian finds its normal and its bones."""
 CASTERS = 400
 """Points of the body that hide lights."""
+_PLACES_REFRESH = 8
+"""Steps after which the places that shadows fall on are drawn anew."""
 _DIRECTION_DROPOUT = 0.5
 """Share of the steps that hide the view direction from the scene's network."""
 
@@ -91,6 +94,7 @@ class DiscModel(PosedModel):
         self.surface = NearestSurface(body.sample_surface(NORMAL_SAMPLES, generator))
         roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
         middle = roots.mean(0).float()
+        self.places = ScenePlaces(_PLACES_REFRESH)
         self.lamps: Lamps | None = None
         self.shadow: BodyShadow | None = None
         if lamps:
@@ -109,8 +113,8 @@ class DiscModel(PosedModel):
 
     @property
     def row_caches(self) -> dict[str, RowCache]:
-        """The nearest points of the body's surface."""
-        return {"surface": self.surface}
+        """The nearest points of the body's surface, and the scene's places in the pictures."""
+        return {"surface": self.surface, "places": self.places}
 
     @property
     def residual_active(self) -> bool:
@@ -154,8 +158,9 @@ class DiscModel(PosedModel):
         The times of a step lie within a frame of each other: the non-rigid network sees the pose
         at the frame's middle alone, and own shadows are looked up at the time nearest to it.
         """
-        _, bones = self.pose(times_us)
-        rotations, _ = self.pose([frame.mid_us])
+        # Posed together: the skeleton is walked once for all times.
+        turned, bones = self.pose([*times_us, frame.mid_us])
+        bones, rotations = bones[:-1], turned[-1:]
         joints = rotations.shape[1]
         rotations = rotations + draw_pose_noise(joints, self.pose_noise, generator, self.device)
         nearest = min(range(len(times_us)), key=lambda t: abs(times_us[t] - frame.mid_us))
@@ -165,7 +170,7 @@ class DiscModel(PosedModel):
             view = _View(camera.center(), hidden, camera)
         lit_at = slice(nearest, nearest + 1)
         layers = self._layers(bones, rotations, lit_at, view, hard_semantics=False)
-        return draw(layers, camera, center_gradients=True)
+        return draw(layers, camera, center_gradients=True, places=self.places)
 
     def following(self, track: BodyTrack) -> "DiscModel":
         """The same person doing what ``track`` says, without pose residuals; see `Model`."""

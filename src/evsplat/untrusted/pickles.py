@@ -5,44 +5,23 @@ plain containers need are answered by functions of our own, and every other name
 numpy's own are not called either, because a forged dtype can make them read arbitrary memory.
 """
 
-import bz2
-import gzip
 import io
-import lzma
-import math
-import operator
-import os
 import pickle
 import struct
-import tokenize
-import zipfile
-import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from evsplat.errors import DataError
+from evsplat.untrusted.faults import BROKEN, ordinary_file, reason
+from evsplat.untrusted.sizes import count_of, sound_text, unpacked
 
 StandIns = Callable[[str, str], type | None]
 """Maps a module and a name in it to a class to build instead; it gets state by __setstate__."""
 
-BROKEN = (
-    *(OSError, EOFError, ValueError, TypeError, KeyError, AttributeError, IndexError),
-    *(AssertionError, OverflowError, MemoryError, RuntimeError, struct.error, zlib.error),
-    *(lzma.LZMAError, pickle.UnpicklingError, zipfile.BadZipFile),
-    *(SyntaxError, tokenize.TokenError),
-)
-"""What NumPy, zipfile and pickle raise on damaged files."""
-_UNPACK: dict[bytes, Callable[[bytes], bytes]] = {
-    b"\x1f\x8b": gzip.decompress,
-    b"BZ": bz2.decompress,
-    b"\xfd7zXZ": lzma.decompress,
-    b"\x5d\x00": lzma.decompress,
-    b"\x78": zlib.decompress,
-}
 _PLAIN_KINDS = "biufcSU"
 
 
@@ -54,56 +33,19 @@ def read_pickle(path: Path, *, what: str = "pickle", stand_ins: StandIns | None 
     Raises:
         DataError: unreadable, or holding a type that is neither an array nor a plain container.
     """
-
-    def read() -> Any:
-        data = path.read_bytes()
-        for magic, unpack in _UNPACK.items():
-            if data.startswith(magic):
-                data = unpack(data)
-                break
-        return _Unpickler(io.BytesIO(data), stand_ins).load()
-
-    return _guarded(path, what, read)
+    return read_guarded(path, what, lambda: unpickled(path.read_bytes(), stand_ins))
 
 
-def read_npy(path: Path, *, what: str = "npy file", stand_ins: StandIns | None = None) -> Any:
-    """The array of a .npy; what was wrapped in a 0-d object array comes bare. Errors as above."""
-
-    def read() -> Any:
-        with path.open("rb") as stream:
-            return _read_array(stream, os.fstat(stream.fileno()).st_size, stand_ins)
-
-    return _guarded(path, what, read)
+def unpickled(data: bytes, stand_ins: StandIns | None) -> Any:
+    """What a pickle stands for, packed or not; errors are those of `BROKEN`."""
+    return Unpickler(io.BytesIO(unpacked(data)), stand_ins).load()
 
 
-def read_npz(
-    path: Path,
-    *,
-    what: str = "npz archive",
-    keys: Collection[str] | None = None,
-    stand_ins: StandIns | None = None,
-) -> dict[str, Any]:
-    """The members of a .npz, all or those of ``keys``, each as `read_npy` gives it."""
-
-    def read() -> dict[str, Any]:
-        with zipfile.ZipFile(path) as archive:
-            found = {name.removesuffix(".npy"): name for name in archive.namelist()}
-            members = {}
-            for key, name in found.items():
-                if keys is None or key in keys:
-                    with archive.open(name) as stream:
-                        size = archive.getinfo(name).file_size
-                        members[key] = _read_array(stream, size, stand_ins)
-            return members
-
-    return _guarded(path, what, read)
-
-
-def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
+def read_guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
+    """What ``read`` gives of an ordinary file; its faults as `read_pickle` says them."""
+    ordinary_file(path)
     try:
         return read()
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found.") from None
     except _ForbiddenType as error:
         name = " ".join(str(error).split())
         raise DataError(
@@ -111,43 +53,11 @@ def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
             "get the file again from its official source."
         ) from None
     except BROKEN as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DataError(f"{path}: not a readable {what} ({reason}).") from error
+        raise DataError(f"{path}: not a readable {what} ({reason(error)}).") from error
 
 
 class _ForbiddenType(Exception):
     """A name in a pickle that is not on the list."""
-
-
-def _read_array(stream: IO[bytes], size: int, stand_ins: StandIns | None) -> Any:
-    """One array in npy format, in ``size`` bytes; an object array is a pickle after the header."""
-    version = np.lib.format.read_magic(stream)
-    readers = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    if version not in readers:
-        raise ValueError(f"npy format {version}")
-    shape, fortran_order, dtype = readers[version](stream)
-    if dtype.hasobject:
-        value = _Unpickler(stream, stand_ins).load()
-        is_wrapped = isinstance(value, np.ndarray) and value.shape == ()
-        return value.item() if is_wrapped else value
-    count = _count(shape)
-    if count * dtype.itemsize > size:
-        # before memory is taken for them
-        raise ValueError(f"an array of shape {shape} in {size} bytes")
-    data = stream.read(count * dtype.itemsize)
-    array = np.frombuffer(data, dtype, count).copy()
-    return array.reshape(shape, order="F" if fortran_order else "C")
-
-
-def _count(shape: Any) -> int:
-    """How many values an array has; exact, where NumPy's product of a forged shape overflows."""
-    lengths = [operator.index(length) for length in shape]
-    if any(length < 0 for length in lengths):
-        raise ValueError(f"an array of shape {tuple(lengths)}")
-    return math.prod(lengths)
 
 
 class _DType:
@@ -174,8 +84,9 @@ class _JoblibArray:
     def read(self, read: Callable[[int], bytes]) -> np.ndarray:
         if self.aligned:
             read(read(1)[0])
-        count = _count(self.shape)
-        array = np.frombuffer(read(count * self.dtype.itemsize), self.dtype, count).copy()
+        count = count_of(self.shape)
+        data = read(count * self.dtype.itemsize)
+        array = sound_text(np.frombuffer(data, self.dtype, count).copy())
         return array.reshape(self.shape, order="F" if self.order == "F" else "C")
 
 
@@ -185,11 +96,11 @@ def _new_array(kind: Any, shape: Any, code: Any) -> np.ndarray:
 
 
 def _new_scalar(kind: _DType, data: bytes | str) -> Any:
-    return np.frombuffer(_bytes(data), kind.dtype, 1)[0]
+    return sound_text(np.frombuffer(_bytes(data), kind.dtype, 1))[0]
 
 
 def _from_buffer(data: bytes, kind: _DType, shape: tuple[int, ...], order: str) -> np.ndarray:
-    flat = np.frombuffer(_bytes(data), kind.dtype).copy()
+    flat = sound_text(np.frombuffer(_bytes(data), kind.dtype).copy())
     return flat.reshape(shape, order="F" if order == "F" else "C")
 
 
@@ -239,7 +150,7 @@ for _copyreg in ("copyreg", "copy_reg"):
     _NAMES[_copyreg, "_reconstructor"] = _new_object
 
 
-class _Unpickler(pickle._Unpickler):
+class Unpickler(pickle._Unpickler):
     """Unpickles arrays, plain containers and the caller's stand-ins, nothing else.
 
     The Python version of the class, because joblib's arrays lie between the opcodes.
@@ -258,6 +169,7 @@ class _Unpickler(pickle._Unpickler):
         self._fillable: set[type] = {_DType}
 
     def find_class(self, module: str, name: str) -> Any:
+        """What a name of a pickle stands for."""
         stand_in = self._stand_ins(module, name) if self._stand_ins else None
         if stand_in is not None:
             self._fillable.add(stand_in)
@@ -275,7 +187,7 @@ class _Unpickler(pickle._Unpickler):
         elif isinstance(target, _JoblibArray):
             target.__setstate__(state)
             if target.dtype.hasobject:
-                self.stack[-1] = _Unpickler(self._stream, self._stand_ins).load()
+                self.stack[-1] = Unpickler(self._stream, self._stand_ins).load()
             else:
                 self.stack[-1] = target.read(self._file_read)
         elif type(target) in self._fillable:
@@ -300,7 +212,7 @@ def _fill(array: np.ndarray, state: tuple) -> None:
     would follow a shape beyond the end of a list of objects.
     """
     _, shape, kind, fortran_order, values = state
-    dtype, shape, count = kind.dtype, tuple(shape), _count(shape)
+    dtype, shape, count = kind.dtype, tuple(shape), count_of(shape)
     if array.dtype != object or array.size:
         raise ValueError("an array that is filled twice")
     if dtype.hasobject:
@@ -312,4 +224,5 @@ def _fill(array: np.ndarray, state: tuple) -> None:
     values = _bytes(values)
     if len(values) != count * dtype.itemsize or (count and not dtype.itemsize):
         raise ValueError(f"an array of shape {shape} of {dtype} in {len(values)} bytes")
+    sound_text(np.frombuffer(values, dtype, count))
     array.__setstate__((1, shape, dtype, bool(fortran_order), values))  # type: ignore[arg-type]

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from evsplat.errors import DataError
-from evsplat.safe_pickle import read_npy, read_npz, read_pickle
+from evsplat.untrusted.arrays import read_npy, read_npz
+from evsplat.untrusted.pickles import read_pickle
 
 RNG = np.random.default_rng(0)
 TREE = {

@@ -1,0 +1,95 @@
+"""Where in the world each pixel's scene is, without the person: that is where shadows fall."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from evsplat.camera import Camera
+from evsplat.models.layers import Layers
+from evsplat.render import render, same_values
+
+LEAST_SCENE = 1e-3
+"""Share of a pixel below which its scene has no place of its own."""
+
+
+class ScenePlaces:
+    """World places of the scene's pixels, kept from one picture to the next of a camera at rest.
+
+    In training the scene moves a little with each step, and the places are drawn anew every
+    ``refresh`` pictures and after densification; without ``refresh`` whenever anything changed.
+    """
+
+    def __init__(self, refresh: int | None = None) -> None:
+        """Nothing is known before the first picture."""
+        self.refresh, self.age = refresh, 0
+        self.kept = torch.zeros(0, 0, 3)
+        self.seen: list[Tensor] = []
+
+    @torch.no_grad()
+    def of(self, layers: Layers, camera: Camera, step: int) -> Float[Tensor, "h w 3"]:
+        """Places at every ``step``-th pixel; no gradients, as a shadow is not to move the scene."""
+        shape = -(-camera.height // step), -(-camera.width // step), 3
+        # A camera on a GPU is not compared, for which the host would have to wait.
+        kept = tuple(self.kept.shape) == shape and layers.scene.means.device.type == "cpu"
+        if not (kept and self._same(layers, camera)):
+            self.kept = places_of(scene_depth(layers, camera), camera, step)
+            self.seen, self.age = self._given(layers, camera), 0
+        self.age += 1
+        return self.kept
+
+    def _given(self, layers: Layers, camera: Camera) -> list[Tensor]:
+        given = [camera.K, camera.world_to_camera]
+        if self.refresh is None:
+            scene = layers.scene
+            given += [scene.means, scene.quaternions, scene.scales, scene.opacities]
+        return [tensor.detach().clone() for tensor in given]
+
+    def _same(self, layers: Layers, camera: Camera) -> bool:
+        if self.refresh is not None and self.age >= self.refresh:
+            return False
+        given = self._given(layers, camera)
+        return len(given) == len(self.seen) and all(map(same_values, given, self.seen))
+
+    def rows_changed(self) -> None:
+        """The scene has other Gaussians now."""
+        self.seen = []
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors that a resume needs."""
+        named = {f"seen{number}": tensor for number, tensor in enumerate(self.seen)}
+        return {"kept": self.kept, "age": torch.tensor(self.age), **named}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state` gave; nothing from a checkpoint without."""
+        if not state:
+            return
+        self.kept, self.age = state["kept"], int(state["age"])
+        self.seen = [state[f"seen{number}"] for number in range(len(state) - 2)]
+
+
+def scene_depth(layers: Layers, camera: Camera) -> Float[Tensor, "H W 2"]:
+    """Of each pixel: z of its scene (metres) times the scene's share of it, and that share."""
+    scene, pose = layers.scene, camera.world_to_camera
+    depth = (scene.means @ pose[2, :3] + pose[2, 3])[..., None]
+    shown = replace(scene, channels=torch.cat([depth, torch.ones_like(depth)], -1))
+    return render(shown, camera, low_pass=layers.low_pass).image[0]
+
+
+def places_of(depth: Float[Tensor, "H W 2"], camera: Camera, step: int) -> Float[Tensor, "h w 3"]:
+    """World places of the scene at every ``step``-th pixel."""
+    sums = F.avg_pool2d(depth.movedim(-1, 0), step, ceil_mode=True, count_include_pad=False)
+    z = sums[0] / sums[1].clamp_min(LEAST_SCENE)
+    y, x = ((torch.arange(count, device=z.device) + 0.5) * step for count in z.shape)
+    K, pose = camera.K, camera.world_to_camera.detach()
+    rays = torch.stack(
+        [
+            ((x - K[0, 2]) / K[0, 0]).expand(z.shape),
+            ((y - K[1, 2]) / K[1, 1])[:, None].expand(z.shape),
+            torch.ones_like(z),
+        ],
+        -1,
+    )
+    return (rays * z[..., None] - pose[:3, 3]) @ pose[:3, :3]

@@ -1,0 +1,36 @@
+"""Files of torch (.pt, .pth) and of safetensors."""
+
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from evsplat.untrusted.faults import BROKEN, ordinary_file
+from evsplat.untrusted.sizes import open_zip
+
+
+def load_torch(source: Path | IO[bytes]) -> Any:
+    """What torch.save wrote, nothing of it run; an `Exception` of nearly any kind where it is not.
+
+    Large archives are mapped, not copied.
+    """
+    if isinstance(source, Path):
+        ordinary_file(source)
+    packed = isinstance(source, Path) and zipfile.is_zipfile(source)
+    if packed:
+        open_zip(str(source)).close()
+    return torch.load(source, map_location="cpu", weights_only=True, mmap=packed)
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and texts of a file of safetensors; a `ValueError` where it is none."""
+    ordinary_file(path)
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return tensors, file.metadata() or {}
+    except (*BROKEN, SafetensorError) as error:
+        raise ValueError(str(error)) from None

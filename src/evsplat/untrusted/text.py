@@ -1,0 +1,94 @@
+"""Text in UTF-8, JSON and YAML."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from evsplat.errors import DataError, EvsplatError
+from evsplat.untrusted.faults import ordinary_file, reason, why_not_read
+
+_MOST_BYTES = 1 << 28
+"""Of a text; a capture of 100,000 frames describes itself in 40 MB."""
+_DEEPEST = 50
+"""Levels of a YAML text; settings have a handful."""
+_MOST_NODES = 100_000
+"""Of a YAML text, those that an alias repeats counted again."""
+_MISFITS = (TypeError, KeyError, IndexError, AttributeError, OverflowError)
+"""What PyYAML raises, besides `ValueError` and its own errors, on tags such as ``!!bool 3``."""
+
+
+def read_text(path: Path | str, *, error: type[EvsplatError] = DataError) -> str:
+    """Read a UTF-8 text; a file that is missing, no text or not to be read is an ``error``."""
+    path = Path(path)
+    size = ordinary_file(path, error=error)
+    if size > _MOST_BYTES:
+        raise error(f"{path}: {size:,} bytes are too many for a text, expected {_MOST_BYTES:,}.")
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as fault:
+        raise error(f"{path}: {why_not_read(fault)}.") from None
+    except UnicodeDecodeError as fault:
+        raise error(f"{path}: not a text in UTF-8 ({fault}); write it anew.") from None
+
+
+def read_json(path: Path | str) -> Any:
+    """Read JSON; a missing or broken file is a `DataError` that names it."""
+    path = Path(path)
+    try:
+        return parse_json(read_text(path))
+    except ValueError as error:
+        raise DataError(f"{path}: not valid JSON ({error}); repair it or write it anew.") from None
+
+
+def parse_json(text: str) -> Any:
+    """The value that a JSON text stands for; all that can be wrong with it is a `ValueError`."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(reason(error)) from None
+
+
+def parse_yaml(text: str) -> Any:
+    """The value that a YAML text stands for; all that can be wrong with it is a `ValueError`."""
+    try:
+        _check_yaml(text)
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from None
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(reason(error)) from None
+    except _MISFITS:
+        raise ValueError("a tag that its value does not fit") from None
+
+
+def _check_yaml(text: str) -> None:
+    """Refuse what is nested too deeply, or grows without end through aliases.
+
+    Its events come one by one, so that a text of brackets costs no more than its first few.
+    """
+    nodes, open_nodes, sizes = 0, list[tuple[str | None, int]](), dict[str, int | None]()
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, start = open_nodes.pop()
+            sizes |= {anchor: nodes - start} if anchor else {}
+        elif isinstance(event, yaml.AliasEvent):
+            size = sizes.get(event.anchor or "", 0)
+            if size is None:
+                raise ValueError(f"*{event.anchor} is a part of itself")
+            nodes += size + 1
+        elif isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append((event.anchor, nodes))
+            sizes |= {event.anchor: None} if event.anchor else {}
+            nodes += 1
+        else:
+            nodes += 1
+        if len(open_nodes) > _DEEPEST:
+            raise ValueError(f"nested more than {_DEEPEST} deep")
+        if nodes > _MOST_NODES:
+            raise ValueError(f"more than {_MOST_NODES} values")

@@ -1,0 +1,43 @@
+"""Video files, decoded by FFmpeg (PyAV)."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import av
+
+from evsplat.errors import DataError
+from evsplat.untrusted.faults import ordinary_file, reason
+
+# Containers of video; FFmpeg also knows playlists, which name other files and addresses.
+_FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,ogg,flv,asf,gif,mxf,nut,ivf"
+_OPTIONS = {"protocol_whitelist": "file", "format_whitelist": _FORMATS}
+# More than 8K; a damaged header may announce sizes that fill the memory.
+_MOST_PIXELS = 40_000_000
+_LIMITS = {"max_pixels": str(_MOST_PIXELS)}
+
+
+@contextmanager
+def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
+    """The container and its first video stream; what FFmpeg cannot read is a `DataError`."""
+    ordinary_file(path)
+    try:
+        with av.open(f"file:{path}", options=_OPTIONS) as container:
+            if not container.streams.video:
+                raise DataError(f"{path}: holds no video stream.")
+            stream = container.streams.video[0]
+            context = stream.codec_context
+            if context is None:
+                raise DataError(f"{path}: a video whose codec is not known; encode it again.")
+            if context.width * context.height > _MOST_PIXELS:
+                raise DataError(
+                    f"{path}: pictures of {context.width}x{context.height} pixels, expected at "
+                    f"most {_MOST_PIXELS:,}; make them smaller."
+                )
+            context.options = _LIMITS
+            yield container, stream
+    except (av.error.FFmpegError, OSError, UnicodeError) as error:
+        raise DataError(
+            f"{path}: cannot be decoded as video ({reason(error)}); encode it again."
+        ) from error

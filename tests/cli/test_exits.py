@@ -1,0 +1,113 @@
+"""Exit codes and last words, whatever ends the work."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+from safetensors import SafetensorError
+
+from evsplat.cli.exits import exit_code
+from evsplat.errors import DataError, OutputError
+
+
+def raising(error: BaseException):
+    def work() -> None:
+        raise error
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            OSError(errno.ENOSPC, "No space left on device", "/x"),
+            "/x: not written, the disk is full",
+        ),
+        (OSError(errno.EIO, "Input/output error"), "Input/output error."),
+        (MemoryError(), "Memory is full (no more to be had); close"),
+        (RuntimeError("[enforce fail at alloc_cpu.cpp:118] err == 0."), "Memory is full ([enforce"),
+        (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), "Memory is full (CUDA out"),
+        (
+            SafetensorError("header too large"),
+            "A file of tensors cannot be read or written (header",
+        ),
+    ],
+)
+def test_what_the_machine_does_is_one_sentence_and_a_file(
+    capsys, monkeypatch, tmp_path, error, said
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert exit_code(raising(error)) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"evsplat: {said}") and told.count("\n") == 1
+    (file,) = tmp_path.iterdir()
+    assert f"The traceback is in {file}." in told and "in work" in file.read_text()
+
+
+def test_where_no_traceback_can_be_kept_the_sentence_stays(capsys, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", "/nowhere/at/all")
+    assert exit_code(raising(MemoryError("so much"))) == 2
+    assert capsys.readouterr().err.endswith("fewer frames.\n")
+
+
+@pytest.mark.parametrize("error", [DataError("a: b."), OutputError("a: b.")])
+def test_what_is_expected_needs_no_traceback(capsys, error):
+    assert exit_code(raising(error)) == 2
+    assert capsys.readouterr().err == "evsplat: a: b.\n"
+
+
+def test_a_fault_of_the_program_is_not_hidden():
+    with pytest.raises(RuntimeError, match="shapes"):
+        exit_code(raising(RuntimeError("shapes do not match")))
+
+
+def test_sigterm_ends_the_work_as_ctrl_c_does(capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    assert exit_code(lambda: os.kill(os.getpid(), signal.SIGTERM)) == 130
+    assert capsys.readouterr().err == "\nevsplat: Stopped.\n"
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+LOST = """
+import os, signal, sys, time
+from evsplat.cli.exits import exit_code
+
+class Held:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000):
+            pass
+
+def work():
+    held = Held()
+    del held
+    time.sleep(30)
+
+sys.exit(exit_code(work))
+"""
+
+
+def test_ctrl_c_that_python_drops_is_heard_all_the_same():
+    done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True, timeout=20)
+    assert (done.returncode, done.stderr) == (130, "\nevsplat: Stopped.\n")
+
+
+def test_unwritable_output_is_said_before_the_work(tmp_path: Path, capsys):
+    from evsplat.cli import main
+    from evsplat.shipped import demo_capture
+
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file" / "in", tmp_path / ("x" * 300)):
+        for command in (["train", "--out"], ["inspect", "--out"], ["stage"], ["restore", "--out"]):
+            verb, *option = command
+            capture = [] if verb == "stage" else [str(demo_capture())]
+            assert main([verb, *capture, *option, str(out)]) == 2
+            told = capsys.readouterr().err
+            assert any(words in told for words in ("a file is where", "too long", "is no name"))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,113 @@
+"""Checkpoints on a full disk and after damage: what is there is kept, and said."""
+
+import errno
+import logging
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from evsplat.errors import DataError, OutputError
+from evsplat.training.checkpoint import checkpoints, load_latest, save_checkpoint
+
+CLOCK = {"iteration": 1, "iterations": 9, "fraction": 0.1, "seconds": 1.0, "step_seconds": 1.0}
+STATE = {"clock": CLOCK, "human_count": 4}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "run" / "checkpoints"
+    for iteration in (10, 20):
+        save(path, iteration)
+    return path
+
+
+def save(folder: Path, iteration: int) -> Path:
+    return save_checkpoint(folder, iteration, {"a": torch.full((4,), iteration)}, STATE)
+
+
+def steps(folder: Path) -> list[int]:
+    return [int(path.stem) for path in checkpoints(folder)]
+
+
+def full_unless(monkeypatch: pytest.MonkeyPatch, folder: Path, most: int) -> None:
+    """Nothing can be written while the folder holds more than ``most`` checkpoints."""
+    write = Path.write_bytes
+
+    def on_a_full_disk(path: Path, content: bytes) -> int:
+        if len(steps(folder)) > most:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", on_a_full_disk)
+
+
+def test_on_a_full_disk_the_oldest_gives_way(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    full_unless(monkeypatch, folder, 1)
+    with caplog.at_level(logging.WARNING):
+        save(folder, 30)
+    assert steps(folder) == [20, 30]
+    assert "the disk is full" in caplog.text and "without 000010.safetensors" in caplog.text
+
+
+def test_where_that_is_not_enough_the_newest_is_kept_and_named(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full_unless(monkeypatch, folder, 0)
+    with pytest.raises(OutputError) as error:
+        save(folder, 30)
+    assert steps(folder) == [20]
+    message = str(error.value)
+    assert message.count("000030.safetensors: not written, the disk is full") == 1
+    assert (
+        "step 20 is kept: once that is mended, go on with 'evsplat train CAPTURE --out " in message
+    )
+    assert "\n" not in message
+
+
+def test_the_first_one_without_room_says_that_none_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full_unless(monkeypatch, tmp_path, -1)
+    with pytest.raises(OutputError, match="No checkpoint is kept"):
+        save(tmp_path, 10)
+
+
+@pytest.mark.parametrize("content", [b"", b"\0" * 100, None], ids=["empty", "zeros", "cut"])
+def test_one_that_cannot_be_read_gives_way_to_the_one_before(
+    folder: Path, caplog: pytest.LogCaptureFixture, content: bytes | None
+) -> None:
+    newest = checkpoints(folder)[-1]
+    newest.write_bytes(newest.read_bytes()[:-8] if content is None else content)
+    with caplog.at_level(logging.WARNING):
+        found = load_latest(folder)
+    assert found is not None and found[0].stem == "000010" and found[1]["a"][0] == 10
+    assert "000020.safetensors: not a readable checkpoint" in caplog.text
+    assert "Taking the one before it." in caplog.text
+
+
+def test_where_none_can_be_read_it_is_an_error(folder: Path) -> None:
+    assert load_latest(folder.parent) is None
+    for path in checkpoints(folder):
+        path.write_bytes(b"")
+    with pytest.raises(DataError, match="000010.safetensors: not a readable"):
+        load_latest(folder)
+
+
+def test_a_training_that_goes_on_from_before_drops_what_is_later(folder: Path) -> None:
+    """Later ones were damaged; kept, they would pass for the newest again."""
+    save(folder, 15)
+    assert steps(folder) == [10, 15]
+
+
+def test_the_disk_s_other_faults_keep_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(Path, "write_bytes", broken)
+    with pytest.raises(OSError, match=os.strerror(errno.EIO)):
+        save(folder, 30)
+    assert steps(folder) == [10, 20]

@@ -1,0 +1,176 @@
+"""A training and the machine under it: one at a time, signals, full disks, half-begun runs."""
+
+import errno
+import json
+import logging
+import os
+import resource
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from evsplat.cli import main
+from evsplat.disk import held
+from evsplat.errors import ConfigError, DataError, MachineError, OutputError
+from evsplat.training import load_run, train
+from evsplat.training.checkpoint import checkpoints
+from evsplat.training.trainer import Trainer
+from evsplat.training.watching import is_training
+from evsplat.view.viewed_run import load_newest
+
+from ..small_model import small
+from .test_train import final_tensors, start, wait_for_step
+
+# The package has a function of the module's name.
+MODULE = sys.modules["evsplat.training.train"]
+
+
+def trained(capture: Path, out: Path, **options: object) -> Path:
+    return train(capture, out=out, iterations=2, overrides=small("evsplat"), **options)
+
+
+def test_a_second_training_in_one_folder_is_refused_and_changes_nothing(tiny_capture, tmp_path):
+    capture, out = tiny_capture(), tmp_path / "run"
+    out.mkdir()
+    with held(out / ".watch"):
+        assert is_training(out)
+        told = f"run: process {os.getpid()} is training in this folder; wait for it or choose"
+        with pytest.raises(ConfigError, match=told):
+            trained(capture, out)
+    assert {path.name for path in out.iterdir()} == {".watch"}
+    trained(capture, out)  # the sign of a training that was killed is in nobody's way
+    assert not (out / ".watch").exists()
+    with pytest.raises(ConfigError, match="the folder is not empty; pass --resume"):
+        trained(capture, out)
+
+
+def test_a_refused_training_leaves_no_folder(tiny_capture, tmp_path):
+    with pytest.raises(ConfigError):
+        train(tiny_capture(), out=tmp_path / "a" / "run", overrides=["event_wieght=1"])
+    with pytest.raises(DataError):
+        train(tmp_path / "nothing", out=tmp_path / "a" / "run")
+    assert not (tmp_path / "a").exists()
+
+
+def test_sigterm_saves_as_ctrl_c_does(tiny_capture, tmp_path):
+    out = tmp_path / "run"
+    process = start(tiny_capture(), out, 5_000)
+    wait_for_step(out, 2, process)
+    assert is_training(out)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert f"--out {out} --resume" in errors and process.returncode == 1  # it raised Stopped
+    assert load_run(out).iteration >= 2 and not is_training(out)
+
+
+def test_the_viewer_of_a_training_that_was_killed_before_its_first_checkpoint_ends(
+    tiny_capture, tmp_path
+):
+    out = trained(tiny_capture(), tmp_path / "run")
+    for path in checkpoints(out / "checkpoints"):
+        path.unlink()
+    (out / ".watch").touch()
+    with pytest.raises(DataError, match="no checkpoint; train the run first"):
+        load_newest(out, "cpu")
+
+
+def test_a_run_without_a_checkpoint_is_begun_anew_with_an_empty_log(tiny_capture, tmp_path):
+    capture = tiny_capture()
+    whole = train(capture, out=tmp_path / "whole", iterations=10, overrides=small("evsplat"))
+    out = train(capture, out=tmp_path / "run", iterations=10, overrides=small("evsplat"))
+    config = (out / "config.yaml").read_bytes()
+    for path in checkpoints(out / "checkpoints"):
+        path.unlink()
+    train(capture, out=out, iterations=10, resume=True)
+    lines = (out / "log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["iteration"] for line in lines] == [10]
+    expected, found = final_tensors(whole), final_tensors(out)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    assert (out / "config.yaml").read_bytes() == config
+
+
+def test_a_run_goes_on_from_before_a_damaged_checkpoint(
+    tiny_capture, tmp_path, caplog, monkeypatch
+):
+    monkeypatch.setattr(MODULE, "CHECKPOINT_SECONDS", 0.0)
+    capture = tiny_capture()
+    options = {"iterations": 6, "overrides": small("evsplat")}
+    whole = train(capture, out=tmp_path / "whole", **options)
+    out = train(capture, out=tmp_path / "run", **options)
+    newest = checkpoints(out / "checkpoints")[-1]
+    newest.write_bytes(b"")
+    with caplog.at_level(logging.WARNING):
+        assert load_run(out).iteration == 5
+        train(capture, out=out, iterations=6, resume=True)
+    assert "Taking the one before it." in caplog.text
+    expected, found = final_tensors(whole), final_tensors(out)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+
+
+def fails_after_a_step(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    step, made = Trainer.step, []
+
+    def failing(trainer: Trainer) -> object:
+        if len(made) == 2:
+            raise error
+        made.append(1)
+        return step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", failing)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError(), "Memory is full (no more to be had); close other programs"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "Memory is full (DefaultCPU"),
+        (OSError(errno.EIO, "Input/output error", "events.h5"), "events.h5: Input/output error."),
+    ],
+)
+def test_a_machine_that_fails_is_a_sentence_with_the_traceback_beside_the_run(
+    tiny_capture, tmp_path, monkeypatch, capsys, error, said
+):
+    fails_after_a_step(monkeypatch, error)
+    out = tmp_path / "run"
+    settings = [f"--set={setting}" for setting in small("evsplat")]
+    assert main(["train", str(tiny_capture()), "--out", str(out), *settings]) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told.startswith(f"evsplat: {said}") and "No checkpoint is kept" in told
+    (file,) = out.glob("evsplat-traceback-*.txt")
+    assert told.endswith(f"The traceback is in {file}.")
+    assert "Traceback (most recent call last)" in file.read_text()
+
+
+def test_a_fault_of_the_program_stays_one(tiny_capture, tmp_path, monkeypatch):
+    fails_after_a_step(monkeypatch, RuntimeError("shapes do not match"))
+    with pytest.raises(RuntimeError, match="shapes do not match") as caught:
+        train(tiny_capture(), out=tmp_path / "run", overrides=small("evsplat"))
+    assert not isinstance(caught.value, MachineError)
+
+
+def test_without_room_nothing_is_fitted(tiny_capture, tmp_path, monkeypatch):
+    usage = type("Usage", (), {"free": 1_000_000})
+    monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
+    monkeypatch.setattr(MODULE, "_trainer", lambda *_: pytest.fail("it was"))
+    with pytest.raises(OutputError, match=r"run: 1\.0 MB are free on its disk, expected 3\.1 MB"):
+        trained(tiny_capture(), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_where_files_may_not_grow_the_training_ends_in_a_sentence(tiny_capture, tmp_path, capsys):
+    out = tmp_path / "run"
+    settings = [f"--set={setting}" for setting in small("evsplat")]
+    command = ["train", str(tiny_capture()), "--out", str(out), "--iterations", "3", *settings]
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, before[1]))
+    try:
+        assert main(command) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "000003.safetensors: not written, files may not grow so large here" in told
+    assert told.endswith("No checkpoint is kept: once that is mended, train again.")
+    assert not list((out / "checkpoints").glob("*")) and not (out / ".watch").exists()
