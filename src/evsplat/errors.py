@@ -8,6 +8,10 @@ from pathlib import Path
 class EvsplatError(Exception):
     """The input's or the machine's fault; the command line prints it and exits with 2."""
 
+    def __init__(self, message: str) -> None:
+        """``message`` may quote what was read: half a surrogate pair can be written nowhere."""
+        super().__init__(message.encode("utf-8", "backslashreplace").decode())
+
 
 class DataError(EvsplatError):
     """A capture, event file or run folder is not what it should be."""

@@ -37,7 +37,7 @@ def test_a_wrong_suite_is_refused_with_the_place_that_is_wrong(tmp_path, text, e
 
 
 def test_no_suite_of_that_name_lists_those_that_ship():
-    with pytest.raises(ConfigError, match="ablation, mmhpsd-blur, stage, zju-mocap-blur"):
+    with pytest.raises(ConfigError, match="ablation, grid, mmhpsd-blur, stage, zju-mocap-blur"):
         read_suite("stages")
 
 

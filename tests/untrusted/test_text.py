@@ -86,3 +86,12 @@ def test_what_yaml_cannot_mean_is_a_value_error(text: str, said: str) -> None:
 def test_aliases_and_merged_sections_are_read() -> None:
     text = "base: &base {a: 1, b: &b [2, 3]}\nother: {<<: *base, c: *b}"
     assert parse_yaml(text)["other"] == {"a": 1, "b": [2, 3], "c": [2, 3]}
+
+
+def test_a_sentence_that_quotes_half_a_character_can_be_written_anywhere(tmp_path):
+    """JSON may hold half of a surrogate pair, and a file's name bytes that are no UTF-8."""
+    file = tmp_path / "poses.json"
+    file.write_text('{"\\ud800": 1}')
+    (found,) = read_json(file)
+    said = str(DataError(f"{file}: unknown key {found!s}"))
+    assert said.encode().endswith(b"unknown key \\ud800")

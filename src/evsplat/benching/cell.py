@@ -13,6 +13,7 @@ import torch
 
 import evsplat
 from evsplat.benching.folder import BenchFolder, exclusive
+from evsplat.benching.given_pictures import PICTURES, GivenPictures
 from evsplat.capture import Capture, Policy, load_capture
 from evsplat.config import override, to_dict
 from evsplat.errors import ConfigError, DataError, EvsplatError
@@ -29,6 +30,8 @@ from evsplat.untrusted.records import Shape, misfit, read_record
 logger = logging.getLogger(__name__)
 
 DONE, FAILED = "done", "failed"
+UNTRAINED = (*TRIVIAL, PICTURES)
+"""Methods of rows that need no training."""
 _RECORD = {"status": str, "cell": {"seed": int}}
 _OF_STATUS: dict[str, Shape] = {
     FAILED: {"reason": str},
@@ -79,6 +82,10 @@ class Cell:
     max_minutes: float | None
     backdrop: bool = False
     """Measure it before the median background."""
+    pictures: str | None = None
+    """Folder of the given pictures, for method ``pictures``."""
+    pictures_digest: str | None = None
+    """Changes when one of them does."""
 
     @property
     def id(self) -> str:
@@ -88,7 +95,7 @@ class Cell:
     @property
     def trains(self) -> bool:
         """True for methods that are trained."""
-        return self.method not in TRIVIAL
+        return self.method not in UNTRAINED
 
     @property
     def policy(self) -> Policy:
@@ -158,13 +165,17 @@ def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) 
     reconstruction: Reconstruction
     if cell.trains:
         reconstruction, facts = _trained(run, trained_on, cell, threads, device)
+    elif cell.pictures is not None:
+        reconstruction = GivenPictures(Path(cell.pictures), recorded)
     else:
         reconstruction = TRIVIAL[cell.method](load_capture(trained_on).for_training(cell.policy))
     if cell.backdrop:
         reconstruction = OnMedianBackground(reconstruction, seen)
     measured = evaluate(recorded, reconstruction, out_dir=run, device=device, test_frames_only=True)
     kept = ("frames", "protocols", "per_frame", "reasons", "weights", "protocol_notes")
-    return {**facts, "policy": to_dict(seen.terms), **{key: measured[key] for key in kept}}
+    # Of pictures that were made elsewhere nobody knows what they were made from.
+    terms = None if cell.pictures else to_dict(seen.terms)
+    return {**facts, "policy": terms, **{key: measured[key] for key in kept}}
 
 
 def _trained(

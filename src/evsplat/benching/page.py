@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
+from evsplat.benching.cells_page import cells_section
 from evsplat.benching.figures import Record, Records
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.tables import SPREAD
@@ -52,7 +53,7 @@ def page(records: Records, tables: Sequence[Table], folder: BenchFolder) -> str:
         f'<header><p class="kicker">evsplat · bench · {escape(suite.name)}</p>'
         f'<h1>{escape(title)}</h1><p class="lead">{done} of {len(records.plan.cells)} cells. '
         f"{LEGEND.format(second='underlined')} {SPREAD}</p></header>"
-        f"<main>{figures}{pictures}</main>"
+        f"<main>{figures}{pictures}{cells_section(records, folder)}</main>"
     )
     return document(title, body, style="bench.css")
 

@@ -7,12 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from evsplat.benching.cell import FAILED, CaptureSource, Cell, read_cell_record
+from evsplat.benching.cell import FAILED, UNTRAINED, CaptureSource, Cell, read_cell_record
+from evsplat.benching.drawn import drawn_settings
 from evsplat.benching.folder import BenchFolder
+from evsplat.benching.given_pictures import PICTURES, digest_of
 from evsplat.benching.suite import Suite, SuiteCapture, SuiteRow, check_names
 from evsplat.errors import ConfigError
 from evsplat.files import remove_file
-from evsplat.methods.trivial import TRIVIAL
 from evsplat.options import BenchOptions
 from evsplat.options.declare import given
 from evsplat.shipped import demo_capture
@@ -29,6 +30,10 @@ class Plan:
     """Captures that are missing, and what to do, by name."""
     cells: tuple[Cell, ...]
     """Untrained rows first, since they take seconds and find what is wrong with a capture."""
+    named: str = ""
+    """The suite as it was asked for: the name of one that ships, or its file."""
+    draw_seed: int | None = None
+    """Seed that its captures were drawn with; None where nothing was drawn."""
 
     def of(self, capture: str, row: str) -> list[Cell]:
         """The cells of one place in the table, one per seed."""
@@ -36,22 +41,28 @@ class Plan:
 
 
 def make_plan(
-    suite: Suite, folder: BenchFolder, options: BenchOptions | None = None, **changes: Any
+    suite: Suite,
+    folder: BenchFolder,
+    options: BenchOptions | None = None,
+    *,
+    named: Path | str | None = None,
+    **changes: Any,
 ) -> Plan:
     """Cells of a suite; what options or ``changes`` give replaces what the suite says.
 
-    A time limit replaces the suite's number of steps unless a number is given as well.
+    A time limit replaces the suite's number of steps unless a number is given as well. ``named`` is
+    how the suite was asked for, where that is not its name.
 
     Raises:
         ConfigError: A row does not exist, or a number is out of range.
     """
     options = given(BenchOptions, options, changes)
+    draw = suite.draw
+    if draw is not None and options.draw_seed is not None:
+        draw = replace(draw, seed=options.draw_seed)
     iterations, seeds, only = options.iterations, options.seeds, options.only
-    if options.captures:
-        paths = [Path(path) for path in options.captures]
-        named = tuple(SuiteCapture(path.resolve().name, str(path)) for path in paths)
-        check_names("capture", [capture.name for capture in named], "--captures")
-        suite = replace(suite, captures=named)
+    suite = replace(suite, draw=draw)
+    suite = _with_captures(suite, options)
     if options.max_minutes is not None:
         suite = replace(suite, max_minutes=options.max_minutes, iterations=iterations)
     elif iterations is not None:
@@ -60,6 +71,8 @@ def make_plan(
         suite = replace(suite, seeds=tuple(dict.fromkeys(seeds)))
     if only:
         suite = replace(suite, rows=tuple(_chosen(suite.rows, only)))
+    if options.add:
+        suite = replace(suite, rows=(*suite.rows, *_added(suite.rows, options.add)))
     if not suite.captures:
         raise ConfigError(f"suite {suite.name} names no captures; give some with --captures.")
     sources: dict[str, CaptureSource] = {}
@@ -70,7 +83,16 @@ def make_plan(
             sources[capture.name] = source
         else:
             missing[capture.name] = source
-    return Plan(suite, sources, missing, tuple(_cells(suite, sources.values())))
+    cells = tuple(_cells(suite, sources.values()))
+    for row in suite.rows:
+        if row.pictures and sources and not any(cell.row == row.name for cell in cells):
+            raise ConfigError(
+                f"{row.pictures}: row {row.name} has pictures of no capture of the suite; expected "
+                f"one folder or more out of {', '.join(list(sources)[:5])}."
+            )
+    return Plan(
+        suite, sources, missing, cells, str(named or suite.name), draw.seed if draw else None
+    )
 
 
 def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]:
@@ -86,6 +108,11 @@ def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]
             todo.append(cell)
             continue
         record = read_cell_record(path)
+        if cell.method == PICTURES and record["cell"] != cell.request():
+            # Measured again in seconds, and nothing that was trained is lost.
+            remove_file(path)
+            todo.append(cell)
+            continue
         _check_same_request(path, record["cell"], cell.request(), folder)
         if retry and record["status"] == FAILED:
             remove_file(path)
@@ -93,26 +120,76 @@ def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]
     return todo
 
 
+def _with_captures(suite: Suite, options: BenchOptions) -> Suite:
+    """The suite with the captures that are drawn, or that the options name."""
+    if suite.draw is not None:
+        drawn = drawn_settings(suite.draw).items()
+        staged = (SuiteCapture(name, stage=settings) for name, settings in drawn)
+        suite = replace(suite, captures=tuple(staged))
+    elif options.draw_seed is not None:
+        raise ConfigError(
+            f"--seed {options.draw_seed}: suite {suite.name} draws no captures at random; leave "
+            "it out, or give seeds of training with --seeds."
+        )
+    if not options.captures:
+        return suite
+    of_suite = {capture.name: capture for capture in suite.captures}
+    named = [
+        of_suite[str(path)]
+        if str(path) in of_suite and not (path / "capture.json").exists()
+        else SuiteCapture(path.resolve().name, str(path))
+        for path in map(Path, options.captures)
+    ]
+    check_names("capture", [capture.name for capture in named], "--captures")
+    return replace(suite, captures=tuple(named))
+
+
+def _added(rows: Sequence[SuiteRow], added: Sequence[str]) -> list[SuiteRow]:
+    """Rows of pictures that were made elsewhere, from NAME=FOLDER."""
+    found = []
+    for text in added:
+        name, _, folder = text.partition("=")
+        if not name or not Path(folder).is_dir():
+            raise ConfigError(
+                f"--add {text}: expected NAME=FOLDER, where FOLDER holds a folder of pictures per "
+                "capture."
+            )
+        found.append(
+            SuiteRow(name, PICTURES, title=f"{name} (given pictures)", pictures=folder, added=True)
+        )
+    check_names("row", [row.name for row in (*rows, *found)], "--add")
+    return found
+
+
 def _cells(suite: Suite, sources: Iterable[CaptureSource]) -> list[Cell]:
     cells = [
-        Cell(
-            source,
-            row.name,
-            seed,
-            row.method,
-            row.restore,
-            row.settings if row.method not in TRIVIAL else (),
-            suite.iterations if row.method not in TRIVIAL else None,
-            suite.max_minutes if row.method not in TRIVIAL else None,
-            row.backdrop,
-        )
+        _cell(suite, source, row, seed)
         for seed in suite.seeds
         for source in sources
         for row in suite.rows
         # What is not trained has no seed.
-        if row.method not in TRIVIAL or seed == suite.seeds[0]
+        if row.method not in UNTRAINED or seed == suite.seeds[0]
+        if row.pictures is None or (Path(row.pictures) / source.name).is_dir()
     ]
     return sorted(cells, key=lambda cell: cell.trains)
+
+
+def _cell(suite: Suite, source: CaptureSource, row: SuiteRow, seed: int) -> Cell:
+    trains = row.method not in UNTRAINED
+    pictures = Path(row.pictures) / source.name if row.pictures else None
+    return Cell(
+        source,
+        row.name,
+        seed,
+        row.method,
+        row.restore,
+        row.settings if trains else (),
+        suite.iterations if trains else None,
+        suite.max_minutes if trains else None,
+        row.backdrop,
+        None if pictures is None else str(pictures.resolve()),
+        None if pictures is None else digest_of(pictures),
+    )
 
 
 def _chosen(rows: Sequence[SuiteRow], only: Sequence[str]) -> list[SuiteRow]:

@@ -20,6 +20,7 @@ from evsplat.benching.local import LocalPool
 from evsplat.benching.page import page
 from evsplat.benching.plan import Plan, make_plan, pending_cells
 from evsplat.benching.ray_cluster import RayCluster
+from evsplat.benching.strips import write_strips
 from evsplat.benching.suite import read_suite
 from evsplat.benching.tables import SPREAD, make_tables
 from evsplat.errors import ConfigError
@@ -58,10 +59,10 @@ def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any
         Stopped: Ctrl-C; the same call goes on.
     """
     options = given(BenchOptions, options, changes)
-    plan_suite = read_suite(suite)
-    folder = BenchFolder(Path(options.out or Path("bench") / plan_suite.name))
+    read = read_suite(suite)
+    folder = BenchFolder(Path(options.out or Path("bench") / read.name))
     try_target(folder.path)
-    plan = make_plan(plan_suite, folder, options)
+    plan = make_plan(read, folder, options, named=suite)
     if not plan.cells:
         raise ConfigError("\n".join(plan.missing.values()))
     with exclusive(folder.lock_of("bench"), wait=False):
@@ -206,7 +207,7 @@ def _print(text: str) -> None:
 
 
 def write_output(plan: Plan, folder: BenchFolder) -> None:
-    """Write tables.md, tables.tex and index.html of what has been recorded so far."""
+    """Write tables.md, tables.tex, index.html and strips of what has been recorded so far."""
     records = Records.read(plan, folder)
     title = plan.suite.title or plan.suite.name
     intro = f"{LEGEND.format(second='in italics')} {SPREAD}"
@@ -214,6 +215,7 @@ def write_output(plan: Plan, folder: BenchFolder) -> None:
     with broken_as(folder.path / "cells", "not as the bench wrote them", remedy, kinds=MISFITS):
         tables = make_tables(records)
         html = page(records, tables, folder)
+        write_strips(records, folder)
     write_text(folder.path / "tables.md", markdown(title, intro, tables))
     write_text(folder.path / "tables.tex", latex(tables))
     write_text(folder.path / "index.html", html)

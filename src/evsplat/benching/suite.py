@@ -6,6 +6,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
+from evsplat.benching.drawn import Draw
+from evsplat.benching.given_pictures import PICTURES
 from evsplat.config import Above, AtLeast, from_dict, load_yaml
 from evsplat.errors import ConfigError
 from evsplat.staging import StageSettings
@@ -44,7 +46,7 @@ class SuiteRow:
     name: str
     """The row's name in files and for ``--only``."""
     method: str
-    """A method that is trained, or ``median_background`` or ``nearest_frame``."""
+    """A method that is trained, ``median_background``, ``nearest_frame`` or ``pictures``."""
     title: str | None = None
     """The row's title in tables; the name where it is not given."""
     restore: str | None = None
@@ -55,6 +57,12 @@ class SuiteRow:
     settings: tuple[str, ...] = ()
     """Settings of the method as for ``--set``: ``event_weight=0``."""
     published: Published | None = None
+    pictures: str | None = None
+    """Folder with pictures that were made elsewhere, for method ``pictures``: one folder per
+    capture, in it ``FRAME.png`` for every test frame (`evsplat bench --add`)."""
+
+    added: bool = False
+    """Whether ``--add`` brought the row, and no suite names it."""
 
     @property
     def label(self) -> str:
@@ -78,6 +86,8 @@ class Suite:
     name: str
     rows: tuple[SuiteRow, ...]
     captures: tuple[SuiteCapture, ...] = ()
+    draw: Draw | None = None
+    """Captures drawn at random in place of named ones."""
     title: str = ""
     seeds: tuple[int, ...] = (0,)
     iterations: Annotated[int | None, AtLeast(1)] = None
@@ -115,6 +125,14 @@ def read_suite(suite: Path | str) -> Suite:
     for capture in read.captures:
         if (capture.path is None) == (capture.stage is None):
             raise ConfigError(f"{path}: capture {capture.name}: expected either path or stage.")
+    if read.captures and read.draw is not None:
+        raise ConfigError(f"{path}: captures and draw both say what to run on; keep one of them.")
+    for row in read.rows:
+        if (row.method == PICTURES) != (row.pictures is not None):
+            raise ConfigError(
+                f"{path}: row {row.name}: method {PICTURES} and the folder 'pictures' belong "
+                "together."
+            )
     if not read.rows:
         raise ConfigError(f"{path}: rows is empty, expected at least one.")
     return read

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from statistics import fmean
 from typing import Any
 
 from evsplat.benching.figures import Record, Records, metric
@@ -15,6 +16,8 @@ from evsplat.methods import NOMINAL_ITERATIONS
 Column = tuple[Heading, Callable[[SuiteRow], Figure | None]]
 """Its head, and the figure of a row."""
 _PUBLISHED = "published"
+MOST_CAPTURES_ACROSS = 6
+"""Of more captures each has a line of its own, in place of columns."""
 SPREAD = "± is the standard deviation over seeds."
 
 
@@ -24,7 +27,9 @@ def make_tables(records: Records) -> list[Table]:
     shared = [name for name in records.captures if published and name in published.captures]
     tables = [_published(records, published, shared)] if published and shared else []
     tables.append(_means(records, "standard"))
-    if len(records.captures) > 1:
+    if len(records.captures) > MOST_CAPTURES_ACROSS:
+        tables.append(_capture_by_capture(records))
+    elif len(records.captures) > 1:
         tables.append(_per_capture(records))
     tables.append(_means(records, "avatar-compat"))
     notes = _footnotes(records)
@@ -88,6 +93,37 @@ def _per_capture(records: Records) -> Table:
     ]
     title = "PSNR of every capture, dB"
     return _table(records, title, "standard", columns, records.captures[:1])
+
+
+def _capture_by_capture(records: Records) -> Table:
+    """PSNR of the person's pixels: a line per capture, a column per row of the suite.
+
+    Below it, of the captures that a row has: mean, worst, and how many it is the best on.
+    """
+    rows, region = records.plan.suite.rows, "person_mask"
+    value = metric("standard", region, "psnr")
+    found = {c: [records.figure(row.name, value, [c]) for row in rows] for c in records.captures}
+    lines = [Row(capture, tuple(figures)) for capture, figures in found.items()]
+    headings = tuple(Heading("", row.label, 2, True) for row in rows)
+    table = Table(
+        "PSNR of the person's pixels on every capture, dB",
+        f"standard. {_terms(records, records.captures)}",
+        headings,
+        tuple(lines),
+        by_row=True,
+    )
+    notes = []
+    for column, row in enumerate(rows):
+        known = {c: f.mean for c, figures in found.items() if (f := figures[column]) is not None}
+        if not known:
+            continue
+        worst = min(known, key=lambda capture: known[capture])
+        best = sum(table.rank(line, column) == 1 for line in lines)
+        notes.append(
+            f"{row.label}: mean {fmean(known.values()):.2f}, worst {known[worst]:.2f} ({worst}), "
+            f"best on {best} of {len(known)} captures."
+        )
+    return replace(table, footnotes=tuple(notes))
 
 
 def _metric_columns(
@@ -156,7 +192,9 @@ def _terms(records: Records, captures: Sequence[str]) -> str:
     if made:
         span = f"{made[0]:,}" if len(made) == 1 else f"{made[0]:,} to {made[-1]:,}"
         sentences.append(f"{span} training steps, of schedules made for {NOMINAL_ITERATIONS:,}.")
-    if shown:
+    if len(shown) > MOST_CAPTURES_ACROSS:
+        sentences.append(f"Test frames: {sum(map(int, shown))} of {len(shown)} captures.")
+    elif shown:
         sentences.append(f"Test frames: {' + '.join(shown)}.")
     return " ".join(sentences)
 
@@ -178,6 +216,9 @@ def _footnotes(records: Records) -> list[str]:
     left = len(records.plan.cells) - len(records.by_cell)
     if left:
         notes.append(f"{left} of {len(records.plan.cells)} cells have not been run yet.")
+    given = [row.label for row in records.plan.suite.rows if row.pictures]
+    if given:
+        notes.append(f"{', '.join(given)}: made elsewhere; what training saw is not known.")
     weights: dict[str, dict[str, Any]] = {}
     for record in records.by_cell.values():
         weights |= record.get("weights", {})

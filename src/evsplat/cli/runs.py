@@ -226,7 +226,7 @@ class Bench:
     """
 
     suite: Annotated[Positional[str], option("SUITE")]
-    """ablation, mmhpsd-blur, stage, zju-mocap-blur or a YAML file (docs/bench.md)."""
+    """ablation, grid, mmhpsd-blur, stage, zju-mocap-blur or a YAML file (docs/bench.md)."""
     options: Annotated[BenchOptions, FLAT]
 
     def __call__(self) -> None:

@@ -83,6 +83,8 @@ class Table:
     headings: tuple[Heading, ...]
     rows: tuple[Row, ...]
     footnotes: tuple[str, ...] = ()
+    by_row: bool = False
+    """Whether the figures of a row compete with each other, rather than those of a column."""
 
     @property
     def groups(self) -> list[tuple[str, int]]:
@@ -91,9 +93,12 @@ class Table:
         return [(group, len(list(headings))) for group, headings in groups]
 
     def rank(self, row: Row, column: int) -> int:
-        """1: best of the column as it is printed, 2: second best, 0: neither; equal ones share."""
+        """1: best of the column as it is printed, 2: second best, 0: neither; equal ones share.
+
+        Of its row where the table is `by_row`.
+        """
         heading, figure = self.headings[column], row.figures[column]
-        figures = [other.figures[column] for other in self.rows]
+        figures = row.figures if self.by_row else [o.figures[column] for o in self.rows]
         competing = [round(f.mean, heading.decimals) for f in figures if f and f.competes]
         better = heading.higher_is_better
         if better is None or figure is None or not figure.competes or len(competing) < 2:
@@ -198,7 +203,7 @@ def markdown(title: str, intro: str, tables: Iterable[Table], notes: Sequence[st
     for table in tables:
         lines += [f"## {_markdown_text(table.title)}", "", table.note, ""]
         head = [
-            _markdown_text(f"{h.group} {h.title} {_ARROWS[h.higher_is_better]}")
+            _markdown_text(f"{h.group} {h.title} {_ARROWS[h.higher_is_better]}".strip())
             for h in table.headings
         ]
         rows = [["", *head], ["---", *["---:"] * len(head)]]

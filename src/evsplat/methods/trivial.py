@@ -29,7 +29,7 @@ class MedianBackground:
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """The same picture at any time; only for the camera that recorded the capture."""
-        if not _same_view(camera, self._camera):
+        if not same_view(camera, self._camera):
             raise DataError("median_background draws the recording camera only, not another one.")
         return _flat_rendering([self._image] * len(times_us), parts)
 
@@ -75,7 +75,7 @@ class NearestFrame:
         """Frames of the same view where there are any (several cameras), else of the same size."""
         capture = self._capture
         seen = [(frame, capture.camera(frame)) for frame in capture.train_frames]
-        frames = [frame for frame, view in seen if _same_view(camera, view)] or [
+        frames = [frame for frame, view in seen if same_view(camera, view)] or [
             frame
             for frame, view in seen
             if (view.width, view.height) == (camera.width, camera.height)
@@ -99,7 +99,8 @@ def nearest_in_time(frames: Sequence[Frame], time_us: int) -> Frame:
     return min(frames, key=lambda frame: (abs(frame.mid_us - time_us), frame.mid_us))
 
 
-def _same_view(first: Camera, second: Camera) -> bool:
+def same_view(first: Camera, second: Camera) -> bool:
+    """Whether two cameras take the same picture: equal size, intrinsics and pose."""
     return (first.width, first.height) == (second.width, second.height) and all(
         torch.equal(a.cpu(), b.cpu())
         for a, b in (

@@ -193,13 +193,19 @@ class BenchOptions:
     out: Annotated[Path | None, option("FOLDER", default="bench/SUITE")] = None
     """Results folder: tables.md, tables.tex, index.html, one JSON per cell."""
     captures: Annotated[tuple[Path, ...], option("[CAPTURE ...]", default="the suite's")] = ()
-    """Captures in place of the suite's."""
+    """Captures in place of the suite's, or names of some of the suite's."""
+    draw_seed: Annotated[
+        int | None, AtLeast(0), option("S", default="the suite's", name="seed")
+    ] = None
+    """Draw other captures at random, for suites that draw them (grid)."""
+    add: Annotated[tuple[str, ...], option("[NAME=FOLDER ...]", default="none")] = ()
+    """Rows of pictures made elsewhere: FOLDER/CAPTURE/FRAME.png for every test frame."""
     iterations: Annotated[int | None, AtLeast(1), option("N", default="the suite's")] = None
     """Training steps of every cell."""
     max_minutes: Annotated[float | None, Above(0), option("M", default="the suite's")] = None
     """Minutes of training of every cell; schedules are shortened to fit."""
     seeds: Annotated[tuple[int, ...], option("[S ...]", default="the suite's")] = ()
-    """Seeds in place of the suite's."""
+    """Seeds of training in place of the suite's."""
     only: Annotated[tuple[str, ...], option("[ROW ...]", default="all rows")] = ()
     """Rows of the suite to run."""
     jobs: Annotated[int | None, AtLeast(1), option("N", default="one per core or GPU")] = None

@@ -1,0 +1,216 @@
+"""How far each method comes with more steps: person-crop PSNR until a doubling brings little.
+
+    python benchmarks/convergence.py CAPTURE [CAPTURE ...] [--methods NAME ...] [--out FOLDER]
+        [--first 500] [--most 16000] [--gain 0.2] [--hours 2] [--threads 1]
+
+Every method is trained for 500, 1,000, 2,000 ... steps, each time with its whole schedule, until a
+doubling brings less than `--gain` dB of the person's crop on test frames. A baseline is trained
+twice at each length, with its released rates and with these times the square root of 15,000 /
+steps; the better of both is the one whose pictures come closer to the recorded training frames.
+What was made weaker for quick tables is undone: 50,000 points of a person at the start, HUGS's own
+limit of growth. A length that would take longer than `--hours`, by the one before it, is not
+begun. What exists is not made again, so the command can be stopped and gone on with; two of them
+with different `--methods` may share a folder. Printed: a line per cell, then the knees; the curves
+are drawn to FOLDER/convergence.png. The last line is one JSON object.
+"""
+
+import argparse
+import json
+import math
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import evsplat as ev
+from evsplat.capture import load_capture
+from evsplat.evaluation.run import evaluate_run
+from evsplat.files import write_json
+from evsplat.methods import NOMINAL_ITERATIONS
+from evsplat.methods.avatar_parts import RELEASED_RATES
+
+_NO_LPIPS = ("terms.perceptual=none",)
+METHODS: dict[str, tuple[str, ...]] = {
+    "avatar3dgs_semantic": (*_NO_LPIPS, "human.count=50000"),
+    "hugs": ("scene.kind=median_backdrop", "human.count=110210", "densify.max_human=524288"),
+    "paper": (),
+    "evsplat": (),
+}
+"""Methods, and the settings that differ from their defaults. Not undone: no perceptual term (its
+network may not be downloaded), HUGS's triplane of at most 256 texels and its shorter fit."""
+_SCHEDULE = ("final", "gaussians_final", "constant")
+
+
+def scaled_rates(method: str, steps: int) -> tuple[str, ...]:
+    """Settings of rates scaled to the length of the run; none for methods with rates of our own.
+
+    Adam moves a parameter by about its rate at each step; a walk of noisy steps goes as far as
+    the square root of their number.
+    """
+    factor = math.sqrt(NOMINAL_ITERATIONS / steps)
+    if method == "hugs":
+        return (f"rate_scale={factor:.4g}",)
+    if method.startswith("avatar3dgs"):
+        named = [field.name for field in fields(RELEASED_RATES) if field.name not in _SCHEDULE]
+        return tuple(f"rates.{n}={getattr(RELEASED_RATES, n) * factor:.4g}" for n in named)
+    return ()
+
+
+def cell(
+    capture: Path, method: str, rates: str, steps: int, folder: Path, threads: int, seed: int
+) -> dict[str, Any]:
+    """Figures of one training, made where they are not kept yet."""
+    name = f"{capture.name}-{method}-{rates}-{steps:05d}-{seed}"
+    kept = folder / "cells" / f"{name}.json"
+    if kept.exists():
+        return dict(json.loads(kept.read_text("utf-8")))
+    run = folder / "runs" / name
+    settings = METHODS[method] + (scaled_rates(method, steps) if rates == "scaled" else ())
+    if run.exists():
+        ev.train(capture, out=run, resume=True)
+    else:
+        ev.train(
+            capture,
+            method=method,
+            out=run,
+            iterations=steps,
+            overrides=settings,
+            seed=seed,
+            threads=threads,
+        )
+    test = evaluate_run(run)
+    train = evaluate_run(run, split="train")
+    regions = test["protocols"]["standard"]
+    found = {
+        "capture": capture.name,
+        "method": method,
+        "rates": rates,
+        "steps": steps,
+        "seed": seed,
+        "full_psnr_db": regions["full"]["psnr"],
+        "crop_psnr_db": regions["person_crop"]["psnr"],
+        "mask_psnr_db": regions["person_mask"]["psnr"],
+        "train_recorded_crop_psnr_db": train["blurry_ground_truth"]["person_crop"]["psnr"],
+        "train_s": test["train_seconds"],
+        "gaussians": test["gaussians"],
+        "threads": threads,
+        "policy": test["policy"],
+    }
+    write_json(kept, found)
+    return found
+
+
+def curve(capture: Path, method: str, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """The better cell of each length, until a doubling brings little or would take too long."""
+    points: list[dict[str, Any]] = []
+    steps = options.first
+    while steps <= options.most:
+        kinds = ("released", "scaled") if scaled_rates(method, steps) else ("released",)
+        cells = [
+            cell(capture, method, kind, steps, options.out, options.threads, options.seed)
+            for kind in kinds
+        ]
+        for found in cells:
+            print(
+                f"{found['capture']:24} {method:20} {found['rates']:9} {steps:6} steps  "
+                f"{found['full_psnr_db']:.2f} / {found['crop_psnr_db']:.2f} / "
+                f"{found['mask_psnr_db']:.2f} dB  training frames "
+                f"{found['train_recorded_crop_psnr_db']:.2f}  {found['train_s'] / 60:.1f} min",
+                flush=True,
+            )
+        points.append(max(cells, key=lambda found: found["train_recorded_crop_psnr_db"]))
+        if len(points) > 1 and _gain(points) < options.gain:
+            break
+        if 2 * points[-1]["train_s"] > 3600 * options.hours:
+            break
+        steps *= 2
+    return points
+
+
+def _gain(points: list[dict[str, Any]]) -> float:
+    return float(points[-1]["crop_psnr_db"] - points[-2]["crop_psnr_db"])
+
+
+def knee(points: list[dict[str, Any]], gain: float) -> dict[str, Any]:
+    """Where doubling stops to pay, and whether it did within the limits."""
+    reached = len(points) > 1 and _gain(points) < gain
+    at = points[-2] if reached else points[-1]
+    keys = ("steps", "rates", "full_psnr_db", "crop_psnr_db", "mask_psnr_db", "train_s")
+    return {"converged": reached, **{key: at[key] for key in keys}}
+
+
+def draw(curves: dict[str, dict[str, list[dict[str, Any]]]], path: Path) -> None:
+    """Curves of all methods, a panel per capture."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    panel, margin = (460, 340), 46
+    page = Image.new("RGB", (panel[0] * len(curves), panel[1]), "white")
+    pen, font = ImageDraw.Draw(page), ImageFont.load_default(12)
+    colours = ["#1b6ca8", "#c0392b", "#2e8b57", "#7d3c98"]
+    values = [p["crop_psnr_db"] for c in curves.values() for ps in c.values() for p in ps]
+    lengths = [p["steps"] for c in curves.values() for ps in c.values() for p in ps]
+    low, high = math.floor(min(values)), math.ceil(max(values))
+    first, last = math.log2(min(lengths)), max(math.log2(max(lengths)), math.log2(min(lengths)) + 1)
+    for index, (capture, methods) in enumerate(curves.items()):
+        left, right = index * panel[0] + margin, (index + 1) * panel[0] - margin // 2
+        top, bottom = margin // 2 + 8, panel[1] - margin
+        pen.text((left, 6), f"{capture}: person crop, dB, over steps", "black", font)
+        for value in range(low, high + 1, max(1, (high - low) // 6)):
+            y = bottom - (value - low) / (high - low) * (bottom - top)
+            pen.line([(left, y), (right, y)], "#dddddd")
+            pen.text((left - 24, y - 7), str(value), "black", font)
+        for power in range(round(first), round(last) + 1):
+            x = left + (power - first) / (last - first) * (right - left)
+            pen.text((x - 12, bottom + 6), str(round(2**power)), "black", font)
+        for order, (method, points) in enumerate(methods.items()):
+            colour = colours[order % len(colours)]
+            places = [
+                (
+                    left + (math.log2(p["steps"]) - first) / (last - first) * (right - left),
+                    bottom - (p["crop_psnr_db"] - low) / (high - low) * (bottom - top),
+                )
+                for p in points
+            ]
+            pen.line(places, colour, 2)
+            for x, y in places:
+                pen.ellipse([x - 3, y - 3, x + 3, y + 3], colour)
+            pen.text((left + 6 + 110 * order, bottom + 24), method, colour, font)
+    page.save(path)
+
+
+def main() -> None:
+    """Train what is left, print, draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--out", type=Path, default=Path("bench/convergence"))
+    parser.add_argument("--first", type=int, default=500)
+    parser.add_argument("--most", type=int, default=16_000)
+    parser.add_argument("--gain", type=float, default=0.2)
+    parser.add_argument("--hours", type=float, default=2.0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    for capture in options.captures:
+        load_capture(capture)
+    curves = {
+        capture.name: {method: curve(capture, method, options) for method in options.methods}
+        for capture in options.captures
+    }
+    knees = {
+        capture: {method: knee(points, options.gain) for method, points in methods.items()}
+        for capture, methods in curves.items()
+    }
+    for capture, methods in knees.items():
+        for method, found in methods.items():
+            word = "knee" if found["converged"] else "not converged within the limits:"
+            print(
+                f"{capture:24} {method:20} {word} {found['steps']} steps, {found['rates']} rates: "
+                f"{found['full_psnr_db']:.2f} / {found['crop_psnr_db']:.2f} / "
+                f"{found['mask_psnr_db']:.2f} dB"
+            )
+    draw(curves, options.out / "convergence.png")
+    print(json.dumps({"gain_db": options.gain, "knees": knees}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""Pictures of test frames that were made elsewhere, measured as any method is."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from evsplat.camera import Camera
+from evsplat.capture import Capture
+from evsplat.errors import DataError
+from evsplat.methods.reconstruction import Parts, Rendering
+from evsplat.methods.trivial import same_view
+from evsplat.untrusted.pictures import image_size, read_picture
+
+PICTURES = "pictures"
+"""Method of a row whose pictures are given."""
+_REMEDY = "write it again as an 8-bit RGB PNG"
+
+
+class GivenPictures:
+    """Test frames as somebody else's program drew them.
+
+    ``folder`` holds ``FRAME.png`` for every test frame, of the frame's own size, coded as the
+    capture's sharp pictures are (sRGB unless the capture says linear). What that program was given
+    to see is not known.
+
+    Raises:
+        DataError: A picture is missing, unreadable or of another size.
+    """
+
+    name = PICTURES
+
+    def __init__(self, folder: Path, capture: Capture) -> None:
+        self._places: list[tuple[Camera, int, Path]] = []
+        frames = capture.test_frames
+        paths = [folder / f"{frame.name}.png" for frame in frames]
+        missing = [path.name for path in paths if not path.is_file()]
+        if missing:
+            raise DataError(
+                f"{folder}: {len(missing)} of the {len(frames)} test frames of {capture.name} have "
+                f"no picture here ({', '.join(missing[:5])}{' ...' if missing[5:] else ''}); every "
+                "test frame needs one, named after the frame."
+            )
+        for frame, path in zip(frames, paths, strict=True):
+            camera = capture.camera(frame)
+            found = image_size(path)
+            if found != (camera.width, camera.height):
+                raise DataError(
+                    f"{path}: has {found[0]}x{found[1]} pixels, expected the frame's "
+                    f"{camera.width}x{camera.height}."
+                )
+            self._places.append((camera, frame.mid_us, path))
+
+    def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
+        """The given pictures; of other views, times or parts there are none (`DataError`)."""
+        if parts != "all":
+            raise DataError("pictures that were made elsewhere do not tell person from scene.")
+        rgb = torch.stack([self._picture(camera, time) for time in times_us])
+        alpha = torch.ones(rgb.shape[:3])
+        return Rendering(rgb, alpha, torch.zeros_like(alpha))
+
+    def _picture(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
+        for view, time, path in self._places:
+            if time == time_us and same_view(view, camera):
+                pixels = read_picture(
+                    path, lambda image: np.asarray(image.convert("RGB")), remedy=_REMEDY
+                )
+                return torch.from_numpy(pixels.astype(np.float32) / 255)
+        raise DataError(f"no picture was given of this view at {time_us} us.")
+
+
+def digest_of(folder: Path) -> str:
+    """Digest that changes when a picture directly in ``folder`` does."""
+    state = hashlib.sha256()
+    for path in sorted(folder.glob("*.png")):
+        state.update(path.name.encode())
+        state.update(path.read_bytes())
+    return state.hexdigest()[:16]

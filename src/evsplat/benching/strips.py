@@ -1,0 +1,107 @@
+"""A strip per capture: the person in one test frame, as recorded, by every row, in truth."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from evsplat.benching.figures import Records
+from evsplat.benching.folder import BenchFolder
+from evsplat.capture import Capture, Frame, load_capture
+from evsplat.evaluation.regions import Box, HumanRegions
+from evsplat.pages import read_rgb
+from evsplat.pictures import to_bytes
+from evsplat.pictures.files import save_png
+
+TILE_PX = 240
+"""Height of the pictures."""
+_LABEL_PX = 34
+_GAP_PX = 6
+_FONT_PX = 13
+
+Tile = tuple[str, str, UInt8[np.ndarray, "H W 3"]]
+"""Title, figure, picture."""
+
+
+def write_strips(records: Records, folder: BenchFolder) -> list[Path]:
+    """Write ``strips/CAPTURE.png`` of every capture that some row was measured on."""
+    written = []
+    for name, source in records.plan.sources.items():
+        if not any(records.of(name, row.name) for row in records.plan.suite.rows):
+            continue
+        capture = load_capture(source.path)
+        if not capture.test_frames:
+            continue
+        path = folder.path / "strips" / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_png(path, strip(_tiles(records, capture, name, folder)))
+        written.append(path)
+    return written
+
+
+def strip(tiles: list[Tile]) -> UInt8[np.ndarray, "H W 3"]:
+    """Pictures beside each other on white, titles and figures below them."""
+    scaled = [
+        Image.fromarray(picture).resize(
+            (max(1, round(picture.shape[1] * TILE_PX / picture.shape[0])), TILE_PX),
+            Image.Resampling.LANCZOS,
+        )
+        for _, _, picture in tiles
+    ]
+    width = sum(image.width + _GAP_PX for image in scaled) - _GAP_PX
+    page = Image.new("RGB", (width, TILE_PX + _LABEL_PX), "white")
+    draw, font = ImageDraw.Draw(page), ImageFont.load_default(_FONT_PX)
+    x = 0
+    for (title, note, _), image in zip(tiles, scaled, strict=True):
+        page.paste(image, (x, 0))
+        for line, text in enumerate((title, note)):
+            fitting = _fitting(draw, text, font, image.width)
+            draw.text((x, TILE_PX + 2 + line * (_LABEL_PX // 2)), fitting, "black", font)
+        x += image.width + _GAP_PX
+    return np.asarray(page)
+
+
+def _fitting(
+    draw: ImageDraw.ImageDraw,
+    text: str,
+    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
+    width: int,
+) -> str:
+    """The text, cut where it would run into its neighbour."""
+    if draw.textlength(text, font) <= width:
+        return text
+    while text and draw.textlength(f"{text}…", font) > width:
+        text = text[:-1]
+    return f"{text}…"
+
+
+def _tiles(records: Records, capture: Capture, name: str, folder: BenchFolder) -> list[Tile]:
+    """The test frame in the middle: the camera's picture, every measured row, the truth."""
+    frame = capture.test_frames[len(capture.test_frames) // 2]
+    box = HumanRegions(capture).crop(frame)
+    tiles: list[Tile] = [("recorded", "", _cut(_shown(capture, frame, "image"), box))]
+    for row in records.plan.suite.rows:
+        for record in records.of(name, row.name)[:1]:
+            entry = next((e for e in record["per_frame"] if e["frame"] == frame.name), None)
+            if entry is None:
+                continue
+            id = f"{name}/{row.name}/seed{record['cell']['seed']}"  # noqa: A001
+            remedy = f"remove {folder.record_of(id)} to measure it again"
+            picture = read_rgb(folder.run_of(id) / entry["pictures"]["render"], remedy)
+            mask = entry["protocols"]["standard"]["person_mask"]["psnr"]
+            note = "" if mask is None else f"{mask:.2f} dB mask"
+            tiles.append((row.label, note, _cut(picture, box)))
+    if frame.sharp is not None:
+        tiles.append(("truth", "", _cut(_shown(capture, frame, "sharp"), box)))
+    return tiles
+
+
+def _shown(capture: Capture, frame: Frame, kind: str) -> UInt8[np.ndarray, "H W 3"]:
+    picture = capture.image(frame) if kind == "image" else capture.sharp(frame)
+    return to_bytes(capture.shown(picture))
+
+
+def _cut(picture: UInt8[np.ndarray, "H W 3"], box: Box | None) -> UInt8[np.ndarray, "h w 3"]:
+    """The person's part of a picture; all of it where nobody is in view."""
+    return picture if box is None else picture[box.top : box.bottom, box.left : box.right]
