@@ -15,9 +15,13 @@ from evsplat.options.captures import CameraMotion
 TARGET = (0.0, 0.0, 0.98)
 """Point that every camera looks at: the middle of a standing person, metres."""
 MAIN = (0.25, -3.35, 1.35)
-NOVEL = {"novel_left": (-1.55, -3.0, 1.5), "novel_right": (1.75, -2.85, 1.2)}
+NOVEL = {
+    "novel_left": (-1.55, -3.0, 1.5),
+    "novel_right": (1.75, -2.85, 1.2),
+    "novel_back": (0.35, 1.75, 1.9),
+}
 _FOCAL = 600 / 512
-"""Focal length in picture heights."""
+"""Focal length in picture heights of a camera as far from its target as the recording one."""
 _SWAY_M, _SWAY_RAD = 0.012, np.radians(0.4)
 """Root mean square of each axis of a hand's unrest."""
 _SWAY_HZ = (0.4, 0.9, 1.7, 3.1)
@@ -38,10 +42,14 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 0, 1)) -> np.
 
 def make_camera(eye: ArrayLike, width: int, height: int) -> Camera:
     """A camera at ``eye`` that shows the person at about two thirds of the picture's height."""
-    focal = _FOCAL * height
+    focal = _FOCAL * height * min(1.0, _away(eye) / _away(MAIN))
     intrinsics = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     pose = torch.from_numpy(look_at(eye, TARGET)).float()
     return Camera(width, height, torch.tensor(intrinsics), pose)
+
+
+def _away(eye: ArrayLike) -> float:
+    return float(np.linalg.norm(np.subtract(eye, TARGET)))
 
 
 class CameraPath:
