@@ -1,5 +1,6 @@
 """Reading a COLMAP reconstruction in its text form: cameras, poses of pictures, points."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +60,10 @@ def read_colmap(folder: Path) -> Reconstruction:
         if lens not in intrinsics:
             raise DataError(f"{where}: names camera {lens}, which cameras.txt does not hold.")
         K, distortion = intrinsics[lens]
+        if not 0 < math.hypot(x, y, z, w) < math.inf:
+            raise DataError(
+                f"{where}: QW QX QY QZ are {' '.join(words[1:5])[:60]}, expected a rotation."
+            )
         turn = Rotation.from_quat([x, y, z, w]).as_matrix()
         cameras[name] = SourceCamera(K, rigid(turn, shift, where), distortion)
         used.add(lens)
