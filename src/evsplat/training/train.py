@@ -247,14 +247,18 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
             if report is not None and (logged or clock.done):
                 log.write(json.dumps(_log_line(trainer, report)).encode() + b"\n")
                 _show(bar, trainer, report)
-            if interrupted:
+            # The last step is saved with what finishes it, or not at all.
+            over = clock.done or clock.out_of_time
+            if interrupted and not over:
                 save()
                 raise Stopped(folder.path)
-            if time.perf_counter() - saved_at > CHECKPOINT_SECONDS:
+            if time.perf_counter() - saved_at > CHECKPOINT_SECONDS and not over:
                 save()
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
         check_learned(trainer, clock.iteration - first)
+        if trainer.composition.finish is not None and clock.iteration > first:
+            trainer.composition.finish()
         save()
         if interrupted:
             raise Stopped(folder.path)
