@@ -66,9 +66,6 @@ class Composition:
     capture: TrainingCapture | None = None
     """The recording as the method sees it, where that is not all of it (masked pictures)."""
     held_out: HeldOut | None = None
-    finish: Callable[[], None] | None = None
-    """What is done once after the last step; no step follows it but in a training that is made
-    longer."""
 
 
 def start_of_randomness(seed: int) -> torch.Generator:

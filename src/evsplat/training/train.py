@@ -247,18 +247,14 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
             if report is not None and (logged or clock.done):
                 log.write(json.dumps(_log_line(trainer, report)).encode() + b"\n")
                 _show(bar, trainer, report)
-            # The last step is saved with what finishes it, or not at all.
-            over = clock.done or clock.out_of_time
-            if interrupted and not over:
+            if interrupted:
                 save()
                 raise Stopped(folder.path)
-            if time.perf_counter() - saved_at > CHECKPOINT_SECONDS and not over:
+            if time.perf_counter() - saved_at > CHECKPOINT_SECONDS:
                 save()
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
         check_learned(trainer, clock.iteration - first)
-        if trainer.composition.finish is not None and clock.iteration > first:
-            trainer.composition.finish()
         save()
         if interrupted:
             raise Stopped(folder.path)

@@ -8,7 +8,6 @@ bends beyond that. Light falls on the person from lamps, which it hides from the
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -52,9 +51,6 @@ class DiscModel(PosedModel):
     """Discs of person and scene, the light on them, and the body track."""
 
     residual: PoseCorrection | None
-    seen: Tensor
-    """(H,) what training pictures showed of the person's Gaussians, as `seen_squares` gives it;
-    empty until training ends."""
 
     def __init__(
         self,
@@ -99,7 +95,6 @@ class DiscModel(PosedModel):
         roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
         middle = roots.mean(0).float()
         self.places = ScenePlaces(_PLACES_REFRESH)
-        self.register_buffer("seen", torch.zeros(0))
         self.lamps: Lamps | None = None
         self.shadow: BodyShadow | None = None
         if lamps:
@@ -176,11 +171,6 @@ class DiscModel(PosedModel):
         lit_at = slice(nearest, nearest + 1)
         layers = self._layers(bones, rotations, lit_at, view, hard_semantics=False)
         return draw(layers, camera, center_gradients=True, places=self.places)
-
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
-        # As many as there are Gaussians in the state.
-        self.seen = torch.empty_like(state[f"{prefix}seen"], device=self.device)
-        super()._load_from_state_dict(state, prefix, *rest)
 
     def following(self, track: BodyTrack) -> "DiscModel":
         """The same person doing what ``track`` says, without pose residuals; see `Model`."""

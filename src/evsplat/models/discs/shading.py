@@ -38,15 +38,6 @@ class Shading(nn.Module):
         self.coefficients = nn.Parameter(torch.zeros(4, _NORMAL_DIM, 3))
         self.intensities = nn.Parameter(torch.zeros(lamps, 3))
 
-    def polynomial(
-        self, normals: Float[Tensor, "N 3"], places: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 36"]:
-        """Factors of the coefficients, (place, normal) in their order, without lamps and the 1."""
-        turned = torch.cat([torch.ones_like(normals[..., :1]), sh_basis(normals, degree=2)], -1)
-        moved = ((places - self.center) / self.radius_m).clamp(-2, 2)
-        moved = torch.cat([torch.ones_like(moved[..., :1]), moved], -1)
-        return (moved[..., :, None] * turned[..., None, :]).flatten(-2)
-
     def forward(
         self,
         normals: Float[Tensor, "T N 3"],
