@@ -68,9 +68,9 @@ class Look:
             rgb = (0.3 * solid + 0.7 * grey) * tint
         if self.shown == "certainty":
             certain = reconstruction.certainty(camera, times_us, parts=self.parts)
-            tint = np.stack([colours(picture.numpy(), _CERTAINTY) for picture in certain])
+            hues = np.stack([colours(picture.numpy(), _CERTAINTY) for picture in certain])
             grey = rgb.mean(-1, keepdim=True)
-            rgb = (0.3 * solid + 0.7 * grey) * torch.from_numpy(tint).float() / 255
+            rgb = (0.3 * solid + 0.7 * grey) * torch.from_numpy(hues).float() / 255
         if self.transparent:
             rgb = torch.cat((rgb, alpha[..., None]), -1)
         return list((rgb * 255).round().to(torch.uint8).numpy())
