@@ -20,6 +20,8 @@ Exposure = np.ndarray
 """A picture as it is cached: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""
 
 _HUMAN, _SCENE = (1.0, 0.46, 0.16), (0.16, 0.50, 0.72)
+# From never seen to well seen, on the grey picture.
+_CERTAINTY = ((214, 48, 84), (240, 190, 60), (255, 255, 255))
 # Near to far, from light to dark.
 _NEAR_TO_FAR = ((255, 247, 200), (250, 190, 90), (214, 90, 90), (120, 40, 120), (24, 16, 60))
 
@@ -70,6 +72,11 @@ class Look:
             tint = human * torch.tensor(_HUMAN) + (1 - human) * torch.tensor(_SCENE)
             grey = rgb.mean(-1, keepdim=True)
             rgb = (0.3 * solid + 0.7 * grey) * tint
+        if self.shown == "certainty":
+            certain = reconstruction.certainty(camera, times_us, parts=self.parts)
+            hues = np.stack([colours(picture.numpy(), _CERTAINTY) for picture in certain])
+            grey = rgb.mean(-1, keepdim=True)
+            rgb = (0.3 * solid + 0.7 * grey) * torch.from_numpy(hues).float() / 255
         if self.transparent:
             rgb = torch.cat((rgb, alpha[..., None]), -1)
         return list((rgb * 255).round().to(torch.uint8).numpy())

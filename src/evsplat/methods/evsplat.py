@@ -7,7 +7,7 @@ own, the person's by how the surface is turned and where it stands; the person c
 
 import logging
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -50,6 +50,7 @@ from evsplat.methods.settings import (
 )
 from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start, scene_start
 from evsplat.models.discs import DiscModel
+from evsplat.models.discs.fill import filled
 from evsplat.objectives import (
     EventChange,
     EventNoise,
@@ -137,6 +138,9 @@ class EvsplatConfig:
         prefit_steps=300,
     )
     """Discs of the scene at the start."""
+    fill: NotNegative = 0.0025
+    """How strongly neighbours along the surface, and the other side's, decide at the end of
+    training about colours of the person that were little seen; 0 leaves them as they are."""
     densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=10_000)
     """Growth and pruning."""
 
@@ -286,6 +290,7 @@ def build(
         body_frames=body_frames(poses.track, times_us),
         generator=generator,
         held_out=None if windows is None else _held_out(config, capture, model, windows),
+        fill=partial(filled, model, capture, config.fill) if config.fill else None,
     )
 
 

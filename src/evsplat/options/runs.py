@@ -66,7 +66,7 @@ class TrainOptions:
             )
 
 
-Shown = Literal["rgb", "semantic", "depth", "events"]
+Shown = Literal["rgb", "semantic", "depth", "events", "certainty"]
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Film:
     what: Literal["sequence", "test"] = "sequence"
     """The whole recording, or the held-out frames at mid-exposure."""
     show: Shown = "rgb"
-    """Events are those of a simulated sensor."""
+    """Events are those of a simulated sensor; certainty is what training saw of the person."""
     parts: Parts = "all"
     """The person and the scene, or one of them."""
     camera: Annotated[str | None, option("NAME", default="that of the frames")] = None

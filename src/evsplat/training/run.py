@@ -26,8 +26,10 @@ from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
+from evsplat.models.seen import Seen, draw_values, roughness
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
+    below,
     check_fits,
     counts,
     load_checkpoint,
@@ -110,6 +112,8 @@ class GaussianReconstruction:
 
     name: str
     model: Skinned
+    seen: Seen | None = None
+    """What training saw of the person; None in checkpoints from before its end."""
     backdrop: Backdrop | None = None
     """What the scene looked like to the picture before, for a camera that mostly stands still."""
     shadow_step_px: int = SHADOW_STEP_PX
@@ -148,6 +152,34 @@ class GaussianReconstruction:
             depth = draw_depth(layers, camera, parts=parts).cpu()
         return depth.expand(len(times_us), *depth.shape[1:])
 
+    @torch.no_grad()
+    def certainty(
+        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
+    ) -> Float[Tensor, "T H W"]:
+        """How well training saw what a pixel shows of the person, 0 to 1; the scene counts as 1.
+
+        Raises:
+            DataError: The checkpoint does not tell.
+        """
+        if self.seen is None:
+            raise DataError(
+                "--show certainty: the run's checkpoint does not say what training saw, being from "
+                "before its end or from an older version; go on with 'evsplat train CAPTURE --out "
+                "RUN --resume', which adds it."
+            )
+        camera, layers = self._posed(camera, times_us)
+        human = (
+            self.seen.certainty().to(self.model.device)[None, :, None].expand(len(times_us), -1, -1)
+        )
+        scene = layers.scene.means.new_ones(1, layers.scene.means.shape[1], 1)
+        if parts == "all":
+            return draw_values(layers, camera, human, scene)[..., 0].cpu().clamp(0, 1)
+        layer = replace(layers.human, channels=human)
+        if parts == "scene":
+            layer = replace(layers.scene, channels=scene)
+        picture = render(layer, camera, low_pass=layers.low_pass).image[..., 0].cpu().clamp(0, 1)
+        return picture.expand(len(times_us), *picture.shape[1:])
+
     def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
         camera = camera.to(self.model.device)
         layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
@@ -160,7 +192,7 @@ class GaussianReconstruction:
 
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
         """The same person and scene with the motion ``track`` (same body, own times) instead."""
-        return GaussianReconstruction(self.name, self.model.following(track))
+        return GaussianReconstruction(self.name, self.model.following(track), self.seen)
 
     def changed_by(self, change: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
         """The same, with the posed Gaussians changed before they are drawn."""
@@ -226,6 +258,18 @@ class Run:
     human_only: bool
     """Whether the method learned nothing but the person and draws it on black."""
 
+    def what_was_seen(self) -> dict[str, float | None] | None:
+        """Share of the person's Gaussians that were little seen, and how rough; see `roughness`.
+
+        None where the checkpoint does not tell.
+        """
+        seen = self.reconstruction.seen
+        if seen is None:
+            return None
+        frame = self.capture.train_frames[0]
+        rest = self.reconstruction.at_rest([(frame.mid_us, self.capture.camera(frame))])
+        return roughness(rest, seen)
+
 
 def _runs_below(path: Path) -> str:
     """A sentence that names the runs one level below, the newest first; empty where none is."""
@@ -275,20 +319,21 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     capture = load_capture(Path(facts["capture"]))
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
-    seen = seen_by_training(capture, config)
+    shown = seen_by_training(capture, config)
     composition = TRAINABLE[method].build(
-        config, seen, facts["seed"], device=device, purpose="draw"
+        config, shown, facts["seed"], device=device, purpose="draw"
     )
     check_fits(composition.model, tensors, path)
     with misfits_of(path):
-        load_model(composition.model, tensors, progress["human_count"])
+        load_model(composition.model, tensors, progress["human_count"], filled=True)
+        seen = _seen(tensors, progress)
     return Run(
         path=folder.path,
         config=config,
         method=method,
-        policy=seen.terms,
+        policy=shown.terms,
         capture=capture,
-        reconstruction=GaussianReconstruction(method, composition.model),
+        reconstruction=GaussianReconstruction(method, composition.model, seen),
         device=facts["device"],
         human_only=isinstance(composition.capture, MaskedCapture),
         **_progress(composition.model, progress),
@@ -300,8 +345,15 @@ def reload_run(run: Run, state: Path) -> Run:
     model = run.reconstruction.model
     tensors, progress = load_checkpoint(state)
     with misfits_of(state):
-        load_model(model, tensors, progress["human_count"])
-    return replace(run, **_progress(model, progress))
+        load_model(model, tensors, progress["human_count"], filled=True)
+        seen = _seen(tensors, progress)
+    reconstruction = replace(run.reconstruction, seen=seen)
+    return replace(run, reconstruction=reconstruction, **_progress(model, progress))
+
+
+def _seen(tensors: dict[str, Tensor], progress: dict[str, Any]) -> Seen | None:
+    """What training saw, where the checkpoint is that of its end."""
+    return Seen.of(below("seen", tensors), progress["human_count"])
 
 
 def _progress(model: Model, progress: dict[str, Any]) -> dict[str, Any]:

@@ -226,8 +226,10 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
     """Step until the schedule or the time is over, saving and logging on the way."""
     clock = trainer.clock
 
-    def save() -> None:
+    def save(ending: bool = False) -> None:
         tensors, state = trainer.state()
+        if ending:
+            tensors |= trainer.ending()
         save_checkpoint(folder.checkpoints, clock.iteration, tensors, state)
 
     saved_at, first = time.perf_counter(), clock.iteration
@@ -255,7 +257,7 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
         check_learned(trainer, clock.iteration - first)
-        save()
+        save(ending=not interrupted and clock.iteration > 0)
         if interrupted:
             raise Stopped(folder.path)
     if clock.iteration == 0:

@@ -257,11 +257,30 @@ class DiscModel(PosedModel):
         if light is None:
             return 1.0
         # Detached: a colour must not be bought by moving or turning the body.
-        places, lit = world.detach(), None
-        if self.shadow is not None and self.shadow.on_body and light.lamps is not None:
-            assert casters is not None
-            lit = self.shadow.lit(casters[lit_at].detach(), places[lit_at], light.lamps)
+        places = world.detach()
+        lit = self._lit(light, places[lit_at], None if casters is None else casters[lit_at])
         return light.factors(transforms.detach(), places, lit)
+
+    def light_terms(self, layers: Layers, time_us: int) -> tuple[Tensor, Tensor]:
+        """What the light on the person at a time is linear in, and the light itself.
+
+        `Shading.terms` (1, H, K), and the factors (1, H, 3) on the colours of ``layers``.
+        """
+        light = self.surface_light()
+        assert light is not None
+        casters = None if self.shadow is None else self.shadow.place(self.pose([time_us])[1])
+        places, transforms = layers.human.means.detach(), layers.transforms.detach()
+        lit = self._lit(light, places, casters)
+        return light.terms(transforms, places, lit), light.factors(transforms, places, lit)
+
+    def _lit(
+        self, light: SurfaceLight, places: Float[Tensor, "T H 3"], casters: Tensor | None
+    ) -> Float[Tensor, "L T H"] | None:
+        """Share of the lamps' light that the body leaves its own places; None: all of it."""
+        if self.shadow is None or not self.shadow.on_body or light.lamps is None:
+            return None
+        assert casters is not None
+        return self.shadow.lit(casters.detach(), places, light.lamps)
 
     def _scene_shadow(self, casters: Float[Tensor, "T P 3"] | None) -> SceneShadow | None:
         """The shadow that the body throws on places of the scene."""
