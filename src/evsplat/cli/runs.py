@@ -22,6 +22,7 @@ from evsplat.options.declare import (
     Threads,
     option,
 )
+from evsplat.options.inputs import Input, check_run_folder
 from evsplat.options.runs import Kind, Split
 from evsplat.shipped import demo_capture
 
@@ -141,7 +142,7 @@ class Evaluate:
 class Report:
     """Write report.html of an evaluated run again."""
 
-    run: Annotated[Positional[Path], option("RUN")]
+    run: Annotated[Positional[Path], option("RUN"), Input(check_run_folder)]
     """Run folder with metrics.json (made by 'evsplat evaluate')."""
     split: Annotated[Split, option("SPLIT")] = "test"
     """Frames whose figures it shows: test, or train ('evsplat evaluate --split train')."""
@@ -182,7 +183,11 @@ class View:
     """Show a run in the browser: any time, any viewpoint, beside its input or another."""
 
     run: RunFolder
-    other: Annotated[Positional[Path | None], option("RUN2", default="no comparison")] = None
+    other: Annotated[
+        Positional[Path | None],
+        option("RUN2", default="no comparison"),
+        Input(check_run_folder),
+    ] = None
     """A second run of the same capture to compare with."""
     port: Port = 8080
     host: Annotated[str, option("ADDRESS", default="127.0.0.1, this machine alone")] = "127.0.0.1"

@@ -26,6 +26,7 @@ from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
+from evsplat.options.inputs import check_run_folder
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
     check_fits,
@@ -41,7 +42,6 @@ from evsplat.untrusted.text import parse_json, read_text
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 _FACTS = {"capture": str, "capture_name": str, "device": str, "seed": int}
-_NAMED_RUNS = 5
 """Runs that an error about the folder above them names, at most."""
 
 
@@ -220,21 +220,9 @@ class Run:
     """Whether the method learned nothing but the person and draws it on black."""
 
 
-def _runs_below(path: Path) -> str:
-    """A sentence that names the runs one level below, the newest first; empty where none is."""
-    runs = sorted(path.glob("*/config.yaml"), key=lambda file: -file.stat().st_mtime)
-    if not runs:
-        return ""
-    names = ", ".join(str(file.parent) for file in runs[:_NAMED_RUNS])
-    return f" A run lies below: {names}." if len(runs) == 1 else f" Runs lie below: {names}."
-
-
 def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     """Method, configuration and facts of a run folder."""
-    if not folder.config.exists():
-        raise DataError(
-            f"{folder.path}: not a run folder, config.yaml is missing.{_runs_below(folder.path)}"
-        )
+    check_run_folder(folder.path)
     values = load_yaml(folder.config)
     method = values.pop("method", DEFAULT_METHOD)
     try:
