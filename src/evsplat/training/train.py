@@ -164,7 +164,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
             save_yaml(folder.config, start.settings, method=start.method)
         if fitting is not None and fitting.verdict != "belongs":
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
-        logger.info("%s", schedule_table(start.settings, composition.weights))
+        logger.debug("%s", schedule_table(start.settings, composition.weights))
         logger.info("%s", seen.terms.sentence)
     return trainer
 
