@@ -8,8 +8,8 @@ import pytest
 from evsplat.capture import load_body_track, load_capture
 from evsplat.config import to_dict
 from evsplat.devices import hardware
-from evsplat.evaluation.report.configuration import _changed, configuration, made_with
 from evsplat.evaluation.report.charts import Series
+from evsplat.evaluation.report.configuration import _changed, configuration, made_with
 from evsplat.evaluation.report.frames import _chosen_entries, _speeds
 from evsplat.evaluation.report.page import _running_mean
 from evsplat.methods import TRAINABLE, method_config
