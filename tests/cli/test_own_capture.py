@@ -131,7 +131,14 @@ def test_the_pages_commands_run_as_they_stand_there(
         if arguments[0] == "train":
             stand_ins.append("train")
             # too small, as a video of these pixels, to tell whether the body belongs to it
-            arguments += ["--iterations", "2", "--any-body", "--set", *small("evsplat")]
+            arguments += [
+                "--iterations",
+                "2",
+                "--any-body",
+                "--no-evaluate",
+                "--set",
+                *small("evsplat"),
+            ]
         code = main(arguments)
         assert code == 0, capsys.readouterr().err
     assert set(stand_ins) == shortened, "what is shortened, and nothing else, says so on the page"
