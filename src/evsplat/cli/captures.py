@@ -252,12 +252,10 @@ class Poses:
     threads: Threads = None
 
     def __call__(self) -> None:
-        import torch
-
+        from evsplat.devices import use_threads
         from evsplat.posing import find_poses
 
-        if self.threads is not None:
-            torch.set_num_threads(self.threads)
+        use_threads(self.threads)
         found = find_poses(self.capture, self.out, self.search, keypoints=self.keypoints)
         print(found.summary)
 

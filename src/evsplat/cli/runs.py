@@ -165,15 +165,21 @@ class Render:
     events: Annotated[Path | None, option("FILE", default="no")] = None
     """Write its events as well, such as to events.h5."""
     out: Annotated[Path | None, option("PATH", default="in RUN/renders")] = None
-    """NAME.mp4, .webp or .gif, or a new folder for PNG."""
+    """NAME.mp4, .webp, .gif or a folder."""
     device: Device = "auto"
     """Device that draws."""
+    threads: Threads = None
 
     def __call__(self) -> None:
         from evsplat.export import render_run
 
         written = render_run(
-            self.run, self.film, out=self.out, events_out=self.events, device=self.device
+            self.run,
+            self.film,
+            out=self.out,
+            events_out=self.events,
+            device=self.device,
+            threads=self.threads,
         )
         print(f"written: {written}")
 
@@ -194,11 +200,19 @@ class View:
     """Network to listen at; 0.0.0.0 lets other machines in."""
     device: Device = "auto"
     """Device that draws."""
+    threads: Threads = None
 
     def __call__(self) -> None:
         from evsplat.view import view_run
 
-        view_run(self.run, self.other, port=self.port, host=self.host, device=self.device)
+        view_run(
+            self.run,
+            self.other,
+            port=self.port,
+            host=self.host,
+            device=self.device,
+            threads=self.threads,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

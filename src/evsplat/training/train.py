@@ -12,12 +12,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from evsplat.capture import Capture, load_capture
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
+from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError, machine_error
 from evsplat.files import open_output, try_target
 from evsplat.inspection import check_body, save_fit_sheet
@@ -100,8 +100,7 @@ def train(
     """
     options = given(TrainOptions, options, changes)
     device = choose_device(options.device)
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
+    use_threads(options.threads)
     capture = load_capture(Path(capture_path))
     start = _resumed(capture, options) if options.resume else _new(capture, options)
     folder = start.folder
