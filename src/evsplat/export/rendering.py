@@ -1,6 +1,7 @@
 """Drawing a trained run: test frames, or a film of the recording or of another motion."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ from evsplat.pictures import signed_map, to_bytes
 from evsplat.pictures.video import write_animation, write_pictures, write_video
 from evsplat.training.run import load_run
 
+FILM_HEIGHT = 720
+"""Least height of videos where none is asked for."""
 _NEAREST = 0.6
 """Depth that gets the lightest colour, as a share of the distance to the person."""
 _VIDEO, _ANIMATION = (".mp4",), (".gif", ".webp")
@@ -74,14 +77,17 @@ def render_run(
     loaded = load_run(Path(run), device=device)
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)
+    height = max(frame.height for frame in loaded.capture.cameras.values())
+    if film.size is None and out.suffix.lower() in (*_VIDEO, *_ANIMATION) and film.show != "events":
+        film = replace(film, size=max(FILM_HEIGHT, height))
     plan = FilmPlan.of(film, loaded.capture, loaded.reconstruction)
     transfer = loaded.capture.transfer(loaded.capture.frames[0])
-    look = Look(film.show, film.parts, film.transparent, transfer)
+    look = Look(film.show, film.parts, film.transparent, transfer, plan.surroundings)
     trained = loaded.method, loaded.iteration, loaded.train_seconds
     digest = film_digest(plan.frames, look, film, *trained, *plan.poses)
     cache = FrameCache(out.with_name(out.name + ".partial"), digest)
     cache.fill(plan.reconstruction, look, plan.frames)
-    _write(film, plan, cache, out, events_out, replace=ours)
+    _write(film, plan, cache, out, events_out, anew=ours)
     cache.remove()
     return out
 
@@ -111,7 +117,7 @@ def _write(
     out: Path,
     events_out: Path | str | None,
     *,
-    replace: bool,
+    anew: bool,
 ) -> None:
     """Make the result of the cached frames."""
     suffix = out.suffix.lower()
@@ -137,7 +143,7 @@ def _write(
         pictures, total=len(frames), unit="picture", desc="write", dynamic_ncols=True, leave=False
     )
     if folder:
-        write_pictures(out, zip(names, counted, strict=True), replace=replace)
+        write_pictures(out, zip(names, counted, strict=True), replace=anew)
     elif suffix in _VIDEO:
         write_video(out, counted, fps=film.fps)
     else:

@@ -99,6 +99,14 @@ class Film:
     """Pictures per second that the video plays."""
     slow: Annotated[float, Above(0), AtMost(10_000), option("FACTOR")] = 1.0
     """Times slower than life: draws FPS x SLOW pictures a second."""
+    size: Annotated[
+        int | None, Within(16, 4320), option("PX", default="720 for videos, or the camera's")
+    ] = None
+    """Height of the pictures; the width follows."""
+    background: Annotated[
+        str | None, option("COLOUR|PICTURE", default="a calm room where nothing was seen")
+    ] = None
+    """What shows where nothing is: a colour such as white or #202830, or a picture's file."""
     beside: Flag = False
     """Put the blurry input frame (or the recorded events) at the left."""
     transparent: Flag = False
@@ -116,6 +124,14 @@ class Film:
         if self.what == "test" and changed:
             raise ConfigError(
                 f"--{changed[0]}: films the sequence, not --what test; leave one out."
+            )
+        if self.background is not None and (self.transparent or self.show != "rgb"):
+            other = "--transparent" if self.transparent else f"--show {self.show}"
+            raise ConfigError(f"--background: nothing of it shows with {other}; leave one out.")
+        if self.what == "test" and (self.size is not None or self.background is not None):
+            raise ConfigError(
+                "--what test: held-out frames are drawn as they are measured; leave out --size, "
+                "--background."
             )
         if self.path is not None and self.camera is not None and self.path == "interpolate":
             raise ConfigError("--camera: --path interpolate goes through all; leave one out.")

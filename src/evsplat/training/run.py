@@ -1,7 +1,7 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -114,6 +114,8 @@ class GaussianReconstruction:
     """What the scene looked like to the picture before, for a camera that mostly stands still."""
     shadow_step_px: int = SHADOW_STEP_PX
     """Shadows are looked up so far apart."""
+    changed: Callable[[Layers, Camera], Layers] | None = None
+    """What a film makes of the posed Gaussians before they are drawn."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
@@ -148,7 +150,8 @@ class GaussianReconstruction:
 
     def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
         camera = camera.to(self.model.device)
-        return camera, self.model.at(list(times_us), camera.center(), hard_semantics=True)
+        layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+        return camera, layers if self.changed is None else self.changed(layers, camera)
 
     @property
     def track(self) -> BodyTrack:
@@ -158,6 +161,10 @@ class GaussianReconstruction:
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
         """The same person and scene with the motion ``track`` (same body, own times) instead."""
         return GaussianReconstruction(self.name, self.model.following(track))
+
+    def changed_by(self, change: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
+        """The same, with the posed Gaussians changed before they are drawn."""
+        return replace(self, changed=change)
 
     @property
     def low_pass(self) -> float:
