@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from tqdm import tqdm
 
+from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import (
     PRESETS,
@@ -51,6 +52,7 @@ def render_run(
     out: Path | str | None = None,
     events_out: Path | str | None = None,
     device: str = "auto",
+    threads: int | None = None,
     **changes: Any,
 ) -> Path:
     """Draw a run's reconstruction and return the file or folder that was written.
@@ -58,7 +60,8 @@ def render_run(
     The `Film` to draw can be given by its fields, as ``changes``. An ``out`` that ends in
     .mp4, .webp or .gif becomes a video or animation, any other a folder of PNG files; without it
     ``run/renders/`` receives it. ``events_out`` takes the simulated events of ``show="events"``,
-    in any format that `evsplat.events.write_events` knows.
+    in any format that `evsplat.events.write_events` knows. ``threads`` is the number of CPU threads
+    that draw; None takes all cores.
 
     Pictures are kept beside the result in ``NAME.partial`` until it is complete: when stopped, the
     same call goes on from there.
@@ -70,6 +73,7 @@ def render_run(
     for target in (out, events_out):
         if target is not None:
             try_target(target)
+    use_threads(threads)
     loaded = load_run(Path(run), device=device)
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)

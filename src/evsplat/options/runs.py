@@ -80,9 +80,9 @@ class Film:
     parts: Parts = "all"
     """The person and the scene, or one of them."""
     camera: Annotated[str | None, option("NAME", default="that of the frames")] = None
-    """A camera of the capture; it need not have recorded anything."""
+    """One of the capture's cameras."""
     path: Annotated[str | None, option("PATH", default="it stays")] = None
-    """Move it: orbit, swing, interpolate or a JSON file."""
+    """orbit, swing, interpolate or a JSON file."""
     motion: Annotated[str | None, option("NAME", default="none")] = None
     """Another motion: walk, run, spin, dance_a ... or a motion or pose file."""
     motion_fps: Annotated[float | None, option("HZ", default="the file's")] = None
@@ -102,13 +102,11 @@ class Film:
     size: Annotated[
         int | None, Within(16, 4320), option("PX", default="720 for videos, or the camera's")
     ] = None
-    """Height of the pictures; the width follows."""
-    background: Annotated[
-        str | None, option("COLOUR|PICTURE", default="a calm room where nothing was seen")
-    ] = None
-    """What shows where nothing is: a colour such as white or #202830, or a picture's file."""
+    """Picture height."""
+    background: Annotated[str | None, option("COLOUR|PICTURE", default="a calm room")] = None
+    """Colour (white, #202830) or picture."""
     beside: Flag = False
-    """Put the blurry input frame (or the recorded events) at the left."""
+    """Put the blurry input frame (or recorded events) at the left."""
     transparent: Flag = False
     """Transparent where nothing is (.webp, .gif, PNG)."""
     sensor: Annotated[Sensor, option("NAME")] = "clean"

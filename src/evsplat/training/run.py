@@ -27,6 +27,7 @@ from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_sc
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
 from evsplat.models.seen import Seen, draw_values, roughness
+from evsplat.options.inputs import check_run_folder
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
     below,
@@ -43,7 +44,6 @@ from evsplat.untrusted.text import parse_json, read_text
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 _FACTS = {"capture": str, "capture_name": str, "device": str, "seed": int}
-_NAMED_RUNS = 5
 """Runs that an error about the folder above them names, at most."""
 
 
@@ -271,21 +271,9 @@ class Run:
         return roughness(rest, seen)
 
 
-def _runs_below(path: Path) -> str:
-    """A sentence that names the runs one level below, the newest first; empty where none is."""
-    runs = sorted(path.glob("*/config.yaml"), key=lambda file: -file.stat().st_mtime)
-    if not runs:
-        return ""
-    names = ", ".join(str(file.parent) for file in runs[:_NAMED_RUNS])
-    return f" A run lies below: {names}." if len(runs) == 1 else f" Runs lie below: {names}."
-
-
 def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     """Method, configuration and facts of a run folder."""
-    if not folder.config.exists():
-        raise DataError(
-            f"{folder.path}: not a run folder, config.yaml is missing.{_runs_below(folder.path)}"
-        )
+    check_run_folder(folder.path)
     values = load_yaml(folder.config)
     method = values.pop("method", DEFAULT_METHOD)
     try:
