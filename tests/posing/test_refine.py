@@ -206,6 +206,36 @@ def test_pictures_of_another_motion_correct_it_and_are_explained_better(body):
     assert errors.root_m.max() < 0.02
 
 
+def test_how_far_away_somebody_is_stays_as_unknown_as_their_size(body):
+    """Two shares of one sum: each keeps c^2 s^2 / (c^2 + s^2), here all of it along the view."""
+    _, descent = staged(body, 0.0)
+    camera = descent.targets.camera
+    _, transl = descent.correction.at(TIMES)
+    hidden = descent.look.nearer_m(transl, camera)
+    away = transl + body.rest_joints[0] - camera.center()
+    torch.testing.assert_close(hidden, 0.015 * away)
+    # Pictures of somebody larger by a share and of somebody nearer by it are the same.
+    behind = descent.targets.behind[:1]
+    with torch.no_grad():
+        rotations, places = descent.correction.at([0])
+        nearer = descent.look.draw(rotations, places - hidden[:1], camera, behind)
+        plain = descent.look.draw(rotations, places, camera, behind)
+        descent.look.nearer.fill_(1.0)
+        larger = descent.look.draw(rotations, places, camera, behind)
+        descent.look.nearer.zero_()
+    assert (larger - nearer).abs().mean() < 0.1 * (larger - plain).abs().mean()
+    variance = descent._distance(TIMES)
+    view = torch.nn.functional.normalize(away, dim=1)
+    s2 = hidden.square().sum(1)
+    c2 = 0.02**2 * descent.correction.weights(TIMES).mean(0).square().sum()
+    torch.testing.assert_close(variance, view.square() * (1 / (1 / c2 + 1 / s2))[:, None])
+    assert 0.3 < c2 / 0.02**2 < 0.9, "what lasts, and the mean of what does not"
+    descent.discs = 500
+    told = descent.errors().root_m
+    along = np.sqrt((np.square(told) * view[0].square().detach().numpy()).sum(1))
+    assert along.min() > 0.95 * float(variance.sum(1).min().sqrt())
+
+
 def test_pictures_of_the_same_motion_hardly_move_it(body):
     truth, descent = staged(body, 0.0)
     descent.run(1, 60, first=True)
