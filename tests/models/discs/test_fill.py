@@ -6,10 +6,12 @@ import pytest
 import torch
 
 from evsplat.capture import Policy, load_capture
+from evsplat.errors import DataError
+from evsplat.film.looks import Look
 from evsplat.models.discs.fill import _shade, filled
 from evsplat.models.drawing import draw
 from evsplat.models.seen import Seen, seen_by
-from evsplat.training.checkpoint import below, load_latest, load_model
+from evsplat.training.checkpoint import below, load_latest, load_model, write_state
 from evsplat.training.run import load_run
 from evsplat.training.train import train
 
@@ -101,6 +103,18 @@ def test_a_run_is_drawn_filled_and_goes_on_unfilled(tiny_capture, tmp_path):
     assert drawn.seen is not None
     assert len(drawn.seen.weight) == state["human_count"]
     colour = drawn.model.gaussians.colour
+    frame = load_capture(capture).frames[0]
+    camera = load_capture(capture).camera(frame)
+    certain = drawn.certainty(camera, [frame.mid_us], parts="human")[0]
+    assert 0 < float(certain.max()) <= 1
+    shown = Look("certainty").expose(drawn, camera, [frame.mid_us])[0]
+    assert shown.shape == (camera.height, camera.width, 3)
+    kept = {name: value for name, value in tensors.items() if name.startswith("model.")}
+    write_state(tmp_path / "older.safetensors", kept, state)
+    older = load_run(run, state=tmp_path / "older.safetensors")
+    assert older.what_was_seen() is None
+    with pytest.raises(DataError, match="does not say what training saw.*--resume"):
+        Look("certainty").expose(older.reconstruction, camera, [frame.mid_us])
     learned = copy.deepcopy(drawn.model)
     load_model(learned, tensors, state["human_count"])
     assert not torch.equal(
