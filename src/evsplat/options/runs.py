@@ -74,7 +74,7 @@ class Film:
     """Film of a run, as `render_run` draws it."""
 
     what: Literal["sequence", "test"] = "sequence"
-    """The whole recording, or the held-out frames at mid-exposure."""
+    """The whole recording, or the held-out frames."""
     show: Shown = "rgb"
     """Events are those of a simulated sensor; certainty is what training saw of the person."""
     parts: Parts = "all"
@@ -98,12 +98,12 @@ class Film:
     fps: Annotated[float, Above(0), AtMost(1000), option("HZ")] = 30.0
     """Pictures per second that the video plays."""
     slow: Annotated[float, Above(0), AtMost(10_000), option("FACTOR")] = 1.0
-    """Times slower than life: draws FPS x SLOW pictures a second."""
+    """Times slower than life."""
     size: Annotated[
         int | None, Within(16, 4320), option("PX", default="720 for videos, or the camera's")
     ] = None
     """Picture height."""
-    background: Annotated[str | None, option("COLOUR|PICTURE", default="a calm room")] = None
+    background: Annotated[str | None, option("LOOK", default="a calm room")] = None
     """Colour (white, #202830) or picture."""
     beside: Flag = False
     """Put the blurry input frame (or recorded events) at the left."""
