@@ -258,6 +258,7 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
         iteration=1200,
         train_seconds=61.5,
         human_only=False,
+        what_was_seen=lambda: {"little_seen": 0.5},
         device="cpu",
         gaussians={"human": 10, "scene": 20},
         policy=Policy(held_out_events=True),

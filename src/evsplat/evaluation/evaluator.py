@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from evsplat.capture import Capture, Frame, Policy, TrainingCapture
 from evsplat.errors import DataError
+from evsplat.evaluation.chroma import chroma_psnr
 from evsplat.evaluation.event_maps import drawn, evaluate_event_maps
 from evsplat.evaluation.protocols import (
     METRICS,
@@ -173,6 +174,7 @@ class _MeasuredFrames:
         rows = ("method", *self._others)
         self._means = {(row, p.name): MetricMeans() for row in rows for p in self.protocols}
         self._against_blurry = MetricMeans()
+        self._chroma: list[dict[str, float]] = []
         self._per_frame: list[dict[str, Any]] = []
         self._seen = False
 
@@ -191,6 +193,8 @@ class _MeasuredFrames:
             for row, picture in pictures.items():
                 measured[row][protocol.name] = _compare(reference, picture)
                 self._means[row, protocol.name].add(measured[row][protocol.name])
+        if truth is not None and mask is not None and bool(mask.any()):
+            self._chroma.append(chroma_psnr(ours, truth, mask))
         entry = {
             "frame": frame.name,
             "time_us": frame.mid_us,
@@ -237,7 +241,13 @@ class _MeasuredFrames:
             key: {p.name: row(name, p, f"{key}.{p.name}") for p in self.protocols}
             for key, name in rows.items()
         }
-        frames = {"per_frame": self._per_frame, "reasons": reasons}
+        chroma = None
+        if self._chroma:
+            count = len(self._chroma)
+            chroma = {key: sum(f[key] for f in self._chroma) / count for key in self._chroma[0]}
+        else:
+            reasons["chroma"] = "no frame has both a sharp ground truth and a person mask"
+        frames = {"chroma": chroma, "per_frame": self._per_frame, "reasons": reasons}
         if self.only:
             return {**method, **frames}
         return {

@@ -53,6 +53,7 @@ def evaluate_run(
         "evaluate_seconds": round(time.monotonic() - start, 1),
         "policy": to_dict(run.policy),
         "poses": run.capture.poses_found,
+        "seen": run.what_was_seen(),
         **measured,
     }
     write_json(Path(run.path) / name_of("metrics", split, ".json"), metrics)

@@ -1,7 +1,7 @@
 """Looks of a film: the values that its pixels show."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt16
 
 from evsplat.camera import Camera
 from evsplat.errors import ConfigError
+from evsplat.film.surroundings import Painted, Room
 from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import Shown
 from evsplat.pictures import Transfer, decode, encode, luminance, shown
@@ -19,6 +20,8 @@ Exposure = np.ndarray
 """A picture as it is cached: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""
 
 _HUMAN, _SCENE = (1.0, 0.46, 0.16), (0.16, 0.50, 0.72)
+# From never seen to well seen, on the grey picture.
+_CERTAINTY = ((214, 48, 84), (240, 190, 60), (255, 255, 255))
 # Near to far, from light to dark.
 _NEAR_TO_FAR = ((255, 247, 200), (250, 190, 90), (214, 90, 90), (120, 40, 120), (24, 16, 60))
 
@@ -33,6 +36,8 @@ class Look:
     """RGBA instead of black where nothing is; for ``rgb`` and ``semantic``."""
     transfer: Transfer = "power"
     """From the values that are drawn to light."""
+    surroundings: Room | Painted | None = field(default=None, repr=False)
+    """What shows of ``rgb`` where nothing is; black without. It follows from run and film."""
 
     def __post_init__(self) -> None:
         if self.transparent and self.shown not in ("rgb", "semantic"):
@@ -59,11 +64,19 @@ class Look:
             rgb = (rgb / solid.clamp_min(1e-4)).clamp(0, 1)
             solid = torch.ones_like(solid)
         rgb = shown(rgb, self.transfer)
+        if self.surroundings is not None:
+            rooms = [self.surroundings.behind(camera, time) for time in times_us]
+            rgb = (rgb + (1 - solid) * torch.stack(rooms)).clamp(0, 1)
         if self.shown == "semantic":
             human = drawn.human.cpu().clamp(0, 1)[..., None]
             tint = human * torch.tensor(_HUMAN) + (1 - human) * torch.tensor(_SCENE)
             grey = rgb.mean(-1, keepdim=True)
             rgb = (0.3 * solid + 0.7 * grey) * tint
+        if self.shown == "certainty":
+            certain = reconstruction.certainty(camera, times_us, parts=self.parts)
+            hues = np.stack([colours(picture.numpy(), _CERTAINTY) for picture in certain])
+            grey = rgb.mean(-1, keepdim=True)
+            rgb = (0.3 * solid + 0.7 * grey) * torch.from_numpy(hues).float() / 255
         if self.transparent:
             rgb = torch.cat((rgb, alpha[..., None]), -1)
         return list((rgb * 255).round().to(torch.uint8).numpy())

@@ -6,7 +6,7 @@ from functools import cache, partial
 from typing import Literal, Protocol
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from evsplat.body import BodyTrack, silhouette
 from evsplat.capture import Frame, Policy, TrainingCapture
@@ -15,6 +15,7 @@ from evsplat.gaussians import BodyFrames, DensifyLimits, Part
 from evsplat.methods.learning import Learning
 from evsplat.methods.settings import Weight
 from evsplat.models.at_rest import Skinned
+from evsplat.models.seen import Seen
 from evsplat.objectives import Objective, PackedBounds
 
 Purpose = Literal["train", "resume", "draw"]
@@ -66,9 +67,9 @@ class Composition:
     capture: TrainingCapture | None = None
     """The recording as the method sees it, where that is not all of it (masked pictures)."""
     held_out: HeldOut | None = None
-    finish: Callable[[], None] | None = None
-    """What is done once after the last step; no step follows it but in a training that is made
-    longer."""
+    fill: Callable[[Seen], dict[str, Tensor]] | None = None
+    """Parameters by their names in the model's state, as a prior decides them at the end where
+    little was seen; None: as they were learned."""
 
 
 def start_of_randomness(seed: int) -> torch.Generator:

@@ -6,18 +6,15 @@ own, the person's by how the surface is turned and where it stands; the person c
 """
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate
 from evsplat.capture import (
-    Camera,
     Frame,
     Policy,
     TrainingCapture,
@@ -53,8 +50,7 @@ from evsplat.methods.settings import (
 )
 from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start, scene_start
 from evsplat.models.discs import DiscModel
-from evsplat.models.discs.unseen import calm_light, fill_unseen
-from evsplat.models.seen import seen_squares
+from evsplat.models.discs.fill import filled
 from evsplat.objectives import (
     EventChange,
     EventNoise,
@@ -142,6 +138,9 @@ class EvsplatConfig:
         prefit_steps=300,
     )
     """Discs of the scene at the start."""
+    fill: NotNegative = 0.0025
+    """How strongly neighbours along the surface, and the other side's, decide at the end of
+    training about colours of the person that were little seen; 0 leaves them as they are."""
     densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=10_000)
     """Growth and pruning."""
 
@@ -212,10 +211,6 @@ class EvsplatConfig:
     """Weight of the mean of m (1 - m), which pushes the attribute m to 0 or 1."""
     semantic_band_px_at_256: Positive = 9.0
     """Width of the undecided band around the posed body, for a picture 256 pixels high (A8)."""
-
-    fill: NotNegative = 0.3
-    """Strength by which what no training frame shows of the person takes the colours around it,
-    once training is over; light at normals that none shows becomes the mean. 0: all stays."""
 
     rates: DiscRates = DiscRates()
     """Learning rates."""
@@ -295,34 +290,8 @@ def build(
         body_frames=body_frames(poses.track, times_us),
         generator=generator,
         held_out=None if windows is None else _held_out(config, capture, model, windows),
-        finish=partial(_finish, model, capture, config.fill),
+        fill=partial(filled, model, capture, config.fill) if config.fill else None,
     )
-
-
-def _finish(model: DiscModel, capture: TrainingCapture, fill: float) -> None:
-    """Note what was seen of the person, and put a prior where that is little."""
-    views = [(capture.camera(frame), frame.mid_us) for frame in capture.train_frames]
-    model.seen = seen_squares(model, views)
-    if fill == 0:
-        return
-    fill_unseen(model, model.seen, fill)
-    if model.shading is not None:
-        calm_light(model.shading, *_lit_surface(model, views), model.seen)
-
-
-@torch.no_grad()
-def _lit_surface(
-    model: DiscModel, views: Sequence[tuple[Camera, int]]
-) -> tuple[list[Tensor], list[Tensor]]:
-    """World normals and places of the person's Gaussians at the times of ``views``."""
-    normals, places = [], []
-    canonical = model.surface.normals(model.gaussians.means[model.gaussians.human])
-    for camera, time_us in views:
-        layers = model.at([time_us], camera.to(model.device).center(), hard_semantics=True)
-        turned = (layers.transforms[0, :, :3, :3] @ canonical[..., None])[..., 0]
-        normals.append(torch.nn.functional.normalize(turned, dim=-1))
-        places.append(layers.human.means[0])
-    return normals, places
 
 
 def _start(

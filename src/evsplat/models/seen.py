@@ -1,49 +1,149 @@
-"""How well pictures show each Gaussian of the person."""
+"""What training frames showed of each of the person's Gaussians."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from evsplat.camera import Camera
-from evsplat.models.at_rest import Skinned
-from evsplat.render import render
+from evsplat.capture import TrainingCapture
+from evsplat.models.at_rest import SkinnedGaussians
+from evsplat.models.layers import Layers
+from evsplat.models.model import Model
+from evsplat.neighbours import nearest
+from evsplat.render import Splats, render
 
+LITTLE_PX = 0.3
+"""A Gaussian with smaller `Seen.squares` counts as little seen."""
 _DRAWS = 4
+"""Random signs per frame that the squares are estimated with."""
+_NEIGHBOURS = 8
 
 
-def seen_squares(
-    model: Skinned, views: Sequence[tuple[Camera, int]], *, seed: int = 0
-) -> Float[Tensor, "H"]:
-    """Squares of transmittance times alpha, summed over the pixels of all ``views``, in pixels.
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Sums over the pixels of all training frames, per Gaussian of the person.
 
-    A Gaussian that alone makes up a pixel has 1 of it; one that shines through the front with a
-    tenth has a hundredth, where the sum itself would count ten such pixels as one that is seen.
-    The picture is linear in a channel of the Gaussians, and its derivative is transmittance times
-    alpha: the square of the gradient of its pixels, summed with random signs, has this sum as its
-    mean (Hutchinson 1990). ``views``: cameras and times, microseconds.
+    The share of a pixel is transmittance x alpha. What shines through others has small shares, in
+    as many pixels as there are: their squares tell it from what is really seen.
     """
-    count = next(iter(model.sets.values())).human_count
-    device = model.device
-    generator = torch.Generator().manual_seed(seed)
-    squares = torch.zeros(count, device=device)
-    for camera, time_us in views:
-        camera = camera.to(device)
+
+    weight: Float[Tensor, " H"]
+    """Sum of the shares, pixels."""
+    squares: Float[Tensor, " H"]
+    """Sum of their squares, pixels; an estimate without bias."""
+    directions: Float[Tensor, "H 3"]
+    """Sum of the unit directions to the cameras, each times its frame's share; canonical axes.
+
+    Its length is ``weight`` where all frames looked from one side.
+    """
+
+    def certainty(self) -> Float[Tensor, " H"]:
+        """From 0, never seen, to 1; one half at `LITTLE_PX`."""
+        return self.squares / (self.squares + LITTLE_PX)
+
+    def little(self) -> Bool[Tensor, " H"]:
+        """True where a Gaussian was little seen."""
+        return self.squares < LITTLE_PX
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor], count: int) -> "Seen | None":
+        """From the tensors by their names, or None where there are none.
+
+        Raises:
+            ValueError: They are not those of ``count`` Gaussians.
+        """
+        if not tensors:
+            return None
+        seen = cls(**{field.name: tensors[field.name] for field in fields(cls)})
+        found = [tuple(value.shape) for value in vars(seen).values()]
+        if found != [(count,), (count,), (count, 3)]:
+            raise ValueError(f"what was seen is of shapes {found}, of {count} Gaussians")
+        return seen
+
+
+def seen_by(model: Model, capture: TrainingCapture) -> Seen:
+    """What the training frames showed of the person as ``model`` draws it at their middles.
+
+    A picture's derivative by a Gaussian's colour is its share of the pixels. The gradient of the
+    sum over all pixels is thus the sum of the shares, and that of a sum with random signs has the
+    sum of their squares as its mean square (Hutchinson 1990).
+    """
+    generator = torch.Generator().manual_seed(0)
+    sums: list[Tensor] = []
+    for frame in capture.train_frames:
+        camera = capture.camera(frame).to(model.device)
         with torch.no_grad():
-            layers = model.at([time_us], camera.center(), hard_semantics=True)
-        channels = torch.zeros(1, count, _DRAWS, device=device, requires_grad=True)
-        black = torch.zeros(*layers.scene.means.shape[:2], _DRAWS, device=device)
-        drawn = render(
-            replace(layers.human, channels=channels),
-            camera,
-            static=replace(layers.scene, channels=black),
-            low_pass=layers.low_pass,
-        )
-        signs = torch.randint(0, 2, drawn.image.shape, generator=generator)
-        (gradient,) = torch.autograd.grad(
-            (drawn.image * (2 * signs - 1).to(device)).sum(), channels
-        )
-        squares += gradient[0].square().mean(-1)
-    return squares
+            layers = model.at([frame.mid_us], camera.center(), hard_semantics=True)
+        shares = shares_in(layers, camera, generator)
+        weight, squares = shares[:, 0], shares[:, 1:].square().mean(1)
+        toward = normalize(camera.center() - layers.human.means[0], dim=-1)
+        back = layers.transforms[0, :, :3, :3].transpose(-1, -2)
+        directions = normalize((back @ toward[..., None])[..., 0], dim=-1) * weight[:, None]
+        values = [weight, squares, directions]
+        sums = [a + b for a, b in zip(sums, values, strict=True)] if sums else values
+    return Seen(*(value.detach() for value in sums))
+
+
+def shares_in(
+    layers: Layers, camera: Camera, generator: torch.Generator, draws: int = _DRAWS
+) -> Float[Tensor, "H K"]:
+    """Sums over a picture of the shares of the person's Gaussians at one time.
+
+    The first column is the plain sum, each of the ``draws`` others one with random signs.
+    """
+    count, columns = layers.human.means.shape[1], 1 + draws
+    channels = layers.human.means.new_zeros(1, count, columns).requires_grad_()
+    image = draw_values(layers, camera, channels)
+    signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+    signs[..., 0] = 1
+    (gradient,) = torch.autograd.grad((image * signs).sum(), channels)
+    return gradient[0]
+
+
+def draw_values(
+    layers: Layers,
+    camera: Camera,
+    human: Float[Tensor, "T H C"],
+    scene: Float[Tensor, "1 S C"] | None = None,
+) -> Float[Tensor, "T H W C"]:
+    """Values of Gaussians drawn instead of their colours, without shadow; the scene's may be 0."""
+    if scene is None:
+        scene = human.new_zeros(1, layers.scene.means.shape[1], human.shape[-1])
+    person, behind = fixed(layers.human, human), fixed(layers.scene, scene)
+    return render(person, camera, static=behind, low_pass=layers.low_pass).image
+
+
+def fixed(layer: Splats, channels: Tensor) -> Splats:
+    """A layer with other channels, whose geometry takes no gradient."""
+    geometry = {
+        field.name: value.detach().clone()
+        for field in fields(layer)
+        if field.name != "channels" and (value := getattr(layer, field.name)) is not None
+    }
+    return replace(layer, **geometry, channels=channels)
+
+
+def roughness(rest: SkinnedGaussians, seen: Seen) -> dict[str, float | None]:
+    """How uneven the person's colours are where little was seen, and where much was.
+
+    Root mean square difference to the colours of the eight nearest Gaussians in canonical space,
+    sRGB; ``ratio`` of the first to the second. Speckle makes the little seen rougher than the rest.
+    ``little_seen`` is the share of such Gaussians. None where there are none.
+    """
+    little = seen.little().cpu()
+    result: dict[str, float | None] = {"little_seen": float(little.float().mean())}
+    rough: list[float | None] = [None, None]
+    if len(little) > _NEIGHBOURS:
+        _, index = nearest(rest.means, _NEIGHBOURS)
+        difference = (rest.rgb[index] - rest.rgb[:, None]).square().mean((1, 2))
+        rough = [
+            float(difference[rows].mean().sqrt()) if bool(rows.any()) else None
+            for rows in (little, ~little)
+        ]
+    few, many = rough
+    ratio = few / many if few is not None and many else None
+    return result | {"roughness_little": few, "roughness_much": many, "ratio": ratio}

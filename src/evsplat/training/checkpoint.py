@@ -152,9 +152,14 @@ def check_fits(model: Model, tensors: dict[str, Tensor], path: Path) -> None:
             )
 
 
-def load_model(model: Model, tensors: dict[str, Tensor], human_count: int) -> None:
-    """Give a model the parameters of a checkpoint, whatever its number of Gaussians was."""
-    entries = below("model", tensors)
+def load_model(
+    model: Model, tensors: dict[str, Tensor], human_count: int, *, filled: bool = False
+) -> None:
+    """Give a model the parameters of a checkpoint, whatever its number of Gaussians was.
+
+    ``filled``: those that a finished training decided for what it hardly saw, where it did.
+    """
+    entries = below("model", tensors) | (below("filled", tensors) if filled else {})
     for name, rows in model.sets.items():
         device = rows.means.device
         values = {key: entries[f"{name}.{key}"].to(device) for key in rows.attributes}

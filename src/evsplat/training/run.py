@@ -1,7 +1,7 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -26,8 +26,11 @@ from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
+from evsplat.models.seen import Seen, draw_values, roughness
+from evsplat.options.inputs import check_run_folder
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
+    below,
     check_fits,
     counts,
     load_checkpoint,
@@ -41,7 +44,6 @@ from evsplat.untrusted.text import parse_json, read_text
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 _FACTS = {"capture": str, "capture_name": str, "device": str, "seed": int}
-_NAMED_RUNS = 5
 """Runs that an error about the folder above them names, at most."""
 
 
@@ -110,10 +112,14 @@ class GaussianReconstruction:
 
     name: str
     model: Skinned
+    seen: Seen | None = None
+    """What training saw of the person; None in checkpoints from before its end."""
     backdrop: Backdrop | None = None
     """What the scene looked like to the picture before, for a camera that mostly stands still."""
     shadow_step_px: int = SHADOW_STEP_PX
     """Shadows are looked up so far apart."""
+    changed: Callable[[Layers, Camera], Layers] | None = None
+    """What a film makes of the posed Gaussians before they are drawn."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
@@ -146,9 +152,38 @@ class GaussianReconstruction:
             depth = draw_depth(layers, camera, parts=parts).cpu()
         return depth.expand(len(times_us), *depth.shape[1:])
 
+    @torch.no_grad()
+    def certainty(
+        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
+    ) -> Float[Tensor, "T H W"]:
+        """How well training saw what a pixel shows of the person, 0 to 1; the scene counts as 1.
+
+        Raises:
+            DataError: The checkpoint does not tell.
+        """
+        if self.seen is None:
+            raise DataError(
+                "--show certainty: the run's checkpoint does not say what training saw, being from "
+                "before its end or from an older version; go on with 'evsplat train CAPTURE --out "
+                "RUN --resume', which adds it."
+            )
+        camera, layers = self._posed(camera, times_us)
+        human = (
+            self.seen.certainty().to(self.model.device)[None, :, None].expand(len(times_us), -1, -1)
+        )
+        scene = layers.scene.means.new_ones(1, layers.scene.means.shape[1], 1)
+        if parts == "all":
+            return draw_values(layers, camera, human, scene)[..., 0].cpu().clamp(0, 1)
+        layer = replace(layers.human, channels=human)
+        if parts == "scene":
+            layer = replace(layers.scene, channels=scene)
+        picture = render(layer, camera, low_pass=layers.low_pass).image[..., 0].cpu().clamp(0, 1)
+        return picture.expand(len(times_us), *picture.shape[1:])
+
     def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
         camera = camera.to(self.model.device)
-        return camera, self.model.at(list(times_us), camera.center(), hard_semantics=True)
+        layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+        return camera, layers if self.changed is None else self.changed(layers, camera)
 
     @property
     def track(self) -> BodyTrack:
@@ -157,7 +192,11 @@ class GaussianReconstruction:
 
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
         """The same person and scene with the motion ``track`` (same body, own times) instead."""
-        return GaussianReconstruction(self.name, self.model.following(track))
+        return GaussianReconstruction(self.name, self.model.following(track), self.seen)
+
+    def changed_by(self, change: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
+        """The same, with the posed Gaussians changed before they are drawn."""
+        return replace(self, changed=change)
 
     @property
     def low_pass(self) -> float:
@@ -219,22 +258,22 @@ class Run:
     human_only: bool
     """Whether the method learned nothing but the person and draws it on black."""
 
+    def what_was_seen(self) -> dict[str, float | None] | None:
+        """Share of the person's Gaussians that were little seen, and how rough; see `roughness`.
 
-def _runs_below(path: Path) -> str:
-    """A sentence that names the runs one level below, the newest first; empty where none is."""
-    runs = sorted(path.glob("*/config.yaml"), key=lambda file: -file.stat().st_mtime)
-    if not runs:
-        return ""
-    names = ", ".join(str(file.parent) for file in runs[:_NAMED_RUNS])
-    return f" A run lies below: {names}." if len(runs) == 1 else f" Runs lie below: {names}."
+        None where the checkpoint does not tell.
+        """
+        seen = self.reconstruction.seen
+        if seen is None:
+            return None
+        frame = self.capture.train_frames[0]
+        rest = self.reconstruction.at_rest([(frame.mid_us, self.capture.camera(frame))])
+        return roughness(rest, seen)
 
 
 def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     """Method, configuration and facts of a run folder."""
-    if not folder.config.exists():
-        raise DataError(
-            f"{folder.path}: not a run folder, config.yaml is missing.{_runs_below(folder.path)}"
-        )
+    check_run_folder(folder.path)
     values = load_yaml(folder.config)
     method = values.pop("method", DEFAULT_METHOD)
     try:
@@ -268,20 +307,21 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     capture = load_capture(Path(facts["capture"]))
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
-    seen = seen_by_training(capture, config)
+    shown = seen_by_training(capture, config)
     composition = TRAINABLE[method].build(
-        config, seen, facts["seed"], device=device, purpose="draw"
+        config, shown, facts["seed"], device=device, purpose="draw"
     )
     check_fits(composition.model, tensors, path)
     with misfits_of(path):
-        load_model(composition.model, tensors, progress["human_count"])
+        load_model(composition.model, tensors, progress["human_count"], filled=True)
+        seen = _seen(tensors, progress)
     return Run(
         path=folder.path,
         config=config,
         method=method,
-        policy=seen.terms,
+        policy=shown.terms,
         capture=capture,
-        reconstruction=GaussianReconstruction(method, composition.model),
+        reconstruction=GaussianReconstruction(method, composition.model, seen),
         device=facts["device"],
         human_only=isinstance(composition.capture, MaskedCapture),
         **_progress(composition.model, progress),
@@ -293,8 +333,15 @@ def reload_run(run: Run, state: Path) -> Run:
     model = run.reconstruction.model
     tensors, progress = load_checkpoint(state)
     with misfits_of(state):
-        load_model(model, tensors, progress["human_count"])
-    return replace(run, **_progress(model, progress))
+        load_model(model, tensors, progress["human_count"], filled=True)
+        seen = _seen(tensors, progress)
+    reconstruction = replace(run.reconstruction, seen=seen)
+    return replace(run, reconstruction=reconstruction, **_progress(model, progress))
+
+
+def _seen(tensors: dict[str, Tensor], progress: dict[str, Any]) -> Seen | None:
+    """What training saw, where the checkpoint is that of its end."""
+    return Seen.of(below("seen", tensors), progress["human_count"])
 
 
 def _progress(model: Model, progress: dict[str, Any]) -> dict[str, Any]:

@@ -12,12 +12,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from evsplat.capture import Capture, load_capture
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
+from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError, machine_error
 from evsplat.files import open_output, try_target
 from evsplat.inspection import check_body, save_fit_sheet
@@ -100,8 +100,7 @@ def train(
     """
     options = given(TrainOptions, options, changes)
     device = choose_device(options.device)
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
+    use_threads(options.threads)
     capture = load_capture(Path(capture_path))
     start = _resumed(capture, options) if options.resume else _new(capture, options)
     folder = start.folder
@@ -164,7 +163,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
             save_yaml(folder.config, start.settings, method=start.method)
         if fitting is not None and fitting.verdict != "belongs":
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
-        logger.info("%s", schedule_table(start.settings, composition.weights))
+        logger.debug("%s", schedule_table(start.settings, composition.weights))
         logger.info("%s", seen.terms.sentence)
     return trainer
 
@@ -226,8 +225,10 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
     """Step until the schedule or the time is over, saving and logging on the way."""
     clock = trainer.clock
 
-    def save() -> None:
+    def save(ending: bool = False) -> None:
         tensors, state = trainer.state()
+        if ending:
+            tensors |= trainer.ending()
         save_checkpoint(folder.checkpoints, clock.iteration, tensors, state)
 
     saved_at, first = time.perf_counter(), clock.iteration
@@ -247,19 +248,15 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
             if report is not None and (logged or clock.done):
                 log.write(json.dumps(_log_line(trainer, report)).encode() + b"\n")
                 _show(bar, trainer, report)
-            # The last step is saved with what finishes it, or not at all.
-            over = clock.done or clock.out_of_time
-            if interrupted and not over:
+            if interrupted:
                 save()
                 raise Stopped(folder.path)
-            if time.perf_counter() - saved_at > CHECKPOINT_SECONDS and not over:
+            if time.perf_counter() - saved_at > CHECKPOINT_SECONDS:
                 save()
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
         check_learned(trainer, clock.iteration - first)
-        if trainer.composition.finish is not None and clock.iteration > first:
-            trainer.composition.finish()
-        save()
+        save(ending=not interrupted and clock.iteration > 0)
         if interrupted:
             raise Stopped(folder.path)
     if clock.iteration == 0:

@@ -16,6 +16,7 @@ from evsplat.gaussians import GaussianSet, Part, Rows, ScreenStatistics, densify
 from evsplat.methods.base import Composition
 from evsplat.methods.settings import weight_at
 from evsplat.models.drawing import Drawing
+from evsplat.models.seen import seen_by
 from evsplat.objectives import Objective, Step
 from evsplat.training.bad_steps import BadSteps
 from evsplat.training.checkpoint import below, counts, flatten, load_model
@@ -187,6 +188,18 @@ class Trainer:
         """Part of `state` that is needed to draw the model."""
         tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
         return tensors, {"clock": asdict(self.clock), "human_count": self.counts()["human"]}
+
+    def ending(self) -> dict[str, Tensor]:
+        """What the end of training adds to `state`: what was seen, and what a prior then decides.
+
+        The second replaces parameters where the model is drawn. Those that were learned stay as
+        they are, for a training that goes on.
+        """
+        seen = seen_by(self.model, self.capture)
+        tensors = flatten("seen", vars(seen))
+        if self.composition.fill is not None:
+            tensors |= flatten("filled", self.composition.fill(seen))
+        return tensors
 
     def load_state(self, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:
         """Go back to the moment of `state`; the clock's limits stay those of this run."""

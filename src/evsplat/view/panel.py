@@ -22,7 +22,12 @@ from evsplat.view.save_panel import SavePanel
 
 SPEEDS = {"as recorded": 1.0, **{f"1/{slower}": 1 / slower for slower in (2, 5, 10, 20, 50, 100)}}
 _PARTS: dict[str, Parts] = {"person and scene": "all", "person": "human", "scene": "scene"}
-_SHOWN: dict[str, Shown] = {"colour": "rgb", "person / scene": "semantic", "depth": "depth"}
+_SHOWN: dict[str, Shown] = {
+    "colour": "rgb",
+    "person / scene": "semantic",
+    "depth": "depth",
+    "certainty": "certainty",
+}
 _WHOLE, _EXPOSURE = "the recording", "this exposure"
 _NOTHING = "nothing"
 _RECORDED = "as recorded"

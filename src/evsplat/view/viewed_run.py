@@ -74,8 +74,11 @@ class ViewedRun:
     ) -> Float[np.ndarray, "H W 3"]:
         """One instant, sRGB in [0, 1].
 
-        A ``draft`` evaluates networks for a part of the Gaussians only and has softer shadows.
+        A ``draft`` evaluates networks for a part of the Gaussians only and has softer shadows. A
+        run that cannot tell what it saw, its training going on, shows colours for certainty.
         """
+        if look.shown == "certainty" and self.run.reconstruction.seen is None:
+            look = replace(look, shown="rgb")
         drawn = self._moving(time_us, motion, draft=draft)
         if draft:
             drawn = replace(drawn, shadow_step_px=_DRAFT_SHADOW_STEP_PX)

@@ -8,7 +8,6 @@ bends beyond that. Light falls on the person from lamps, which it hides from the
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -52,9 +51,6 @@ class DiscModel(PosedModel):
     """Discs of person and scene, the light on them, and the body track."""
 
     residual: PoseCorrection | None
-    seen: Tensor
-    """(H,) what training pictures showed of the person's Gaussians, as `seen_squares` gives it;
-    empty until training ends."""
 
     def __init__(
         self,
@@ -99,7 +95,6 @@ class DiscModel(PosedModel):
         roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
         middle = roots.mean(0).float()
         self.places = ScenePlaces(_PLACES_REFRESH)
-        self.register_buffer("seen", torch.zeros(0))
         self.lamps: Lamps | None = None
         self.shadow: BodyShadow | None = None
         if lamps:
@@ -176,11 +171,6 @@ class DiscModel(PosedModel):
         lit_at = slice(nearest, nearest + 1)
         layers = self._layers(bones, rotations, lit_at, view, hard_semantics=False)
         return draw(layers, camera, center_gradients=True, places=self.places)
-
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
-        # As many as there are Gaussians in the state.
-        self.seen = torch.empty_like(state[f"{prefix}seen"], device=self.device)
-        super()._load_from_state_dict(state, prefix, *rest)
 
     def following(self, track: BodyTrack) -> "DiscModel":
         """The same person doing what ``track`` says, without pose residuals; see `Model`."""
@@ -267,11 +257,30 @@ class DiscModel(PosedModel):
         if light is None:
             return 1.0
         # Detached: a colour must not be bought by moving or turning the body.
-        places, lit = world.detach(), None
-        if self.shadow is not None and self.shadow.on_body and light.lamps is not None:
-            assert casters is not None
-            lit = self.shadow.lit(casters[lit_at].detach(), places[lit_at], light.lamps)
+        places = world.detach()
+        lit = self._lit(light, places[lit_at], None if casters is None else casters[lit_at])
         return light.factors(transforms.detach(), places, lit)
+
+    def light_terms(self, layers: Layers, time_us: int) -> tuple[Tensor, Tensor]:
+        """What the light on the person at a time is linear in, and the light itself.
+
+        `Shading.terms` (1, H, K), and the factors (1, H, 3) on the colours of ``layers``.
+        """
+        light = self.surface_light()
+        assert light is not None
+        casters = None if self.shadow is None else self.shadow.place(self.pose([time_us])[1])
+        places, transforms = layers.human.means.detach(), layers.transforms.detach()
+        lit = self._lit(light, places, casters)
+        return light.terms(transforms, places, lit), light.factors(transforms, places, lit)
+
+    def _lit(
+        self, light: SurfaceLight, places: Float[Tensor, "T H 3"], casters: Tensor | None
+    ) -> Float[Tensor, "L T H"] | None:
+        """Share of the lamps' light that the body leaves its own places; None: all of it."""
+        if self.shadow is None or not self.shadow.on_body or light.lamps is None:
+            return None
+        assert casters is not None
+        return self.shadow.lit(casters.detach(), places, light.lamps)
 
     def _scene_shadow(self, casters: Float[Tensor, "T P 3"] | None) -> SceneShadow | None:
         """The shadow that the body throws on places of the scene."""

@@ -38,14 +38,38 @@ class Shading(nn.Module):
         self.coefficients = nn.Parameter(torch.zeros(4, _NORMAL_DIM, 3))
         self.intensities = nn.Parameter(torch.zeros(lamps, 3))
 
-    def polynomial(
-        self, normals: Float[Tensor, "N 3"], places: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 36"]:
-        """Factors of the coefficients, (place, normal) in their order, without lamps and the 1."""
+    def terms(
+        self,
+        normals: Float[Tensor, "T N 3"],
+        places: Float[Tensor, "T N 3"],
+        lamps: Float[Tensor, "L 3"] | None = None,
+        lit: Float[Tensor, "L #T N"] | None = None,
+    ) -> Float[Tensor, "T N K"]:
+        """What factors within the limits are linear in: the factor is 1 plus their weighted sum.
+
+        Weights of the first 36 are `coefficients`, place by normal, and of the rest `intensities`.
+        """
         turned = torch.cat([torch.ones_like(normals[..., :1]), sh_basis(normals, degree=2)], -1)
         moved = ((places - self.center) / self.radius_m).clamp(-2, 2)
-        moved = torch.cat([torch.ones_like(moved[..., :1]), moved], -1)
-        return (moved[..., :, None] * turned[..., None, :]).flatten(-2)
+        around = torch.cat([torch.ones_like(moved[..., :1]), moved], -1)
+        terms = (around[..., :, None] * turned[..., None, :]).flatten(-2)
+        if lamps is None:
+            return torch.cat([terms, terms.new_zeros(*terms.shape[:-1], len(self.intensities))], -1)
+        shares = places.new_ones(len(lamps), 1, 1) if lit is None else lit
+        each = [
+            self._falling(lamp, normals, places) * share
+            for lamp, share in zip(lamps, shares, strict=True)
+        ]
+        return torch.cat([terms, torch.stack(each, -1)], -1)
+
+    def _falling(
+        self, lamp: Float[Tensor, "3"], normals: Float[Tensor, "T N 3"], places: Tensor
+    ) -> Float[Tensor, "T N"]:
+        """Light of a lamp that hides nowhere, of intensity 1."""
+        ray = lamp - places
+        square = ray.square().sum(-1)
+        facing = (ray * normals).sum(-1).clamp_min(0) * square.rsqrt()
+        return facing * ((lamp - self.center).square().sum() / square.clamp_min(_NEAREST_M**2))
 
     def forward(
         self,
@@ -69,11 +93,8 @@ class Shading(nn.Module):
             return factor.clamp(_DARKEST, _BRIGHTEST)
         shares = places.new_ones(len(lamps), 1, 1) if lit is None else lit
         for lamp, share, intensity in zip(lamps, shares, self.intensities, strict=True):
-            ray = lamp - places
-            square = ray.square().sum(-1)
-            facing = (ray * normals).sum(-1).clamp_min(0) * square.rsqrt()
-            near = (lamp - self.center).square().sum() / square.clamp_min(_NEAREST_M**2)
-            factor = factor + (facing * near * share)[..., None] * intensity
+            falling = self._falling(lamp, normals, places)
+            factor = factor + (falling * share)[..., None] * intensity
         return factor.clamp(_DARKEST, _BRIGHTEST)
 
 
@@ -109,8 +130,20 @@ class SurfaceLight:
                 lit if self.lamps is not None else None,
             )
             return factors
+        return self.shading(self._turned(transforms), places, self.lamps, lit)
+
+    def terms(
+        self,
+        transforms: Float[Tensor, "T N 4 4"],
+        places: Float[Tensor, "T N 3"],
+        lit: Float[Tensor, "L #T N"] | None = None,
+    ) -> Float[Tensor, "T N K"]:
+        """`Shading.terms`, for the same as `factors`."""
+        return self.shading.terms(self._turned(transforms), places, self.lamps, lit)
+
+    def _turned(self, transforms: Float[Tensor, "T N 4 4"]) -> Float[Tensor, "T N 3"]:
         turned = (transforms[..., :3, :3] @ self.normals[..., None])[..., 0]
-        return self.shading(nn.functional.normalize(turned, dim=-1), places, self.lamps, lit)
+        return nn.functional.normalize(turned, dim=-1)
 
 
 class _NativeLight(torch.autograd.Function):

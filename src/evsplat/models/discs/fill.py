@@ -1,0 +1,206 @@
+"""Colours and light where training saw little: neighbours tell them, and what was seen stays.
+
+Adam moves a colour that no picture tells of a third as far as the others, since gradients a
+thousand times smaller are still gradients; what the front lets through tells it nonsense.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from evsplat.camera import Camera
+from evsplat.capture import Frame, TrainingCapture
+from evsplat.gaussians.surface_graph import closest, harmonic, laplacian, mirror_plane
+from evsplat.models.discs.model import DiscModel
+from evsplat.models.layers import Layers
+from evsplat.models.seen import Seen, draw_values, shares_in
+
+MOST_FRAMES = 24
+"""Training frames that hold the colours, spread evenly: drawing them takes the time."""
+STEPS = 5
+"""Of conjugate gradients, twice."""
+MOST_BEHIND = 0.25
+"""Largest difference to what neighbours say where a surface was seen from behind alone."""
+EVEN = 0.1
+"""Strength of a link between neighbours, against the squared shares that were seen (`Seen`)."""
+CALM = 0.003
+"""Weight of the squares of the light's numbers, the constant one apart, against the mean squared
+change of the factors that were seen."""
+SHADE, SHADE_WEIGHT = 0.2, 0.2
+"""What turns its back to a camera is lit like the darkest of what is seen, at this quantile: the
+side that is filmed is mostly the one in the light. The weight is against all that is seen."""
+_BACK = -0.1
+"""Cosine to the camera under which a surface turns its back."""
+_FAST = 1e6
+_LEAST, _MOST = 0.5 / 255, 1 - 0.5 / 255
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A training frame as the model draws it before the fill."""
+
+    frame: Frame
+    camera: Camera
+    picture: Float[Tensor, "1 H W 3"]
+    """Person and scene without the shadow, sRGB."""
+    weight: Float[Tensor, " H"]
+    """Sum of each Gaussian's shares of the pixels."""
+    away: Bool[Tensor, " H"]
+    """True where the surface turns its back."""
+
+
+def filled(
+    model: DiscModel, capture: TrainingCapture, strength: float, seen: Seen
+) -> dict[str, Tensor]:
+    """Parameters by their names in the model's state, as they follow for what was little seen.
+
+    First the light: as it is where it was seen, and no brighter elsewhere than in the shade. Then
+    what neighbours would say of each colour: the even transition between those that were well seen
+    and facing (`harmonic`). Last the colours closest to that with which the training frames look as
+    before (`closest`): what shines through the front, or has a small share of its pixels, gives
+    way, and what is well seen stays. ``strength`` is what a difference to the neighbours costs,
+    per training frame, against one of a whole pixel.
+    """
+    gaussians, rows = model.gaussians, model.gaussians.human
+    if gaussians.human_count < 2 or not float(seen.squares.sum()) > 0:
+        return {}
+    with torch.no_grad():
+        normals = model.surface.normals(gaussians.means[rows])
+        bones = model.surface.weights(gaussians.means[rows])
+    views = _views(model, capture, normals)
+    new = copy.deepcopy(model)
+    names = [f"gaussians.{gaussians.colour}"]
+    if new.shading is not None:
+        _dim(new, views)
+        names += ["shading.coefficients", "shading.intensities"]
+    own = gaussians.get_parameter(gaussians.colour)[rows, :3].detach().sigmoid()
+    rough = laplacian(gaussians.means[rows], normals, bones, mirror_plane(new.track.body))
+    facing = (seen.directions * normals).sum(-1) / seen.weight.clamp_min(1e-9)
+    sure = (seen.squares * facing.clamp_min(0).square()).masked_fill(seen.little(), 0)
+    told = harmonic(own, sure, EVEN * rough)
+    pictures = _Pictures.of(new, views, own)
+    share = len(views) / len(capture.train_frames)
+    diagonal = share * seen.squares * pictures.brightness()
+    held = torch.full_like(diagonal, strength * len(views))
+    colours = closest(told, pictures.missing(told), pictures.twice, diagonal, held, STEPS)
+    # What is seen through the front alone must not glare; the front makes up for it.
+    behind = facing < 0
+    limited = told + (colours - told).clamp(-MOST_BEHIND, MOST_BEHIND)
+    start = torch.where(behind[:, None], limited, colours).clamp(_LEAST, _MOST)
+    held = held.masked_fill(behind, _FAST)
+    colours = closest(start, pictures.missing(start), pictures.twice, diagonal, held, STEPS)
+    with torch.no_grad():
+        new.gaussians.get_parameter(gaussians.colour)[rows, :3] = colours.clamp(
+            _LEAST, _MOST
+        ).logit()
+    state = new.state_dict()
+    return {name: state[name].detach().clone() for name in names}
+
+
+@torch.no_grad()
+def _layers(model: DiscModel, frame: Frame, camera: Camera) -> Layers:
+    return model.at([frame.mid_us], camera.center(), hard_semantics=True)
+
+
+def _views(
+    model: DiscModel, capture: TrainingCapture, normals: Float[Tensor, "H 3"]
+) -> list[_View]:
+    frames = capture.train_frames
+    generator = torch.Generator().manual_seed(0)
+    views = []
+    for frame in frames[:: -(-len(frames) // MOST_FRAMES)]:
+        camera = capture.camera(frame).to(model.device)
+        layers = _layers(model, frame, camera)
+        person, scene = layers.human.channels[..., :3], layers.scene.channels[..., :3]
+        with torch.no_grad():
+            picture = draw_values(layers, camera, person, scene)
+        weight = shares_in(layers, camera, generator, draws=0)[:, 0]
+        turned = normalize((layers.transforms[0, :, :3, :3] @ normals[..., None])[..., 0], dim=-1)
+        toward = normalize(camera.center() - layers.human.means[0], dim=-1)
+        away = (turned * toward).sum(-1) < _BACK
+        views.append(_View(frame, camera, picture, weight, away))
+    return views
+
+
+@torch.no_grad()
+def _dim(model: DiscModel, views: Sequence[_View]) -> None:
+    """Ridge regression of the light to its own factors by what was seen of each, and to shade.
+
+    Linear in the light's numbers (`Shading.terms`), all colours at once.
+    """
+    assert model.shading is not None
+    terms, factors = [], []
+    for view in views:
+        layers = _layers(model, view.frame, view.camera)
+        found = model.light_terms(layers, view.frame.mid_us)
+        terms.append(found[0][0].double())
+        factors.append(found[1][0].double())
+    weights = torch.cat([view.weight for view in views]).double()
+    total, away = weights.sum(), [view.away for view in views]
+    rows = SHADE_WEIGHT * total / torch.stack(away).sum().clamp_min(1)
+    shade = _shade(torch.cat(factors), weights) - 1
+    width = terms[0].shape[1]
+    ridge = torch.full((width,), CALM, dtype=weights.dtype, device=weights.device) * total
+    ridge[0] = 0.0  # the same light from everywhere
+    squares, told = ridge.diag(), weights.new_zeros(width, 3)
+    for view, term, factor, back in zip(views, terms, factors, away, strict=True):
+        weighed = term * view.weight.double()[:, None]
+        squares += weighed.T @ term + rows * term[back].T @ term[back]
+        told += weighed.T @ (factor - 1) + rows * term[back].sum(0)[:, None] * shade
+    numbers = torch.linalg.solve(squares, told).to(model.shading.coefficients)
+    bent = model.shading.coefficients.flatten(0, 1)
+    model.shading.coefficients.copy_(numbers[: len(bent)].view_as(model.shading.coefficients))
+    model.shading.intensities.copy_(numbers[len(bent) :])
+
+
+def _shade(factors: Float[Tensor, "N 3"], weights: Float[Tensor, " N"]) -> Float[Tensor, "3"]:
+    """The mean factor, as much darker as the quantile `SHADE` is of all brightnesses."""
+    mean = (factors * weights[:, None]).sum(0) / weights.sum()
+    bright, order = factors.mean(-1).sort()
+    reached = weights[order].cumsum(0) >= SHADE * weights.sum()
+    return mean * (bright[reached.int().argmax()] / mean.mean()).clamp(max=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """The views as linear functions of the person's colours: ``J y + rest``."""
+
+    views: Sequence[_View]
+    layers: Sequence[Layers]
+    light: Sequence[Float[Tensor, "1 H 3"]]
+    """Factors on the colours."""
+
+    @classmethod
+    def of(cls, model: DiscModel, views: Sequence[_View], own: Float[Tensor, "H 3"]) -> "_Pictures":
+        """``own``: the colours of ``model``, sRGB without light."""
+        layers = [_layers(model, view.frame, view.camera) for view in views]
+        return cls(views, layers, [each.human.channels[..., :3] / own for each in layers])
+
+    def brightness(self) -> Float[Tensor, " H"]:
+        """Mean square of the factors."""
+        return torch.stack([light[0].square().mean(-1) for light in self.light]).mean(0)
+
+    def missing(self, values: Float[Tensor, "H 3"]) -> Float[Tensor, "H 3"]:
+        """``J^T (b - J y - rest)``, b being the pictures before the fill."""
+        total = torch.zeros_like(values)
+        for view, layers, light in zip(self.views, self.layers, self.light, strict=True):
+            leaf = values.clone().requires_grad_()
+            scene = layers.scene.channels[..., :3]
+            picture = draw_values(layers, view.camera, leaf[None] * light, scene)
+            lacks = view.picture - picture.detach()
+            total += torch.autograd.grad(picture, leaf, lacks)[0]
+        return total
+
+    def twice(self, values: Float[Tensor, "H 3"]) -> Float[Tensor, "H 3"]:
+        """``J^T J y``."""
+        total = torch.zeros_like(values)
+        for view, layers, light in zip(self.views, self.layers, self.light, strict=True):
+            leaf = values.clone().requires_grad_()
+            picture = draw_values(layers, view.camera, leaf[None] * light)
+            total += torch.autograd.grad(picture, leaf, picture.detach())[0]
+        return total

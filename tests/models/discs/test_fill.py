@@ -1,0 +1,123 @@
+"""What the end of training decides where little was seen; pictures and learned values stay."""
+
+import copy
+
+import pytest
+import torch
+
+from evsplat.capture import Policy, load_capture
+from evsplat.errors import DataError
+from evsplat.film.looks import Look
+from evsplat.models.discs.fill import _shade, filled
+from evsplat.models.drawing import draw
+from evsplat.models.seen import Seen, seen_by
+from evsplat.training.checkpoint import below, load_latest, load_model, write_state
+from evsplat.training.run import load_run
+from evsplat.training.train import train
+
+from ...small_model import built, small
+
+
+@pytest.fixture
+def spoilt(tiny_capture):
+    """A model with light whose unseen colours are noise, what it saw, and its capture."""
+    capture = load_capture(tiny_capture()).for_training(Policy())
+    model = built("evsplat", load_capture(tiny_capture("again"))).model
+    generator = torch.Generator().manual_seed(0)
+    gaussians = model.gaussians
+    seen = seen_by(model, capture)
+    with torch.no_grad():
+        colours = gaussians.get_parameter(gaussians.colour)
+        colours.fill_(0.5)
+        noise = 2 * torch.randn(gaussians.human_count, 3, generator=generator)
+        colours[gaussians.human][seen.little()] += noise[seen.little()]
+        model.shading.coefficients.normal_(0, 0.02, generator=generator)
+    return model, capture, seen
+
+
+@torch.no_grad()
+def frames_of(model, capture):
+    cameras = [capture.camera(frame) for frame in capture.train_frames]
+    times = [frame.mid_us for frame in capture.train_frames]
+    return [
+        (model.at([time], camera.center(), hard_semantics=True), camera)
+        for time, camera in zip(times, cameras, strict=True)
+    ]
+
+
+def test_light_is_linear_in_its_terms(spoilt):
+    model, capture, _ = spoilt
+    frame = capture.train_frames[1]
+    layers = model.at([frame.mid_us], capture.camera(frame).center(), hard_semantics=True)
+    terms, factors = model.light_terms(layers, frame.mid_us)
+    shading = model.shading
+    numbers = torch.cat([shading.coefficients.flatten(0, 1), shading.intensities])
+    assert torch.allclose(1 + terms @ numbers, factors, atol=1e-5)
+    colours = model.gaussians.get_parameter(model.gaussians.colour)[model.gaussians.human].sigmoid()
+    assert torch.allclose(layers.human.channels[..., :3], colours * factors, atol=1e-5)
+
+
+def test_the_fill_evens_what_is_unseen_and_leaves_the_pictures(spoilt):
+    model, capture, seen = spoilt
+    before = copy.deepcopy(model.state_dict())
+    found = filled(model, capture, 0.005, seen)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    new = copy.deepcopy(model)
+    new.load_state_dict({**before, **found})
+    rows = model.gaussians.human
+    name = f"gaussians.{model.gaussians.colour}"
+    assert torch.equal(found[name][rows.stop :], before[name][rows.stop :])
+    never = seen.squares <= seen.squares.quantile(0.1)
+    assert float(found[name][rows][never].std()) < 0.3 * float(before[name][rows][never].std())
+    for (old, camera), (layers, _) in zip(
+        frames_of(model, capture), frames_of(new, capture), strict=True
+    ):
+        with torch.no_grad():
+            change = (draw(layers, camera).output.image - draw(old, camera).output.image)[..., :3]
+        assert float(change.square().mean().sqrt()) < 0.01
+
+
+def test_the_shade_is_the_darkest_fifth_in_the_mean_light_s_hue():
+    factors = torch.linspace(0.5, 1.5, 11, dtype=torch.float64)[:, None].expand(11, 3)
+    tint = torch.tensor([1.2, 1.0, 0.8], dtype=torch.float64)
+    shade = _shade(factors * tint, torch.ones(11, dtype=torch.float64))
+    assert torch.allclose(shade, 0.7 * tint)
+
+
+def test_nothing_is_decided_where_nobody_was_seen(spoilt):
+    model, capture, seen = spoilt
+    nothing = Seen(*(torch.zeros_like(value) for value in vars(seen).values()))
+    assert filled(model, capture, 0.005, nothing) == {}
+
+
+def test_a_run_is_drawn_filled_and_goes_on_unfilled(tiny_capture, tmp_path):
+    capture = tiny_capture()
+    run = train(capture, out=tmp_path / "run", iterations=3, overrides=small("evsplat"))
+    bare = train(capture, out=tmp_path / "bare", iterations=3, overrides=small("evsplat", "fill=0"))
+    states = [load_latest(path / "checkpoints") for path in (run, bare)]
+    (_, tensors, state), (_, others, _) = states
+    assert below("filled", tensors) and not below("filled", others) and below("seen", others)
+    model, other = below("model", tensors), below("model", others)
+    assert all(torch.equal(model[name], other[name]) for name in model)
+    drawn = load_run(run).reconstruction
+    assert drawn.seen is not None
+    assert len(drawn.seen.weight) == state["human_count"]
+    colour = drawn.model.gaussians.colour
+    frame = load_capture(capture).frames[0]
+    camera = load_capture(capture).camera(frame)
+    certain = drawn.certainty(camera, [frame.mid_us], parts="human")[0]
+    assert 0 < float(certain.max()) <= 1
+    shown = Look("certainty").expose(drawn, camera, [frame.mid_us])[0]
+    assert shown.shape == (camera.height, camera.width, 3)
+    kept = {name: value for name, value in tensors.items() if name.startswith("model.")}
+    write_state(tmp_path / "older.safetensors", kept, state)
+    older = load_run(run, state=tmp_path / "older.safetensors")
+    assert older.what_was_seen() is None
+    with pytest.raises(DataError, match="does not say what training saw.*--resume"):
+        Look("certainty").expose(older.reconstruction, camera, [frame.mid_us])
+    learned = copy.deepcopy(drawn.model)
+    load_model(learned, tensors, state["human_count"])
+    assert not torch.equal(
+        drawn.model.gaussians.get_parameter(colour), learned.gaussians.get_parameter(colour)
+    )
+    assert torch.equal(learned.gaussians.get_parameter(colour), model[f"gaussians.{colour}"])
