@@ -14,7 +14,8 @@ from evsplat.capture import Capture, TrainingCapture, load_body_track, load_capt
 from evsplat.errors import ConfigError
 from evsplat.methods import poses
 from evsplat.methods.evsplat import EvsplatConfig
-from evsplat.methods.poses import Poses, prepare_poses
+from evsplat.methods.poses import SMOOTHED, Poses, prepare_poses
+from evsplat.models.pose_correction import SHARES
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
@@ -86,6 +87,9 @@ def test_poses_that_err_are_smoothed_and_corrected_by_what_is_said_of_them(captu
     assert "(source: estimated) are taken as off by some 0.050 rad and 10 mm" in caplog.text
     assert "smoothed in time, corrected in training" in caplog.text
     assert np.abs(found.track.poses - exact).mean() < np.abs(noisy - exact).mean()
+    believed = SMOOTHED * 0.05 * SHARES["fast"] ** 0.5
+    moved = np.sqrt(np.square(found.track.poses - noisy).mean())
+    assert 0 < moved < 1.2 * believed, "the noise is larger, but may be fast motion"
     assert float(found.correction.joint_rad.max()) == pytest.approx(0.05)
     assert not bool(found.correction.exact)
     off = prepared(seen(captures[1]), smooth="never", refine="never", between=False)

@@ -22,6 +22,9 @@ When = Literal["auto", "always", "never"]
 UNKNOWN = (0.05, 0.02)
 """Errors expected of joints (radians) and of the root's place (metres), per axis, of poses whose
 source is unknown, and of those that are said to be exact where they are to be corrected."""
+SMOOTHED = 0.5
+"""Noise that is believed of a curve alone, over what is expected to be new in every key: fast
+motion looks like noise as well, and with all of it up to 15 % was added to errors of joints."""
 
 _NOT_ALWAYS = ReadIf("pose.refine", "auto or never", lambda refine: refine != "always")
 _REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "never")
@@ -32,8 +35,8 @@ class PoseSettings:
     """Errors of the given poses."""
 
     smooth: When
-    """Take out of the given key poses what looks like noise, up to the share of the expected errors
-    that is new in every pose. ``auto``: where the capture says how far its poses err."""
+    """Take out of the given key poses what looks like noise, up to half of what is expected to be
+    new in every pose. ``auto``: where the capture says how far its poses err."""
     refine: When
     """Learn the errors of the poses from pictures and events. ``auto``: where the capture says that
     they err, and where it doesn't say, if pictures are explained better by others."""
@@ -108,8 +111,8 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
 
 
 def _smoothed(track: BodyTrack, joint_rad: np.ndarray, root_m: np.ndarray) -> BodyTrack:
-    """Without the noise that is new in every pose, up to its share of the errors expected."""
-    new = SHARES["fast"] ** 0.5
+    """Without the noise that is new in every pose, up to half of what is expected of it."""
+    new = SMOOTHED * SHARES["fast"] ** 0.5
     noise = motion_noise(
         track, most_rad=new * float(joint_rad.max()), most_m=new * float(root_m.max())
     )
