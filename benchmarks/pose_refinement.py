@@ -66,6 +66,18 @@ def errors(track: BodyTrack, capture: Capture) -> dict[str, float]:
     return {name: round(value, 3) for name, value in found.items()}
 
 
+def told_ratio(track: BodyTrack, capture: Capture) -> float:
+    """Error of the root's place, root mean square, over what the track says of it: 1 is right.
+
+    Most of it is one distance from the camera, so a single capture tells it roughly.
+    """
+    assert track.errors is not None
+    true = load_body_track(capture, dense=True).at(track.times_us.tolist())[1]
+    off = track.at(track.times_us.tolist())[1] - true
+    told = np.square(track.errors.root_m).sum(1).mean()
+    return float(np.sqrt(off.square().sum(1).mean() / told))
+
+
 def main() -> None:
     """Stage what is missing, correct, and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -105,7 +117,8 @@ def main() -> None:
                 rows.append((level, before, after, after if refined.disproves else before))
                 print(
                     f"{path.name:32} gain {refined.gain:.3f} +- {refined.gain_error:.3f}, "
-                    f"{'wrong' if refined.disproves else 'not told wrong'}, {seconds:.0f} s:",
+                    f"{'wrong' if refined.disproves else 'not told wrong'}, {seconds:.0f} s, "
+                    f"root off {told_ratio(refined.track, capture):.2f} times what it says:",
                     ", ".join(f"{name} {before[name]:.2f} -> {after[name]:.2f}" for name in before),
                     flush=True,
                 )

@@ -4,7 +4,7 @@ import threading
 
 import torch
 
-from evsplat.devices import DeviceCache, send
+from evsplat.devices import DeviceCache, send, use_threads
 
 
 def maker(log, key, count=100):
@@ -79,3 +79,16 @@ def test_send_keeps_values_and_gradients():
     assert send(tensor, "cpu") is tensor
     there = send(tensor * 2, "meta")
     assert there.device.type == "meta" and there.requires_grad
+
+
+def test_threads_that_draw_take_the_number_that_was_set():
+    before, seen = torch.get_num_threads(), []
+    try:
+        use_threads(before + 2)
+        drawing = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
+        drawing.start()
+        drawing.join()
+        use_threads(None)
+        assert seen == [before + 2] and torch.get_num_threads() == before + 2
+    finally:
+        torch.set_num_threads(before)

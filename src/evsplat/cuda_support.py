@@ -124,7 +124,7 @@ def _numbers(text: str) -> tuple[int, ...]:
     """The leading numbers of a version: '1.5.3+pt26cu124' -> (1, 5, 3)."""
     numbers = []
     for part in text.split("+")[0].split("."):
-        if not part.isdigit():
+        if not part.isdecimal():
             break
         numbers.append(int(part))
     return tuple(numbers)

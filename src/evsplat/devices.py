@@ -27,6 +27,15 @@ def send(tensor: Tensor, device: torch.device | str) -> Tensor:
     return tensor.to(device, non_blocking=True)
 
 
+def use_threads(count: int | None) -> None:
+    """Let this process compute with ``count`` CPU threads; None: as many as it would by itself.
+
+    Threads of Python that draw, as the viewer's, take the number that was set last.
+    """
+    if count is not None:
+        torch.set_num_threads(count)
+
+
 def network_device(asked: str) -> torch.device:
     """Where a network of plain PyTorch runs; unlike rendering it needs no kernels of others."""
     if asked not in ("auto", "cpu", "cuda"):

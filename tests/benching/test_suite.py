@@ -24,6 +24,7 @@ def write(tmp_path, text):
         ("name: s\nrows: [{name: a}]", "method is missing"),
         ("name: s\nrows: []", "rows is empty"),
         ("name: s\nrows: [{name: ../a, method: paper}]", "'../a'"),
+        (f"name: s\nrows: [{{name: {'a' * 300}, method: paper}}]", "up to 100 letters"),
         ("name: s\nrows: [{name: a, method: m}, {name: a, method: n}]", "two rows are named a"),
         (f"name: s\ncaptures: [{{name: c}}]\n{ROW}", "either path or stage"),
         (f"name: s\nseeds: one\n{ROW}", "seeds"),

@@ -108,9 +108,9 @@ def test_ctrl_c_is_code_130_and_says_how_to_go_on(capsys, monkeypatch, tmp_path)
         raise Stopped(tmp_path / "my run")
 
     monkeypatch.setattr(evsplat.training, "train", interrupted)
-    code, _, stderr = _outcome(capsys, "train", "my capture")
+    code, _, stderr = _outcome(capsys, "train", str(demo_capture()))
     assert code == 130
-    assert f"evsplat train 'my capture' --out '{tmp_path}/my run' --resume" in stderr
+    assert f"evsplat train {demo_capture()} --out '{tmp_path}/my run' --resume" in stderr
     assert "Traceback" not in stderr
 
 
@@ -141,7 +141,7 @@ def test_ctrl_c_during_evaluation_says_that_the_training_is_safe(capsys, monkeyp
 
     monkeypatch.setattr(evsplat.training, "train", lambda capture, options, **_: tmp_path)
     monkeypatch.setattr(evsplat.evaluation.run, "evaluate_run", interrupted)
-    code, _, stderr = _outcome(capsys, "train", "capture")
+    code, _, stderr = _outcome(capsys, "train", str(demo_capture()))
     assert code == 130
     assert f"evsplat evaluate {tmp_path}" in stderr
 
@@ -206,12 +206,15 @@ def test_ctrl_c_is_answered_with_a_word(capsys, monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("evsplat.synthesis.synthesize", interrupted)
-    code, _, stderr = _outcome(capsys, "synthesize", "clip.mp4", "--out", str(tmp_path / "out"))
+    clip = tmp_path / "clip.mp4"
+    clip.touch()
+    code, _, stderr = _outcome(capsys, "synthesize", str(clip), "--out", str(tmp_path / "out"))
     assert (code, stderr) == (130, "\nevsplat: Stopped.\n")
 
 
 def test_view_without_its_package_says_how_to_get_it(capsys, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
+    (tmp_path / "config.yaml").touch()
     assert main(["view", str(tmp_path)]) == 2
     message = capsys.readouterr().err
     assert "pip install 'evsplat[view]'" in message and message.count("\n") == 1

@@ -97,7 +97,7 @@ def spoil(capture: Path, kind: str) -> None:
         ((32, 24), "brighter", ""),
         ((32, 24), "darker", ""),
         ((32, 24), "no light", "an empty exposure"),
-        ((32, 24), "clock back", "ms_to_idx[|earlier than the event before"),
+        ((32, 24), "clock back", "ms_to_idx[|before the one before"),
         ((32, 24), "clock on", ""),
     ],
 )

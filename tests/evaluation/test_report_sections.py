@@ -8,8 +8,10 @@ import pytest
 from evsplat.capture import load_body_track, load_capture
 from evsplat.config import to_dict
 from evsplat.devices import hardware
+from evsplat.evaluation.report.charts import Series
 from evsplat.evaluation.report.configuration import _changed, configuration, made_with
 from evsplat.evaluation.report.frames import _chosen_entries, _speeds
+from evsplat.evaluation.report.page import _running_mean
 from evsplat.methods import TRAINABLE, method_config
 
 
@@ -82,3 +84,14 @@ def test_a_long_recording_shows_the_hardest_frame_and_an_even_choice_of_others(c
     assert len(shown) >= min(count, 29)
     if count > 30:
         assert np.diff(sorted(shown)).max() < 3 * count / 30
+
+
+def test_the_curve_of_training_pictures_is_a_running_mean() -> None:
+    steps, psnr = np.arange(40) * 10, 30 + np.arange(40) * 0.1
+    zigzag = psnr + np.where(np.arange(40) % 2, 4.0, -4.0)
+    smooth = _running_mean(Series("psnr", steps.tolist(), zigzag.tolist()))
+    # an even count of neighbours: the zig-zag cancels, a straight line stays one
+    assert np.allclose(smooth.x, np.arange(31) * 10 + 45)
+    assert np.allclose(smooth.y, 30 + np.asarray(smooth.x) / 10 * 0.1)
+    assert _running_mean(Series("psnr", [3.0], [30.0])).y == [30.0]
+    assert list(_running_mean(Series("psnr", [], [])).y) == []

@@ -46,6 +46,9 @@ class _Lamp:
     def following(self, track):
         return _Lamp(track)
 
+    def changed_by(self, change):
+        return self
+
 
 @pytest.fixture
 def lamp(tiny_capture, tmp_path, monkeypatch):

@@ -82,6 +82,15 @@ def replace(name: str, old: str, new: str) -> Change:
     return lambda root: (root / name).write_text((root / name).read_text().replace(old, new))
 
 
+def zero_turn(root: Path) -> None:
+    path = root / "sparse" / "images.txt"
+    lines = path.read_text().splitlines()
+    at = next(n for n, line in enumerate(lines) if line.endswith(".png"))
+    words = lines[at].split()
+    lines[at] = " ".join([words[0], "0", "0", "0", "0", *words[5:]])
+    path.write_text("\n".join(lines) + "\n")
+
+
 class Call:
     def __reduce__(self):
         return os.system, ("touch touched",)
@@ -219,6 +228,16 @@ FAULTS: dict[str, tuple[str, Change, str]] = {
         "neuman",
         replace("sparse/images.txt", " 1 00002.png", ""),
         r"images.txt: line 6: found .* expected IMAGE_ID QW",
+    ),
+    "endless focal length": (
+        "neuman",
+        replace("sparse/cameras.txt", "140.0", "1e400"),
+        r"cameras.txt: line \d+: found '1e400 .* expected finite numbers",
+    ),
+    "no rotation": (
+        "neuman",
+        zero_turn,
+        r"images.txt: line \d+: QW QX QY QZ are 0 0 0 0, expected a rotation",
     ),
     "fewer poses": (
         "neuman",

@@ -131,8 +131,8 @@ def finder(monkeypatch):
     """A stand-in for the search, which takes most of the time; gives what it was asked for."""
     asked = []
 
-    def found(path, out, search, overwrite):
-        asked.append((load_capture(path), search))
+    def found(path, out, search, *, keypoints, overwrite):
+        asked.append((load_capture(path), search, keypoints))
         with derived_capture(load_capture(path), out, replace=overwrite) as making:
             making.document["provenance"]["poses"] = "found"
 
@@ -144,19 +144,36 @@ def test_an_import_goes_on_to_find_poses_and_leaves_one_capture(
     davis: Path, tmp_path: Path, finder: list
 ) -> None:
     out = tmp_path / "out"
-    for height, overwrite in ((1.7, False), (1.8, True)):
+    points = tmp_path / "points.npy"
+    np.save(points, np.full((COUNT, 17, 3), 0.5))
+    for height, overwrite, keypoints in ((1.7, False, None), (1.8, True, points)):
         options = PoseOptions(height_m=height)
-        import_capture("davis", davis, out, find_poses=options, overwrite=overwrite)
+        import_capture(
+            "davis", davis, out, find_poses=options, keypoints=keypoints, overwrite=overwrite
+        )
         assert load_capture(out).provenance["poses"] == "found"
-        capture, search = finder.pop()
-        assert not capture.has_body and capture.name == "out" and search.height_m == height
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["dance.aedat4", "out"]
+        capture, search, asked = finder.pop()
+        assert not capture.has_body and capture.name == "out"
+        assert (search.height_m, asked) == (height, keypoints)
+        names = ["dance.aedat4", "out", "points.npy"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == names
+
+
+def test_key_points_that_cannot_be_read_are_refused_before_anything_is_imported(
+    davis: Path, tmp_path: Path, finder: list, capsys
+) -> None:
+    command = ["import", "davis", str(davis), "--out", str(tmp_path / "out"), "--find-poses"]
+    assert main([*command, "--keypoints", str(tmp_path / "points.npy")]) == 2
+    assert "points.npy" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="find_poses=True"):
+        import_capture("davis", davis, tmp_path / "out", keypoints=tmp_path / "points.npy")
+    assert not finder and [path.name for path in tmp_path.iterdir()] == ["dance.aedat4"]
 
 
 def test_where_no_poses_are_found_the_capture_without_them_stays(
     davis: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    def nobody(path, out, search, overwrite):
+    def nobody(path, out, search, *, keypoints, overwrite):
         raise DataError("nobody")
 
     monkeypatch.setattr(posing, "find_poses", nobody)
@@ -172,8 +189,9 @@ def test_where_no_poses_are_found_the_capture_without_them_stays(
 
 def test_options_of_poses_that_are_not_searched_for_are_refused(davis: Path, capsys) -> None:
     command = ["import", "davis", str(davis), "--out", str(davis.with_name("out"))]
-    assert main([*command, "--height", "1.7"]) == 2
-    assert "belong to --find-poses" in capsys.readouterr().err
+    for option in (("--height", "1.7"), ("--keypoints", "points.npy")):
+        assert main([*command, *option]) == 2
+        assert "belong to --find-poses" in capsys.readouterr().err
 
 
 def test_poses_of_a_data_set_can_be_left_out(tmp_path: Path) -> None:

@@ -183,3 +183,28 @@ def test_started_at_a_better_motion_it_counts_and_gives_that_motion(seed):
     assert torch.allclose(found @ axis_angle_to_matrix(corrected), expected, atol=2e-3)
     assert torch.allclose(at + shifts, there, atol=1e-3)
     assert bool(learned.started)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_smoothed_away_is_part_of_the_state_and_no_error(seed):
+    """Smoothed keys come back at the keys, from a state as well; they are neither learned nor
+    paid for, and another motion knows nothing of them."""
+    rng, track = np.random.default_rng(seed), dance(seed)
+    poses = track.poses + rng.normal(0, 0.02, track.poses.shape)
+    transl = track.transl + rng.normal(0, 0.01, track.transl.shape)
+    noisy = BodyTrack(track.body, track.times_us, poses, transl)
+    learned = correction(noisy)
+    learned.smooth_to(noisy, track)
+    assert learned.price().detach() == 0
+    assert not {id(value) for value in learned.parameters()} & {id(learned.smoothing.rotations)}
+    again = correction(noisy)
+    again.load_state_dict(learned.state_dict())
+    times = track.times_us.tolist()
+    for each in (learned, again):
+        turns, shifts = each.residual(times)
+        rotations, places = noisy.at(times)
+        wanted, there = track.at(times)
+        assert torch.allclose(rotations @ axis_angle_to_matrix(turns), wanted, atol=2e-4)
+        assert torch.allclose(places + shifts, there, atol=2e-4)
+    learned.forget()
+    assert not any(value.any() for value in learned.residual(times))

@@ -13,7 +13,7 @@ from evsplat.capture import Frame
 from evsplat.pictures import decode, encode, luminance
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import Descent
-from evsplat.posing.refine import _gain, expected_errors
+from evsplat.posing.refine import _gain, _given_errors, expected_errors
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets
 
@@ -91,6 +91,23 @@ def test_where_nobody_says_limbs_err_more_than_the_trunk(body):
     joint_rad, root_m = expected_errors(still_track(body))
     assert joint_rad[0] < joint_rad.max()
     assert (root_m > 0).all()
+
+
+@pytest.mark.parametrize("size", [0.2, 1.0])
+def test_a_motion_errs_by_how_far_it_was_corrected(body, size):
+    """A correction drawn from its prior, ``size`` times as large, gives errors of that size."""
+    torch.manual_seed(2)
+    rad, metres = 0.05, 0.02
+    correction = correction_of(body, rad, metres)
+    with torch.no_grad():
+        correction.turns.normal_(std=size)
+        correction.shifts.normal_(std=size)
+    errors = _given_errors(correction)
+    assert errors.source == "estimated" and not errors.typical
+    assert errors.joint_rad == pytest.approx(np.full_like(errors.joint_rad, size * rad), rel=0.2)
+    # Three axes of a handful of coordinates: a rough estimate, no axis far below the worst.
+    assert size * metres / 3 < errors.root_m.max() < 3 * size * metres
+    assert errors.root_m.min() >= 0.5 * errors.root_m.max()
 
 
 def test_discs_take_the_colours_of_the_pixels_that_show_them(body):
@@ -187,6 +204,36 @@ def test_pictures_of_another_motion_correct_it_and_are_explained_better(body):
     errors.check(len(descent.correction.key_times), len(body.parents), "test")
     assert errors.joint_rad.max() < 0.08
     assert errors.root_m.max() < 0.02
+
+
+def test_how_far_away_somebody_is_stays_as_unknown_as_their_size(body):
+    """Two shares of one sum: each keeps c^2 s^2 / (c^2 + s^2), here all of it along the view."""
+    _, descent = staged(body, 0.0)
+    camera = descent.targets.camera
+    _, transl = descent.correction.at(TIMES)
+    hidden = descent.look.nearer_m(transl, camera)
+    away = transl + body.rest_joints[0] - camera.center()
+    torch.testing.assert_close(hidden, 0.015 * away)
+    # Pictures of somebody larger by a share and of somebody nearer by it are the same.
+    behind = descent.targets.behind[:1]
+    with torch.no_grad():
+        rotations, places = descent.correction.at([0])
+        nearer = descent.look.draw(rotations, places - hidden[:1], camera, behind)
+        plain = descent.look.draw(rotations, places, camera, behind)
+        descent.look.nearer.fill_(1.0)
+        larger = descent.look.draw(rotations, places, camera, behind)
+        descent.look.nearer.zero_()
+    assert (larger - nearer).abs().mean() < 0.1 * (larger - plain).abs().mean()
+    variance = descent._distance(TIMES)
+    view = torch.nn.functional.normalize(away, dim=1)
+    s2 = hidden.square().sum(1)
+    c2 = 0.02**2 * descent.correction.weights(TIMES).mean(0).square().sum()
+    torch.testing.assert_close(variance, view.square() * (1 / (1 / c2 + 1 / s2))[:, None])
+    assert 0.3 < c2 / 0.02**2 < 0.9, "what lasts, and the mean of what does not"
+    descent.discs = 500
+    told = descent.errors().root_m
+    along = np.sqrt((np.square(told) * view[0].square().detach().numpy()).sum(1))
+    assert along.min() > 0.95 * float(variance.sum(1).min().sqrt())
 
 
 def test_pictures_of_the_same_motion_hardly_move_it(body):

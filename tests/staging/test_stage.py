@@ -65,7 +65,11 @@ def test_capture_is_valid_and_complete(made):
     capture = made[0]
     assert validate_capture(capture.path) == []
     assert len(capture.frames) == 8 and [f.split for f in capture.frames].count("test") == 1
-    assert {view.camera for view in capture.novel_views} == {"novel_left", "novel_right"}
+    assert {view.camera for view in capture.novel_views} == {
+        "novel_left",
+        "novel_right",
+        "novel_back",
+    }
     assert capture.contrast_threshold == (0.2, 0.2) and capture.events_simulated
     assert len(capture.events) > 1000
     assert capture.provenance["settings"]["motion"] == "kick"

@@ -79,7 +79,7 @@ class RayCluster:
 def _check_listening(address: str) -> None:
     """Fail at once where nobody listens at HOST:PORT; Ray itself would try for minutes."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if colon and port.isdigit():
+    if colon and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=_ANSWER_SECONDS).close()
 
 

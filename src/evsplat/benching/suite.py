@@ -12,7 +12,7 @@ from evsplat.config import Above, AtLeast, from_dict, load_yaml
 from evsplat.errors import ConfigError
 from evsplat.staging import StageSettings
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,8 @@ def check_names(kind: str, names: list[str], where: str) -> None:
     for name in names:
         if not _NAME.fullmatch(name):
             raise ConfigError(
-                f"{where}: {kind} {name!r}: expected letters, digits, '.', '_', '+' and '-' only."
+                f"{where}: {kind} {name!r}: expected up to 100 letters, digits, '.', '_', '+' and "
+                "'-'."
             )
         if names.count(name) > 1:
             raise ConfigError(f"{where}: two {kind}s are named {name}; give each its own name.")

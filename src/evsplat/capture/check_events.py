@@ -15,12 +15,16 @@ from evsplat.untrusted.hdf5 import open_hdf5, wrong_data_set
 
 _COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 _SCAN_EVENTS = 1 << 20
+_SHORT = 500_000
+"""Events of a recording that is scanned whenever it is opened, which takes some 20 ms."""
+_INDEX_PIECE = 1 << 20
+"""Entries of the index that are read at a time."""
 _INDEX_SAMPLES = 64
 _REPAIR = "Copy the file again or write it anew."
 
 
 def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
-    """Layout, clock and sensor size; ``deep`` scans every event."""
+    """Layout, clock and sensor size; every event if ``deep``, and of short recordings always."""
     entry = metadata.events
     if entry is None:
         return
@@ -33,7 +37,7 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
             if not _check_layout(entry.file, file, findings):
                 return
             _check_clock(metadata, entry, file, findings)
-            if deep:
+            if deep or len(file["events/t"]) <= _SHORT:
                 _Scan(entry, file, findings).run()
             else:
                 _check_index(entry, file, findings)
@@ -148,7 +152,7 @@ def _check_clock(
 
 
 def _check_index(entry: EventsEntry, file: h5py.File, findings: Findings) -> None:
-    """Whether `_INDEX_SAMPLES` entries of ms_to_idx, evenly spread, lead to the right events."""
+    """Whether ms_to_idx ascends, and `_INDEX_SAMPLES` entries lead to the right events."""
     t, index = file["events/t"], file["ms_to_idx"]
     count = len(t)
     if count == 0:
@@ -157,19 +161,38 @@ def _check_index(entry: EventsEntry, file: h5py.File, findings: Findings) -> Non
     if last_ms >= len(index):
         _note_short_index(entry, len(index), last_ms + 1, findings)
         return
-    for ms in np.unique(np.linspace(max(0, int(t[0]) // 1000), last_ms, _INDEX_SAMPLES).round()):
-        row, time = int(index[int(ms)]), 1000 * int(ms)
+    if (wrong := _descent(index)) is not None:
+        _note_wrong_index(entry, wrong, int(index[wrong]), findings)
+        return
+    first_ms = max(0, int(t[0]) // 1000)
+    asked = np.unique(np.linspace(first_ms, last_ms, _INDEX_SAMPLES).round())
+    for ms in map(int, asked):
+        row, time = int(index[ms]), 1000 * ms
         found = 0 <= row <= count
         found = found and (row == 0 or int(t[row - 1]) < time)
         if not found or (row < count and int(t[row]) < time):
-            findings.error(
-                entry.file,
-                f"ms_to_idx[{int(ms)}]",
-                str(row),
-                f"the first event with t >= {time}",
-                "Rebuild ms_to_idx, or write the recording anew with evsplat convert.",
-            )
+            _note_wrong_index(entry, ms, row, findings)
             return
+
+
+def _descent(index: h5py.Dataset) -> int | None:
+    """The first millisecond whose entry is less than the one before it."""
+    for start in range(0, len(index), _INDEX_PIECE):
+        piece = index[max(0, start - 1) : start + _INDEX_PIECE]
+        falls = np.flatnonzero(piece[1:] < piece[:-1])
+        if len(falls):
+            return max(0, start - 1) + int(falls[0]) + 1
+    return None
+
+
+def _note_wrong_index(entry: EventsEntry, ms: int, row: int, findings: Findings) -> None:
+    findings.error(
+        entry.file,
+        f"ms_to_idx[{ms}]",
+        str(row),
+        f"the first event with t >= {1000 * ms}",
+        "Rebuild ms_to_idx, or write the recording anew with evsplat convert.",
+    )
 
 
 def _note_short_index(entry: EventsEntry, length: int, needed: int, findings: Findings) -> None:

@@ -1,6 +1,5 @@
 """capture.json: from JSON to `Metadata`, every fault noted."""
 
-import os
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +15,7 @@ from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Frame, Metadata, NovelView
 from evsplat.errors import DataError
 from evsplat.names import NAME_RULE, is_name
+from evsplat.options.inputs import no_capture
 from evsplat.pictures.light import TRANSFERS, Transfer
 from evsplat.untrusted.faults import brief
 from evsplat.untrusted.text import read_json
@@ -41,15 +41,15 @@ def read_metadata(path: Path, findings: Findings) -> Metadata | None:
     None where the file as a whole cannot be used; entries with errors are left out otherwise.
     """
     file = path / "capture.json"
-    if not os.path.isdir(path):
-        findings.error(path, "", "no such folder", "a capture folder", "Check the path.")
+    if missing := no_capture(path):
+        where, found, expected, remedy = missing
+        findings.error(where, "", found, expected, remedy)
         return None
     try:
         document = read_json(file)
     except DataError as error:
         reason, remedy = reason_and_remedy(error, file)
-        if not remedy:
-            reason, remedy = "no such file", "Is this a capture folder?"
+        remedy = remedy or "Is this a capture folder?"
         expected = "the capture's description as a JSON object"
         findings.error(file, "", reason, expected, remedy)
         return None

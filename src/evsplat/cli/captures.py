@@ -19,6 +19,7 @@ from evsplat.options.declare import (
     Use,
     option,
 )
+from evsplat.options.inputs import Input, check_capture_or_recording, check_file, check_footage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +29,7 @@ class Convert:
     What is read: docs/event-formats.md.
     """
 
-    recording: Annotated[Positional[Path], option("IN")]
+    recording: Annotated[Positional[Path], option("IN"), Input(check_file)]
     """AEDAT4, AEDAT2, RAW, DAT, HDF5, .npz, text, .es or a ROS bag."""
     out: Annotated[Positional[Path], option("OUT")]
     """The file to write."""
@@ -53,7 +54,7 @@ class Convert:
 class Simulate:
     """Write the events that an event camera would have sent, seeing a video."""
 
-    source: Annotated[Positional[Path], option("SOURCE")]
+    source: Annotated[Positional[Path], option("SOURCE"), Input(check_footage)]
     """A video, or a folder of pictures in the order of their names;
     200 a second or more, as light is taken to change evenly between two."""
     out: Annotated[Path, option("FILE")]
@@ -95,7 +96,7 @@ class Simulate:
 class Synthesize:
     """Make a capture of sharp footage: blur and events (docs/synthesize.md)."""
 
-    source: Annotated[Positional[Path], option("SOURCE")]
+    source: Annotated[Positional[Path], option("SOURCE"), Input(check_footage)]
     """Video, folder of pictures, or capture with sharp frames."""
     out: Annotated[Path, option("CAPTURE")]
     """New capture folder."""
@@ -165,7 +166,7 @@ class Inspect:
     Draws frames, events, posed body, time and clocks, where there are any.
     """
 
-    capture: Annotated[Positional[Path], option("CAPTURE")]
+    capture: Annotated[Positional[Path], option("CAPTURE"), Input(check_capture_or_recording)]
     """Capture folder (docs/capture-format.md), or an event file of any format."""
     out: Annotated[Path | None, option("FOLDER", default="inspect/CAPTURE")] = None
     """Folder for the pictures."""
@@ -251,12 +252,10 @@ class Poses:
     threads: Threads = None
 
     def __call__(self) -> None:
-        import torch
-
+        from evsplat.devices import use_threads
         from evsplat.posing import find_poses
 
-        if self.threads is not None:
-            torch.set_num_threads(self.threads)
+        use_threads(self.threads)
         found = find_poses(self.capture, self.out, self.search, keypoints=self.keypoints)
         print(found.summary)
 

@@ -18,7 +18,7 @@ from evsplat.options.declare import Flag
 from evsplat.shipped import demo_capture
 
 _RESTORERS_WITH_WEIGHTS = ("nafnet", "mprnet", "efnet", "d2net", "e2vid")
-_MARKS = {"ok": "ok", "missing": "MISSING", "optional": "-"}
+_TITLES = {"missing": "missing", "ok": "there", "optional": "optional, not there"}
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,14 @@ def doctor(*, json: Flag = False) -> None:
         print(json_format.dumps(found, indent=1))
         return
     width = max(len(check.name) for check in checks)
-    for check in checks:
-        remedy = f" {check.remedy}" if check.remedy else ""
-        print(f"{check.name:{width}}  {_MARKS[check.status]:7}  {check.detail}{remedy}")
+    for status, title in _TITLES.items():
+        among = [check for check in checks if check.status == status]
+        if among:
+            print(f"{title}:")
+        for check in among:
+            print(f"  {check.name:{width}}  {check.detail} {check.remedy}".rstrip())
+    missing = ", ".join(check.name for check in checks if check.status == "missing")
+    print(f"ready: no, for want of {missing}" if missing else "ready: yes")
 
 
 def run_checks() -> Iterator[Check]:

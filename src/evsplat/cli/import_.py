@@ -61,14 +61,16 @@ class _ImportToPose(_Import):
     find_poses: Flag = False
     """Go on to find the person's poses: evsplat poses, whose options stand last."""
     search: Annotated[PoseOptions, FLAT]
+    keypoints: Annotated[Path | None, option("FILE", default="found by the network")] = None
+    """Key points of COCO (17, 133), OpenPose (25) or BlazePose (33)."""
 
     def going_on(self) -> dict[str, Any]:
         if self.find_poses:
-            return {"poses": self.search}
-        if self.search != PoseOptions():
+            return {"poses": self.search, "keypoints": self.keypoints}
+        if self.search != PoseOptions() or self.keypoints is not None:
             raise ConfigError(
-                "--body, --height, --refine, --use and --held-out-events belong to --find-poses; "
-                "leave them out, or give it as well."
+                "--body, --height, --refine, --use, --held-out-events and --keypoints belong to "
+                "--find-poses; leave them out, or give it as well."
             )
         return {}
 

@@ -3,6 +3,7 @@
 import io
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import tyro
@@ -12,6 +13,8 @@ from evsplat.cli import captures, runs
 from evsplat.cli.doctor import doctor
 from evsplat.cli.exits import end_quietly, exit_code
 from evsplat.cli.import_ import import_, import_with_kinds
+from evsplat.errors import ConfigError
+from evsplat.options.inputs import check_inputs
 
 _VERBS: dict[str, Callable[..., Any]] = {
     "demo": runs.demo,
@@ -59,6 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         verbs = {**_VERBS, "import": import_with_kinds()}
 
     def work() -> None:
+        if arguments and not arguments[0].startswith("-") and arguments[0] not in _VERBS:
+            near = get_close_matches(arguments[0], _VERBS, 1, cutoff=0.0)[0]
+            raise ConfigError(
+                f"{arguments[0]}: no such verb; did you mean {near}? 'evsplat --help' lists all."
+            )
         asked = tyro.extras.subcommand_cli_from_dict(
             verbs,
             prog="evsplat",
@@ -67,6 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
         )
         if callable(asked):
+            check_inputs(asked)
             asked()
 
     code = exit_code(work)

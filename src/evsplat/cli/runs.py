@@ -22,6 +22,7 @@ from evsplat.options.declare import (
     Threads,
     option,
 )
+from evsplat.options.inputs import Input, check_run_folder
 from evsplat.options.runs import Kind, Split
 from evsplat.shipped import demo_capture
 
@@ -141,7 +142,7 @@ class Evaluate:
 class Report:
     """Write report.html of an evaluated run again."""
 
-    run: Annotated[Positional[Path], option("RUN")]
+    run: Annotated[Positional[Path], option("RUN"), Input(check_run_folder)]
     """Run folder with metrics.json (made by 'evsplat evaluate')."""
     split: Annotated[Split, option("SPLIT")] = "test"
     """Frames whose figures it shows: test, or train ('evsplat evaluate --split train')."""
@@ -164,15 +165,21 @@ class Render:
     events: Annotated[Path | None, option("FILE", default="no")] = None
     """Write its events as well, such as to events.h5."""
     out: Annotated[Path | None, option("PATH", default="in RUN/renders")] = None
-    """NAME.mp4, .webp or .gif, or a new folder for PNG."""
+    """NAME.mp4, .webp, .gif or a folder."""
     device: Device = "auto"
     """Device that draws."""
+    threads: Threads = None
 
     def __call__(self) -> None:
         from evsplat.export import render_run
 
         written = render_run(
-            self.run, self.film, out=self.out, events_out=self.events, device=self.device
+            self.run,
+            self.film,
+            out=self.out,
+            events_out=self.events,
+            device=self.device,
+            threads=self.threads,
         )
         print(f"written: {written}")
 
@@ -182,18 +189,30 @@ class View:
     """Show a run in the browser: any time, any viewpoint, beside its input or another."""
 
     run: RunFolder
-    other: Annotated[Positional[Path | None], option("RUN2", default="no comparison")] = None
+    other: Annotated[
+        Positional[Path | None],
+        option("RUN2", default="no comparison"),
+        Input(check_run_folder),
+    ] = None
     """A second run of the same capture to compare with."""
     port: Port = 8080
     host: Annotated[str, option("ADDRESS", default="127.0.0.1, this machine alone")] = "127.0.0.1"
     """Network to listen at; 0.0.0.0 lets other machines in."""
     device: Device = "auto"
     """Device that draws."""
+    threads: Threads = None
 
     def __call__(self) -> None:
         from evsplat.view import view_run
 
-        view_run(self.run, self.other, port=self.port, host=self.host, device=self.device)
+        view_run(
+            self.run,
+            self.other,
+            port=self.port,
+            host=self.host,
+            device=self.device,
+            threads=self.threads,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

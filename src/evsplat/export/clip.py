@@ -1,5 +1,7 @@
 """``export html``: the recording as a page of moving Gaussians, played by viser offline."""
 
+import contextlib
+import io
 import logging
 import math
 from pathlib import Path
@@ -68,7 +70,8 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
             serializer.insert_sleep(1 / fps)
         page = serializer.as_html(dark_mode=True)
     finally:
-        server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
     write_text(path, page)
     logger.info(
         "%d pictures, %g per second, colours as camera %s sees them; metres, axes of the capture.",

@@ -1,6 +1,7 @@
 """Drawing a trained run: test frames, or a film of the recording or of another motion."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from tqdm import tqdm
 
+from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import (
     PRESETS,
@@ -30,6 +32,8 @@ from evsplat.pictures import signed_map, to_bytes
 from evsplat.pictures.video import write_animation, write_pictures, write_video
 from evsplat.training.run import load_run
 
+FILM_HEIGHT = 720
+"""Least height of videos where none is asked for."""
 _NEAREST = 0.6
 """Depth that gets the lightest colour, as a share of the distance to the person."""
 _VIDEO, _ANIMATION = (".mp4",), (".gif", ".webp")
@@ -48,6 +52,7 @@ def render_run(
     out: Path | str | None = None,
     events_out: Path | str | None = None,
     device: str = "auto",
+    threads: int | None = None,
     **changes: Any,
 ) -> Path:
     """Draw a run's reconstruction and return the file or folder that was written.
@@ -55,7 +60,8 @@ def render_run(
     The `Film` to draw can be given by its fields, as ``changes``. An ``out`` that ends in
     .mp4, .webp or .gif becomes a video or animation, any other a folder of PNG files; without it
     ``run/renders/`` receives it. ``events_out`` takes the simulated events of ``show="events"``,
-    in any format that `evsplat.events.write_events` knows.
+    in any format that `evsplat.events.write_events` knows. ``threads`` is the number of CPU threads
+    that draw; None takes all cores.
 
     Pictures are kept beside the result in ``NAME.partial`` until it is complete: when stopped, the
     same call goes on from there.
@@ -67,17 +73,21 @@ def render_run(
     for target in (out, events_out):
         if target is not None:
             try_target(target)
+    use_threads(threads)
     loaded = load_run(Path(run), device=device)
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)
+    height = max(frame.height for frame in loaded.capture.cameras.values())
+    if film.size is None and out.suffix.lower() in (*_VIDEO, *_ANIMATION) and film.show != "events":
+        film = replace(film, size=max(FILM_HEIGHT, height))
     plan = FilmPlan.of(film, loaded.capture, loaded.reconstruction)
     transfer = loaded.capture.transfer(loaded.capture.frames[0])
-    look = Look(film.show, film.parts, film.transparent, transfer)
+    look = Look(film.show, film.parts, film.transparent, transfer, plan.surroundings)
     trained = loaded.method, loaded.iteration, loaded.train_seconds
     digest = film_digest(plan.frames, look, film, *trained, *plan.poses)
     cache = FrameCache(out.with_name(out.name + ".partial"), digest)
     cache.fill(plan.reconstruction, look, plan.frames)
-    _write(film, plan, cache, out, events_out, replace=ours)
+    _write(film, plan, cache, out, events_out, anew=ours)
     cache.remove()
     return out
 
@@ -107,7 +117,7 @@ def _write(
     out: Path,
     events_out: Path | str | None,
     *,
-    replace: bool,
+    anew: bool,
 ) -> None:
     """Make the result of the cached frames."""
     suffix = out.suffix.lower()
@@ -133,7 +143,7 @@ def _write(
         pictures, total=len(frames), unit="picture", desc="write", dynamic_ncols=True, leave=False
     )
     if folder:
-        write_pictures(out, zip(names, counted, strict=True), replace=replace)
+        write_pictures(out, zip(names, counted, strict=True), replace=anew)
     elif suffix in _VIDEO:
         write_video(out, counted, fps=film.fps)
     else:

@@ -1,4 +1,4 @@
-"""Camera paths: as recorded, around the person, from camera to camera, or as a file says.
+"""Camera paths that do not follow the person: as recorded, from camera to camera, from a file.
 
 The file is JSON:
 
@@ -34,7 +34,6 @@ from evsplat.untrusted.text import read_json
 CameraPath = Callable[[float], Camera]
 """The camera at a share of the film, 0 to 1."""
 
-_SWING_DEG = 25.0
 _LARGEST = 1e6
 """Of the numbers of a key: metres, pixels or degrees."""
 _LEAST_STEP = 1e-6
@@ -67,22 +66,6 @@ def camera_at(capture: Capture, name: str, time_us: int) -> Camera:
     rotation = Slerp([0, 1], Rotation.from_matrix(rotations))(share).as_matrix()
     center = torch.lerp(ends[0].center().double(), ends[1].center().double(), share).numpy()
     return _placed(ends[0], rotation, center)
-
-
-def orbit(start: Camera, middle: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> CameraPath:
-    """Once around ``middle`` at the height and distance of ``start``, where it begins and ends.
-
-    The view is turned with the camera, so that the person stays where they are in the picture.
-    """
-    return lambda share: _turned(start, middle, up, 2 * math.pi * share)
-
-
-def swing(
-    start: Camera, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], degrees: float = _SWING_DEG
-) -> CameraPath:
-    """Swing both ways from ``start`` around ``middle``: as far as one camera's recording bears."""
-    angle = math.radians(degrees)
-    return lambda share: _turned(start, middle, up, angle * math.sin(2 * math.pi * share))
 
 
 def through(shares: Sequence[float], cameras: Sequence[Camera]) -> CameraPath:
@@ -231,16 +214,6 @@ def _intrinsics(camera: Camera, like: Camera) -> Float[np.ndarray, "4"]:
     K = camera.K.double().numpy()
     scale = np.array([like.width / camera.width, like.height / camera.height])
     return np.concatenate((np.diag(K)[:2] * scale, K[:2, 2] * scale))
-
-
-def _turned(
-    camera: Camera, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle: float
-) -> Camera:
-    """The camera carried around the axis ``up`` through ``middle``."""
-    turn = Rotation.from_rotvec(angle * up.double().numpy()).as_matrix()
-    about = middle.double().cpu().numpy()
-    rotation = camera.world_to_camera[:3, :3].double().numpy() @ turn.T
-    return _placed(camera, rotation, about + turn @ (camera.center().double().numpy() - about))
 
 
 def _placed(

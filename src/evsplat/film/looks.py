@@ -1,7 +1,7 @@
 """Looks of a film: the values that its pixels show."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt16
 
 from evsplat.camera import Camera
 from evsplat.errors import ConfigError
+from evsplat.film.surroundings import Painted, Room
 from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import Shown
 from evsplat.pictures import Transfer, decode, encode, luminance, shown
@@ -35,6 +36,8 @@ class Look:
     """RGBA instead of black where nothing is; for ``rgb`` and ``semantic``."""
     transfer: Transfer = "power"
     """From the values that are drawn to light."""
+    surroundings: Room | Painted | None = field(default=None, repr=False)
+    """What shows of ``rgb`` where nothing is; black without. It follows from run and film."""
 
     def __post_init__(self) -> None:
         if self.transparent and self.shown not in ("rgb", "semantic"):
@@ -61,6 +64,9 @@ class Look:
             rgb = (rgb / solid.clamp_min(1e-4)).clamp(0, 1)
             solid = torch.ones_like(solid)
         rgb = shown(rgb, self.transfer)
+        if self.surroundings is not None:
+            rooms = [self.surroundings.behind(camera, time) for time in times_us]
+            rgb = (rgb + (1 - solid) * torch.stack(rooms)).clamp(0, 1)
         if self.shown == "semantic":
             human = drawn.human.cpu().clamp(0, 1)[..., None]
             tint = human * torch.tensor(_HUMAN) + (1 - human) * torch.tensor(_SCENE)

@@ -1,25 +1,20 @@
 """The frames of a film of one run: the motion, and time and camera of each frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from evsplat.body import BodyTrack, up_axis
+from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, Frame
 from evsplat.errors import ConfigError, DataError
-from evsplat.film.camera_path import (
-    CameraPath,
-    camera_at,
-    interpolated,
-    orbit,
-    read_camera_path,
-    swing,
-)
+from evsplat.film.camera_path import CameraPath, camera_at, interpolated, read_camera_path
+from evsplat.film.following import follow, in_view, straight, to_both_sides, whole_turn
 from evsplat.film.frame_cache import FilmFrame
 from evsplat.film.motion import load_motion_of
+from evsplat.film.surroundings import Painted, Room
 from evsplat.options import Film
 from evsplat.training.run import GaussianReconstruction
 
@@ -40,6 +35,8 @@ class FilmPlan:
     """Distance of the person from the first camera, metres."""
     poses: tuple[object, ...]
     """Times and poses of a motion, for the film's digest; empty for the recorded one."""
+    surroundings: Room | Painted | None
+    """What shows where nothing is."""
 
     @classmethod
     def of(cls, film: Film, capture: Capture, reconstruction: GaussianReconstruction) -> "FilmPlan":
@@ -72,14 +69,24 @@ class FilmPlan:
         middle = _middle(track, times)
         start = camera_at(capture, view, times[0])
         # Up is where people stood in the recording: a motion may be a somersault.
-        path = _camera_path(film, capture, start, up_axis(recorded), middle)
+        room = Room.of(recorded, track)
+        path = _camera_path(film, capture)
+        turn = {"orbit": whole_turn, "swing": to_both_sides}.get(film.path or "", straight)
+        leaves = (
+            film.motion is not None and film.camera is None and not in_view(start, track, times)
+        )
         if path is not None:
             last = max(1, len(times) - 1)
             cameras = [path(index / last) for index in range(len(times))]
+        elif film.path is not None or leaves:
+            cameras = follow(start, track, times, room.up, turn)
         elif film.at is None and film.motion is None and not capture.is_static_camera:
             cameras = [camera_at(capture, view, time) for time in times]
         else:
             cameras = [start] * len(times)
+        if film.path in ("orbit", "swing"):
+            reconstruction = reconstruction.changed_by(room.clear)
+        cameras = _of_height(cameras, film.size)
         frames = [FilmFrame(*fields) for fields in zip(names, times, clock, cameras, strict=True)]
         return cls(
             capture,
@@ -88,6 +95,7 @@ class FilmPlan:
             oversampling,
             float((middle - cameras[0].center().cpu()).norm()),
             poses,
+            _surroundings(film, room),
         )
 
     def edges_us(self) -> list[int]:
@@ -137,25 +145,41 @@ def _times(
     return [f"{index:05d}" for index in range(len(times))], times, clock
 
 
-def _camera_path(
-    film: Film,
-    capture: Capture,
-    start: Camera,
-    up: torch.Tensor,
-    middle: torch.Tensor,
-) -> CameraPath | None:
-    if film.path is None:
+def _camera_path(film: Film, capture: Capture) -> CameraPath | None:
+    """The path that does not depend on the person; None where the camera stays or follows."""
+    if film.path in (None, "orbit", "swing"):
         return None
-    if film.path in ("orbit", "swing"):
-        around = orbit if film.path == "orbit" else swing
-        return around(start, middle, up)
     if film.path == "interpolate":
         return interpolated(capture)
+    assert film.path is not None
     if not Path(film.path).is_file():
         raise ConfigError(
             f"--path {film.path}: neither a file nor orbit, swing or interpolate; correct it."
         )
     return read_camera_path(film.path)
+
+
+def _of_height(cameras: list[Camera], height: int | None) -> list[Camera]:
+    """The same cameras with pictures so high; a camera that stands still stays one object."""
+    if height is None:
+        return cameras
+    made: dict[int, Camera] = {}
+    for camera in cameras:
+        if id(camera) not in made:
+            # Videos want even numbers.
+            width = 2 * round(camera.width * height / camera.height / 2)
+            K = camera.K.clone()
+            K[0] *= width / camera.width
+            K[1] *= height / camera.height
+            made[id(camera)] = replace(camera, width=width, height=height, K=K)
+    return [made[id(camera)] for camera in cameras]
+
+
+def _surroundings(film: Film, room: Room) -> Room | Painted | None:
+    if film.background is not None:
+        return Painted.of(film.background)
+    plain = film.show != "rgb" or film.parts != "all" or film.transparent or film.what == "test"
+    return None if plain else room
 
 
 def _middle(track: BodyTrack, times_us: Sequence[int]) -> torch.Tensor:

@@ -20,6 +20,7 @@ from evsplat.importers.video import Video
 from evsplat.importers.zju_mocap import ZjuMocap
 from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
 from evsplat.inspection import warn_of_body
+from evsplat.landmarks.keypoint_files import read_points
 from evsplat.options import PoseOptions, PoseSearch
 from evsplat.options.declare import given
 
@@ -58,6 +59,7 @@ def import_capture(
     overwrite: bool = False,
     blur: Blur | bool = False,
     find_poses: PoseOptions | bool = False,
+    keypoints: Path | str | None = None,
     **options: Any,
 ) -> Path:
     """Turn a data set's sequence into a capture and give its folder (docs/import.md).
@@ -73,6 +75,7 @@ def import_capture(
             (`evsplat.synthesize`); the sharp capture stays beside it as ``<out>_sharp``.
         find_poses: Find the person's poses (`evsplat.find_poses`), whatever poses there are.
             Where none are found, a capture without them stays as ``<out>_unposed``.
+        keypoints: A file of key points to find them by, a row for each frame of the capture.
         options: Fields of the kind's class in `KINDS`.
 
     Raises:
@@ -84,9 +87,21 @@ def import_capture(
         raise ConfigError(f"{kind!r} is no kind of source; did you mean {near!r}?")
     chosen = (Blur() if blur else None) if isinstance(blur, bool) else blur
     poses = (PoseOptions() if find_poses else None) if isinstance(find_poses, bool) else find_poses
+    if keypoints is not None and poses is None:
+        raise ConfigError(
+            f"keypoints {keypoints}: no poses are to be found by them; leave them out, or give "
+            "find_poses=True as well."
+        )
     importer = given(KINDS[kind], None, options)
     return run_importer(
-        importer, source, out, smpl=smpl, overwrite=overwrite, blur=chosen, poses=poses
+        importer,
+        source,
+        out,
+        smpl=smpl,
+        overwrite=overwrite,
+        blur=chosen,
+        poses=poses,
+        keypoints=None if keypoints is None else Path(keypoints),
     )
 
 
@@ -99,6 +114,7 @@ def run_importer(
     overwrite: bool = False,
     blur: Blur | None = None,
     poses: PoseOptions | None = None,
+    keypoints: Path | None = None,
 ) -> Path:
     """`import_capture` with the options as a checked object."""
     source, out = Path(source), Path(out)
@@ -117,7 +133,9 @@ def run_importer(
     CaptureWriter(out, overwrite=overwrite)
     if poses is not None:
         importer = replace(importer, no_poses=True)
-        _import_and_pose(importer, source, out, smpl, poses, overwrite=overwrite)
+        if keypoints is not None:
+            read_points(keypoints)  # a bad file is better found before the long work, too
+        _import_and_pose(importer, source, out, smpl, poses, keypoints, overwrite=overwrite)
     elif blur is not None:
         from evsplat.synthesis import synthesize
 
@@ -164,6 +182,7 @@ def _import_and_pose(
     out: Path,
     smpl: Path | None,
     poses: PoseOptions,
+    keypoints: Path | None,
     *,
     overwrite: bool,
 ) -> None:
@@ -174,7 +193,8 @@ def _import_and_pose(
     writer = CaptureWriter(unposed, out.name, overwrite=overwrite)
     _import(importer, source, writer, smpl, going_on=True)
     try:
-        find_poses(unposed, out, PoseSearch(**vars(poses)), overwrite=overwrite)
+        search = PoseSearch(**vars(poses))
+        find_poses(unposed, out, search, keypoints=keypoints, overwrite=overwrite)
     except BaseException:
         logger.info(
             "without poses it is: %s; find them with: evsplat poses %s --out %s",

@@ -158,7 +158,7 @@ def numbered(folder: Path, what: str, suffixes: tuple[str, ...]) -> dict[int, Pa
     need(folder, f"the folder of {what}")
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
-        digits = "".join(c if c.isdigit() else " " for c in path.stem).split()
+        digits = "".join(c if c.isdecimal() else " " for c in path.stem).split()
         if path.suffix.lower() not in suffixes or not digits:
             continue
         number = int(digits[-1])

@@ -1,5 +1,6 @@
 """Reading a COLMAP reconstruction in its text form: cameras, poses of pictures, points."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +60,10 @@ def read_colmap(folder: Path) -> Reconstruction:
         if lens not in intrinsics:
             raise DataError(f"{where}: names camera {lens}, which cameras.txt does not hold.")
         K, distortion = intrinsics[lens]
+        if not 0 < math.hypot(x, y, z, w) < math.inf:
+            raise DataError(
+                f"{where}: QW QX QY QZ are {' '.join(words[1:5])[:60]}, expected a rotation."
+            )
         turn = Rotation.from_quat([x, y, z, w]).as_matrix()
         cameras[name] = SourceCamera(K, rigid(turn, shift, where), distortion)
         used.add(lens)
@@ -87,6 +92,11 @@ def _read_cameras(path: Path) -> dict[int, tuple[np.ndarray, tuple[float, ...] |
                 f"{path}: line {number}: found {len(words) - 4} parameters of a {model} camera, "
                 "expected more numbers."
             ) from None
+        if not np.isfinite(values).all():
+            raise DataError(
+                f"{path}: line {number}: found {' '.join(words[4:])[:60]!r}, expected finite "
+                "numbers."
+            )
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         cameras[int(words[0])] = (K, distortion or None)
     return cameras
@@ -101,8 +111,10 @@ def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
             rows.append([float(word) for word in words[1:7]])
         except ValueError:
             rows.append([])
-        if len(rows[-1]) != 6:
-            raise DataError(f"{path}: line {number}: expected POINT3D_ID X Y Z R G B and more.")
+        if len(rows[-1]) != 6 or not np.isfinite(rows[-1]).all():
+            raise DataError(
+                f"{path}: line {number}: expected POINT3D_ID X Y Z R G B, finite numbers, and more."
+            )
     table = np.array(rows).reshape(-1, 6)
     return table[:, :3], table[:, 3:] / 255
 

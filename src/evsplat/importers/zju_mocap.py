@@ -244,8 +244,8 @@ def _frame_number(path: str) -> int:
     """``000012.jpg`` is 12; CoreView_313 and 315 write ``CoreView_313_Camera_(1)_0012_2019-…``."""
     stem = Path(path).stem
     parts = stem.split("_")
-    digits = stem if stem.isdigit() else parts[4] if len(parts) > 4 else ""
-    if not digits.isdigit():
+    digits = stem if stem.isdecimal() else parts[4] if len(parts) > 4 else ""
+    if not digits.isdecimal():
         raise DataError(
             f"annots.npy: {path!r} has no frame number, expected a name like 000012.jpg."
         )

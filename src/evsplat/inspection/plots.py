@@ -39,8 +39,8 @@ def draw_timeline(capture: Capture) -> Image.Image:
     def x_of(time_us: float) -> float:
         return _LEFT + (time_us - start) / (end - start) * (_WIDTH - _LEFT - _RIGHT)
 
-    for tick in round_ticks(start, end):
-        x = x_of(tick)
+    for tick in round_ticks(0, end - start):
+        x = x_of(start + tick)
         line(shapes, [(x, _BARS[0]), (x, _RATE[1] + 5)], (232, 235, 239), 1)
     _draw_exposures(capture, shapes, x_of)
     for time_us in _pose_times(capture):
@@ -126,12 +126,12 @@ def _draw_labels(
     draw.text((10, (_RATE[0] + _RATE[1]) / 2), "events/s", fill=INK, font=font(14), anchor="lm")
     for value, y in ((peak, _RATE[0]), (0.0, _RATE[1])):
         draw.text((_LEFT - 6, y), short_number(value), fill=FAINT, font=font(12), anchor="rm")
-    for tick in round_ticks(start, end):
-        draw.text(
-            (x_of(tick), _RATE[1] + 10), f"{tick / 1e6:g}", fill=FAINT, font=font(13), anchor="mt"
-        )
+    for tick in round_ticks(0, end - start):
+        at = x_of(start + tick), _RATE[1] + 10
+        draw.text(at, f"{tick / 1e6:g}", fill=FAINT, font=font(13), anchor="mt")
     centre = (_LEFT + _WIDTH - _RIGHT) / 2
-    draw.text((centre, _HEIGHT - 26), "seconds", fill=FAINT, font=font(14), anchor="mt")
+    text = f"seconds from {start:,} us of the capture's clock" if start else "seconds"
+    draw.text((centre, _HEIGHT - 26), text, fill=FAINT, font=font(14), anchor="mt")
 
 
 def draw_curve(

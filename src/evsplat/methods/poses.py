@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from evsplat.body import BodyTrack, PoseSource
+from evsplat.body import BodyTrack, PoseErrors, PoseSource
 from evsplat.body.smoothing import motion_noise, moving_joints, smoothed, spline_error
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
@@ -78,29 +78,48 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
     told = track.errors is not None and not track.errors.typical and source != "exact"
     smooth = config.smooth == "always" or (config.smooth == "auto" and told)
     if smooth:
-        new = SHARES["fast"] ** 0.5
-        noise = motion_noise(
-            track, most_rad=new * float(joint_rad.max()), most_m=new * float(root_m.max())
-        )
-        track = smoothed(track, noise)
+        track = _smoothed(track, joint_rad, root_m)
     # Poses that were corrected when they were found need not wait for the same again.
     tried = source is not None and capture.poses_refined
     found = _refined(track, capture) if fit and exact is not True and not tried else None
     decided = exact if exact is not None else found is None or not found.disproves
     if exact is not False and decided and fit:
         _refuse_unread(config, capture)
+    given = track
+    if found is not None and found.better and not decided and not told:
+        track = _as_far_off(track, found.given_errors, smooth=config.smooth == "auto")
+        found = _refined(track, capture) or found
+        joint_rad, root_m = _expected(config, track)
     if fit:
+        smooth = smooth or track is not given and config.smooth == "auto"
         _announce(config, source, joint_rad, root_m, exact=decided, smooth=smooth)
-    between = spline_error(track) if config.between and exact is not False else None
+    between = spline_error(given) if config.between and exact is not False else None
     if exact and between is None:
-        return Poses(track)
+        return Poses(given)
     frames_us = [frame.mid_us for frame in capture.train_frames]
     correction = PoseCorrection(
-        track, frames_us, joint_rad=joint_rad, root_m=root_m, between=between, exact=decided
+        given, frames_us, joint_rad=joint_rad, root_m=root_m, between=between, exact=decided
     )
     if found is not None and found.better and not decided:
+        if track is not given:
+            correction.smooth_to(given, track)
         correction.start_at(track, found.track)
-    return Poses(track, correction)
+    return Poses(given, correction)
+
+
+def _smoothed(track: BodyTrack, joint_rad: np.ndarray, root_m: np.ndarray) -> BodyTrack:
+    """Without the noise that is new in every pose, up to its share of the errors expected."""
+    new = SHARES["fast"] ** 0.5
+    noise = motion_noise(
+        track, most_rad=new * float(joint_rad.max()), most_m=new * float(root_m.max())
+    )
+    return smoothed(track, noise)
+
+
+def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTrack:
+    """The motion as one that says how far it errs, and smoothed accordingly."""
+    told = BodyTrack(track.body, track.times_us, track.poses, track.transl, errors=errors)
+    return _smoothed(told, errors.joint_rad, errors.root_m) if smooth else told
 
 
 def _refined(track: BodyTrack, capture: TrainingCapture) -> Refined | None:

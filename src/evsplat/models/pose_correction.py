@@ -32,7 +32,8 @@ class PoseCorrection(nn.Module):
     own spline cannot know.
 
     ``exact`` says which count: of poses that are exact only ``between``, else the other three. It
-    is part of the state, as it may have been found from pictures.
+    is part of the state, as are the errors expected and what was smoothed (`smooth_to`): they may
+    have been found from pictures.
     """
 
     exact: Tensor
@@ -70,20 +71,21 @@ class PoseCorrection(nn.Module):
                 for name, knot_us in knots.items()
             }
         )
+        self.smoothing = PoseSpline(span, gap, joints, learned=False)
         self.between, self.between_m = None, 0.0
         if between is not None:
             self.between = PoseSpline(span, gap / 2, joints, held_us=times.tolist())
             self.between_m = between.translation_m
         buffers = {
             "key_us": torch.from_numpy(times).double(),
-            "joint_rad": torch.as_tensor(joint_rad).float(),
-            "root_m": torch.as_tensor(root_m).float(),
             "between_rad": torch.zeros(joints)
             if between is None
             else torch.from_numpy(between.rotation_rad),
         }
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
+        self.register_buffer("joint_rad", torch.as_tensor(joint_rad).float())
+        self.register_buffer("root_m", torch.as_tensor(root_m).float())
         self.register_buffer("exact", torch.tensor(exact))
         self.register_buffer("started", torch.tensor(False))
 
@@ -106,7 +108,8 @@ class PoseCorrection(nn.Module):
                 turns = turns + SHARES[name] ** 0.5 * some_turns
                 shifts = shifts + SHARES[name] ** 0.5 * some_shifts
             joint_rad, root_m = self._expected(times)
-            return turns * joint_rad[..., None], shifts * root_m
+            smoothed, moved = self.smoothing.values(times)
+            return turns * joint_rad[..., None] + smoothed, shifts * root_m + moved
         if self.between is not None:
             turns, shifts = self.between.values(times)
         return turns * self.between_rad[:, None], shifts * self.between_m
@@ -163,18 +166,25 @@ class PoseCorrection(nn.Module):
             assert isinstance(spline, PoseSpline)
             yield name, spline
 
+    def smooth_to(self, given: BodyTrack, smoothed: BodyTrack) -> None:
+        """Add what turns the given keys into smoothed ones: not learned, and no error's price."""
+        times = given.times_us.tolist()
+        turns, shifts = _apart(given, smoothed)
+        design = self.smoothing.weights(times).double()
+        goal = torch.cat((turns.flatten(1), shifts), 1).double()
+        # Two more control points than keys: of all that fit, the smallest.
+        found = (torch.linalg.pinv(design, rtol=1e-3) @ goal).float()
+        with torch.no_grad():
+            self.smoothing.rotations.copy_(found[:, :-3].view_as(self.smoothing.rotations))
+            self.smoothing.translations.copy_(found[:, -3:])
+
     def start_at(self, given: BodyTrack, better: BodyTrack, *, misfit: float = 0.05) -> None:
         """Set the errors to the likeliest that turn the given motion into a better one.
 
         Ridge regression at the given keys: each unknown has variance one, and the better motion
         errs by ``misfit`` in units of what is expected. From then on the errors count.
         """
-        times = given.times_us.tolist()
-        (given_turns, given_shifts), (turns, shifts) = given.at(times), better.at(times)
-        apart = (given_turns.mT @ turns).double().cpu().numpy()
-        vectors = Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec()
-        turned = torch.from_numpy(vectors).to(shifts).view(*apart.shape[:2], 3)
-        self.fit(times, turned, shifts - given_shifts, misfit=misfit)
+        self.fit(given.times_us.tolist(), *_apart(given, better), misfit=misfit)
 
     def fit(
         self,
@@ -206,5 +216,18 @@ class PoseCorrection(nn.Module):
     def forget(self) -> None:
         """Set all residuals to zero."""
         with torch.no_grad():
-            for value in self.parameters():
+            smoothing = self.smoothing.rotations, self.smoothing.translations
+            for value in (*self.parameters(), *smoothing):
                 value.zero_()
+
+
+def _apart(
+    first: BodyTrack, second: BodyTrack
+) -> tuple[Float[Tensor, "P J 3"], Float[Tensor, "P 3"]]:
+    """Turns and shifts from one motion to another at the keys of the first."""
+    times = first.times_us.tolist()
+    (turns, places), (other_turns, other_places) = first.at(times), second.at(times)
+    apart = (turns.mT @ other_turns).double().cpu().numpy()
+    vectors = Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec()
+    turned = torch.from_numpy(vectors).to(other_places).view(*apart.shape[:2], 3)
+    return turned, other_places - places

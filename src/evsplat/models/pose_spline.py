@@ -27,6 +27,8 @@ class PoseSpline(nn.Module):
       there; what is left is how it moves from one to the next.
     """
 
+    rotations: Tensor
+    translations: Tensor
     mean: Tensor
     held: Tensor
     held_s: Tensor
@@ -39,10 +41,12 @@ class PoseSpline(nn.Module):
         *,
         centred_us: Sequence[int] = (),
         held_us: Sequence[int] = (),
+        learned: bool = True,
     ) -> None:
         """Knots every ``knot_us`` from the start of ``span_us``; outside of it the ends are held.
 
-        ``knot_us`` infinite: one value for all times.
+        ``knot_us`` infinite: one value for all times. ``learned`` false: part of the state, but no
+        parameter.
         """
         super().__init__()
         self.span_us, self.knot_us = span_us, float(knot_us)
@@ -62,8 +66,15 @@ class PoseSpline(nn.Module):
             self.held = torch.from_numpy(through.c.transpose(1, 0, 2).copy())
         elif len(centred_us):
             self.mean = self.weights(centred_us).mean(0)
-        self.rotations = nn.Parameter(torch.zeros(self.count, joints, 3))
-        self.translations = nn.Parameter(torch.zeros(self.count, 3))
+        starts = {
+            "rotations": torch.zeros(self.count, joints, 3),
+            "translations": torch.zeros(self.count, 3),
+        }
+        for name, value in starts.items():
+            if learned:
+                self.register_parameter(name, nn.Parameter(value))
+            else:
+                self.register_buffer(name, value)
 
     def weights(self, times_us: Sequence[int] | Tensor) -> Float[Tensor, "T K"]:
         """Weights of the control points at given times."""

@@ -11,6 +11,7 @@ import tyro
 
 from evsplat.config import AtLeast, Range, expected
 from evsplat.errors import ConfigError
+from evsplat.options.inputs import Input, check_capture_folder, check_run_folder
 
 Options = TypeVar("Options")
 
@@ -49,10 +50,14 @@ def option(
 
 Flag = Annotated[bool, option(default="")]
 CaptureFolder = Annotated[
-    tyro.conf.Positional[Path], option("CAPTURE", "Capture folder (docs/capture-format.md).")
+    tyro.conf.Positional[Path],
+    option("CAPTURE", "Capture folder (docs/capture-format.md)."),
+    Input(check_capture_folder),
 ]
 RunFolder = Annotated[
-    tyro.conf.Positional[Path], option("RUN", "Run folder written by 'evsplat train'.")
+    tyro.conf.Positional[Path],
+    option("RUN", "Run folder written by 'evsplat train'."),
+    Input(check_run_folder),
 ]
 Port = Annotated[int, option("PORT", "Where to listen.", default="8080, or the next free one")]
 Threads = Annotated[int | None, AtLeast(1), option("N", "CPU threads.", default="all cores")]

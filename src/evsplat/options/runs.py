@@ -80,9 +80,9 @@ class Film:
     parts: Parts = "all"
     """The person and the scene, or one of them."""
     camera: Annotated[str | None, option("NAME", default="that of the frames")] = None
-    """A camera of the capture; it need not have recorded anything."""
+    """One of the capture's cameras."""
     path: Annotated[str | None, option("PATH", default="it stays")] = None
-    """Move it: orbit, swing, interpolate or a JSON file."""
+    """orbit, swing, interpolate or a JSON file."""
     motion: Annotated[str | None, option("NAME", default="none")] = None
     """Another motion: walk, run, spin, dance_a ... or a motion or pose file."""
     motion_fps: Annotated[float | None, option("HZ", default="the file's")] = None
@@ -99,8 +99,14 @@ class Film:
     """Pictures per second that the video plays."""
     slow: Annotated[float, Above(0), AtMost(10_000), option("FACTOR")] = 1.0
     """Times slower than life: draws FPS x SLOW pictures a second."""
+    size: Annotated[
+        int | None, Within(16, 4320), option("PX", default="720 for videos, or the camera's")
+    ] = None
+    """Picture height."""
+    background: Annotated[str | None, option("COLOUR|PICTURE", default="a calm room")] = None
+    """Colour (white, #202830) or picture."""
     beside: Flag = False
-    """Put the blurry input frame (or the recorded events) at the left."""
+    """Put the blurry input frame (or recorded events) at the left."""
     transparent: Flag = False
     """Transparent where nothing is (.webp, .gif, PNG)."""
     sensor: Annotated[Sensor, option("NAME")] = "clean"
@@ -116,6 +122,14 @@ class Film:
         if self.what == "test" and changed:
             raise ConfigError(
                 f"--{changed[0]}: films the sequence, not --what test; leave one out."
+            )
+        if self.background is not None and (self.transparent or self.show != "rgb"):
+            other = "--transparent" if self.transparent else f"--show {self.show}"
+            raise ConfigError(f"--background: nothing of it shows with {other}; leave one out.")
+        if self.what == "test" and (self.size is not None or self.background is not None):
+            raise ConfigError(
+                "--what test: held-out frames are drawn as they are measured; leave out --size, "
+                "--background."
             )
         if self.path is not None and self.camera is not None and self.path == "interpolate":
             raise ConfigError("--camera: --path interpolate goes through all; leave one out.")

@@ -139,7 +139,8 @@ class Descent:
         """What is still unknown of the motion, by the curvature at the end (Laplace).
 
         The diagonal of the curvature from differences of gradients along random signs
-        (Bekas et al., An estimator for the diagonal of a matrix, 2007).
+        (Bekas et al., An estimator for the diagonal of a matrix, 2007); to the root's place comes
+        what the look, which these gradients hold, makes up for (`_distance`).
         """
         correction = self.correction
         generator = torch.Generator().manual_seed(0)
@@ -159,12 +160,27 @@ class Descent:
         weights = correction.weights(times).square()
         known = [1 / (1 + torch.einsum("m,...->m...", shares, rate)) for rate in rates]
         joint = correction.joint_rad.square() * torch.einsum("tm,mjc->tj", weights, known[0]) / 3
-        root = correction.root_m.square() * (weights @ known[1])
+        root = correction.root_m.square() * (weights @ known[1]) + self._distance(times)
         joint = torch.minimum(joint + _LEAST_RAD**2, correction.joint_rad.square()).sqrt()
         root = torch.minimum(root + _LEAST_M**2, correction.root_m.square()).sqrt()
         joint_rad = np.zeros((len(times), len(correction.track.body.parents)))
         joint_rad[:, correction.joints.numpy()] = joint.detach().numpy()
         return PoseErrors("estimated", joint_rad, root.detach().double().numpy())
+
+    @torch.no_grad()
+    def _distance(self, times_us: Sequence[int]) -> Float[Tensor, "T 3"]:
+        """Variances along the axes of the world, m^2, of a distance that a look makes up for.
+
+        A shift along the view that lasts has variance c^2 before anything was seen, and clothes,
+        hair and shoes look like one of variance s^2. Pictures tell only the sum of both, which
+        leaves ``c^2 s^2 / (c^2 + s^2)`` of each.
+        """
+        correction = self.correction
+        along = self.look.nearer_m(correction.at(times_us)[1], self.targets.camera).square()
+        hidden = along.sum(1, keepdim=True)
+        lasting = correction.weights(times_us).mean(0).square().sum()
+        expected = lasting * (along / hidden * correction.root_m.square()).sum(1, keepdim=True)
+        return along / hidden * (expected * hidden / (expected + hidden))
 
     def _gradient(
         self, params: Sequence[Tensor], signs: Sequence[Tensor], size: float

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from evsplat.body import Body, BodyTrack
+from evsplat.body import Body, BodyTrack, PoseErrors
 from evsplat.body.pose_noise import PoseNoise, joint_angles
 from evsplat.camera import Camera
 from evsplat.capture import TrainingCapture
@@ -30,6 +30,7 @@ LEAST_GAIN = 0.12
 """Share by which pictures kept aside must be explained better, for certain, for given poses to
 count as wrong. What discs cannot show of a person moves true motions: exact poses of staged people
 were explained up to 0.08 better, fitted ones of a real recording 0.15."""
+_LEAST_AXIS = 0.5
 _STEPS = (160, 140)
 _LAST_STEPS = 40
 """Steps in which pictures kept aside are explained as well, once they have judged."""
@@ -47,6 +48,9 @@ class Refined:
     """Share by which it explains pictures better that neither motion was fitted to."""
     gain_error: float
     """Standard error of the gain over the frames."""
+    given_errors: PoseErrors
+    """Errors of the given motion, by how far the corrected one lies from it: for motions that don't
+    say how far they err."""
     stages: tuple[Stage, ...]
     seconds: float
 
@@ -103,7 +107,12 @@ def refine(
     errors = descent.errors()
     limit.close()
     return Refined(
-        correction.corrected(errors), gain, gain_error, tuple(stages), time.monotonic() - began
+        correction.corrected(errors),
+        gain,
+        gain_error,
+        _given_errors(correction),
+        tuple(stages),
+        time.monotonic() - began,
     )
 
 
@@ -127,6 +136,23 @@ def expected_errors(track: BodyTrack) -> tuple[Float[np.ndarray, "J"], Float[np.
         size = np.sqrt(np.square(errors.joint_rad).mean(0))
         return size, np.sqrt(np.square(errors.root_m).mean(0))
     return _anatomical(track.body), np.full(3, UNKNOWN_M)
+
+
+@torch.no_grad()
+def _given_errors(correction: Correction) -> PoseErrors:
+    """Errors of the motion that was corrected, root mean squares of the correction.
+
+    Of the joints one factor on what was expected of each: the correction of a single joint may be
+    another's, turned the other way. Of the root at least `_LEAST_AXIS` of its worst axis.
+    """
+    track = correction.track
+    weights = correction.weights(track.times_us.tolist())
+    turned = torch.einsum("tm,mjc->tjc", weights, correction.turns).square().mean().sqrt()
+    joint_rad = np.zeros(track.poses.shape[:2])
+    joint_rad[:, correction.joints.numpy()] = float(turned) * correction.joint_rad.numpy()
+    moved = (correction.root_m * (weights @ correction.shifts)).square().mean(0).sqrt()
+    root_m = moved.clamp_min(_LEAST_AXIS * float(moved.max())).double().numpy()
+    return PoseErrors("estimated", joint_rad, np.tile(root_m, (len(joint_rad), 1)))
 
 
 def _anatomical(body: Body) -> Float[np.ndarray, "J"]:

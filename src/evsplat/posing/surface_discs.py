@@ -134,6 +134,10 @@ class SurfaceDiscs(nn.Module):
             mean = shown.sum(0) / total.sum(0).clamp_min(1e-6)
             self.colours[first:] = ((shown + 0.1 * mean) / (total + 0.1))[first:]
 
+    def nearer_m(self, transl: Float[Tensor, "T 3"], camera: Camera) -> Float[Tensor, "T 3"]:
+        """Vectors along the view, as long as looks of a typical size hide of a distance, metres."""
+        return _SIZE * (transl + self.body.rest_joints[0] - camera.center())
+
     def _drawn(
         self,
         rotations: Float[Tensor, "T J 3 3"],
@@ -141,8 +145,7 @@ class SurfaceDiscs(nn.Module):
         camera: Camera,
         count: int | None,
     ) -> RenderOutput:
-        away = transl + self.body.rest_joints[0] - camera.center()
-        moved = transl - _SIZE * self.nearer * away
+        moved = transl - self.nearer * self.nearer_m(transl, camera)
         depth = camera.project(transl.detach() + self.body.rest_joints[0])[1]
         pixel_m = float(depth.clamp_min(0.1).mean() / camera.K[0, 0])
         splats = self.splats(rotations, moved, count, pixel_m)

@@ -276,8 +276,8 @@ class FootageSource(Source):
         """See `Source`."""
         if self._body is None:
             logger.warning(
-                "No body poses are given; 'evsplat train' will need them, 'evsplat poses' finds "
-                "them."
+                "No body poses are given, and 'evsplat train' needs them; next: "
+                "evsplat poses CAPTURE --out CAPTURE-posed (docs/poses.md)."
             )
             writer.leave_out_body()
             return

@@ -1,7 +1,7 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -27,6 +27,7 @@ from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_sc
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
 from evsplat.models.seen import Seen, draw_values, roughness
+from evsplat.options.inputs import check_run_folder
 from evsplat.render import Backdrop, Splats, choose_device, render
 from evsplat.training.checkpoint import (
     below,
@@ -43,7 +44,6 @@ from evsplat.untrusted.text import parse_json, read_text
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 _FACTS = {"capture": str, "capture_name": str, "device": str, "seed": int}
-_NAMED_RUNS = 5
 """Runs that an error about the folder above them names, at most."""
 
 
@@ -118,6 +118,8 @@ class GaussianReconstruction:
     """What the scene looked like to the picture before, for a camera that mostly stands still."""
     shadow_step_px: int = SHADOW_STEP_PX
     """Shadows are looked up so far apart."""
+    changed: Callable[[Layers, Camera], Layers] | None = None
+    """What a film makes of the posed Gaussians before they are drawn."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
@@ -184,7 +186,8 @@ class GaussianReconstruction:
 
     def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
         camera = camera.to(self.model.device)
-        return camera, self.model.at(list(times_us), camera.center(), hard_semantics=True)
+        layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+        return camera, layers if self.changed is None else self.changed(layers, camera)
 
     @property
     def track(self) -> BodyTrack:
@@ -194,6 +197,10 @@ class GaussianReconstruction:
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
         """The same person and scene with the motion ``track`` (same body, own times) instead."""
         return GaussianReconstruction(self.name, self.model.following(track), self.seen)
+
+    def changed_by(self, change: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
+        """The same, with the posed Gaussians changed before they are drawn."""
+        return replace(self, changed=change)
 
     @property
     def low_pass(self) -> float:
@@ -268,21 +275,9 @@ class Run:
         return roughness(rest, seen)
 
 
-def _runs_below(path: Path) -> str:
-    """A sentence that names the runs one level below, the newest first; empty where none is."""
-    runs = sorted(path.glob("*/config.yaml"), key=lambda file: -file.stat().st_mtime)
-    if not runs:
-        return ""
-    names = ", ".join(str(file.parent) for file in runs[:_NAMED_RUNS])
-    return f" A run lies below: {names}." if len(runs) == 1 else f" Runs lie below: {names}."
-
-
 def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     """Method, configuration and facts of a run folder."""
-    if not folder.config.exists():
-        raise DataError(
-            f"{folder.path}: not a run folder, config.yaml is missing.{_runs_below(folder.path)}"
-        )
+    check_run_folder(folder.path)
     values = load_yaml(folder.config)
     method = values.pop("method", DEFAULT_METHOD)
     try:

@@ -12,12 +12,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from evsplat.capture import Capture, load_capture
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
+from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError, machine_error
 from evsplat.files import open_output, try_target
 from evsplat.inspection import check_body, save_fit_sheet
@@ -100,8 +100,7 @@ def train(
     """
     options = given(TrainOptions, options, changes)
     device = choose_device(options.device)
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
+    use_threads(options.threads)
     capture = load_capture(Path(capture_path))
     start = _resumed(capture, options) if options.resume else _new(capture, options)
     folder = start.folder
@@ -164,7 +163,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
             save_yaml(folder.config, start.settings, method=start.method)
         if fitting is not None and fitting.verdict != "belongs":
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
-        logger.info("%s", schedule_table(start.settings, composition.weights))
+        logger.debug("%s", schedule_table(start.settings, composition.weights))
         logger.info("%s", seen.terms.sentence)
     return trainer
 

@@ -12,18 +12,23 @@ def view_run(
     port: int = 8080,
     host: str = "127.0.0.1",
     device: str = "auto",
+    threads: int | None = None,
 ) -> None:
     """Show a run in the browser until Ctrl-C, or two runs of one capture to compare.
 
     Only this machine can reach it unless ``host`` says otherwise. A ``port`` in use gives way to
-    the next free one, which is said with the address.
+    the next free one, which is said with the address. ``threads`` is the number of CPU threads that
+    draw; None takes all cores.
 
     Raises:
         ConfigError: the package viser is missing, or the address cannot be listened at.
         DataError: no run folder, no checkpoint in it, or runs of two captures.
     """
     check_viewer()
+    from evsplat.devices import use_threads
     from evsplat.view.server import serve
+
+    use_threads(threads)
 
     serve([path for path in (run, other) if path is not None], host, port, device)
 

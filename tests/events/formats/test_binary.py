@@ -220,3 +220,13 @@ def test_wrong_content_is_never_decoded_as_another_format(tmp_path: Path) -> Non
         with pytest.raises(DataError, match="not a recording|holds no events|neither numbers"):
             read_events(path)
         assert name
+
+
+@pytest.mark.parametrize("digit", ["³", "²40"])
+def test_a_size_in_superscript_is_refused_in_one_sentence(tmp_path: Path, digit: str) -> None:
+    """Python calls such characters digits, and no number can be read of them."""
+    header = f"% evt 3.0\n% width {digit}\n% height 240\n% end\n"
+    path = tmp_path / "recording.raw"
+    path.write_bytes(header.encode() + bytes(64))
+    with pytest.raises(DataError, match="its header gives a sensor of"):
+        open_recording(path)

@@ -135,7 +135,7 @@ def _read_frames(path: Path) -> list[dict[str, list[str]]]:
     frames: list[dict[str, list[str]]] = []
     for line in read_text(path).splitlines():
         words = line.split()
-        if len(words) == 1 and words[0].isdigit():
+        if len(words) == 1 and words[0].isdecimal():
             frames.append({})
         elif frames and words:
             frames[-1][words[0]] = words[1:]

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from html import escape
 from typing import Any
 
+import numpy as np
+
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
 from evsplat.evaluation.report.configuration import configuration, duration, made_with
@@ -43,6 +45,8 @@ _HEADLINE = {
     "person_mask": "on the person’s mask",
 }
 """Where a figure was reached; of the full frame the split says it."""
+_FRAMES_TOGETHER = 10
+"""Logged training pictures whose mean PSNR is a point of the curve."""
 _REFERENCES = {
     "trivial": ("the best picture that needs no method", "the best without a method"),
     "camera": ("the camera’s own blurry picture", "the camera’s own"),
@@ -229,6 +233,15 @@ def _novel_views(source: Source) -> str:
     )
 
 
+def _running_mean(line: Series) -> Series:
+    """Means of `_FRAMES_TOGETHER` neighbours: frames differ more than training changes them."""
+    count = min(_FRAMES_TOGETHER, len(line.x))
+    if not count:
+        return line
+    x, y = (np.convolve(values, np.ones(count) / count, "valid") for values in (line.x, line.y))
+    return Series(line.name, x.tolist(), y.tolist())
+
+
 def _curves(source: Source) -> str:
     log = source.log
     if not log:
@@ -249,9 +262,9 @@ def _curves(source: Source) -> str:
     charts = [
         line_chart(losses, x_title="iteration", y_title="Loss and its terms", log=True),
         line_chart(
-            [series("psnr", [entry.get("psnr") for entry in log])],
+            [_running_mean(series("psnr", [entry.get("psnr") for entry in log]))],
             x_title="iteration",
-            y_title="PSNR of the training pictures, dB",
+            y_title=f"PSNR of the training pictures, dB, means of {_FRAMES_TOGETHER} in turn",
         ),
         line_chart(counts, x_title="iteration", y_title="Gaussians"),
     ]

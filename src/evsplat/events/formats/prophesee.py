@@ -62,7 +62,7 @@ class _Header:
             found = (self.values["width"], self.values["height"])
         if found is None:
             return None, None
-        if not all(text.isdigit() and 0 < int(text) <= 1 << 16 for text in found):
+        if not all(text.isdecimal() and 0 < int(text) <= 1 << 16 for text in found):
             raise DataError(f"{path}: its header gives a sensor of {' x '.join(found)} pixels.")
         return int(found[0]), int(found[1])
 

@@ -111,6 +111,6 @@ def _read_names(fields: list[str]) -> tuple[list[str], tuple[int | None, int | N
     for field in fields:
         name, _, tail = field.partition("@")
         names.append(name.strip())
-        if tail.isdigit():
+        if tail.isdecimal():
             size[name.strip()] = int(tail)
     return names, (size.get("x"), size.get("y"))

@@ -1,0 +1,131 @@
+"""What stands around the person in a film: a calm room where nothing was seen, nothing in between.
+
+A recording shows the scene from one side. From elsewhere there are holes, and walls whose backs
+hide the person: holes show a soft floor below an even gradient, and what is nearer to the camera
+than the person fades.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, ImageColor
+from torch import Tensor
+
+from evsplat.body import BodyTrack, up_axis
+from evsplat.camera import Camera
+from evsplat.errors import ConfigError
+from evsplat.models.layers import Layers
+from evsplat.pages import read_rgb
+
+_FLOOR, _HORIZON, _TOP = (0.60, 0.58, 0.56), (0.83, 0.83, 0.82), (0.66, 0.69, 0.73)
+"""sRGB."""
+_FLOOR_ENDS_M = 5.0
+_SHADOW, _SHADOW_M = 0.4, 0.4
+"""Depth and standard deviation of the soft spot below the person."""
+_CLEAR_M = (0.45, 0.15)
+"""What is nearer to the camera than the person's nearest point by these begins and ends to fade."""
+_FLOOR_STAYS_M = 0.12
+"""Height above the floor of what never fades: it hides nobody."""
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """An even gradient above a soft floor, and the person's soft spot on it."""
+
+    track: BodyTrack
+    """The motion that is filmed."""
+    up: Float[Tensor, "3"]
+    floor_m: float
+    """Height of the floor along ``up``."""
+
+    @classmethod
+    def of(cls, recorded: BodyTrack, filmed: BodyTrack) -> "Room":
+        """The floor is where the recorded person's lowest point is."""
+        up = up_axis(recorded).float().cpu()
+        first, last = int(recorded.times_us[0]), int(recorded.times_us[-1])
+        times = np.linspace(first, last, 16).round().astype(int).tolist()
+        lowest = min(float((recorded.vertices(time).cpu() @ up).min()) for time in times)
+        return cls(filmed, up, lowest)
+
+    def behind(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
+        """The picture of the empty room, sRGB."""
+        center, directions = camera.center().cpu(), _directions(camera)
+        climbing = directions @ self.up
+        colour = _mixed(_HORIZON, _TOP, (climbing / 0.6).clamp(0, 1))
+        height = float(center @ self.up) - self.floor_m
+        if height <= 0:
+            return colour
+        below = climbing < -1e-4
+        way = height / (-climbing).clamp_min(1e-4)
+        places = center + way[..., None] * directions
+        root = self.track.at([time_us])[1][0] + self.track.body.rest_joints[0]
+        pelvis = root.float().cpu()
+        apart = places - pelvis
+        apart = apart - (apart @ self.up)[..., None] * self.up
+        square = apart.square().sum(-1)
+        floor = _mixed(_FLOOR, _HORIZON, 1 - torch.exp(-square / _FLOOR_ENDS_M**2))
+        spot = 1 - _SHADOW * torch.exp(-square / (2 * _SHADOW_M**2))
+        return torch.where(below[..., None], floor * spot[..., None], colour)
+
+    def clear(self, layers: Layers, camera: Camera) -> Layers:
+        """Fade what stands between the camera and the person, but for the floor."""
+        scene, human = layers.scene, layers.human
+        depth, nearest = (camera.project(part.means)[1] for part in (scene, human))
+        begin, end = (nearest.min() - metres for metres in _CLEAR_M)
+        share = ((depth[0] - begin) / (end - begin)).clamp(0, 1)
+        share = share * share * (3 - 2 * share)
+        height = scene.means[0] @ self.up.to(scene.means) - self.floor_m
+        share = torch.where(height < _FLOOR_STAYS_M, 1.0, share)
+        return replace(layers, scene=replace(scene, opacities=scene.opacities * share))
+
+
+@dataclass(frozen=True, eq=False)
+class Painted:
+    """A colour or a picture behind everything."""
+
+    picture: Float[Tensor, "h w 3"]
+    """sRGB; fills the frame, and what does not fit is cut off evenly."""
+
+    @classmethod
+    def of(cls, asked: str) -> "Painted":
+        """By a colour's name, ``#rrggbb``, or the path of a picture; else a `ConfigError`."""
+        if Path(asked).is_file():
+            rgb8 = read_rgb(Path(asked), "give a PNG or JPEG picture")
+            return cls(torch.from_numpy(rgb8.astype(np.float32) / 255))
+        try:
+            rgb = ImageColor.getrgb(asked)[:3]
+        except ValueError:
+            raise ConfigError(
+                f"--background {asked}: neither a colour (white, #202830) nor a picture's file."
+            ) from None
+        return cls(torch.tensor(rgb).view(1, 1, 3) / 255)
+
+    def behind(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
+        """The picture at the camera's size."""
+        high, wide = self.picture.shape[:2]
+        scale = max(camera.height / high, camera.width / wide)
+        size = max(camera.width, round(wide * scale)), max(camera.height, round(high * scale))
+        image = Image.fromarray((self.picture * 255).round().byte().numpy())
+        image = image.resize(size, Image.Resampling.LANCZOS)
+        left, top = (size[0] - camera.width) // 2, (size[1] - camera.height) // 2
+        image = image.crop((left, top, left + camera.width, top + camera.height))
+        return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
+
+
+def _directions(camera: Camera) -> Float[Tensor, "H W 3"]:
+    """Unit directions of the pixels' middles in the world."""
+    K = camera.K.cpu()
+    y, x = torch.meshgrid(
+        torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
+    )
+    rays = torch.stack(((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)), -1)
+    return torch.nn.functional.normalize(rays, dim=-1) @ camera.world_to_camera[:3, :3].cpu()
+
+
+def _mixed(
+    near: tuple[float, ...], far: tuple[float, ...], share: Float[Tensor, "H W"]
+) -> Float[Tensor, "H W 3"]:
+    return torch.lerp(torch.tensor(near), torch.tensor(far), share[..., None])
