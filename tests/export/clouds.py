@@ -42,6 +42,7 @@ def random_cloud(rng: np.random.Generator, count: int) -> SplatCloud:
         opacities=np.float32(rng.random(count)),
         rgb=np.float32(rng.uniform(-0.2, 1.2, size=(count, 3))),
         semantic=np.float32(rng.random(count) > 0.5),
+        seen=np.float32(rng.random(count)),
     )
 
 

@@ -21,7 +21,8 @@ def test_ply_holds_everything_in_the_layout_of_3dgs(tmp_path, seed):
     # The order in which graphdeco's scene/gaussian_model.py writes them; viewers rely on it.
     assert list(columns) == [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-        *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "semantic"),
+        *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+        *("semantic", "seen"),
     ]
 
     def stack(prefix: str, count: int) -> np.ndarray:
@@ -34,6 +35,7 @@ def test_ply_holds_everything_in_the_layout_of_3dgs(tmp_path, seed):
     opacity = 1 / (1 + np.exp(-columns["opacity"].astype(np.float64)))
     np.testing.assert_allclose(opacity, cloud.opacities, atol=2e-6)
     np.testing.assert_array_equal(columns["semantic"], cloud.semantic)
+    np.testing.assert_array_equal(columns["seen"], cloud.seen)
     assert not any(columns[name].any() for name in ("nx", "ny", "nz"))
 
 

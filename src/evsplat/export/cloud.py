@@ -32,6 +32,8 @@ class SplatCloud:
     """sRGB; mostly in [0, 1], not clamped."""
     semantic: Float32[np.ndarray, " N"]
     """1 = person, 0 = scene."""
+    seen: Float32[np.ndarray, " N"]
+    """How certain training was of the person, 0 to 1; 1 where nothing tells, and of the scene."""
 
     def __len__(self) -> int:
         """Number of Gaussians."""
@@ -52,7 +54,7 @@ class SplatCloud:
         return replace(self, rgb=_float32(rgb))
 
 
-def cloud_of(splats: Splats, time: int = 0) -> SplatCloud:
+def cloud_of(splats: Splats, time: int = 0, seen: Float[Tensor, " N"] | None = None) -> SplatCloud:
     """One time of drawn Gaussians; ``channels`` are R, G, B and the semantic attribute.
 
     Skinning shears a Gaussian: its covariance is ``(L R S)(L R S)^T`` with any matrix L. The
@@ -84,6 +86,7 @@ def cloud_of(splats: Splats, time: int = 0) -> SplatCloud:
         opacities=_float32(at(splats.opacities)),
         rgb=_float32(channels[:, :3]),
         semantic=_float32(channels[:, 3]),
+        seen=_float32(torch.ones_like(channels[:, 3]) if seen is None else seen.cpu()),
     )
     values = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities[:, None], cloud.rgb)
     good = np.isfinite(np.concatenate(values, axis=1)).all(1) & (cloud.scales > 0).all(1)

@@ -32,7 +32,7 @@ _GLTF_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def write_ply(path: Path | str, cloud: SplatCloud, *, comments: Sequence[str] = ()) -> None:
-    """Write the .ply of Kerbl et al. 2023 (SH degree 0), and a column ``semantic`` after it.
+    """Write the .ply of Kerbl et al. 2023 (SH degree 0), then columns ``semantic`` and ``seen``.
 
     All is float32. Normals are zero, ``opacity`` is a logit, ``scale_*`` are natural logarithms of
     metres and ``rot_*`` is (w, x, y, z). ``comments`` become comment lines of the header.
@@ -46,6 +46,7 @@ def write_ply(path: Path | str, cloud: SplatCloud, *, comments: Sequence[str] = 
         **{f"scale_{k}": np.log(cloud.scales[:, k]) for k in range(3)},
         **{f"rot_{k}": cloud.quaternions[:, k] for k in range(4)},
         "semantic": cloud.semantic,
+        "seen": cloud.seen,
     }
     table = np.stack([np.float32(values) for values in columns.values()], axis=1)
     header = [

@@ -74,7 +74,8 @@ def cloud_at(
 ) -> SplatCloud:
     """The Gaussians of one instant in the capture's world, coloured as ``camera`` sees them."""
     splats = source.splats(camera, [time_us], parts=parts)
-    return joined([cloud_of(layer) for layer in splats])
+    certain = None if parts == "scene" else source.certainties()
+    return joined([cloud_of(splats[0], seen=certain), *map(cloud_of, splats[1:])])
 
 
 def facts_of(run: Run) -> dict[str, Any]:

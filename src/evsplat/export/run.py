@@ -79,7 +79,7 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
     facts = facts_of(run)
     if options.canonical:
         gaussians = at_rest(run, options.camera)
-        cloud = cloud_of(gaussians.at_rest())
+        cloud = cloud_of(gaussians.at_rest(), seen=run.reconstruction.certainties())
         rotation = file_rotation(rest_track(gaussians.body), kind, options.up)
         label, when = (
             "canonical",

@@ -152,6 +152,10 @@ class GaussianReconstruction:
             depth = draw_depth(layers, camera, parts=parts).cpu()
         return depth.expand(len(times_us), *depth.shape[1:])
 
+    def certainties(self) -> Float[Tensor, " H"] | None:
+        """How well training saw each Gaussian of the person, 0 to 1; None where nothing tells."""
+        return None if self.seen is None else self.seen.certainty()
+
     @torch.no_grad()
     def certainty(
         self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"

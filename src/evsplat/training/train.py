@@ -256,9 +256,11 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
                 saved_at = time.perf_counter()
             showcase.show(trainer.snapshot)
         check_learned(trainer, clock.iteration - first)
-        save(ending=not interrupted and clock.iteration > 0)
+        save()
         if interrupted:
             raise Stopped(folder.path)
+        if clock.iteration > 0:
+            save(ending=True)  # once more: what was learned is safe whatever this takes
     if clock.iteration == 0:
         raise DataError(f"{folder.path}: no step was made.")
 

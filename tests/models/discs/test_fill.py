@@ -90,6 +90,20 @@ def test_nothing_is_decided_where_nobody_was_seen(spoilt):
     assert filled(model, capture, 0.005, nothing) == {}
 
 
+@pytest.mark.parametrize(
+    "settings", [("lamps=0",), ("shading=false", "lamps=2"), ("scene.kind=random_cube",)]
+)
+def test_every_kind_of_model_is_filled(tiny_capture, settings):
+    capture = load_capture(tiny_capture())
+    model = built("evsplat", capture, *settings).model
+    training = capture.for_training(Policy())
+    found = filled(model, training, 0.0025, seen_by(model, training))
+    state = model.state_dict()
+    assert f"gaussians.{model.gaussians.colour}" in found
+    assert all(value.shape == state[name].shape for name, value in found.items())
+    assert all(bool(value.isfinite().all()) for value in found.values())
+
+
 def test_a_run_is_drawn_filled_and_goes_on_unfilled(tiny_capture, tmp_path):
     capture = tiny_capture()
     run = train(capture, out=tmp_path / "run", iterations=3, overrides=small("evsplat"))
