@@ -112,6 +112,17 @@ def test_page_is_one_file_without_any_request_and_hostile_names_stay_text(tiny_c
     assert sum(HOSTILE in data for data in parsed.text) >= 2
 
 
+def test_page_of_a_trained_run_ends_with_commands_for_its_folder(tiny_capture, tmp_path):
+    path, folder = tiny_capture(), tmp_path / "a <b> run"
+    folder.mkdir()
+    text = " ".join(Page(page(evaluated(path, folder))).text)
+    for command in ("view", "render", "export"):
+        assert f"evsplat {command} '{folder}'" in text
+    other = tmp_path / "untrained"
+    other.mkdir()
+    assert "What to do next" not in page(evaluated(path, other, training=False))
+
+
 def test_page_shows_every_test_frame_pair_and_view(tiny_capture, tmp_path):
     source = evaluated(tiny_capture(frames=20), tmp_path)
     parsed = Page(page(source))

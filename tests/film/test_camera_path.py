@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.capture import Camera
 from evsplat.errors import DataError
-from evsplat.film.camera_path import read_camera_path, through
+from evsplat.film.camera_path import camera_path_document, read_camera_path, through
 
 
 def _camera(seed: int) -> Camera:
@@ -97,3 +97,23 @@ def test_wrong_files_name_file_and_field(tmp_path, change, message):
     with pytest.raises(DataError, match=message) as error:
         read_camera_path(path)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_cameras_come_back_from_the_file_written_of_them(tmp_path, count):
+    cameras = [_camera(seed) for seed in range(count)]
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(camera_path_document(cameras)))
+    path = read_camera_path(file)
+    for share, camera in zip(np.linspace(0, 1, count), cameras, strict=True):
+        back = path(share)
+        torch.testing.assert_close(back.world_to_camera, camera.world_to_camera)
+        torch.testing.assert_close(back.K, camera.K)
+
+
+def test_key_frames_at_one_place_make_a_camera_that_stands(tmp_path):
+    camera = _camera(0)
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(camera_path_document([camera] * 3)))
+    back = read_camera_path(file)(0.3)
+    torch.testing.assert_close(back.world_to_camera, camera.world_to_camera)

@@ -2,11 +2,13 @@
 
 import asyncio
 import io
+import json
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 viser = pytest.importorskip("viser", reason="needs the extra view: pip install 'evsplat[view]'")
 
@@ -16,6 +18,7 @@ import zstandard  # noqa: E402
 from PIL import Image  # noqa: E402
 
 from evsplat.capture import load_capture  # noqa: E402
+from evsplat.film.camera_path import read_camera_path  # noqa: E402
 from evsplat.training.run import GaussianReconstruction, Run  # noqa: E402
 from evsplat.view.request import Motion  # noqa: E402
 from evsplat.view.server import Viewer  # noqa: E402
@@ -118,6 +121,23 @@ def test_the_picture_comes_with_all_pixels_of_the_window(run):
     name, content = in_browser(run, 18650, lambda browser: browser.download("Picture (PNG)"))
     assert name.startswith(f"{run.capture.name}-") and name.endswith("ms.png")
     assert Image.open(io.BytesIO(content)).size == (SIDE, SIDE)
+
+
+def test_a_camera_path_of_key_frames_is_one_that_films_are_made_with(run, tmp_path):
+    async def act(browser):
+        await browser.set("Add key frame of a camera path", True)
+        await browser.set("Add key frame of a camera path", True)
+        kept = await browser.download("Camera path (JSON)")
+        await browser.set("Forget key frames", True)
+        return kept, await browser.download("Camera path (JSON)")
+
+    (name, content), (_, without) = in_browser(run, 18670, act)
+    assert [len(json.loads(file)["keys"]) for file in (content, without)] == [2, 1]
+    (tmp_path / name).write_bytes(content)
+    camera = read_camera_path(tmp_path / name)(0.5)
+    assert (camera.width, camera.height) == (SIDE, SIDE)
+    recorded = run.capture.camera(run.capture.frames[0])  # what the viewer opens on
+    assert torch.allclose(camera.world_to_camera, recorded.world_to_camera, atol=1e-5)
 
 
 def test_gaussians_come_in_every_format_and_as_the_parts_that_are_shown(run, tmp_path):

@@ -148,6 +148,22 @@ def read_camera_path(path: Path | str) -> CameraPath:
     return through(shares, cameras)
 
 
+def camera_path_document(cameras: Sequence[Camera]) -> dict[str, Any]:
+    """The JSON document of a path through cameras, at equal shares of the film.
+
+    The size of the film's picture is the first camera's; intrinsics are scaled to it.
+    """
+    first = cameras[0]
+    keys = []
+    for share, camera in zip(np.linspace(0, 1, len(cameras)), cameras, strict=True):
+        fx, fy, cx, cy = _intrinsics(camera, first).tolist()
+        K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+        pose = camera.world_to_camera.double().tolist()
+        keys.append({"at": float(share), "world_to_camera": pose, "K": K})
+    size = {"width": first.width, "height": first.height}
+    return {"format": "evsplat-camera-path", "version": 1, **size, "keys": keys}
+
+
 def _key_pose(path: Path, index: int, key: dict[str, Any]) -> Float[Tensor, "4 4"]:
     if "world_to_camera" in key:
         pose = _numbers(path, index, key, "world_to_camera", (4, 4))

@@ -1,13 +1,16 @@
 """The controls that hand what is shown to the browser as a file."""
 
 import io
+import json
 
 import viser
 from PIL import Image
 
+from evsplat.camera import Camera
 from evsplat.errors import DataError
 from evsplat.export.gaussians import FileKind, facts_of, file_rotation, write_file
 from evsplat.files import scratch_folder
+from evsplat.film.camera_path import camera_path_document
 from evsplat.view.client import Client
 from evsplat.view.request import ViewRequest
 
@@ -21,7 +24,7 @@ _FORMATS: dict[str, tuple[FileKind, str]] = {
 
 
 class SavePanel:
-    """A picture of the view, and the Gaussians of its instant for other programs."""
+    """A picture of the view, the Gaussians of its instant, and a camera path for films."""
 
     def __init__(self, client: Client) -> None:
         """Build the controls in the folder that is open."""
@@ -29,6 +32,10 @@ class SavePanel:
         picture = gui.add_button("Picture (PNG)", icon=viser.Icon.DOWNLOAD)
         self.format = gui.add_dropdown("Format", tuple(_FORMATS))
         gaussians = gui.add_button("Gaussians", icon=viser.Icon.DOWNLOAD)
+        self._keys: list[Camera] = []
+        add_key = gui.add_button("Add key frame of a camera path", icon=viser.Icon.PLUS)
+        save_path = gui.add_button("Camera path (JSON)", icon=viser.Icon.DOWNLOAD)
+        clear_path = gui.add_button("Forget key frames", icon=viser.Icon.TRASH)
 
         async def save_picture(_: viser.GuiEvent) -> None:
             client.scheduler.submit(self._send_picture)
@@ -36,6 +43,19 @@ class SavePanel:
         async def save_gaussians(_: viser.GuiEvent) -> None:
             client.scheduler.submit(self._send_gaussians)
 
+        async def add(_: viser.GuiEvent) -> None:
+            self._add_key()
+
+        async def save_keys(_: viser.GuiEvent) -> None:
+            self._send_path()
+
+        async def forget(_: viser.GuiEvent) -> None:
+            self._keys.clear()
+            self._notify("No key frames", "The next camera path starts anew.")
+
+        add_key.on_click(add)
+        save_path.on_click(save_keys)
+        clear_path.on_click(forget)
         picture.on_click(save_picture)
         gaussians.on_click(save_gaussians)
 
@@ -69,6 +89,18 @@ class SavePanel:
             data = path.read_bytes()
         self._send(name, data)
         self._notify(name, f"{len(cloud):,} Gaussians, {len(data) / 1e6:.1f} MB.")
+
+    def _add_key(self) -> None:
+        """Keep the camera that is seen through as the next key of the path."""
+        self._keys.append(self.client.compositor.camera(self.client.current))
+        self._notify(f"Key frame {len(self._keys)}", "Keys are spread evenly over the film.")
+
+    def _send_path(self) -> None:
+        """Send the keys as a file that `evsplat render --path` reads; none: the present view."""
+        keys = self._keys or [self.client.compositor.camera(self.client.current)]
+        name = f"{self.client.compositor.capture.name}-camera-path.json"
+        self._send(name, json.dumps(camera_path_document(keys), indent=1).encode())
+        self._notify(name, f"{len(keys)} key frames: evsplat render RUN --path {name}")
 
     def _stem(self, request: ViewRequest) -> str:
         """File name of a request's instant, without ending."""

@@ -1,5 +1,6 @@
 """The report page, put together from its sections."""
 
+import shlex
 from collections.abc import Sequence
 from html import escape
 from typing import Any
@@ -66,6 +67,7 @@ def page(source: Source) -> str:
         _curves(source),
         configuration(source),
         made_with(source),
+        _next_steps(source),
     ]
     title = f"{source.metrics['capture']} · {source.metrics['method']}"
     body = f"{_header(source)}<main>{''.join(sections)}</main>{_footer(source)}"
@@ -269,6 +271,24 @@ def _curves(source: Source) -> str:
         line_chart(counts, x_title="iteration", y_title="Gaussians"),
     ]
     return section("Curves", "", f'<div class="charts">{"".join(charts)}</div>')
+
+
+def _next_steps(source: Source) -> str:
+    """Commands that go on from the run, with its folder as it was named."""
+    if not source.log:  # a method that does not train has nothing to animate
+        return ""
+    run = shlex.quote(str(source.folder))
+    steps = {
+        "Look at it from anywhere, at any time": f"evsplat view {run}",
+        "Film another motion": f"evsplat render {run} --motion spin --path orbit",
+        "Share a page in which the person can be posed": f"evsplat export {run} avatar",
+        "Check a recording of your own (docs/own-capture.md)": "evsplat inspect FOLDER",
+    }
+    listed = "".join(
+        f"<li>{escape(what)}: <code>{escape(command)}</code></li>"
+        for what, command in steps.items()
+    )
+    return section("What to do next", "", f"<ul>{listed}</ul>")
 
 
 def _footer(source: Source) -> str:
