@@ -71,7 +71,8 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
     site.mkdir()
     shots = []
     for kind in ("ply", "spz", "splat"):
-        ev.export_run(arguments.run, kind, frame=frame.name, out=site / f"run.{kind}", device="cpu")
+        file, own = site / f"run.{kind}", source.low_pass
+        ev.export_run(run.path, kind, frame=frame.name, out=file, low_pass=own, device="cpu")
         view = seen_from(camera, file_rotation(source.track, kind, None))
         for rules in ("3dgs", "default"):
             shots.append(

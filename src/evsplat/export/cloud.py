@@ -73,11 +73,8 @@ def cloud_of(splats: Splats, time: int = 0, seen: Float[Tensor, " N"] | None = N
     quaternions, scales = at(splats.quaternions), at(splats.scales).abs()
     if splats.linear is not None:
         axes = at(splats.linear) @ quaternion_to_matrix(quaternions) * scales[:, None, :]
-        axes = torch.nan_to_num(axes)
-        turned, scales, _ = torch.linalg.svd(axes)
-        # A reflection of the axes leaves the covariance as it is, but is no rotation.
-        turned[..., 2] *= torch.linalg.det(turned)[:, None].sign()
-        quaternions = matrix_to_quaternion(turned)
+        turned, lengths = principal_axes(torch.nan_to_num(axes))
+        quaternions, scales = torch.from_numpy(turned), torch.from_numpy(lengths)
     channels = at(splats.channels)
     cloud = SplatCloud(
         means=_float32(at(splats.means)),
@@ -91,6 +88,16 @@ def cloud_of(splats: Splats, time: int = 0, seen: Float[Tensor, " N"] | None = N
     values = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities[:, None], cloud.rgb)
     good = np.isfinite(np.concatenate(values, axis=1)).all(1) & (cloud.scales > 0).all(1)
     return SplatCloud(*(column[good] for column in vars(cloud).values()))
+
+
+def principal_axes(
+    axes: Float[Tensor, "N 3 3"],
+) -> tuple[Float32[np.ndarray, "N 4"], Float32[np.ndarray, "N 3"]]:
+    """Quaternions (w >= 0) and scales of the covariance ``axes axes^T`` of any matrix."""
+    turned, scales, _ = torch.linalg.svd(axes)
+    # A reflection of the axes leaves the covariance as it is, but is no rotation.
+    turned[..., 2] *= torch.linalg.det(turned)[:, None].sign()
+    return _positive(matrix_to_quaternion(turned)), _float32(scales)
 
 
 def joined(clouds: list[SplatCloud]) -> SplatCloud:
