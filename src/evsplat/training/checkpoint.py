@@ -162,6 +162,9 @@ def load_model(model: Model, tensors: dict[str, Tensor], human_count: int) -> No
             raise ValueError(f"{human_count} Gaussians of the person, of {len(values['means'])}")
         rows.set_rows(values, human_count)
     model.load_state_dict(entries)
+    for cache in model.row_caches.values():
+        # found for the rows that were there before, which may be as many
+        cache.rows_changed()
 
 
 def counts(model: Model) -> dict[str, int]:
