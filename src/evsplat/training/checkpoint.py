@@ -158,7 +158,7 @@ def load_model(model: Model, tensors: dict[str, Tensor], human_count: int) -> No
     for name, rows in model.sets.items():
         device = rows.means.device
         values = {key: entries[f"{name}.{key}"].to(device) for key in rows.attributes}
-        if not 0 <= human_count <= len(values["means"]):
+        if rows.holds("human") and not 0 <= human_count <= len(values["means"]):
             raise ValueError(f"{human_count} Gaussians of the person, of {len(values['means'])}")
         rows.set_rows(values, human_count)
     model.load_state_dict(entries)
