@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from evsplat.errors import DataError, OutputError
-from evsplat.training.checkpoint import checkpoints, load_latest, save_checkpoint
+from evsplat.training.checkpoint import checkpoints, load_latest, load_model, save_checkpoint
+
+from ..small_model import SMALL, built
 
 CLOCK = {"iteration": 1, "iterations": 9, "fraction": 0.1, "seconds": 1.0, "step_seconds": 1.0}
 STATE = {"clock": CLOCK, "human_count": 4}
@@ -111,3 +113,22 @@ def test_the_disk_s_other_faults_keep_all(folder: Path, monkeypatch: pytest.Monk
     with pytest.raises(OSError, match=os.strerror(errno.EIO)):
         save(folder, 30)
     assert steps(folder) == [10, 20]
+
+
+@pytest.mark.parametrize("method", SMALL)
+def test_a_model_with_another_s_rows_is_drawn_as_that_one(method: str, tiny_capture) -> None:
+    path = tiny_capture()
+    first, second = (built(method, path, seed=seed).model for seed in (0, 1))
+    times, centre = [15_000, 55_000], torch.tensor([0.0, -3.0, 1.0])
+
+    def drawn(model):
+        with torch.no_grad():
+            human = model.at(times, centre, hard_semantics=True).human
+        return torch.cat([human.means, human.channels], -1)
+
+    drawn(first)  # what is kept per Gaussian is found now
+    counts = [sum(rows.human_count for rows in model.sets.values()) for model in (first, second)]
+    assert counts[0] == counts[1]
+    tensors = {f"model.{name}": value.clone() for name, value in second.state_dict().items()}
+    load_model(first, tensors, counts[1])
+    assert torch.equal(drawn(first), drawn(second))

@@ -163,10 +163,13 @@ def load_model(
     for name, rows in model.sets.items():
         device = rows.means.device
         values = {key: entries[f"{name}.{key}"].to(device) for key in rows.attributes}
-        if not 0 <= human_count <= len(values["means"]):
+        if rows.holds("human") and not 0 <= human_count <= len(values["means"]):
             raise ValueError(f"{human_count} Gaussians of the person, of {len(values['means'])}")
         rows.set_rows(values, human_count)
     model.load_state_dict(entries)
+    for cache in model.row_caches.values():
+        # found for the rows that were there before, which may be as many
+        cache.rows_changed()
 
 
 def counts(model: Model) -> dict[str, int]:
