@@ -49,8 +49,8 @@ def export_run(
     view; in the file they are those seen from ``camera`` (default: the recording one) at that
     instant. Axes are the capture's unless ``up`` turns them; .spz and .glb are always y up.
 
-    Gaussians are narrowed by what a viewer adds more than training did: ``low_pass`` (px^2; most
-    add 0.3), at the size and the distance of that camera.
+    With ``low_pass`` Gaussians are narrowed by what a viewer adds more than training did (px^2;
+    most add 0.3), at the size and the distance of that camera.
 
     ``html`` is one page that plays the recording (``fps`` pictures per second) in 3D without a
     network; it needs the extra ``view``. ``avatar`` is the person for any browser, to play and to
@@ -97,12 +97,13 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
         )
         source = run.reconstruction
         cloud = cloud_at(source, instant.camera, instant.time_us, parts or "all")
-        cloud = for_viewer(cloud, instant.camera, source.low_pass, options.low_pass)
+        viewers = source.low_pass if options.low_pass is None else options.low_pass
+        cloud = for_viewer(cloud, instant.camera, source.low_pass, viewers)
         which = "" if parts in (None, "all") else f"{parts}-"
         label = f"{which}{instant.label}"
         when = f"at {instant.time_us} us, colours as camera {instant.camera_name} sees them"
         facts |= {"time_us": instant.time_us, "colours_seen_by": instant.camera_name}
-        facts |= {"viewer_low_pass_px2": options.low_pass}
+        facts |= {"viewer_low_pass_px2": viewers}
     if target is None:
         target = run.path / "exports" / f"{label}{_SUFFIXES[kind][0]}"
     cloud = cloud.shown(capture.transfer(capture.frames[0]))
@@ -127,7 +128,7 @@ def _check_use(kind: Kind, options: ExportOptions) -> None:
         "--time and --frame": moving and (options.time_s, options.frame) != (None, None),
         "--canonical": moving and options.canonical,
         "--up": moving and options.up is not None,
-        "--low-pass": moving and options.low_pass != ExportOptions.low_pass,
+        "--low-pass": moving and options.low_pass is not None,
         "--motion": kind != "avatar" and options.motion is not None,
     }
     for names, given_in_vain in unused.items():

@@ -183,8 +183,10 @@ class ExportOptions:
         None
     )
     """Turn the world so that this axis points up."""
-    low_pass: Annotated[float, Within(0, 1), option("PX2")] = 0.3
-    """What the viewer of the file adds to each Gaussian, px^2 at the recording's size."""
+    low_pass: Annotated[
+        float | None, Within(0, 1), option("PX2", default="what training added")
+    ] = None
+    """Make up for a viewer that adds so many px^2 (most: 0.3), at the recording's size."""
     motion: Annotated[str | None, option("NAME", default="the recorded one alone")] = None
     """Another motion for the avatar, as 'evsplat render' takes it."""
     fps: Annotated[float, Within(1, 120), option("HZ")] = 24.0
