@@ -95,7 +95,7 @@ def stand_ins(tiny_capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     write_recordings(place, tiny)
     used: list[str] = []
 
-    def found(path, out, search, overwrite):
+    def found(path, out, search, overwrite, **_):
         used.append("--find-poses")
         attach_poses(path, tiny / "body.npz", out, overwrite=overwrite)
         document = json.loads((out / "capture.json").read_text())
