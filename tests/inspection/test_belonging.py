@@ -183,3 +183,13 @@ def test_track_of_the_caller_is_judged_in_place_of_the_captures_own(path: Path) 
     track = load_body_track(load_capture(path))
     behind = BodyTrack(track.body, track.times_us + 80_000, track.poses, track.transl)
     assert judge_body(seen(path), behind).delay_frames == pytest.approx(2, abs=0.5)
+
+
+def test_nobody_in_any_picture_is_refused_whosever_body_is_wanted(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed(path, transl=stored(path, "transl") + np.float32([30, 0, 0]))
+    train = ["train", str(path), "--out", str(tmp_path / "run"), "--iterations", "1"]
+    assert main([*train, "--any-body"]) == 2
+    assert "the posed body is in none of the" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -6,7 +6,7 @@ elsewhere; another recording's body fits a frame no better in its own pose than 
 Limits are from staged captures (benchmarks/wrong_bodies.py).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -69,6 +69,8 @@ class Belonging:
     """Share of its correlation that the first or second half of the recording, the worse, loses at
     the common best place against the best place of its own."""
     standing_camera: bool
+    in_no_training_frame: bool
+    """The posed body is out of view in every training frame."""
     in_no_held_out_frame: bool
     """There are held-out frames, and the posed body is out of view in all of them."""
 
@@ -192,12 +194,13 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
         order=best.order,
         parting=best.parting,
         standing_camera=stands(frames),
-        in_no_held_out_frame=_in_no_held_out_frame(capture, figure),
+        in_no_training_frame=not now.any() and _in_none(capture, figure, capture.train_frames),
+        in_no_held_out_frame=_in_none(capture, figure, spread(capture.held_out_frames)),
     )
 
 
-def _in_no_held_out_frame(capture: TrainingCapture, figure: Figure) -> bool:
-    frames = spread(capture.held_out_frames)
+def _in_none(capture: TrainingCapture, figure: Figure, frames: Sequence[Frame]) -> bool:
+    """Whether there are frames, and the body is out of view in all."""
     mids_us, cameras = [f.mid_us for f in frames], [capture.camera(f) for f in frames]
     return len(frames) > 0 and not figure.heights_px(mids_us, cameras).any()
 

@@ -41,9 +41,16 @@ def check_body(capture: TrainingCapture, *, refuse: bool) -> Belonging:
     """Judge the body that a training is given; a right one is said nothing of.
 
     Raises:
-        DataError: with ``refuse``, a body that follows nothing of what moves, or is out of view.
+        DataError: a body that is in no training picture; with ``refuse``, also one that follows
+            nothing of what moves.
     """
     found = judge_body(capture)
+    if found.in_no_training_frame:
+        raise DataError(
+            f"{capture.body_file.path}: the posed body is in none of the "
+            f"{len(capture.train_frames)} training pictures, expected it in view of the camera; "
+            f"correct poses or camera (evsplat inspect {capture.path} draws them)."
+        )
     if found.verdict == "another" and refuse:
         raise DataError(
             f"{capture.body_file.path}: {found.sentence}; give the body of this recording (evsplat "
