@@ -162,6 +162,7 @@ def read_settings(root: Path, damaged: Path) -> None:
         method_config(damaged.stem, override({}, lines), where="--set")
         return
     run = RunFolder(root)
+    run.config.touch()  # a run has one by that name
     run.config = damaged
     run.facts = root / "versions.json"
     run.facts.write_text('{"capture": "c", "capture_name": "c", "device": "cpu", "seed": 0}')

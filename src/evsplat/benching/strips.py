@@ -10,6 +10,7 @@ from evsplat.benching.figures import Records
 from evsplat.benching.folder import BenchFolder
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.evaluation.regions import Box, HumanRegions
+from evsplat.files import make_folder
 from evsplat.pages import read_rgb
 from evsplat.pictures import to_bytes
 from evsplat.pictures.files import save_png
@@ -34,7 +35,7 @@ def write_strips(records: Records, folder: BenchFolder) -> list[Path]:
         if not capture.test_frames:
             continue
         path = folder.path / "strips" / f"{name}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         save_png(path, strip(_tiles(records, capture, name, folder)))
         written.append(path)
     return written

@@ -77,8 +77,8 @@ def render_run(
     loaded = load_run(Path(run), device=device)
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)
-    height = max(frame.height for frame in loaded.capture.cameras.values())
-    if film.size is None and out.suffix.lower() in (*_VIDEO, *_ANIMATION) and film.show != "events":
+    if _is_made_larger(film, out):
+        height = max(camera.height for camera in loaded.capture.cameras.values())
         film = replace(film, size=max(FILM_HEIGHT, height))
     plan = FilmPlan.of(film, loaded.capture, loaded.reconstruction)
     transfer = loaded.capture.transfer(loaded.capture.frames[0])
@@ -90,6 +90,12 @@ def render_run(
     _write(film, plan, cache, out, events_out, anew=ours)
     cache.remove()
     return out
+
+
+def _is_made_larger(film: Film, out: Path) -> bool:
+    """Whether the film is a video to look at, of which nobody says how large it shall be."""
+    measured = film.what == "test" or film.show == "events"
+    return film.size is None and not measured and out.suffix.lower() in (*_VIDEO, *_ANIMATION)
 
 
 def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours: bool) -> None:
@@ -199,6 +205,6 @@ def _beside(
 def _side_by_side(left: Picture, right: Picture) -> Picture:
     """Join two pictures; the left one is scaled to the height of the right one."""
     if left.shape[0] != right.shape[0]:
-        width = round(left.shape[1] * right.shape[0] / left.shape[0])
+        width = 2 * round(left.shape[1] * right.shape[0] / left.shape[0] / 2)
         left = np.asarray(Image.fromarray(left).resize((width, right.shape[0])))
     return np.concatenate([left, right], axis=1)
