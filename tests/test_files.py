@@ -44,8 +44,15 @@ def test_a_pipe_is_written_into_and_stays(tmp_path: Path) -> None:
     write_json(pipe, [1])
     reader.join(10)
     assert got == ["[\n 1\n]\n"] and pipe.is_fifo()
+    reader = threading.Thread(target=pipe.read_text, daemon=True)
+    reader.start()
     with pytest.raises(KeyboardInterrupt), atomic_path(pipe):
         raise KeyboardInterrupt
+    reader.join(10)
+    assert not reader.is_alive()
+    # Nobody reads: a sentence in place of waiting for ever.
+    with pytest.raises(OutputError, match="is a pipe that nobody reads"):
+        write_json(pipe, [1])
     assert [path.name for path in tmp_path.iterdir()] == ["pipe.json"] and pipe.is_fifo()
 
 

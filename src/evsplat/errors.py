@@ -103,6 +103,8 @@ def _words(error: BaseException) -> str | None:
             f"Memory is full ({detail or 'no more to be had'}); close other programs, or ask for "
             "less: smaller pictures, fewer frames."
         )
+    if isinstance(error, ImportError) and "failed to map segment" in str(error):
+        return f"Memory is full ({detail}); close other programs, or raise the limit (ulimit -v)."
     # Named only where it has been imported, which takes time.
     tensors = sys.modules.get("safetensors")
     if tensors is not None and isinstance(error, tensors.SafetensorError):

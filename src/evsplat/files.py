@@ -1,9 +1,11 @@
 """Writing files whole or not at all."""
 
+import errno
 import json
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -27,6 +29,9 @@ from evsplat.errors import (
     why_not_written,
 )
 
+_READER_S, _AGAIN_S = 2.0, 0.02
+"""Time that the reader of a pipe has to open it, and between two looks."""
+
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
@@ -46,7 +51,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             raise DataError(f"{path}: is a folder; give the name of a file.")
         if path.exists() and not path.is_file():
             # replaced, a device would be lost to all who use it
-            with errors.of_writing():
+            with errors.of_writing(), _with_reader(path):
                 yield path
             return
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
@@ -60,6 +65,31 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             os.fsync(handle)
             os.replace(temporary, target)
             flush_folder(target.parent)
+
+
+@contextmanager
+def _with_reader(path: Path) -> Iterator[None]:
+    """Hold a pipe open that somebody reads: opening one that nobody does would wait for ever."""
+    if not path.is_fifo():
+        yield
+        return
+    deadline = time.monotonic() + _READER_S
+    while True:
+        try:
+            handle = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+            break
+        except OSError as error:
+            if error.errno != errno.ENXIO:
+                raise
+            if time.monotonic() > deadline:
+                raise OutputError(
+                    f"{path}: is a pipe that nobody reads; start what reads it first, or remove it."
+                ) from None
+            time.sleep(_AGAIN_S)
+    try:
+        yield
+    finally:
+        os.close(handle)
 
 
 @contextmanager

@@ -82,3 +82,21 @@ def test_held_at_keys_it_is_scipys_curve_less_the_cubic_through_its_keys(seed):
     assert np.abs(expected).max() > 0.3
     assert np.allclose(values(spline, times.tolist())[0], expected, atol=1e-4)
     assert np.abs(values(spline, [-5_000, 2_000_000])[0]).max() < 1e-5
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_between_many_keys_it_is_the_spline_through_all_of_them(seed):
+    """Pieces that know near keys alone against the cubic spline through a thousand keys."""
+    rng = np.random.default_rng(seed)
+    keys = np.cumsum(rng.integers(15_000, 60_000, 1_000))
+    spline = PoseSpline((int(keys[0]), int(keys[-1])), 20_000.0, 1, held_us=keys.tolist())
+    plain = PoseSpline((int(keys[0]), int(keys[-1])), 20_000.0, 1)
+    values = rng.normal(size=spline.count)
+    times = np.sort(rng.integers(keys[0], keys[-1], 400))
+    own = CubicSpline(keys * 1e-6, plain.weights(keys.tolist()).double().numpy() @ values)
+    expected = plain.weights(times.tolist()).double().numpy() @ values - own(times * 1e-6)
+    found = spline.weights(times.tolist()).double().numpy() @ values
+    assert np.abs(found - expected).max() < 1e-4
+    assert np.abs(spline.weights(keys.tolist()).double().numpy() @ values).max() < 1e-4
+    # Bytes in proportion to the keys, where all weights of all pieces would be a million.
+    assert spline.held.numel() < 1_000 * 4 * 250

@@ -20,6 +20,7 @@ TILE_PX = 240
 _LABEL_PX = 34
 _GAP_PX = 6
 _FONT_PX = 13
+_WIDEST, _LETTERS = 4, 200
 
 Tile = tuple[str, str, UInt8[np.ndarray, "H W 3"]]
 """Title, figure, picture."""
@@ -43,13 +44,7 @@ def write_strips(records: Records, folder: BenchFolder) -> list[Path]:
 
 def strip(tiles: list[Tile]) -> UInt8[np.ndarray, "H W 3"]:
     """Pictures beside each other on white, titles and figures below them."""
-    scaled = [
-        Image.fromarray(picture).resize(
-            (max(1, round(picture.shape[1] * TILE_PX / picture.shape[0])), TILE_PX),
-            Image.Resampling.LANCZOS,
-        )
-        for _, _, picture in tiles
-    ]
+    scaled = [_scaled(picture) for _, _, picture in tiles]
     width = sum(image.width + _GAP_PX for image in scaled) - _GAP_PX
     page = Image.new("RGB", (width, TILE_PX + _LABEL_PX), "white")
     draw, font = ImageDraw.Draw(page), ImageFont.load_default(_FONT_PX)
@@ -63,6 +58,14 @@ def strip(tiles: list[Tile]) -> UInt8[np.ndarray, "H W 3"]:
     return np.asarray(page)
 
 
+def _scaled(picture: UInt8[np.ndarray, "H W 3"]) -> Image.Image:
+    """As high as a tile, or as wide as `_WIDEST` of them."""
+    high, wide = picture.shape[:2]
+    scale = min(TILE_PX / high, _WIDEST * TILE_PX / wide)
+    size = max(1, round(wide * scale)), max(1, round(high * scale))
+    return Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS)
+
+
 def _fitting(
     draw: ImageDraw.ImageDraw,
     text: str,
@@ -70,8 +73,9 @@ def _fitting(
     width: int,
 ) -> str:
     """The text, cut where it would run into its neighbour."""
-    if draw.textlength(text, font) <= width:
+    if len(text) <= _LETTERS and draw.textlength(text, font) <= width:
         return text
+    text = text[:_LETTERS]
     while text and draw.textlength(f"{text}…", font) > width:
         text = text[:-1]
     return f"{text}…"

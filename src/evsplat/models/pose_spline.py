@@ -3,8 +3,9 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
@@ -14,6 +15,9 @@ from evsplat.devices import send
 _PIECES = torch.tensor(
     [[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], dtype=torch.float64
 ) / 6  # fmt: skip
+
+_REACH, _BLOCK = 24, 256
+"""Keys that a piece of the spline through keys knows on either side; pieces made at a time."""
 
 
 class PoseSpline(nn.Module):
@@ -31,6 +35,7 @@ class PoseSpline(nn.Module):
     translations: Tensor
     mean: Tensor
     held: Tensor
+    held_first: Tensor
     held_s: Tensor
 
     def __init__(
@@ -55,15 +60,15 @@ class PoseSpline(nn.Module):
         """Number of control points."""
         buffers = {
             "mean": torch.zeros(self.count),
-            "held": torch.zeros(0, 4, self.count, dtype=torch.float64),
+            "held": torch.zeros(0, 4, 0, dtype=torch.float64),
+            "held_first": torch.zeros(0, dtype=torch.long),
             "held_s": torch.zeros(0, dtype=torch.float64),
         }
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
         if len(held_us) > 1:
             self.held_s = 1e-6 * (torch.tensor(held_us, dtype=torch.float64) - span_us[0])
-            through = CubicSpline(self.held_s.numpy(), self.weights(held_us).double().numpy())
-            self.held = torch.from_numpy(through.c.transpose(1, 0, 2).copy())
+            self.held, self.held_first = self._through(held_us)
         elif len(centred_us):
             self.mean = self.weights(centred_us).mean(0)
         starts = {
@@ -82,25 +87,67 @@ class PoseSpline(nn.Module):
         times = send(torch.as_tensor(times_us, dtype=torch.float64), device)
         if math.isinf(self.knot_us):
             return torch.ones(len(times), 1, device=device)
+        first, four = self._four(times)
+        index = first[:, None] + torch.arange(4, device=device)
+        found = torch.zeros(len(times), self.count, dtype=torch.float64, device=device)
+        found.scatter_(1, index, four)
+        if len(self.held):
+            index, through = self._through_keys(times)
+            found.scatter_add_(1, index, -through)
+        return found.float() - self.mean
+
+    def _four(self, times: Float[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Float[Tensor, "T 4"]]:
+        """The first of the four control points that count at each time, and their weights."""
         place = (times.clamp(*self.span_us) - self.span_us[0]) / self.knot_us
         segment = place.floor().clamp(max=self.segments - 1)
         step = place - segment
         powers = torch.stack([torch.ones_like(step), step, step**2, step**3], 1)
-        index = segment.long()[:, None] + torch.arange(4, device=device)
-        found = torch.zeros(len(times), self.count, dtype=torch.float64, device=device)
-        found.scatter_(1, index, powers @ send(_PIECES, device))
-        if len(self.held):
-            found = found - self._through_keys(times)
-        return found.float() - self.mean
+        return segment.long(), powers @ send(_PIECES, times.device)
 
-    def _through_keys(self, times: Float[Tensor, "T"]) -> Float[Tensor, "T K"]:
-        """The cubic spline through what the control points weigh at the keys."""
+    def _through(
+        self, keys_us: Sequence[int]
+    ) -> tuple[Float[Tensor, "P-1 4 B"], Int[Tensor, "P-1"]]:
+        """Cubic splines through what the control points weigh at the keys, and the first of them.
+
+        Per piece those of the `_REACH` keys before and after: farther ones count less than a
+        rounding error, since a spline forgets three quarters of a value from one key to the next.
+        So memory grows with the number of keys, not with its square.
+        """
+        index, four = self._four(torch.tensor(keys_us, dtype=torch.float64))
+        first, seconds, pieces = index.numpy(), self.held_s.numpy(), len(keys_us) - 1
+        lows = np.maximum(np.arange(pieces) - _REACH, 0)
+        highs = np.minimum(np.arange(pieces) + _REACH + 1, pieces)
+        width = int((first[highs] + 4 - first[lows]).max())
+        starts = np.minimum(first[lows], self.count - width)
+        held = np.zeros((pieces, 4, width))
+        for begin in range(0, pieces, _BLOCK):
+            end = min(begin + _BLOCK, pieces)
+            # Beside the block as many keys again, at whose ends the spline may bend otherwise.
+            low, high = max(begin - 2 * _REACH, 0), min(end + 2 * _REACH, pieces) + 1
+            origin = int(first[low])
+            local = np.zeros(
+                (high - low, max(int(first[high - 1]) + 4, starts[end - 1] + width) - origin)
+            )
+            columns = first[low:high, None] - origin + np.arange(4)
+            np.put_along_axis(local, columns, four[low:high].numpy(), 1)
+            curves = CubicSpline(seconds[low:high], local).c.transpose(1, 0, 2)
+            for piece in range(begin, end):
+                left = starts[piece] - origin
+                inside = slice(max(left, 0), left + width)
+                held[piece, :, max(-left, 0) :] = curves[piece - low][:, inside]
+        return torch.from_numpy(held), torch.from_numpy(starts)
+
+    def _through_keys(
+        self, times: Float[Tensor, "T"]
+    ) -> tuple[Int[Tensor, "T B"], Float[Tensor, "T B"]]:
+        """Control points, and the cubic spline through what they weigh at the keys."""
         seconds = 1e-6 * (times.clamp(*self.span_us) - self.span_us[0])
         piece = torch.searchsorted(self.held_s, seconds, right=True) - 1
         piece = piece.clamp(0, len(self.held) - 1)
         step = (seconds - self.held_s[piece])[:, None]
         c3, c2, c1, c0 = self.held[piece].unbind(1)
-        return ((c3 * step + c2) * step + c1) * step + c0
+        index = self.held_first[piece, None] + torch.arange(c0.shape[1], device=times.device)
+        return index, ((c3 * step + c2) * step + c1) * step + c0
 
     def values(
         self, times_us: Sequence[int] | Tensor
