@@ -19,17 +19,19 @@ import json
 import shutil
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import evsplat as ev
-from evsplat.body.motion import load_motion
+from evsplat.benching.drawn import Draw, drawn_settings
 from evsplat.capture import Policy, load_capture
 from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.poses import prepare_poses
-from evsplat.staging.assets import characters, find_motion, motions
+from evsplat.options import StageSettings
+from evsplat.staging.assets import characters
 
 FORCED = {
     "never": ("pose.smooth=never", "pose.refine=never"),
@@ -43,34 +45,10 @@ ROWS: dict[str, tuple[str, tuple[str, ...]]] = {
     "unsaid": ("evsplat", ()),
 }
 STATED = ("pose_std_rad", "transl_std_m")
-NOISE = ("none", "mocap", "estimated", "estimated-blurry")
-RATES = (12.5, 15.0, 20.0, 25.0)
-LEAST_FRAMES = 16
-"""Of short motions; the rate is raised until there are as many, or is the highest."""
 LEAST_FORCED = {"never", "both"}
 """Without these nothing is said of the best of the forced settings."""
 CLOSE_DB = 0.2
 """Behind the best of the forced settings by no more than this counts as close."""
-
-
-def draw(rng: np.random.Generator, people: list[str], frames: int) -> dict[str, Any]:
-    """Settings of one staged capture."""
-    fps = float(rng.choice(RATES))
-    character, motion = str(rng.choice(people)), str(rng.choice(motions()))
-    lasts_s = float(np.ptp(load_motion(find_motion(motion)).times_us)) * 1e-6
-    if int(lasts_s * fps) < LEAST_FRAMES:
-        fps = next((rate for rate in RATES if int(lasts_s * rate) >= LEAST_FRAMES), RATES[-1])
-    return {
-        "character": character,
-        "motion": motion,
-        "fps": fps,
-        "frames": min(frames, int(lasts_s * fps)),
-        "exposure_ms": float(rng.uniform(0.3, 0.9) * min(1000 / fps, 80)),
-        "yaw_deg": float(rng.uniform(0, 360)),
-        "events": str(rng.choice(["clean", "davis346", "dvxplorer", "evk4"])),
-        "pose_noise": str(rng.choice(NOISE)),
-        "seed": int(rng.integers(1 << 30)),
-    }
 
 
 def without_errors(capture: Path) -> Path:
@@ -132,16 +110,16 @@ def trained(capture: Path, run: Path, row: str, iterations: int, *, make: bool) 
 
 def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Of each capture what was drawn, and the figure of each row that is there or is made."""
-    rng = np.random.default_rng(options.seed)
     make = not options.table
-    for number in range(options.captures):
-        drawn = draw(rng, options.characters, options.frames)
+    characters = tuple(options.characters)
+    draw = Draw(options.seed, options.captures, options.frames, characters=characters)
+    for number, drawn in enumerate(drawn_settings(draw).values()):
         capture = options.out / f"capture_{options.seed}_{number:02d}"
         if make and not capture.exists():
-            ev.stage(capture, width=128, progress=False, **drawn)
+            ev.stage(capture, drawn, progress=False)
         rows: dict[str, dict[str, Any]] = {}
         for row in options.only:
-            same = same_as(row, capture, drawn["pose_noise"], make=make)
+            same = same_as(row, capture, drawn.pose_noise, make=make)
             if same is None:
                 continue
             run = options.out / "runs" / f"{capture.name}-{same}"
@@ -162,7 +140,7 @@ def behind(captures: list[dict[str, Any]]) -> dict[str, float]:
             if FORCED.keys() & psnr.keys() >= LEAST_FORCED:
                 best = max(psnr[name] for name in FORCED if name in psnr)
                 found[f"{row}_best_forced"].append(best - psnr[row])
-            if capture["drawn"]["pose_noise"] == "none" and "never" in psnr:
+            if capture["drawn"].pose_noise == "none" and "never" in psnr:
                 found[f"{row}_never_of_exact"].append(psnr["never"] - psnr[row])
             if "paper" in psnr:
                 found[f"{row}_paper"].append(psnr["paper"] - psnr[row])
@@ -194,9 +172,9 @@ def table(captures: list[dict[str, Any]], rows: list[str]) -> str:
     return "\n".join(lines)
 
 
-def said(drawn: dict[str, Any]) -> str:
+def said(drawn: StageSettings) -> str:
     """A capture in four words."""
-    return "{character} {motion} {fps:g} {pose_noise}".format(**drawn)
+    return f"{drawn.character} {drawn.motion} {drawn.fps:g} {drawn.pose_noise}"
 
 
 def main() -> None:
@@ -224,7 +202,8 @@ def main() -> None:
         print(table(captures, options.only))
     figures = behind(captures)
     if options.table:
-        kept = {"iterations": options.iterations, "figures": figures, "captures": captures}
+        kept = {"iterations": options.iterations, "figures": figures}
+        kept["captures"] = [{**capture, "drawn": asdict(capture["drawn"])} for capture in captures]
         (options.out / "grid.json").write_text(json.dumps(kept, indent=1) + "\n", "utf-8")
     print(json.dumps(figures))
 
