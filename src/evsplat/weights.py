@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from evsplat.errors import WeightsError
-from evsplat.untrusted.faults import ordinary_file
+from evsplat.untrusted.faults import open_bytes, ordinary_file
 from evsplat.untrusted.tensors import load_torch
 
 
@@ -21,7 +21,7 @@ class MissingWeights(WeightsError):
 
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as stream:
+    with open_bytes(path, error=WeightsError) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

@@ -53,6 +53,14 @@ def remove(name: str) -> Change:
     return change
 
 
+def pipe(name: str) -> Change:
+    def change(root: Path) -> None:
+        (root / name).unlink()
+        os.mkfifo(root / name)
+
+    return change
+
+
 def edit(name: str, change: Callable[[dict], object]) -> Change:
     """Change the dictionary in an .npy, .npz, .pkl or .json file."""
 
@@ -207,6 +215,11 @@ FAULTS: dict[str, tuple[str, Change, str]] = {
         "mmhpsd raw",
         lambda root: (root / "event_camera/events/event0002.csv").write_text("1,2,3\nx"),
         r"event0002.csv: ",
+    ),
+    "a pipe": (
+        "neuman",
+        pipe("sparse/cameras.txt"),
+        r"cameras.txt: a device or pipe, expected a file",
     ),
     "no COLMAP": ("neuman", remove("sparse"), r"sparse: holds no images.txt"),
     "binary COLMAP": (

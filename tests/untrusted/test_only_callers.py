@@ -21,6 +21,16 @@ READERS = {
 # A pipe from the parent process, which wrote it a moment before.
 OWN_PIPE = ("benching/local.py", "pickle.load")
 
+# The gate out, files of the package, of the system and of a folder that was made a moment before.
+OWN_FILES = {
+    *(("disk.py", "open"), ("files.py", "open"), ("cli/exits.py", "open")),
+    *(("pages.py", "read_text"), ("export/avatar.py", "read_text"), ("devices.py", "read_text")),
+    *(("evaluation/report/clip.py", "read_bytes"), ("view/save_panel.py", "read_bytes")),
+    *(("benching/local.py", "read_text"), ("benching/plan.py", "read_bytes")),
+}
+CONTAINERS = ("av", "archive", "found", "Showcase(folder.path)")
+"""Have an ``open`` of their own, which opens no file to read it."""
+
 
 def calls(tree: ast.Module) -> Iterator[tuple[str, ast.Call]]:
     """Full names of what is called, and the calls."""
@@ -42,8 +52,23 @@ def calls(tree: ast.Module) -> Iterator[tuple[str, ast.Call]]:
 
 def writes(call: ast.Call) -> bool:
     """Whether a call opens a file to write it, which no stranger's bytes are needed for."""
-    modes = [*call.args[1:2], *(word.value for word in call.keywords if word.arg == "mode")]
+    modes = [*call.args[:2], *(word.value for word in call.keywords if word.arg == "mode")]
     return any(isinstance(mode, ast.Constant) and mode.value in ("w", "x") for mode in modes)
+
+
+def openings(text: str) -> set[str]:
+    """Ways in which a text opens files to read them, other than those of the gate."""
+    found = set()
+    for name, call in calls(ast.parse(text)):
+        way = name.rpartition(".")[2]
+        archive = (
+            isinstance(call.func, ast.Attribute) and ast.unparse(call.func.value) in CONTAINERS
+        )
+        if way in ("open", "read_text", "read_bytes") and not archive and not writes(call):
+            # read_text(path) is the gate's own, path.read_text() is not
+            if way == "open" or isinstance(call.func, ast.Attribute):
+                found.add(way)
+    return found
 
 
 def found_in(text: str) -> list[str]:
@@ -58,6 +83,18 @@ def test_no_other_module_calls_a_parser_of_files():
         for name in found_in(path.read_text("utf-8"))
     }
     assert found == {OWN_PIPE}
+
+
+def test_no_other_module_opens_a_file_that_may_be_a_pipe():
+    found = {
+        (path.relative_to(SOURCE).as_posix(), way)
+        for path in SOURCE.rglob("*.py")
+        if path.parent.name != "untrusted"
+        for way in openings(path.read_text("utf-8"))
+    }
+    assert found == OWN_FILES
+    assert openings("path.open('rb')\nopen(path)\npath.read_bytes()") == {"open", "read_bytes"}
+    assert openings("path.open('w')\nread_text(path)") == set()
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from evsplat.capture import Capture
 from evsplat.errors import DataError
 from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.methods.trivial import same_view
+from evsplat.untrusted.faults import open_bytes
 from evsplat.untrusted.pictures import image_size, read_picture
 
 PICTURES = "pictures"
@@ -78,5 +79,6 @@ def digest_of(folder: Path) -> str:
     state = hashlib.sha256()
     for path in sorted(folder.glob("*.png")):
         state.update(path.name.encode())
-        state.update(path.read_bytes())
+        with open_bytes(path) as file:
+            state.update(file.read())
     return state.hexdigest()[:16]

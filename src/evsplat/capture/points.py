@@ -10,7 +10,7 @@ from jaxtyping import Float32
 from evsplat.errors import DataError
 from evsplat.files import write_bytes
 from evsplat.untrusted.arrays import read_table
-from evsplat.untrusted.faults import ordinary_file
+from evsplat.untrusted.faults import open_bytes
 
 _TYPES = {
     **{name: "i1" for name in ("char", "int8")},
@@ -31,9 +31,8 @@ def read_points(
     path: Path,
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 3"]]:
     """Positions (metres, world) and colours in [0, 1] of the vertices; grey 0.5 without colour."""
-    ordinary_file(path)
     try:
-        with path.open("rb") as file:
+        with open_bytes(path) as file:
             layout, count, fields = _read_header(file)
             left = os.fstat(file.fileno()).st_size - file.tell()
             if count * len(fields) > left:

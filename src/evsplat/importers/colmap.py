@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.errors import DataError
 from evsplat.importers.base import GUIDE, SourceCamera, rigid
+from evsplat.untrusted.faults import open_text
 
 # Model -> places of fx, fy, cx, cy and of OpenCV's distortion coefficients among the parameters.
 _MODELS: dict[str, tuple[tuple[int, int, int, int], tuple[int | None, ...]]] = {
@@ -139,10 +140,10 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _text(path: Path) -> Iterator[tuple[int, str]]:
+    if not path.exists():
+        raise DataError(f"{path}: not found, expected COLMAP's text form; {GUIDE}.")
     try:
-        with path.open(encoding="utf-8") as file:
+        with open_text(path) as file:
             yield from enumerate(file, start=1)
-    except FileNotFoundError:
-        raise DataError(f"{path}: not found, expected COLMAP's text form; {GUIDE}.") from None
     except UnicodeDecodeError:
         raise DataError(f"{path}: is not text, expected COLMAP's text form.") from None

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from evsplat.errors import DataError
 from evsplat.landmarks.landmarks import SETS
 from evsplat.untrusted.arrays import read_plain_arrays
-from evsplat.untrusted.faults import brief, ordinary_file, reason
+from evsplat.untrusted.faults import brief, open_text, reason
 from evsplat.untrusted.text import read_json
 
 _KEYS = ("keypoints", "poses", "places", "joints", "landmarks", "arr_0")
@@ -171,9 +171,8 @@ def _from_arrays(path: Path) -> Float[np.ndarray, "N L D"]:
 
 def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
     """Rows of frames; x, y and perhaps confidence of each point one after the other."""
-    ordinary_file(path)
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
+        with open_text(path, newline="") as stream:
             rows = [row for row in csv.reader(stream) if row]
         first = 0 if rows and _is_number(rows[0][0]) else 1
         array = np.array([[float(cell or "nan") for cell in row] for row in rows[first:]])

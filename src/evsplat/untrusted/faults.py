@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from evsplat.errors import DataError, EvsplatError
 
@@ -51,6 +51,20 @@ def ordinary_file(path: Path | str, *, error: type[EvsplatError] = DataError) ->
     if not stat.S_ISREG(found.st_mode):
         raise error(f"{path}: a device or pipe, expected a file; copy what it gives into a file.")
     return found.st_size
+
+
+def open_bytes(
+    path: Path | str, *, error: type[EvsplatError] = DataError, buffering: int = -1
+) -> IO[bytes]:
+    """A file opened to be read; an ``error`` where `ordinary_file` refuses it."""
+    ordinary_file(path, error=error)
+    return open(path, "rb", buffering=buffering)
+
+
+def open_text(path: Path | str, *, newline: str | None = None) -> IO[str]:
+    """A text in UTF-8 opened to be read; a `DataError` where `ordinary_file` refuses it."""
+    ordinary_file(path)
+    return open(path, encoding="utf-8", newline=newline)
 
 
 def why_not_read(error: OSError | ValueError) -> str:

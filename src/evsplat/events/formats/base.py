@@ -14,7 +14,7 @@ import numpy as np
 
 from evsplat.errors import DataError
 from evsplat.options import ReadOptions
-from evsplat.untrusted.faults import ordinary_file
+from evsplat.untrusted.faults import open_bytes
 
 BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
@@ -97,8 +97,7 @@ class ByteReader(ExitStack):
         super().__init__()
         self.path = path
         self.offset = 0
-        ordinary_file(path)
-        self._file = self.enter_context(open(path, "rb", buffering=_BUFFER_BYTES))
+        self._file = self.enter_context(open_bytes(path, buffering=_BUFFER_BYTES))
         self._size = os.fstat(self._file.fileno()).st_size
         self.zipped = self._file.read(2) == b"\x1f\x8b"
         self._file.seek(0)
