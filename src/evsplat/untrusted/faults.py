@@ -1,5 +1,6 @@
 """What keeps a file from being read, in one sentence."""
 
+import io
 import lzma
 import os
 import pickle
@@ -11,7 +12,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from evsplat.errors import DataError, EvsplatError
 
@@ -54,14 +55,14 @@ def ordinary_file(path: Path | str, *, error: type[EvsplatError] = DataError) ->
 
 
 def open_bytes(
-    path: Path | str, *, error: type[EvsplatError] = DataError, buffering: int = -1
-) -> IO[bytes]:
-    """A file opened to be read; an ``error`` where `ordinary_file` refuses it."""
+    path: Path | str, *, error: type[EvsplatError] = DataError, buffer: int = io.DEFAULT_BUFFER_SIZE
+) -> io.BufferedReader:
+    """A file opened to be read, ``buffer`` bytes at a time; an ``error`` as of `ordinary_file`."""
     ordinary_file(path, error=error)
-    return open(path, "rb", buffering=buffering)
+    return io.BufferedReader(io.FileIO(path), buffer)
 
 
-def open_text(path: Path | str, *, newline: str | None = None) -> IO[str]:
+def open_text(path: Path | str, *, newline: str | None = None) -> io.TextIOWrapper:
     """A text in UTF-8 opened to be read; a `DataError` where `ordinary_file` refuses it."""
     ordinary_file(path)
     return open(path, encoding="utf-8", newline=newline)

@@ -97,7 +97,7 @@ class ByteReader(ExitStack):
         super().__init__()
         self.path = path
         self.offset = 0
-        self._file = self.enter_context(open_bytes(path, buffering=_BUFFER_BYTES))
+        self._file = self.enter_context(open_bytes(path, buffer=_BUFFER_BYTES))
         self._size = os.fstat(self._file.fileno()).st_size
         self.zipped = self._file.read(2) == b"\x1f\x8b"
         self._file.seek(0)
