@@ -221,6 +221,11 @@ FAULTS: dict[str, tuple[str, Change, str]] = {
         pipe("sparse/cameras.txt"),
         r"cameras.txt: a device or pipe, expected a file",
     ),
+    "a camera without a number": (
+        "neuman",
+        replace("sparse/cameras.txt", "1 SIMPLE_RADIAL", "1" * 5001 + " SIMPLE_RADIAL"),
+        r"cameras.txt: line 2: found '1{60}', expected the number of a camera",
+    ),
     "no COLMAP": ("neuman", remove("sparse"), r"sparse: holds no images.txt"),
     "binary COLMAP": (
         "neuman",

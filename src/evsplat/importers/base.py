@@ -20,6 +20,7 @@ SHARP_EXPOSURE_US = 1_000
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 # Rotations of data sets are rounded; further off than this they are something else.
 _ROTATION_TOLERANCE = 1e-2
+_MOST_DIGITS = 18
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +154,16 @@ def need(path: Path, what: str) -> Path:
     return path
 
 
+def whole_number(digits: str, name: str) -> int:
+    """The number of decimal ``digits`` in ``name``; a `DataError` for none or too many."""
+    if not 0 < len(digits) <= _MOST_DIGITS:
+        raise DataError(
+            f"{name[:60]!r} has a number of {len(digits)} digits, expected 1 to {_MOST_DIGITS}; "
+            "rename it."
+        )
+    return int(digits)
+
+
 def numbered(folder: Path, what: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Files of a folder by the last number in their names, in that order."""
     need(folder, f"the folder of {what}")
@@ -161,7 +172,7 @@ def numbered(folder: Path, what: str, suffixes: tuple[str, ...]) -> dict[int, Pa
         digits = "".join(c if c.isdecimal() else " " for c in path.stem).split()
         if path.suffix.lower() not in suffixes or not digits:
             continue
-        number = int(digits[-1])
+        number = whole_number(digits[-1], str(path))
         if number in found:
             raise DataError(
                 f"{path}: has the number {number} as has {found[number].name}, expected one file "

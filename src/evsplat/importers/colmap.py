@@ -85,6 +85,12 @@ def _read_cameras(path: Path) -> dict[int, tuple[np.ndarray, tuple[float, ...] |
             )
         linear, lens = _MODELS[model]
         try:
+            camera = int(words[0])
+        except ValueError:
+            raise DataError(
+                f"{path}: line {number}: found {words[0][:60]!r}, expected the number of a camera."
+            ) from None
+        try:
             values = [float(word) for word in words[4:]]
             fx, fy, cx, cy = (values[place] for place in linear)
             distortion = tuple(0.0 if place is None else values[place] for place in lens)
@@ -99,7 +105,7 @@ def _read_cameras(path: Path) -> dict[int, tuple[np.ndarray, tuple[float, ...] |
                 "numbers."
             )
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        cameras[int(words[0])] = (K, distortion or None)
+        cameras[camera] = (K, distortion or None)
     return cameras
 
 

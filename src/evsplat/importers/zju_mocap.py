@@ -28,6 +28,7 @@ from evsplat.importers.base import (
     picture,
     rigid,
     table,
+    whole_number,
 )
 from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
 from evsplat.untrusted.arrays import read_npy, read_npz
@@ -249,4 +250,4 @@ def _frame_number(path: str) -> int:
         raise DataError(
             f"annots.npy: {path!r} has no frame number, expected a name like 000012.jpg."
         )
-    return int(digits)
+    return whole_number(digits, path)

@@ -28,6 +28,7 @@ from evsplat.importers.base import (
     opencv_intrinsics,
     rigid,
     table,
+    whole_number,
 )
 from evsplat.importers.smpl import add_body
 from evsplat.untrusted.pickles import read_pickle
@@ -155,7 +156,8 @@ def _exposure(names: list[str], times: list[float], unit: float) -> tuple[float,
 
     Names count sub-frames, and a picture is the mean of all from one picture to the next but one.
     """
-    counts = np.array([int("".join(c for c in name if c.isdecimal())) for name in names])
+    digits = ["".join(c for c in name if c.isdecimal()) for name in names]
+    counts = np.array([whole_number(*pair) for pair in zip(digits, names, strict=True)])
     step = int(np.median(np.diff(counts))) if len(counts) > 1 else 1
     spacing = float(np.median(np.diff(times))) * unit if len(times) > 1 else 20_000.0
     return spacing * max(1, step - 1) / max(1, step), step

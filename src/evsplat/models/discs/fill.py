@@ -28,10 +28,10 @@ MOST_BEHIND = 0.25
 """Largest difference to what neighbours say where a surface was seen from behind alone."""
 EVEN = 0.1
 """Strength of a link between neighbours, against the squared shares that were seen (`Seen`)."""
-CALM = 0.003
+CALM = 0.0005
 """Weight of the squares of the light's numbers, the constant one apart, against the mean squared
 change of the factors that were seen."""
-SHADE, SHADE_WEIGHT = 0.2, 0.2
+SHADE, SHADE_WEIGHT = 0.2, 0.05
 """What turns its back to a camera is lit like the darkest of what is seen, at this quantile: the
 side that is filmed is mostly the one in the light. The weight is against all that is seen."""
 _BACK = -0.1
