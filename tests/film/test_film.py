@@ -46,7 +46,7 @@ class _Lamp:
     def following(self, track):
         return _Lamp(track)
 
-    def changed_by(self, change):
+    def changed_by(self, *changes):
         return self
 
 

@@ -21,6 +21,7 @@ from evsplat.film.following import (
 )
 from evsplat.film.motion import load_motion_of
 from evsplat.film.surroundings import Painted, Room
+from evsplat.gaussians.initialise import pixel_rays
 from evsplat.models.layers import Layers
 from evsplat.render import Splats
 from evsplat.staging.assets import motions
@@ -137,3 +138,28 @@ def test_a_background_is_a_colour_or_a_picture(tmp_path, recorded):
     assert picture[:, :40].max() < 0.1 and picture[:, 56:].min() > 0.9
     with pytest.raises(ConfigError, match="neither a colour"):
         Painted.of("no such colour")
+
+
+def test_the_rim_of_what_was_recorded_fades_as_the_camera_goes_away(recorded):
+    camera = camera_before(recorded, away=4.0)
+    room = Room.of(recorded, recorded, camera)
+    rays = pixel_rays(camera)
+    middle, rim = rays[32, 48], rays[32, 0]
+    outside = rays[32, 0] + 0.2 * (rays[32, 0] - rays[32, 1]) * camera.width
+    means = camera.center() + 3 * torch.stack((middle, rim, outside, -middle))
+    person = recorded.vertices(0)[None]
+    layers = Layers(
+        splats(person), splats(means[None]), torch.eye(4).expand(1, person.shape[1], 4, 4)
+    )
+    assert room.soften(layers, camera).scene.opacities.tolist() == pytest.approx([0.9] * 4)
+    step = 1.0 * camera.world_to_camera[0, :3]
+    aside = camera_before(recorded, away=4.0)
+    aside.world_to_camera[:3, 3] -= aside.world_to_camera[:3, :3] @ step
+    faded = room.soften(layers, aside).scene.opacities
+    assert faded[0] == pytest.approx(0.9)
+    assert 0 < faded[1] < 0.05
+    assert faded[2:].tolist() == [0, 0]
+    halfway = camera_before(recorded, away=4.0)
+    halfway.world_to_camera[:3, 3] -= halfway.world_to_camera[:3, :3] @ (0.15 * step)
+    assert float(room.soften(layers, halfway).scene.opacities[2]) == pytest.approx(0.45)
+    assert Room.of(recorded, recorded).soften(layers, aside) is layers

@@ -69,7 +69,8 @@ class FilmPlan:
         middle = _middle(track, times)
         start = camera_at(capture, view, times[0])
         # Up is where people stood in the recording: a motion may be a somersault.
-        room = Room.of(recorded, track)
+        room = Room.of(recorded, track, start if capture.is_static_camera else None)
+        surroundings = _surroundings(film, room)
         path = _camera_path(film, capture)
         turn = {"orbit": whole_turn, "swing": to_both_sides}.get(film.path or "", straight)
         leaves = (
@@ -84,8 +85,10 @@ class FilmPlan:
             cameras = [camera_at(capture, view, time) for time in times]
         else:
             cameras = [start] * len(times)
-        if film.path in ("orbit", "swing"):
-            reconstruction = reconstruction.changed_by(room.clear)
+        changes = [room.clear] if film.path in ("orbit", "swing") else []
+        if surroundings is not None and cameras[0] is not cameras[-1]:
+            changes.append(room.soften)
+        reconstruction = reconstruction.changed_by(*changes)
         cameras = _of_height(cameras, film.size)
         frames = [FilmFrame(*fields) for fields in zip(names, times, clock, cameras, strict=True)]
         return cls(
@@ -95,7 +98,7 @@ class FilmPlan:
             oversampling,
             float((middle - cameras[0].center().cpu()).norm()),
             poses,
-            _surroundings(film, room),
+            surroundings,
         )
 
     def edges_us(self) -> list[int]:

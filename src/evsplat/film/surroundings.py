@@ -29,6 +29,10 @@ _CLEAR_M = (0.45, 0.15)
 """What is nearer to the camera than the person's nearest point by these begins and ends to fade."""
 _FLOOR_STAYS_M = 0.12
 """Height above the floor of what never fades: it hides nobody."""
+_EDGE = 0.08
+"""Width of the rim of the recorded picture that fades, in its shorter side."""
+_ELSEWHERE = (0.3, 0.15)
+"""Metres and radians from the recording camera at which the rim has faded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +44,17 @@ class Room:
     up: Float[Tensor, "3"]
     floor_m: float
     """Height of the floor along ``up``."""
+    recording: Camera | None = None
+    """The camera that recorded the scene, where it stood still."""
 
     @classmethod
-    def of(cls, recorded: BodyTrack, filmed: BodyTrack) -> "Room":
+    def of(cls, recorded: BodyTrack, filmed: BodyTrack, recording: Camera | None = None) -> "Room":
         """The floor is where the recorded person's lowest point is."""
         up = up_axis(recorded).float().cpu()
         first, last = int(recorded.times_us[0]), int(recorded.times_us[-1])
         times = np.linspace(first, last, 16).round().astype(int).tolist()
         lowest = min(float((recorded.vertices(time).cpu() @ up).min()) for time in times)
-        return cls(filmed, up, lowest)
+        return cls(filmed, up, lowest, recording)
 
     def behind(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
         """The picture of the empty room, sRGB."""
@@ -75,10 +81,25 @@ class Room:
         scene, human = layers.scene, layers.human
         depth, nearest = (camera.project(part.means)[1] for part in (scene, human))
         begin, end = (nearest.min() - metres for metres in _CLEAR_M)
-        share = ((depth[0] - begin) / (end - begin)).clamp(0, 1)
-        share = share * share * (3 - 2 * share)
+        share = _eased((depth[0] - begin) / (end - begin))
         height = scene.means[0] @ self.up.to(scene.means) - self.floor_m
         share = torch.where(height < _FLOOR_STAYS_M, 1.0, share)
+        return replace(layers, scene=replace(scene, opacities=scene.opacities * share))
+
+    def soften(self, layers: Layers, camera: Camera) -> Layers:
+        """Fade the scene towards the edge of what was recorded, the more the camera went away."""
+        if self.recording is None:
+            return layers
+        scene, recording = layers.scene, self.recording.to(layers.scene.means.device)
+        axes = camera.world_to_camera[2, :3] @ recording.world_to_camera[2, :3].to(camera.K)
+        turned = float(axes.clamp(-1, 1).arccos())
+        moved = float((camera.center() - recording.center().to(camera.K)).norm())
+        gone = _eased(torch.tensor(moved / _ELSEWHERE[0] + turned / _ELSEWHERE[1]))
+        pixels, depth = recording.project(scene.means[0])
+        size = pixels.new_tensor([recording.width, recording.height])
+        inside = torch.minimum(pixels, size - pixels).amin(-1) / size.min()
+        rim = _eased(inside / _EDGE).masked_fill(depth <= 0, 0.0)
+        share = 1 - gone.to(rim) * (1 - rim)
         return replace(layers, scene=replace(scene, opacities=scene.opacities * share))
 
 
@@ -113,6 +134,12 @@ class Painted:
         left, top = (size[0] - camera.width) // 2, (size[1] - camera.height) // 2
         image = image.crop((left, top, left + camera.width, top + camera.height))
         return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
+
+
+def _eased(share: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
+    """0 below 0, 1 above 1, and smooth in between."""
+    share = share.clamp(0, 1)
+    return share * share * (3 - 2 * share)
 
 
 def _directions(camera: Camera) -> Float[Tensor, "H W 3"]:

@@ -118,7 +118,7 @@ class GaussianReconstruction:
     """What the scene looked like to the picture before, for a camera that mostly stands still."""
     shadow_step_px: int = SHADOW_STEP_PX
     """Shadows are looked up so far apart."""
-    changed: Callable[[Layers, Camera], Layers] | None = None
+    changes: tuple[Callable[[Layers, Camera], Layers], ...] = ()
     """What a film makes of the posed Gaussians before they are drawn."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
@@ -187,7 +187,9 @@ class GaussianReconstruction:
     def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
         camera = camera.to(self.model.device)
         layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
-        return camera, layers if self.changed is None else self.changed(layers, camera)
+        for change in self.changes:
+            layers = change(layers, camera)
+        return camera, layers
 
     @property
     def track(self) -> BodyTrack:
@@ -198,9 +200,9 @@ class GaussianReconstruction:
         """The same person and scene with the motion ``track`` (same body, own times) instead."""
         return GaussianReconstruction(self.name, self.model.following(track), self.seen)
 
-    def changed_by(self, change: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
-        """The same, with the posed Gaussians changed before they are drawn."""
-        return replace(self, changed=change)
+    def changed_by(self, *changes: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
+        """The same, with the posed Gaussians changed by each in turn before they are drawn."""
+        return replace(self, changes=changes)
 
     @property
     def low_pass(self) -> float:
