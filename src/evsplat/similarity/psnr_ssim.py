@@ -97,15 +97,17 @@ def ssim_map(
         rows, columns = padded.shape[1] - size + 1, padded.shape[2] - size + 1
         down = kernel[0] * padded[:, :rows]
         for k in range(1, size):
-            down = torch.add(down, padded[:, k : k + rows], alpha=kernel[k])
+            down.add_(padded[:, k : k + rows], alpha=kernel[k])
         across = kernel[0] * down[:, :, :columns]
         for k in range(1, size):
-            across = torch.add(across, down[:, :, k : k + columns], alpha=kernel[k])
+            across.add_(down[:, :, k : k + columns], alpha=kernel[k])
         return across
 
     x, y = image.movedim(-1, 0), reference.movedim(-1, 0)
-    # One call for all five: on a GPU it is the number of operations that counts.
-    smoothed = smooth(torch.cat([x, y, x * x, y * y, x * y])).split(len(x))
+    planes = torch.cat([x, y, x * x, y * y, x * y])
+    # A CPU's cache holds a plane; on a GPU it is the number of operations that counts.
+    pieces = planes.split(1 if planes.device.type == "cpu" else len(planes))
+    smoothed = torch.cat([smooth(piece) for piece in pieces]).split(len(x))
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = smoothed
     unbias = size**2 / (size**2 - 1) if settings.sample_covariance else 1.0
     variance_x = unbias * (mean_xx - mean_x**2)
