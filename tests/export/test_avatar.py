@@ -151,9 +151,8 @@ def test_a_body_of_too_many_joints_is_told(reconstruction):
 def test_the_recorded_clip_is_the_motion_that_the_method_has(reconstruction):
     capture, source = reconstruction
     mids = [frame.mid_us for frame in capture.frames]
-    gaussians = source.at_rest(_views(capture)[:1])
-    clip = recorded_clip(source, gaussians, (mids[0], mids[-1]))
-    body = gaussians.body
+    clip = recorded_clip(source, (mids[0], mids[-1]))
+    body = source.track.body
     assert len(clip.rotations) == 1 + int((mids[-1] - mids[0]) * 60 / 1e6)
     for key in (0, 5, len(clip.rotations) - 1):
         turns = Rotation.from_quat(clip.rotations[key][:, [1, 2, 3, 0]]).as_matrix()

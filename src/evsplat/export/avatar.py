@@ -86,15 +86,14 @@ def avatar_of(gaussians: SkinnedGaussians) -> Avatar:
     )
 
 
-def recorded_clip(
-    source: GaussianReconstruction, gaussians: SkinnedGaussians, times_us: tuple[int, int]
-) -> Clip:
+def recorded_clip(source: GaussianReconstruction, times_us: tuple[int, int]) -> Clip:
     """The recorded motion from the first to the second time, as the method corrected it."""
     times = _even_times(*times_us)
     rotations, bones = source.pose(times)
-    root = gaussians.body.rest_joints[0]
+    body = source.track.body.to("cpu")
+    root = body.rest_joints[0]
     # Canonical to world after rest to canonical: where the root's rest place goes.
-    placed = bones[:, 0] @ gaussians.body.canonical_bone_transforms()[0]
+    placed = bones[:, 0] @ body.canonical_bone_transforms()[0]
     transl = placed[:, :3, :3] @ root + placed[:, :3, 3] - root
     return _clip("recorded", rotations, transl)
 

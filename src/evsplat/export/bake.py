@@ -64,7 +64,7 @@ def export_avatar(
     gaussians = with_correctives(run, at_rest(run, camera), camera)
     avatar = avatar_of(gaussians)
     mids = [frame.mid_us for frame in capture.frames]
-    clips.insert(0, recorded_clip(source, gaussians, (min(mids), max(mids))))
+    clips.insert(0, recorded_clip(source, (min(mids), max(mids))))
     loss = measure_loss(source, avatar, capture)
     instant = instant_of(capture, time_s=None, frame=None, camera=camera)
     scene = cloud_at(source, instant.camera, instant.time_us, "scene") if parts == "all" else None
