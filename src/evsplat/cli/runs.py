@@ -248,11 +248,13 @@ class Export:
     html is a page that plays the recording in 3D.
 
     avatar is a page with a person to play and to pose.
+
+    bvh and skeleton (glTF) hold the motion alone.
     """
 
     run: RunFolder
     kind: Annotated[Positional[Kind], option("KIND")]
-    """ply, spz, splat, gltf, html or avatar."""
+    """ply, spz, splat, gltf, html, avatar, bvh or skeleton."""
     options: Annotated[ExportOptions, FLAT]
 
     def __call__(self) -> None:
