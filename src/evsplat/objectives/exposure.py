@@ -54,9 +54,9 @@ class Exposure(Objective):
     """L1 and D-SSIM between a blurry frame and the mean, in linear light, of K renders.
 
     The slope of L1 is the sign of each channel's error. Where brightness errs by more than hue, as
-    it does wherever something fast is not yet in its place or events ask for another brightness
-    than the blur, the three signs are the same and L1 does not see the hue at all; so brightness
-    and hue are compared apart as well (`opponent_difference`).
+    it does wherever something fast is not yet in its place, the three signs are the same and L1
+    does not see the hue at all; so brightness and hue are compared apart as well
+    (`opponent_difference`).
 
     The exposure is cut into K equal strata; a render lies at a random place of each but the middle
     one, whose is the middle. K grows with how far the body moves in the exposure, so that
