@@ -27,7 +27,7 @@ from PIL import Image
 import evsplat as ev
 from evsplat.capture import Camera
 from evsplat.export.avatar import avatar_of
-from evsplat.export.bake import at_rest
+from evsplat.export.bake import at_rest, with_correctives
 from evsplat.export.cloud import cloud_of
 from evsplat.export.gaussians import file_rotation
 from evsplat.render import render
@@ -89,8 +89,9 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
     )  # fmt: skip
     seen = photograph(arguments, site, shots, out)
 
-    avatar = avatar_of(at_rest(run, None))
-    skinned = avatar.gaussians.posed(source.pose([frame.mid_us])[1])
+    avatar = avatar_of(with_correctives(run, at_rest(run, None), None))
+    rotations, bones = source.pose([frame.mid_us])
+    skinned = avatar.gaussians.posed(bones, rotations)
     (alone,) = source.splats(camera, [frame.mid_us], parts="scene")
     avatar = render(skinned, camera, static=alone, low_pass=source.low_pass).image[0, ..., :3]
     save(out / "ours.png", ours)

@@ -14,6 +14,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from evsplat.body.rotations import matrix_to_quaternion
 from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import DataError
 from evsplat.export import export_run
@@ -150,9 +151,8 @@ def test_a_body_of_too_many_joints_is_told(reconstruction):
 def test_the_recorded_clip_is_the_motion_that_the_method_has(reconstruction):
     capture, source = reconstruction
     mids = [frame.mid_us for frame in capture.frames]
-    gaussians = source.at_rest(_views(capture)[:1])
-    clip = recorded_clip(source, gaussians, (mids[0], mids[-1]))
-    body = gaussians.body
+    clip = recorded_clip(source, (mids[0], mids[-1]))
+    body = source.track.body
     assert len(clip.rotations) == 1 + int((mids[-1] - mids[0]) * 60 / 1e6)
     for key in (0, 5, len(clip.rotations) - 1):
         turns = Rotation.from_quat(clip.rotations[key][:, [1, 2, 3, 0]]).as_matrix()
@@ -235,6 +235,49 @@ def test_the_page_moves_the_skeleton_as_the_document_says(reconstruction, tmp_pa
         np.testing.assert_allclose(moved[:-1], want[:, :3], atol=1e-5)
         # What follows no bone stays.
         np.testing.assert_array_equal(moved[-1], np.eye(4)[:3])
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's script")
+def test_the_page_shares_correctives_as_we_do(reconstruction, tmp_path):
+    """skeleton.js against `Correctives.shares`, at recorded poses and beside them."""
+    capture, source = reconstruction
+    rest = source.with_correctives(source.at_rest(_views(capture)), _views(capture))
+    assert rest.correctives is not None
+    avatar = avatar_of(rest)
+    camera = capture.camera(capture.frames[0])
+    document = avatar_document(avatar, [], track=source.track, camera=camera, facts={})
+    rotations = source.pose([frame.mid_us for frame in capture.frames[:3]])[0]
+    turns = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix()
+    rotations = torch.cat([rotations, rotations @ torch.from_numpy(turns).float()])
+    quaternions = matrix_to_quaternion(rotations.double())
+    given = {"correctives": document["correctives"], "poses": quaternions.tolist()}
+    (tmp_path / "given.json").write_text(json.dumps(given))
+    script = (files("evsplat") / "data" / "player" / "skeleton.js").read_text(encoding="utf-8")
+    script += """
+    const { readFileSync } = require("fs");
+    const given = JSON.parse(readFileSync("given.json"));
+    const bytes = new Uint8Array(Buffer.from(given.correctives.linear, "base64"));
+    const made = new Correctives({ ...given.correctives, linear: new Float32Array(bytes.buffer) });
+    console.log(JSON.stringify(given.poses.map((pose) => made.shares(pose))));
+    """
+    (tmp_path / "run.cjs").write_text(script)
+    done = subprocess.run(["node", "run.cjs"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    want = rest.correctives.shares(rotations)
+    torch.testing.assert_close(torch.tensor(json.loads(done.stdout)), want, atol=1e-5, rtol=1e-4)
+
+
+def test_correctives_bring_the_avatar_to_the_model(reconstruction):
+    """An untrained own shadow darkens with the pose: skinning drops that, the fields keep it."""
+    capture, source = reconstruction
+    with torch.no_grad():
+        source.model.shading.intensities.fill_(0.5)
+    rest = source.at_rest(_views(capture))
+    views = [(frame.mid_us, capture.camera(frame)) for frame in capture.frames]
+    plain = measure_loss(source, avatar_of(rest), capture)
+    kept = measure_loss(source, avatar_of(source.with_correctives(rest, views)), capture)
+    assert kept.avatar_to_model.person > plain.avatar_to_model.person + 1
+    assert "8 correctives" in kept.sentence()
 
 
 def test_loss_is_that_of_the_avatar_and_nothing_else(reconstruction):

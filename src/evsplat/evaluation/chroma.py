@@ -5,9 +5,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from evsplat.evaluation.protocols import PSNR_CEILING_DB, eight_bit
+from evsplat.pictures import BT601
 
-_LUMA = (0.299, 0.587, 0.114)
-_LARGEST_BLUE, _LARGEST_RED = 2 * (1 - _LUMA[2]), 2 * (1 - _LUMA[0])
+_LARGEST_BLUE, _LARGEST_RED = 2 * (1 - BT601[2]), 2 * (1 - BT601[0])
+
+
+def chroma(rgb: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 2"]:
+    """Cb and Cr (ITU-R BT.601) of sRGB values, each of range 1."""
+    luma = rgb @ torch.tensor(BT601, dtype=rgb.dtype, device=rgb.device)
+    blue, red = (rgb[..., 2] - luma) / _LARGEST_BLUE, (rgb[..., 0] - luma) / _LARGEST_RED
+    return torch.stack((blue, red), -1)
 
 
 def chroma_psnr(
@@ -16,9 +23,8 @@ def chroma_psnr(
     """PSNR in dB of Cb and Cr (ITU-R BT.601, each of range 1) inside of ``mask``; sRGB, 8 bit."""
     values = {}
     error = (eight_bit(image.cpu().double()) - eight_bit(truth.cpu().double()))[mask]
-    luma = error @ torch.tensor(_LUMA, dtype=error.dtype)
-    for name, channel, largest in (("cb", 2, _LARGEST_BLUE), ("cr", 0, _LARGEST_RED)):
-        square = float(((error[:, channel] - luma) / largest).square().mean())
+    for name, column in zip(("cb", "cr"), chroma(error).unbind(-1), strict=True):
+        square = float(column.square().mean())
         psnr = -10 * torch.log10(torch.tensor(square, dtype=error.dtype)) if square else torch.inf
         values[name] = min(float(psnr), PSNR_CEILING_DB)
     return values

@@ -22,13 +22,14 @@ from evsplat.export.cloud import SplatCloud, cloud_of
 from evsplat.export.formats import write_ply
 from evsplat.files import new_folder, write_json, write_text
 from evsplat.models.at_rest import SkinnedGaussians
+from evsplat.models.correctives import Correctives
 from evsplat.models.discs.shading import SurfaceLight
 from evsplat.training.run import GaussianReconstruction
 
 BONES_EACH = 4
 _MOST_JOINTS = 256
 KEYS_PER_SECOND = 60.0
-FORMAT, VERSION = "evsplat-avatar", 1
+FORMAT, VERSION = "evsplat-avatar", 2
 _PLAYER = files("evsplat") / "data" / "player"
 _SCRIPTS = ("splats.js", "skeleton.js", "orbit.js", "player.js")
 _README = """An avatar made by evsplat.
@@ -85,15 +86,14 @@ def avatar_of(gaussians: SkinnedGaussians) -> Avatar:
     )
 
 
-def recorded_clip(
-    source: GaussianReconstruction, gaussians: SkinnedGaussians, times_us: tuple[int, int]
-) -> Clip:
+def recorded_clip(source: GaussianReconstruction, times_us: tuple[int, int]) -> Clip:
     """The recorded motion from the first to the second time, as the method corrected it."""
     times = _even_times(*times_us)
     rotations, bones = source.pose(times)
-    root = gaussians.body.rest_joints[0]
+    body = source.track.body.to("cpu")
+    root = body.rest_joints[0]
     # Canonical to world after rest to canonical: where the root's rest place goes.
-    placed = bones[:, 0] @ gaussians.body.canonical_bone_transforms()[0]
+    placed = bones[:, 0] @ body.canonical_bone_transforms()[0]
     transl = placed[:, :3, :3] @ root + placed[:, :3, 3] - root
     return _clip("recorded", rotations, transl)
 
@@ -161,7 +161,7 @@ def avatar_document(
 ) -> dict[str, Any]:
     """Content of avatar.json; arrays are base64 of little-endian numbers, rows after rows."""
     body = avatar.gaussians.body
-    light = avatar.gaussians.light
+    light, correctives = avatar.gaussians.light, avatar.gaussians.correctives
     inverse = torch.linalg.inv(body.canonical_bone_transforms().double())
     return {
         "format": FORMAT,
@@ -187,6 +187,7 @@ def avatar_document(
             "weights": _base64(avatar.weights, "u1"),
         },
         "light": None if light is None else _light(light),
+        "correctives": None if correctives is None else _correctives(correctives),
         "clips": [
             {
                 "name": clip.name,
@@ -234,6 +235,21 @@ def _light(light: SurfaceLight) -> dict[str, Any]:
         "lamps": [] if light.lamps is None else light.lamps.tolist(),
         "intensities": shading.intensities.tolist(),
         "normals": _base64(light.normals.numpy(), "<f4"),
+    }
+
+
+def _correctives(correctives: Correctives) -> dict[str, Any]:
+    return {
+        "count": len(correctives.values),
+        "low": correctives.low.tolist(),
+        "high": correctives.high.tolist(),
+        "linear": _base64(correctives.linear.numpy(), "<f4"),
+        "constant": correctives.constant.tolist(),
+        "least": correctives.least.tolist(),
+        "most": correctives.most.tolist(),
+        "reach": correctives.reach,
+        "steps": correctives.steps.tolist(),
+        "values": _base64(correctives.values.numpy(), "i1"),
     }
 
 

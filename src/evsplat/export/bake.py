@@ -37,6 +37,21 @@ def at_rest(run: Run, camera: str | None) -> SkinnedGaussians:
     return run.reconstruction.at_rest(views)
 
 
+_BAKED_POSES = 90
+"""Instants of the recording whose poses the correctives are fitted to."""
+
+
+def with_correctives(run: Run, gaussians: SkinnedGaussians, camera: str | None) -> SkinnedGaussians:
+    """The person at rest with what the recorded poses do beyond skinning."""
+    capture = run.capture
+    mids = sorted(frame.mid_us for frame in capture.frames)
+    shown = camera or capture.train_frames[0].camera
+    count = min(_BAKED_POSES, 3 * len(mids))
+    times = [mids[0] + k * (mids[-1] - mids[0]) // max(count - 1, 1) for k in range(count)]
+    views = [(time, camera_at(capture, shown, time)) for time in times]
+    return run.reconstruction.with_correctives(gaussians, views)
+
+
 def export_avatar(
     run: Run, path: Path, parts: Parts, camera: str | None, motion: str | None
 ) -> Path:
@@ -46,10 +61,10 @@ def export_avatar(
     clips: list[Clip] = []
     if motion is not None:
         clips.append(clip_of(Path(motion).stem, load_motion_of(motion, track)))
-    gaussians = at_rest(run, camera)
+    gaussians = with_correctives(run, at_rest(run, camera), camera)
     avatar = avatar_of(gaussians)
     mids = [frame.mid_us for frame in capture.frames]
-    clips.insert(0, recorded_clip(source, gaussians, (min(mids), max(mids))))
+    clips.insert(0, recorded_clip(source, (min(mids), max(mids))))
     loss = measure_loss(source, avatar, capture)
     instant = instant_of(capture, time_s=None, frame=None, camera=camera)
     scene = cloud_at(source, instant.camera, instant.time_us, "scene") if parts == "all" else None
@@ -85,6 +100,8 @@ class Loss:
     frames: int
     keeps_light: bool
     """True where the avatar has the light, which a method may know."""
+    correctives: int
+    """Fields that the avatar keeps of what poses do beyond skinning."""
     avatar_to_model: Psnr
     model_to_truth: Psnr | None
     """None where the capture has no sharp truth."""
@@ -92,9 +109,12 @@ class Loss:
 
     def sentence(self) -> str:
         """The loss in words, with its figures."""
-        dropped = "non-rigid motion, colour" + ("" if self.keeps_light else ", light")
+        dropped = "the rest of cloth, own shadow and colour" + (
+            "" if self.keeps_light else ", light"
+        )
         sentence = (
-            f"Dropped: what poses do beyond skinning ({dropped}). On the "
+            f"Dropped: what poses do beyond skinning and {self.correctives} correctives "
+            f"({dropped}). On the "
             f"person's pixels of {self.frames} test frames the avatar is "
             f"{self.avatar_to_model.person:.2f} dB PSNR from the model"
         )
@@ -115,7 +135,8 @@ def measure_loss(source: GaussianReconstruction, avatar: Avatar, capture: Captur
     for frame in tqdm(frames, unit="frame", desc="avatar against model", dynamic_ncols=True):
         camera = capture.camera(frame)
         person, scene = source.splats(camera, [frame.mid_us])
-        skinned = avatar.gaussians.posed(source.pose([frame.mid_us])[1])
+        rotations, bones = source.pose([frame.mid_us])
+        skinned = avatar.gaussians.posed(bones, rotations)
         model, model_share = _draw(person, scene, camera, source.low_pass)
         baked, avatar_share = _draw(skinned, scene, camera, source.low_pass)
         mask = capture.mask(frame)
@@ -137,6 +158,7 @@ def measure_loss(source: GaussianReconstruction, avatar: Avatar, capture: Captur
     return Loss(
         len(rows["avatar"]),
         avatar.gaussians.light is not None,
+        0 if avatar.gaussians.correctives is None else len(avatar.gaussians.correctives.values),
         between,
         _mean(rows["model_truth"]),
         _mean(rows["avatar_truth"]),

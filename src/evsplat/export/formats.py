@@ -204,9 +204,14 @@ def write_gltf(
         "bufferViews": views,
         "buffers": [{"byteLength": len(content)}],
     }
+    write_bytes(path, glb_bytes(document, content))
+
+
+def glb_bytes(document: Mapping[str, Any], content: bytes) -> bytes:
+    """Binary glTF 2.0 of a document and its only buffer."""
     text = json.dumps(document, separators=(",", ":")).encode()
     chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
-    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def _chunk(kind: bytes, data: bytes, padding: bytes) -> bytes:

@@ -19,6 +19,7 @@ from evsplat.export.gaussians import (
     write_file,
 )
 from evsplat.export.low_pass import for_viewer
+from evsplat.export.skeleton import export_motion
 from evsplat.files import try_target
 from evsplat.options import ExportOptions
 from evsplat.options.declare import given
@@ -34,6 +35,8 @@ _SUFFIXES: dict[Kind, tuple[str, ...]] = {
     "gltf": (".glb",),
     "html": (".html",),
     "avatar": ("", ".html"),
+    "bvh": (".bvh",),
+    "skeleton": (".glb",),
 }
 """Endings that ``out`` may have; the first is the default. No ending: a folder."""
 
@@ -55,7 +58,8 @@ def export_run(
     ``html`` is one page that plays the recording (``fps`` pictures per second) in 3D without a
     network; it needs the extra ``view``. ``avatar`` is the person for any browser, to play and to
     pose, with ``motion`` (what `render_run` takes) beside the recorded one: one page where ``out``
-    ends in .html, else a folder with the data around it.
+    ends in .html, else a folder with the data around it. ``bvh`` and ``skeleton`` (glTF) hold the
+    motion alone: the recorded one as the method corrected it, or ``motion``; metres, y up.
 
     ``parts`` are person and scene or one of them; by default all, of an avatar the person.
     Lengths are metres. Without ``out`` the file goes to ``run/exports/``.
@@ -72,6 +76,10 @@ def export_run(
     if kind == "avatar":
         page = target or folder / "avatar"
         return export_avatar(loaded, page, parts or "human", camera, options.motion)
+    if kind in ("bvh", "skeleton"):
+        name = "recorded" if options.motion is None else Path(options.motion).stem
+        file = target or folder / f"{name}{_SUFFIXES[kind][0]}"
+        return export_motion(loaded, file, kind, options.motion)
     if kind == "html":
         page = target or folder / "clip.html"
         return export_clip(loaded, page, parts or "all", camera, options.fps)
@@ -123,13 +131,15 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
 
 def _check_use(kind: Kind, options: ExportOptions) -> None:
     """Refuse options that a format has no use for."""
-    moving = kind in ("html", "avatar")
+    skeletal = kind in ("bvh", "skeleton")
+    moving = kind in ("html", "avatar") or skeletal
     unused = {
         "--time and --frame": moving and (options.time_s, options.frame) != (None, None),
         "--canonical": moving and options.canonical,
         "--up": moving and options.up is not None,
         "--low-pass": moving and options.low_pass is not None,
-        "--motion": kind != "avatar" and options.motion is not None,
+        "--motion": kind != "avatar" and not skeletal and options.motion is not None,
+        "--parts and --camera": skeletal and (options.parts, options.camera) != (None, None),
     }
     for names, given_in_vain in unused.items():
         if given_in_vain:

@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 
 from evsplat.body import Body, BodyTrack, skin
 from evsplat.capture import Camera
+from evsplat.models.correctives import Correctives, bake_correctives
 from evsplat.models.discs.shading import SurfaceLight
 from evsplat.models.model import Model
 from evsplat.render import Splats
@@ -21,7 +22,7 @@ from evsplat.render import Splats
 class SkinnedGaussians:
     """H Gaussians in canonical space with weights of the body's J bones, and the light on them.
 
-    What a pose does to a person beyond that (cloth, muscles, own shadow) is not in it.
+    What a pose does to a person beyond that (cloth, muscles, own shadow) is in the correctives.
     """
 
     body: Body
@@ -38,6 +39,8 @@ class SkinnedGaussians:
     """Of bones, each row sums to 1."""
     light: SurfaceLight | None
     """None: it is in the colours."""
+    correctives: Correctives | None = None
+    """None: what poses do beyond skinning is dropped."""
 
     def at_rest(self) -> Splats:
         """Splats in the canonical pose, without light; channels as those of `posed`."""
@@ -45,10 +48,18 @@ class SkinnedGaussians:
         return replace(self, light=None).posed(identity)
 
     @torch.no_grad()
-    def posed(self, bones: Float[Tensor, "T J 4 4"]) -> Splats:
-        """Splats for bone transforms canonical to world; channels R, G, B and 1 (a person)."""
-        means, transforms = skin(self.means, self.weights, bones)
-        rgb = self.rgb.expand(len(bones), -1, -1)
+    def posed(
+        self, bones: Float[Tensor, "T J 4 4"], rotations: Float[Tensor, "T J 3 3"] | None = None
+    ) -> Splats:
+        """Splats for bone transforms canonical to world; channels R, G, B and 1 (a person).
+
+        ``rotations`` of the joints against their parents bring the correctives in, if there are.
+        """
+        centers, rgb = self.means, self.rgb.expand(len(bones), -1, -1)
+        if self.correctives is not None and rotations is not None:
+            offsets, factors = self.correctives.at(rotations)
+            centers, rgb = centers + offsets, rgb * factors
+        means, transforms = skin(centers, self.weights, bones)
         if self.light is not None:
             rgb = rgb * self.light.factors(transforms, means)
         channels = torch.cat([rgb, torch.ones_like(rgb[..., :1])], -1)
@@ -97,23 +108,19 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
     light = model.surface_light()
     sums: list[Tensor] = []
     first: Tensor | None = None
-    for time_us, camera in views:
-        layers = model.at([time_us], camera.center().to(model.device), hard_semantics=True)
-        person = layers.human
-        transforms = layers.transforms[0].double()
-        offset = person.means[0].double() - transforms[:, :3, 3]
-        centers = torch.linalg.solve(transforms[:, :3, :3], offset)
-        quaternions = normalize(person.quaternions[0].double(), dim=-1)
+    for view in views:
+        shown = _undone(model, view, light)
+        quaternions = shown.quaternions
         first = quaternions if first is None else first
         # q and -q are one rotation: only those on one side have a mean.
         quaternions = quaternions * torch.where((quaternions * first).sum(-1) < 0, -1, 1)[:, None]
-        # Covariances know no sign of a scale; decoders of HUGS may give either.
-        log_scales = person.scales[0].double().abs().log()
-        rgb = person.channels[0, :, :3].double()
-        factors = torch.ones_like(rgb)
-        if light is not None:
-            factors = light.factors(layers.transforms, person.means)[0].double()
-        values = [centers, log_scales, quaternions, rgb * factors, factors.square()]
+        values = [
+            shown.centers,
+            shown.log_scales,
+            quaternions,
+            shown.rgb * shown.factors,
+            shown.factors.square(),
+        ]
         sums = [a + b for a, b in zip(sums, values, strict=True)] if sums else values
     centers, log_scales, quaternions, lit, squares = (
         (total / len(views)).float().cpu() for total in sums
@@ -123,11 +130,68 @@ def mean_at_rest(model: Skinned, views: Sequence[tuple[int, Camera]]) -> Skinned
         means=centers,
         quaternions=normalize(quaternions, dim=-1),
         scales=log_scales.exp(),
-        opacities=layers.human.opacities.cpu(),
+        opacities=shown.opacities.cpu(),
         # The colour c with the least sum of (c * factor - rgb)^2.
         rgb=lit / squares,
         weights=model.skinning_weights(centers.to(model.device)).cpu(),
         light=None if light is None else _on_cpu(light),
+    )
+
+
+@torch.no_grad()
+def with_correctives(
+    rest: SkinnedGaussians, model: Skinned, views: Sequence[tuple[int, Camera]]
+) -> SkinnedGaussians:
+    """A person at rest and what the poses at ``views`` change of it, as correctives.
+
+    These are where the centres go beside skinning and, as one factor for all channels, how bright
+    the colours are: own shadow, clothes. What poses do to scales, rotations and hues is left out.
+    """
+    light = model.surface_light()
+    changes = []
+    for view in views:
+        shown = _undone(model, view, light)
+        plain = rest.rgb.to(shown.rgb) * shown.factors
+        # The factor f with the least sum over the channels of (f * plain - rgb)^2.
+        brightness = (shown.rgb * plain).sum(-1) / plain.square().sum(-1).clamp_min(1e-6)
+        offsets = shown.centers - rest.means.to(shown.centers)
+        changes.append(torch.cat([offsets, brightness[:, None] - 1], -1).float().cpu())
+    rotations = model.pose([time_us for time_us, _ in views])[0].float().cpu()
+    return replace(rest, correctives=bake_correctives(torch.stack(changes), rotations))
+
+
+@dataclass(frozen=True, eq=False)
+class _Undone:
+    """What a model shows at an instant with the skinning and the light undone, in float64."""
+
+    centers: Float[Tensor, "H 3"]
+    log_scales: Float[Tensor, "H 3"]
+    quaternions: Float[Tensor, "H 4"]
+    opacities: Float[Tensor, " H"]
+    rgb: Float[Tensor, "H 3"]
+    """As shown, with the light."""
+    factors: Float[Tensor, "H 3"]
+    """Of the light alone, without own shadow; 1 where it is not known."""
+
+
+def _undone(model: Skinned, view: tuple[int, Camera], light: SurfaceLight | None) -> _Undone:
+    time_us, camera = view
+    layers = model.at([time_us], camera.center().to(model.device), hard_semantics=True)
+    person = layers.human
+    transforms = layers.transforms[0].double()
+    offset = person.means[0].double() - transforms[:, :3, 3]
+    rgb = person.channels[0, :, :3].double()
+    factors = torch.ones_like(rgb)
+    if light is not None:
+        factors = light.factors(layers.transforms, person.means)[0].double()
+    return _Undone(
+        centers=torch.linalg.solve(transforms[:, :3, :3], offset),
+        # Covariances know no sign of a scale; decoders of HUGS may give either.
+        log_scales=person.scales[0].double().abs().log(),
+        quaternions=normalize(person.quaternions[0].double(), dim=-1),
+        opacities=person.opacities,
+        rgb=rgb,
+        factors=factors,
     )
 
 

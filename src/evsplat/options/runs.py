@@ -156,7 +156,8 @@ class Film:
 Split = Literal["test", "train"]
 UpAxis = Literal["y", "z"]
 FileKind = Literal["ply", "spz", "splat", "gltf"]
-Kind = Literal["ply", "spz", "splat", "gltf", "html", "avatar"]
+MotionKind = Literal["bvh", "skeleton"]
+Kind = Literal["ply", "spz", "splat", "gltf", "html", "avatar", "bvh", "skeleton"]
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ class ExportOptions:
     ] = None
     """Make up for a viewer that adds so many px^2 (most: 0.3), at the recording's size."""
     motion: Annotated[str | None, option("NAME", default="the recorded one alone")] = None
-    """Another motion for the avatar, as 'evsplat render' takes it."""
+    """Another motion for avatar, bvh or skeleton, as 'evsplat render' takes it."""
     fps: Annotated[float, Within(1, 120), option("HZ")] = 24.0
     """Pictures per second of html."""
     device: Device = "auto"

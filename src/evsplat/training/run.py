@@ -22,7 +22,7 @@ from evsplat.files import write_json, write_text
 from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Rendering
-from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest
+from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest, with_correctives
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
@@ -226,6 +226,12 @@ class GaussianReconstruction:
     def at_rest(self, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
         """The person's mean over ``views`` (times in us and their cameras), in canonical space."""
         return mean_at_rest(self.model, views)
+
+    def with_correctives(
+        self, rest: SkinnedGaussians, views: Sequence[tuple[int, Camera]]
+    ) -> SkinnedGaussians:
+        """A person at rest and what the poses at ``views`` change beyond skinning."""
+        return with_correctives(rest, self.model, views)
 
     @torch.no_grad()
     def pose(

@@ -27,9 +27,14 @@ if (avatar.scene) {
   });
 }
 
+const correctives = avatar.correctives && new Correctives({ ...avatar.correctives, linear: floats(avatar.correctives.linear) });
+const fields = avatar.correctives && {
+  ...avatar.correctives, values: new Int8Array(bytes(avatar.correctives.values).buffer),
+};
+
 let renderer = null;
 try {
-  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.low_pass_px2, avatar.light);
+  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.low_pass_px2, avatar.light, fields);
   find("message").remove();
 } catch (error) {
   find("message").textContent = error.message;
@@ -67,7 +72,10 @@ function draw() {
   const columns = new Float32Array([0, 1, 2, 3].flatMap((c) => view.map((row) => row[c])));
   const count = state.scene ? renderer.count : avatar.person.count;
   const background = state.exact || (avatar.scene && state.scene) ? [0, 0, 0] : [0.08, 0.086, 0.1];
-  renderer.draw(skeleton.bones(pose()), columns, lens, background, count);
+  const posed = pose();
+  const shares = correctives
+    ? correctives.shares(posed.rotations.map((_, joint) => skeleton.turned(posed.rotations, joint))) : [];
+  renderer.draw(skeleton.bones(posed), columns, lens, background, count, shares);
 }
 
 function seek(seconds) {

@@ -55,13 +55,18 @@ class Skeleton {
     };
   }
 
+  // A joint's rotation with what the reader adds.
+  turned(rotations, joint) {
+    return Q.multiply(rotations[joint], Q.ofDegrees(this.offsets[joint]));
+  }
+
   // Rows of all bones one after the other, and an identity last, for what follows no bone.
   bones({ rotations, transl }) {
     const count = this.names.length, result = new Float32Array(12 * (count + 1));
     const turned = [], origins = [];
     for (let joint = 0; joint < count; joint++) {
       const home = this.rest[joint], above = this.parents[joint];
-      const local = Q.multiply(rotations[joint], Q.ofDegrees(this.offsets[joint]));
+      const local = this.turned(rotations, joint);
       if (above < 0) {
         turned[joint] = local;
         origins[joint] = home.map((v, k) => v + transl[k]);
@@ -82,5 +87,25 @@ class Skeleton {
     }
     for (let k = 0; k < 3; k++) result[12 * count + 5 * k] = 1;
     return result;
+  }
+}
+
+// What poses do beyond skinning: fields whose shares are linear in R - I of all joints, inside the
+// range of the recorded poses, and fade outside.
+class Correctives {
+  constructor({ count, low, high, linear, constant, least, most, reach }) {
+    Object.assign(this, { count, low, high, linear, constant, least, most, reach });
+  }
+
+  // rotations: quaternions of all joints against their parents.
+  shares(rotations) {
+    const features = rotations.flatMap((turn) => Q.rows(turn).flatMap((row, r) => row.map((v, c) => v - (r === c))));
+    const inside = features.map((v, f) => Math.min(Math.max(v, this.low[f]), this.high[f]));
+    const excess = features.reduce((sum, v, f) => sum + (v - inside[f]) ** 2, 0);
+    const left = Math.exp(-excess / this.reach ** 2);
+    return this.constant.map((start, k) => {
+      const share = inside.reduce((sum, v, f) => sum + v * this.linear[f * this.count + k], start);
+      return left * Math.min(Math.max(share, this.least[k]), this.most[k]);
+    });
   }
 }

@@ -7,11 +7,15 @@ const TEXELS = 6;
 const WIDTH = 1020; // of its texture, a multiple of TEXELS
 const MIN_ALPHA = 1 / 255;
 const MOST_LAMPS = 16;
+const MOST_CORRECTIVES = 8;
+const CORRECTIVES_WIDTH = 1024; // of their texture, a multiple of MOST_CORRECTIVES
 
 const VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
-uniform highp sampler2D gaussians, bones;
+uniform highp sampler2D gaussians, bones, correctives;
+uniform int correctiveCount, correctedCount; // fields, and the Gaussians (the first) that have them
+uniform float shares[${MOST_CORRECTIVES}];
 uniform mat4 view;         // world to camera: x right, y down, z forward
 uniform vec4 lens;         // focal lengths and principal point, pixels
 uniform vec2 size;         // of the picture, pixels
@@ -60,7 +64,15 @@ void main() {
       texelFetch(bones, ivec2(0, bone), 0), texelFetch(bones, ivec2(1, bone), 0),
       texelFetch(bones, ivec2(2, bone), 0));
   }
-  vec3 world = vec4(a.xyz, 1) * blend;
+  vec4 change = vec4(0);   // offset of the centre, metres, and relative brightness
+  if (int(index) < correctedCount) {
+    for (int k = 0; k < correctiveCount; k++) {
+      int at = int(index) * ${MOST_CORRECTIVES} + k;
+      ivec2 place = ivec2(at % ${CORRECTIVES_WIDTH}, at / ${CORRECTIVES_WIDTH});
+      change += shares[k] * texelFetch(correctives, place, 0);
+    }
+  }
+  vec3 world = vec4(a.xyz + change.xyz, 1) * blend;
   vec3 local = (view * vec4(world, 1)).xyz;
   if (local.z < 0.01 || a.w < ${MIN_ALPHA}) return;
 
@@ -82,7 +94,7 @@ void main() {
   conic = vec3(yy, -xy, xx) / determinant;
   vec4 paint = texel(3);
   vec3 normal = vec3(c.zw, paint.w);
-  colour = vec4(paint.rgb, a.w);
+  colour = vec4(paint.rgb * max(1.0 + change.w, 0.0), a.w);
   if (lit && dot(normal, normal) > 0.5) colour.rgb *= shade(normalize(moved * normal), world);
   float extent = sqrt(2.0 * log(a.w / ${MIN_ALPHA}));
   vec2 reach = ceil(extent * sqrt(vec2(xx, yy)));
@@ -116,8 +128,9 @@ void main() { result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 
 class SplatRenderer {
   // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with bones, weights and,
   // where light falls on them, normals. lowPass: px². light: center, radius_m,
-  // coefficients (4 x 9 x 3), lamps and their intensities (L x 3), or null.
-  constructor(canvas, clouds, boneCount, lowPass, light) {
+  // coefficients (4 x 9 x 3), lamps and their intensities (L x 3), or null. correctives: count of
+  // fields, steps and values (count x Gaussians x 4) for the first cloud, or null.
+  constructor(canvas, clouds, boneCount, lowPass, light, correctives) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2, which drawing Gaussians needs.");
     this.gl = gl;
@@ -131,6 +144,7 @@ class SplatRenderer {
     this.program = program(gl, VERTEX, FRAGMENT);
     this.copy = program(gl, COPY_VERTEX, COPY_FRAGMENT);
     this.gaussians = this.pack(clouds);
+    this.correctives = this.packCorrectives(correctives, clouds[0].count);
     this.bones = texture(gl);
     this.order = new Uint32Array(this.count);
     this.depths = new Float32Array(this.count);
@@ -170,6 +184,25 @@ class SplatRenderer {
     return made;
   }
 
+  packCorrectives(correctives, gaussians) {
+    const gl = this.gl;
+    if (correctives && correctives.count > MOST_CORRECTIVES) throw new Error("Too many correctives.");
+    this.corrected = correctives ? { count: correctives.count, gaussians } : { count: 0, gaussians: 0 };
+    const rows = Math.max(1, Math.ceil((this.corrected.gaussians * MOST_CORRECTIVES) / CORRECTIVES_WIDTH));
+    const texels = new Float32Array(4 * CORRECTIVES_WIDTH * rows);
+    for (let k = 0; k < this.corrected.count; k++) {
+      for (let row = 0; row < gaussians; row++) {
+        for (let c = 0; c < 4; c++) {
+          const value = correctives.values[4 * (k * gaussians + row) + c];
+          texels[4 * (row * MOST_CORRECTIVES + k) + c] = correctives.steps[k][c] * value;
+        }
+      }
+    }
+    const made = texture(gl);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, CORRECTIVES_WIDTH, rows, 0, gl.RGBA, gl.FLOAT, texels);
+    return made;
+  }
+
   // Far to near, by a counting sort of 16 bits of depth.
   sort(bones, view, count) {
     const depthOf = new Float32Array(4 * this.boneCount);
@@ -202,8 +235,8 @@ class SplatRenderer {
   }
 
   // bones: rows of 3x4 matrices; view: 4x4 by columns; lens: fx, fy, cx, cy in pixels; count: how
-  // many Gaussians from the start.
-  draw(bones, view, lens, background, count = this.count) {
+  // many Gaussians from the start; shares: of the correctives.
+  draw(bones, view, lens, background, count = this.count, shares = []) {
     const gl = this.gl, { width, height } = this.canvas;
     this.sort(bones, view, count);
     gl.bindTexture(gl.TEXTURE_2D, this.bones);
@@ -217,6 +250,10 @@ class SplatRenderer {
     gl.useProgram(this.program);
     bind(gl, this.program, "gaussians", 0, this.gaussians);
     bind(gl, this.program, "bones", 1, this.bones);
+    bind(gl, this.program, "correctives", 2, this.correctives);
+    gl.uniform1i(gl.getUniformLocation(this.program, "correctiveCount"), shares.length);
+    gl.uniform1i(gl.getUniformLocation(this.program, "correctedCount"), this.corrected.gaussians);
+    if (shares.length) gl.uniform1fv(gl.getUniformLocation(this.program, "shares"), shares);
     gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "view"), false, view);
     gl.uniform4fv(gl.getUniformLocation(this.program, "lens"), lens);
     gl.uniform2f(gl.getUniformLocation(this.program, "size"), width, height);
