@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evsplat.inspection.matching import Correlations, normalised, own_time_order
-from evsplat.inspection.search import _changing
+from evsplat.inspection.search import DELAYS, NOW, BestPlace, _changing
 
 REACH = 5
 
@@ -87,3 +87,18 @@ def test_what_changes_in_time_tells_delays_of_somebody_who_stays():
     assert np.corrcoef(now.ravel(), late.ravel())[0, 1] > 0.95
     assert _changing(now, late) < 0.3
     assert _changing(now, np.ones_like(now)) == 0
+
+
+def test_delays_are_told_where_both_halves_say_so():
+    def peaks(*at: int, top: float = 0.4) -> BestPlace:
+        curves = np.full((3, len(DELAYS)), 0.1)
+        curves[range(3), np.array(at) + NOW] = top
+        return BestPlace(changing=curves)
+
+    delay, lost = peaks(4, 3, 5).changed
+    assert (delay, lost) == (NOW + 4, pytest.approx(0.75))
+    assert peaks(0, 0, 0).changed == (NOW, pytest.approx(0))
+    assert peaks(4, -3, 5).changed is None
+    assert peaks(4, 0, 5).changed is None
+    faint = BestPlace(changing=np.full((3, len(DELAYS)), 0.05))
+    assert faint.changed is None and BestPlace().changed is None

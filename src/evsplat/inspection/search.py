@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Shaped
+from jaxtyping import Bool, Float, Float32, Int, Shaped
 
 from evsplat.inspection.matching import Correlations, normalised, own_time_order
 
@@ -14,6 +14,8 @@ REACH_PX = 24
 DELAYS = tuple(step / 2 for step in range(-8, 9))
 """Delays that are tried, in frames."""
 NOW = DELAYS.index(0.0)
+_CHANGES = 0.08
+"""A lower correlation of what changes in time tells nothing."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,9 @@ class BestPlace:
     """`own_time_order` there."""
     parting: float = 0.0
     """`Belonging.parting`."""
-    changing: tuple[float, ...] = ()
-    """At each of `DELAYS`, without shift: correlation of what changes in time (`_changing`)."""
+    changing: Float[np.ndarray, "3 D"] | None = None
+    """Of the recording, its first and its second half, at each of `DELAYS`, without shift:
+    correlation of what changes in time (`_changing`)."""
 
     @classmethod
     def of(
@@ -66,10 +69,11 @@ class BestPlace:
             )
             for kind, m in maps.items()
         ]
-        changing = [
-            [_changing(m, in_picture(silhouettes(kind, at), m.shape[1:], 0, 0)) for at in row.T]
-            for kind, m in raw.items()
-        ]
+        changing = []
+        for kind, m in raw.items():
+            films = [in_picture(silhouettes(kind, at), m.shape[1:], 0, 0) for at in row.T]
+            parts = (slice(None), *halves)
+            changing.append([[_changing(m[p], film[p]) for film in films] for p in parts])
         told = [order for order in orders if order is not None]
         return cls(
             delay,
@@ -79,8 +83,22 @@ class BestPlace:
             score=float(overall[place]),
             order=float(np.mean(told)) if told else None,
             parting=float((1 - grouped[:, *place] / highest).max()),
-            changing=tuple(np.mean(changing, axis=0).tolist()),
+            changing=np.mean(changing, axis=0),
         )
+
+    @property
+    def changed(self) -> tuple[int, float] | None:
+        """The delay, as an index in `DELAYS`, at which what changes in time fits best, and the
+        share of its correlation that is lost without it.
+
+        None where too little changes, or where the halves of the recording contradict each other.
+        """
+        if self.changing is None or self.changing[0].max() < _CHANGES:
+            return None
+        delay, *halves = self.changing.argmax(1).tolist()
+        if any(np.sign(half - NOW) != np.sign(delay - NOW) for half in halves):
+            return None
+        return delay, float(1 - self.changing[0, NOW] / self.changing[0, delay])
 
 
 def _changing(moves: Float32[np.ndarray, "K h w"], drawn: Float32[np.ndarray, "K h w"]) -> float:
