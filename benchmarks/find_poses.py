@@ -1,14 +1,15 @@
 """Errors of found body poses against the truth, by stage: landmarks, fit, refinement.
 
     python benchmarks/find_poses.py CAPTURE … [--held-out-events] [--refine] [--keypoints-px 2]
-                                              [--threads 1]
+                                              [--out FOLDER] [--threads 1]
 
 Per capture and stage the mean distance of 14 joints in pixels (through the frame's camera), in
 millimetres about the pelvis (MPJPE), and after a similarity per frame (PA-MPJPE), at the times of
 training and of held-out frames apart; the share of the given poses' overlap with the masks that
 the found ones reach; seconds. The stature is taken from the truth, the pose prior leaves the
 capture's motion out. With ``--keypoints-px`` a row follows that is fitted to the true joints, off
-by that many pixels of noise per axis, in place of landmarks. The last line is all of it as JSON.
+by that many pixels of noise per axis, in place of landmarks. With ``--out`` the poses of each stage
+are written as captures NAME_STAGE. The last line is all of it as JSON.
 """
 
 import argparse
@@ -22,6 +23,7 @@ import torch
 from evsplat.body import BodyTrack
 from evsplat.body.skeleton import find_skeleton
 from evsplat.capture import Capture, Policy, load_body_track, load_capture
+from evsplat.capture.derive import derived_capture
 from evsplat.errors import DataError
 from evsplat.inspection.capture import body_mask_overlap
 from evsplat.landmarks import (
@@ -32,7 +34,7 @@ from evsplat.landmarks import (
     sharp_pictures,
 )
 from evsplat.posing.find import key_times
-from evsplat.posing.fit import FitSettings, fit_landmarks
+from evsplat.posing.fit import FitSettings, PoseFit, fit_landmarks
 from evsplat.posing.prior import pose_prior
 from evsplat.posing.refine import refine
 
@@ -50,20 +52,22 @@ def main() -> None:
     parser.add_argument("--held-out-events", action="store_true")
     parser.add_argument("--refine", action="store_true", help="correct fits by drawing the person")
     parser.add_argument("--keypoints-px", type=float)
+    parser.add_argument("--out", type=Path, help="folder for captures with the poses found")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     policy = Policy(held_out_events=options.held_out_events)
     results = []
     for path in options.captures:
-        results += measure(load_capture(path), policy, options.keypoints_px, options.refine)
+        capture = load_capture(path)
+        results += measure(capture, policy, options.keypoints_px, options.refine, options.out)
     print(json.dumps({"policy": policy.sentence, "rows": results}))
 
 
 def measure(
-    capture: Capture, policy: Policy, keypoints_px: float | None, refined: bool
+    capture: Capture, policy: Policy, keypoints_px: float | None, refined: bool, out: Path | None
 ) -> list[dict]:
-    """A row per stage."""
+    """A row per stage, whose poses are written to ``out``."""
     seen = capture.for_training(policy)
     truth = load_body_track(capture, dense=capture.dense_body_file is not None)
     extent = truth.body.rest_vertices.amax(0) - truth.body.rest_vertices.amin(0)
@@ -92,15 +96,36 @@ def measure(
         track = fitted.track(key_times(seen))
         seconds = time.perf_counter() - start
         rows.append({"stage": stage, "seconds": seconds, **pose_errors(capture, truth, track)})
+        tracks = {stage: track}
         if refined:
             better = refine(track, seen)
             errors = pose_errors(capture, truth, better.track)
             rows.append({"stage": f"{stage}, refined", "seconds": better.seconds, **errors})
+            tracks[f"{stage}, refined"] = better.track
+        if out is not None:
+            for name, one in tracks.items():
+                write(capture, out / f"{capture.name}_{name.replace(', ', '_')}", one, fitted)
     for row in rows:
         row["capture"] = capture.name
         shown = {k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}
         print("  ".join(f"{key} {value}" for key, value in shown.items()), flush=True)
     return rows
+
+
+def write(capture: Capture, folder: Path, track: BodyTrack, fitted: PoseFit) -> None:
+    """A capture with found poses, and what they are expected to err by, in place of its own."""
+    assert track.errors is not None
+    with derived_capture(capture, folder, replace=True) as making:
+        making.set_body(
+            fitted.rig.model,
+            track.times_us,
+            track.poses,
+            track.transl,
+            betas=fitted.betas,
+            source="estimated",
+            pose_std_rad=track.errors.joint_rad,
+            transl_std_m=track.errors.root_m,
+        )
 
 
 def pose_errors(capture: Capture, truth: BodyTrack, track: BodyTrack) -> dict:

@@ -78,6 +78,17 @@ def told_ratio(track: BodyTrack, capture: Capture) -> float:
     return float(np.sqrt(off.square().sum(1).mean() / told))
 
 
+def told_limbs(track: BodyTrack, capture: Capture) -> float:
+    """Errors of the limbs' turns, root mean square, over what the track says of them."""
+    assert track.errors is not None
+    skeleton = find_skeleton(track.body.parents.tolist(), track.body.joint_names)
+    limbs = [skeleton.limbs[f"{side}_{part}"] for part in PARTS for side in ("left", "right")]
+    true, own = (one.at(track.times_us)[0] for one in (load_body_track(capture, dense=True), track))
+    trace = (true.mT @ own).diagonal(dim1=-2, dim2=-1).sum(-1)
+    angle = ((trace - 1) / 2).clamp(-1, 1).arccos().numpy()[:, limbs]
+    return float(np.sqrt(np.mean(angle**2 / 3) / np.mean(track.errors.joint_rad[:, limbs] ** 2)))
+
+
 def main() -> None:
     """Stage what is missing, correct, and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -118,7 +129,8 @@ def main() -> None:
                 print(
                     f"{path.name:32} gain {refined.gain:.3f} +- {refined.gain_error:.3f}, "
                     f"{'wrong' if refined.disproves else 'not told wrong'}, {seconds:.0f} s, "
-                    f"root off {told_ratio(refined.track, capture):.2f} times what it says:",
+                    f"root off {told_ratio(refined.track, capture):.2f} and limbs "
+                    f"{told_limbs(refined.track, capture):.2f} times what they say:",
                     ", ".join(f"{name} {before[name]:.2f} -> {after[name]:.2f}" for name in before),
                     flush=True,
                 )

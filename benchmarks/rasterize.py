@@ -1,8 +1,9 @@
 """Speed of the native rasteriser on the random scene of many small Gaussians.
 
 Prints forward and forward+backward times on 1 and 2 threads, the stages on one thread, the share of
-one core's peak, the ratio to the torch reference on a smaller scene, what five times of
-one camera cost, and memory; with ``--run`` also what five times of a trained run's exposure cost.
+one core's peak, what it is where memory and short runs do not count, the ratio to the torch
+reference on a smaller scene, what five times of one camera cost, and memory; with ``--run`` also
+what five times of a trained run's exposure cost.
 The last line is one JSON object with the same numbers.
 """
 
@@ -155,11 +156,53 @@ def stages(scene: Scene, repeats: int) -> tuple[dict[str, float], int]:
         job = native_job(scene)
         fields = (s.means, s.quaternions[None], s.scales[None], s.opacities[None], s.channels)
         grads = [*map(torch.zeros_like, fields), None, None]
-        job.backward(scene.image_grad, scene.alpha_grad, grads, [], torch.zeros(12), None)
+        job.backward(scene.image_grad, scene.alpha_grad, grads, [], torch.zeros(12), None, None)
         faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
         for stage, seconds in job.seconds.items():
             best[stage] = min(best.get(stage, math.inf), 1e3 * seconds)
     return best, min(faults)
+
+
+def covering(size_px: int, count: int) -> Scene:
+    """Wide faint Gaussians: each reaches all pixels, and hides so little that every one counts."""
+    scene = make_scene(size_px, count, 4)
+    depth = scene.splats.means[0, :, 2]
+    means = torch.stack([torch.zeros(count), torch.zeros(count), depth], -1)
+    scales = 2 * depth[:, None].expand(-1, 3).contiguous()
+    opacities = torch.linspace(0.01, 0.02, count)
+    splats = replace(scene.splats, means=means[None], scales=scales, opacities=opacities)
+    return replace(scene, splats=splats)
+
+
+def limits(scene: Scene, repeats: int) -> dict[str, float]:
+    """Share of the core's peak that compositing alone makes, one thread, and what takes the rest.
+
+    Besides the scene: as many Gaussians per tile in so small a picture that all stay in the cache,
+    and Gaussians that reach every pixel, so that nothing is lost between short runs of patches.
+    """
+    size_px, count = scene.camera.width, scene.splats.means.shape[1]
+    small_px, channels = 64, scene.splats.channels.shape[-1]
+    in_cache = make_scene(small_px, count * small_px**2 // size_px**2, channels)
+    scenes = {
+        "the scene": (scene, repeats),
+        "the same in the cache": (in_cache, 20 * repeats),
+        "whole tiles in the cache": (covering(128, 64), 20 * repeats),
+    }
+    result = {}
+    for name, (given, times) in scenes.items():
+        best, _ = stages(given, times)
+        job, of_peak = native_job(given), peak_flops()
+        lanes = job.patch_steps * _native.lanes()
+        per_pair = job.patch_steps / job.intersections
+        print(f"  {name}: {per_pair:.1f} patch steps per Gaussian and tile", end="")
+        for stage, direction in (("composite", "forward"), ("composite_backward", "backward")):
+            constant, per_channel = FLOP_PER_LANE[direction]
+            flop = lanes * (constant + per_channel * given.splats.channels.shape[-1])
+            share = flop / (1e-3 * best[stage]) / of_peak
+            result[f"{name}_{direction}_share_of_core_peak".replace(" ", "_")] = round(share, 3)
+            print(f", {direction} {share:.0%} of the peak", end="")
+        print()
+    return result
 
 
 def with_gradient(splats: Splats) -> Splats:
@@ -255,9 +298,9 @@ def many_times(scene: TwoLayers, repeats: int) -> dict[str, float]:
 def peak_flops() -> float:
     """Multiply-add peak of one core, FLOP/s."""
     best = 0.0
-    for _ in range(5):
+    for _ in range(100):  # short, so that one of them is undisturbed
         start = time.perf_counter()
-        operations = _native.multiply_add(3_000_000)
+        operations = _native.multiply_add(200_000)
         best = max(best, operations / (time.perf_counter() - start))
     return best
 
@@ -298,6 +341,7 @@ def main() -> None:
     result |= arithmetic(job.patch_steps * _native.lanes(), args.channels, *timings[1])
 
     best, faults = stages(scene, args.repeats)
+    result |= limits(scene, args.repeats)
     torch.set_num_threads(2)
     print("  stages on 1 thread: " + ", ".join(f"{k} {v:.2f} ms" for k, v in best.items()))
     print(f"  page faults of a render: {faults}")

@@ -97,8 +97,9 @@ class Embedder:
     def image(self, picture: UInt8[np.ndarray, "H W 3"], alt: str) -> str:
         """An image element with the picture inside."""
         buffer = io.BytesIO()
+        # Without loss quality is effort: more of it takes seven times as long for 13 % fewer bytes.
         if self.lossless:
-            Image.fromarray(picture).save(buffer, "WEBP", lossless=True, quality=60, method=4)
+            Image.fromarray(picture).save(buffer, "WEBP", lossless=True, quality=20, method=2)
         else:
             Image.fromarray(picture).save(buffer, "WEBP", quality=92, method=4)
         height, width = picture.shape[:2]

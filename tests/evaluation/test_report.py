@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import os
 import re
 from html.parser import HTMLParser
 from types import SimpleNamespace
@@ -121,6 +122,33 @@ def test_page_of_a_trained_run_ends_with_commands_for_its_folder(tiny_capture, t
     other = tmp_path / "untrained"
     other.mkdir()
     assert "What to do next" not in page(evaluated(path, other, training=False))
+
+
+def test_page_shows_films_and_links_pages_that_were_made_of_the_run(
+    tiny_capture, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("evsplat.evaluation.report.made._MOST_BYTES", 1000)
+    renders, exports = tmp_path / "renders", tmp_path / "exports"
+    (exports / "dancer").mkdir(parents=True)
+    renders.mkdir()
+    name = "<b>a"
+    (renders / f"{name}.mp4").write_bytes(b"film" * 100)
+    (renders / "b.webp").write_bytes(b"loop" * 100)
+    (renders / "too large.mp4").write_bytes(b"long" * 1000)
+    (renders / "notes.txt").write_bytes(b"no film")
+    (renders / "outside.mp4").symlink_to("/etc/hostname")
+    os.mkfifo(renders / "pipe.mp4")
+    (exports / "avatar.html").touch()
+    (exports / "dancer" / "index.html").touch()
+    parsed = Page(page(evaluated(tiny_capture(), tmp_path)))
+    sources = [str(attributes.get("src")) for _, attributes in parsed.elements]
+    for kind, content in (("video/mp4", b"film" * 100), ("image/webp", b"loop" * 100)):
+        assert f"data:{kind};base64,{base64.b64encode(content).decode()}" in sources
+    links = [attributes["href"] for tag, attributes in parsed.elements if tag == "a"]
+    places = ["renders/too%20large.mp4", "exports/avatar.html", "exports/dancer/index.html"]
+    assert [link for link in links if not link.startswith("#")] == places
+    assert name in parsed.text and "b" in parsed.text
+    assert "outside" not in parsed.text and "pipe" not in parsed.text
 
 
 def test_page_shows_every_test_frame_pair_and_view(tiny_capture, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from evsplat.inspection.matching import Correlations, normalised, own_time_order
+from evsplat.inspection.search import _changing
 
 REACH = 5
 
@@ -72,3 +73,17 @@ def test_order_is_one_for_the_own_times_and_a_half_by_chance() -> None:
 def test_order_of_a_body_that_stands_still_is_not_told() -> None:
     posed = squares([(4, 4)] * 8)
     assert own_time_order(posed.astype(float), posed, ~np.eye(8, dtype=bool)) is None
+
+
+def test_what_changes_in_time_tells_delays_of_somebody_who_stays():
+    """A large part that stands and a small one that moves on by its own width per frame."""
+    film = np.zeros((12, 20, 60), np.float32)
+    film[:, :16] = 1
+    for frame in range(12):
+        film[frame, 17:19, 4 * frame : 4 * frame + 4] = 1
+    now, late = film[2:10], film[4:12]
+    assert _changing(now, now) == pytest.approx(1)
+    assert _changing(now, 3 * now + 5) == pytest.approx(1)
+    assert np.corrcoef(now.ravel(), late.ravel())[0, 1] > 0.95
+    assert _changing(now, late) < 0.3
+    assert _changing(now, np.ones_like(now)) == 0

@@ -1,6 +1,7 @@
 """The person found and tracked, and what is refused instead of finding a wrong one."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,11 @@ from evsplat.landmarks.detect import MIRRORED, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33
 from evsplat.landmarks.motion import Motion, global_shift, pieces
 from evsplat.landmarks.pictures import SharpPicture
-from evsplat.landmarks.refusals import refuse_half_out_of_view, refuse_moving_camera
+from evsplat.landmarks.refusals import (
+    refuse_empty,
+    refuse_half_out_of_view,
+    refuse_moving_camera,
+)
 from evsplat.landmarks.track import _Tracker
 from evsplat.shipped import demo_capture
 
@@ -121,6 +126,47 @@ def test_nobody_is_one_sentence(tiny_capture, network):
     capture = load_capture(tiny_capture()).for_training(Policy())
     with pytest.raises(DataError, match="nobody was found in .* of 1 pictures"):
         find_landmarks(capture, blurry(capture, 10), network=network, progress=False)
+
+
+def test_an_empty_room_is_refused_after_a_few_pictures(training, network, monkeypatch):
+    room = training.median_background()
+    generator = torch.Generator().manual_seed(0)
+    empty = Changed(
+        training, lambda picture, _: room + 0.01 * torch.randn(picture.shape, generator=generator)
+    )
+    empty.events = None
+    looked = []
+    search = _Tracker.search
+    monkeypatch.setattr(_Tracker, "search", lambda *a: looked.append(1) or search(*a))
+    with pytest.raises(DataError, match="nobody was found in 2 of 2 pictures looked at first"):
+        find_landmarks(empty, blurry(empty, 1)[::12], network=network, progress=False)
+    assert len(looked) == 2
+
+
+@pytest.mark.parametrize("shown", [1, 2])
+def test_furniture_that_is_once_taken_for_somebody_is_nobody(training, middles, shown):
+    answers = iter([True] * shown + [False] * 6)
+
+    def look():
+        refuse_empty(training, middles[:6], lambda _: next(answers))
+
+    if shown == 2:
+        look()
+        assert len(list(answers)) == 6  # no more were looked at
+    else:
+        with pytest.raises(DataError, match="nobody was found in 5 of 6 pictures"):
+            look()
+
+
+def test_a_person_cut_at_the_hips_is_one_sentence(training, middles, network):
+    def upper(picture, _=None):
+        return picture[: round(0.6 * len(picture))]
+
+    capture = Changed(training, upper)
+    capture.events = None
+    pictures = [replace(picture, image=upper(picture.image)) for picture in middles[:1]]
+    with pytest.raises(DataError, match="partly out of view in 1 of 1 pictures"):
+        find_landmarks(capture, pictures, network=network, progress=False)
 
 
 def test_a_second_person_is_one_sentence(training, network):

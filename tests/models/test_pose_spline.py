@@ -51,6 +51,23 @@ def test_centred_its_mean_is_zero_and_a_constant_says_nothing(seed):
     assert np.allclose(values(spline, times)[0], given, atol=1e-5)
 
 
+@pytest.mark.parametrize("variant", [{}, {"centred_us": FRAMES}, {"held_us": FRAMES}])
+def test_many_times_in_blocks_are_those_at_once(variant, monkeypatch):
+    spline, _ = make(0, knot_us=15_000, **variant)
+    times = np.random.default_rng(0).integers(-10_000, 1_000_000, size=60)
+    upstream = torch.from_numpy(np.random.default_rng(1).normal(size=(60, 4, 3))).float()
+
+    def found():
+        turns, shifts = spline.values(times.tolist())
+        gradient = torch.autograd.grad((turns * upstream).sum(), spline.rotations)[0]
+        return turns.detach(), shifts.detach(), gradient
+
+    at_once = found()
+    monkeypatch.setattr("evsplat.models.pose_spline._BLOCK", 7)
+    for blocks, expected in zip(found(), at_once, strict=True):
+        torch.testing.assert_close(blocks, expected, rtol=1e-5, atol=1e-5)
+
+
 def test_an_infinite_knot_is_a_constant():
     spline = PoseSpline(SPAN, float("inf"), 4)
     with torch.no_grad():

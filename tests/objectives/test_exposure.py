@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from evsplat.objectives import Exposure, renders_for
+from evsplat.objectives.exposure import opponent_difference
 from evsplat.similarity import ssim
 
 
@@ -94,5 +95,61 @@ def test_a_black_exposure_has_a_finite_gradient():
         rgb=pictures.unbind(0),
         observed=lambda _: torch.ones(16, 16, 3),
     )
-    Exposure(None, lambda frame: 3, torch.Generator()).loss(step)["l1"].backward()
+    terms = Exposure(None, lambda frame: 3, torch.Generator()).loss(step)
+    (terms["l1"] + terms["opponent"]).backward()
     assert pictures.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_opponent_errors_by_hand(seed):
+    generator = torch.Generator().manual_seed(seed)
+    truth = torch.rand(6, 7, 3, generator=generator, dtype=torch.float64)
+    # Grey is brightness alone.
+    grey = torch.randn(6, 7, 1, generator=generator, dtype=torch.float64)
+    found = opponent_difference(truth + grey, truth)
+    assert float(found) == pytest.approx(0.5 * float(grey.abs().mean()))
+    # Blue off by 0.1: luma errs by 0.0114, R - Y by as much the other way, B - Y by the rest.
+    bluer = truth + torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
+    expected = 0.5 * (0.0114 + 0.0114 + 0.0886)
+    assert float(opponent_difference(bluer, truth)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_slope_along_grey_is_that_of_luma_alone(seed):
+    generator = torch.Generator().manual_seed(seed)
+    drawn, truth = torch.rand(2, 4, 5, 3, generator=generator, dtype=torch.float64)
+    drawn.requires_grad_()
+    assert torch.autograd.gradcheck(lambda image: opponent_difference(image, truth), drawn)
+    (slope,) = torch.autograd.grad(opponent_difference(drawn, truth), drawn)
+    weights = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64)
+    expected = 0.5 * ((drawn - truth) @ weights).sign() / 20
+    assert torch.allclose(slope.sum(-1), expected, atol=1e-12)
+
+
+def test_hue_is_seen_where_brightness_errs_by_more():
+    truth = torch.full((16, 16, 3), 0.5, dtype=torch.float64)
+    purple = (truth + torch.tensor([0.25, 0.15, 0.3])).requires_grad_()
+    (slope,) = torch.autograd.grad((purple - truth).abs().mean(), purple)
+    assert bool((slope == slope[0, 0, 0]).all())  # L1 alone: as if it were grey
+    (slope,) = torch.autograd.grad(opponent_difference(purple, truth), purple)
+    assert bool((slope[..., (0, 2)] > 0).all() and (slope[..., 1] < 0).all())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_opponent_errors_are_those_of_the_mean_in_linear_light(seed):
+    generator = torch.Generator().manual_seed(seed)
+    pictures = torch.rand(3, 16, 16, 3, generator=generator, dtype=torch.float64)
+    observed = torch.rand(16, 16, 3, generator=generator, dtype=torch.float64)
+    step = SimpleNamespace(
+        transfer="power",
+        frame=frame(),
+        times_us=(2_000, 16_000, 30_000),
+        rgb=pictures,
+        observed=lambda _: observed,
+    )
+    found = Exposure(None, lambda frame: 3, generator).loss(step)["opponent"]
+    error = (pictures**2.2).mean(0) ** (1 / 2.2) - observed
+    luma = error @ torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64)
+    hue = error[..., [0, 2]] - luma[..., None]
+    expected = 0.5 * luma.abs().mean() + hue.abs().mean()
+    assert float(found) == pytest.approx(float(expected), rel=1e-9)

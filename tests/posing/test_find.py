@@ -1,6 +1,7 @@
 """`find_poses` on a tiny capture with key points of a file, and what it refuses."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -79,6 +80,19 @@ def test_a_given_focal_length_is_written_and_refined_with(unposed, tmp_path, mon
     assert new.provenance["poses"]["refinement"]["seconds"] > 0
     assert new.camera(new.frames[0]).K[0, 0] == 45
     assert load_capture(path).camera(new.frames[0]).K[0, 0] == 37.5
+
+
+def test_a_focal_length_that_was_searched_for_is_said_to_be_rough(unposed, tmp_path, caplog):
+    path, points = unposed
+    find_poses(path, tmp_path / "new", keypoints=points, focal="auto", refine_s=0)
+    new = load_capture(tmp_path / "new")
+    made = new.provenance["poses"]
+    assert made["focal_px"] == pytest.approx(float(new.camera(new.frames[0]).K[0, 0]), abs=0.01)
+    assert 0 < made["focal_std_share"] < 0.5
+    said = (
+        f"focal length: {made['focal_px']:.0f} pixels .* {made['focal_std_share']:.0%}.*--focal PX"
+    )
+    assert re.search(said, caplog.text)
 
 
 def test_poses_that_were_there_are_ignored_and_stay(tiny_capture, unposed, tmp_path):

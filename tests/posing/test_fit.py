@@ -95,12 +95,17 @@ def test_the_track_has_the_fitted_joints_and_errors():
     assert track.errors.source == "estimated"
 
 
-def test_a_wrong_focal_length_costs_more_than_the_right_one():
-    K = torch.tensor([[180.0, 0, 128], [0, 180, 128], [0, 0, 1]])
-    wrong = Camera(256, 256, K, CAMERA.world_to_camera)
-    fit = _fit(landmarks(), wrong, flips=False)
-    focal, _ = fit_focal(fit, [150.0, 300.0, 600.0])
-    assert focal == 300.0
+def test_the_focal_length_is_found_as_well_as_is_told():
+    """Of a camera whose focal length is 300 pixels, taken for another one."""
+    for usual in (220.0, 400.0):
+        K = torch.tensor([[usual, 0, 128], [0, usual, 128], [0, 0, 1]])
+        fit = _fit(landmarks(), Camera(256, 256, K, CAMERA.world_to_camera), flips=False)
+        found = fit_focal(fit, usual)
+        off = abs(np.log(found.focal_px / 300))
+        assert off < 0.7 * abs(np.log(usual / 300))
+        assert 0.4 * off < found.std_share < 0.4  # what lenses differ by, had nothing been seen
+        views = found.fit.problem.evidence.views
+        torch.testing.assert_close(views.focal_px, torch.full_like(views.focal_px, found.focal_px))
 
 
 def test_too_few_pictures_are_one_sentence():

@@ -202,6 +202,12 @@ def test_pictures_of_another_motion_correct_it_and_are_explained_better(body):
     assert gain - 2 * gain_error > 0.3
     errors = descent.errors()
     errors.check(len(descent.correction.key_times), len(body.parents), "test")
+    expected = descent.correction.joint_rad.numpy()
+    told = errors.joint_rad[:, descent.correction.joints] / expected
+    assert told.max() <= 1
+    # half of the variance is left whatever pictures say; here they say nearly all
+    assert told.min() >= 0.5**0.5
+    assert np.median(told) < 0.9
     assert errors.joint_rad.max() < 0.08
     assert errors.root_m.max() < 0.02
 

@@ -9,6 +9,7 @@ import torch
 
 from evsplat.capture import load_capture
 from evsplat.film import Look
+from evsplat.film.surroundings import Room
 from evsplat.training.run import GaussianReconstruction, Run
 from evsplat.view.posing import HeldPose, PoseSlider, turned
 from evsplat.view.request import Motion
@@ -113,3 +114,22 @@ def test_gaussians_of_an_instant_are_those_that_are_drawn(run):
     everything = viewed.cloud(camera, time_us, Motion(), "all")
     assert len(everything) == run.gaussians["human"] + run.gaussians["scene"]
     assert everything.semantic.sum() == run.gaussians["human"]
+
+
+def test_from_elsewhere_holes_show_a_room_and_the_rest_what_films_show(run):
+    viewed, time_us = ViewedRun(run, "it"), run.capture.frames[0].mid_us
+    camera = next(iter(run.capture.cameras.values()))
+    turned_away = camera.world_to_camera.clone()
+    turned_away[[0, 2]] *= -1
+    away = replace(camera, world_to_camera=turned_away)
+    empty = viewed.picture(away, time_us, Motion(), Look(), draft=False, elsewhere=True)
+    assert empty.min() > 0.2
+    track = run.reconstruction.track
+    recording = camera if run.capture.is_static_camera else None
+    room = Room.of(track, track, recording)
+    assert np.abs(empty - room.behind(away, time_us).numpy()).max() < 0.05
+    drawn = run.reconstruction.changed_by(room.clear, room.soften)
+    drawn = replace(drawn, backdrop=None)
+    expected = Look(surroundings=room).expose(drawn, camera, [time_us])[0] / 255
+    found = viewed.picture(camera, time_us, Motion(), Look(), draft=False, elsewhere=True)
+    assert np.abs(found - expected).max() < 0.05

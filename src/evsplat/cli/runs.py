@@ -50,7 +50,7 @@ def demo(
     if find_poses:
         capture, given = Path("captures") / f"demo_{datetime.now():%Y-%m-%d_%H-%M-%S}", capture
         Poses(capture=given, out=capture, search=PoseSearch(), threads=threads)()
-    Train(capture=capture, options=options)()
+    _Demo(capture=capture, options=options)()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,12 +108,36 @@ class Train:
 
     def _evaluate(self, run: Path) -> None:
         try:
-            Evaluate(run=run, device=self.options.device)()
+            self._finish(run)
         except KeyboardInterrupt:
             command = shlex.join(["evsplat", "evaluate", str(run)])
             raise KeyboardInterrupt(
                 f"Stopped; the training is finished and saved. Go on with: {command}"
             ) from None
+
+    def _finish(self, run: Path) -> None:
+        Evaluate(run=run, device=self.options.device)()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Demo(Train):
+    """Training that is filmed before its report is written, which shows the films."""
+
+    def _finish(self, run: Path) -> None:
+        from evsplat.export import export_run, render_run
+
+        device, threads = self.options.device, self.options.threads
+        for film in _DEMO_FILMS:
+            render_run(run, film, device=device, threads=threads)
+        export_run(run, "avatar", out=run / "exports" / "avatar.html", device=device)
+        super()._finish(run)
+
+
+_DEMO_FILMS = (
+    Film(motion="spin", path="orbit", size=360, seconds=4.0, fps=25.0),
+    Film(path="swing", at=1.0, size=360, seconds=3.0, fps=25.0),
+)
+"""Another motion from all sides, and one instant of the recording from both sides."""
 
 
 @dataclass(frozen=True, kw_only=True)

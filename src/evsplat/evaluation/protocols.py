@@ -19,9 +19,9 @@ from evsplat.similarity.psnr_ssim import (
     SCIKIT_DEFAULT_SSIM,
     ZERO_PADDED_SSIM,
     Ssim,
+    SsimReference,
     psnr,
     psnr_channel_mean,
-    ssim,
 )
 
 REGIONS = ("full", "person_crop", "person_mask")
@@ -198,7 +198,7 @@ class _Region:
             reason = Absent("only PSNR is defined for single pixels; see person_crop")
             return values | dict.fromkeys(METRICS[1:], reason)
         try:
-            values["ssim"] = float(ssim(image, self.truth, self.protocol.ssim))
+            values["ssim"] = float(self._ssim_truth.map(image).mean())
         except ValueError as error:
             values["ssim"] = Absent(str(error))
         seen = image.clamp(max=1.0) if self.protocol.perceptual_clip else image
@@ -229,6 +229,10 @@ class _Region:
                 return float(network.compare(features, self._truth_features[name]))
         except ValueError as error:
             return Absent(str(error))
+
+    @cached_property
+    def _ssim_truth(self) -> SsimReference:
+        return SsimReference(self.truth, self.protocol.ssim)
 
     @cached_property
     def _truth_features(self) -> dict[str, Features]:

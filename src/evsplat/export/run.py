@@ -76,7 +76,7 @@ def export_run(
     if kind == "avatar":
         page = target or folder / "avatar"
         return export_avatar(loaded, page, parts or "human", camera, options.motion)
-    if kind in ("bvh", "skeleton"):
+    if kind == "bvh" or kind == "skeleton":
         name = "recorded" if options.motion is None else Path(options.motion).stem
         file = target or folder / f"{name}{_SUFFIXES[kind][0]}"
         return export_motion(loaded, file, kind, options.motion)

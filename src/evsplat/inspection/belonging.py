@@ -28,6 +28,10 @@ _OFF_PX, _OFF_FRAMES = 3.5, 1.0
 _LEAST_GAIN, _LEAST_GAIN_IN_TIME, _LEAST_GAIN_OF_A_FRAME = 0.025, 0.05, 0.1
 """... if so much of the correlation there is missing where the body is: for shifts, for delays
 alone, and for those of less than two frames, which slow motions hardly show."""
+_CHANGES, _LEAST_GAIN_OF_CHANGE = 0.08, 0.13
+"""Where what changes in time correlates so much at some delay, it alone tells delays, if so much of
+it is missing without one: the man's own bodies lost up to 0.06, those 2 frames off 0.27 and more,
+and this is midway."""
 _ANOTHER, _DOUBTFUL, _FOLLOWS = 0.75, 0.85, 0.9
 """Order below which a body is another one, below which it may be, and above which it is none."""
 _PARTED = 0.05
@@ -68,6 +72,9 @@ class Belonging:
     parting: float
     """Share of its correlation that the first or second half of the recording, the worse, loses at
     the common best place against the best place of its own."""
+    change_lost: float | None
+    """Share of the correlation of what changes in time that is lost for want of the delay, which is
+    then the one at which it is highest; None where too little changes to tell, or shifts do."""
     standing_camera: bool
     in_no_training_frame: bool
     """The posed body is out of view in every training frame."""
@@ -102,6 +109,8 @@ class Belonging:
         gain, delay = 1 - self.score / self.best_score, abs(self.delay_frames)
         if self._is_far:
             return gain > _LEAST_GAIN
+        if self.change_lost is not None:
+            return delay >= _OFF_FRAMES and self.change_lost > _LEAST_GAIN_OF_CHANGE
         least = _LEAST_GAIN_OF_A_FRAME if delay < 2 * _OFF_FRAMES else _LEAST_GAIN_IN_TIME
         return delay >= _OFF_FRAMES and gain > least
 
@@ -181,17 +190,25 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
         np.abs(mids_us[:, None] - mids_us) >= _APART * period_us,
         row,
     )
+    shift_px = best.right * coarse.pixel, best.down * coarse.pixel
+    tolerance_px = _OFF_PX * coarse.pixel
+    delay, change_lost = best.delay, None
+    far = float(np.hypot(*shift_px)) >= tolerance_px
+    if not far and stands(frames) and max(best.changing, default=0) >= _CHANGES:
+        delay = int(np.argmax(best.changing))
+        change_lost = 1 - best.changing[NOW] / best.changing[delay]
     return Belonging(
         frames,
         shares={name: float(maps[now].sum() / maps.sum()) for name, maps in found.items()},
         area=float(now.mean()),
-        shift_px=(best.right * coarse.pixel, best.down * coarse.pixel),
-        tolerance_px=_OFF_PX * coarse.pixel,
-        delay_frames=DELAYS[best.delay],
-        delay_us=round(DELAYS[best.delay] * period_us),
+        shift_px=shift_px,
+        tolerance_px=tolerance_px,
+        delay_frames=DELAYS[delay],
+        delay_us=round(DELAYS[delay] * period_us),
         score=best.given_score,
         best_score=best.score,
         order=best.order,
+        change_lost=change_lost,
         parting=best.parting,
         standing_camera=stands(frames),
         in_no_training_frame=not now.any() and _in_none(capture, figure, capture.train_frames),

@@ -32,6 +32,8 @@ class BestPlace:
     """`own_time_order` there."""
     parting: float = 0.0
     """`Belonging.parting`."""
+    changing: tuple[float, ...] = ()
+    """At each of `DELAYS`, without shift: correlation of what changes in time (`_changing`)."""
 
     @classmethod
     def of(
@@ -47,7 +49,8 @@ class BestPlace:
         half = (len(row) + 1) // 2
         halves = (slice(half), slice(half, None))
         # counts of events have a long tail, which a root shortens
-        maps = {k: normalised(np.sqrt(m) if k == "events" else m) for k, m in found.items()}
+        raw = {k: np.sqrt(m) if k == "events" else m for k, m in found.items()}
+        maps = {k: normalised(m) for k, m in raw.items()}
         searched = [
             Correlations.of(m, partial(silhouettes, kind), row, REACH_PX, halves)
             for kind, m in maps.items()
@@ -63,6 +66,10 @@ class BestPlace:
             )
             for kind, m in maps.items()
         ]
+        changing = [
+            [_changing(m, in_picture(silhouettes(kind, at), m.shape[1:], 0, 0)) for at in row.T]
+            for kind, m in raw.items()
+        ]
         told = [order for order in orders if order is not None]
         return cls(
             delay,
@@ -72,7 +79,18 @@ class BestPlace:
             score=float(overall[place]),
             order=float(np.mean(told)) if told else None,
             parting=float((1 - grouped[:, *place] / highest).max()),
+            changing=tuple(np.mean(changing, axis=0).tolist()),
         )
+
+
+def _changing(moves: Float32[np.ndarray, "K h w"], drawn: Float32[np.ndarray, "K h w"]) -> float:
+    """Correlation of two films, each less its mean over time: of what differs between frames.
+
+    It tells delays of people who stay where they are, most of whom is the same in all frames.
+    """
+    one, other = (film - film.mean(0) for film in (moves, drawn))
+    size = float(np.sqrt(np.square(one).sum() * np.square(other).sum()))
+    return float((one * other).sum()) / size if size > 0 else 0.0
 
 
 def drawn(

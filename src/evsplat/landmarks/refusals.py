@@ -23,8 +23,35 @@ _SECOND_SIZE = 0.35
 _EXAMINED = 8
 """Pictures, spread over the recording, in which a second person is looked for."""
 _LEAST_SHIFT_PX = 2.0
+_LEAST_SHOWN = 2
+"""Of the pictures looked at first: furniture may once be taken for somebody."""
+_NOBODY = (
+    "expected one person, from head to feet, in most of them; look at them with evsplat inspect, "
+    "and give key points of another tool with --keypoints if there is one to be seen."
+)
 _HALF_OUT = 0.25
 """Share of limb joints beyond the border of which a picture shows too little."""
+
+
+def refuse_empty(
+    capture: TrainingCapture,
+    pictures: Sequence[SharpPicture],
+    is_somebody: Callable[[SharpPicture], bool],
+) -> None:
+    """A `DataError` where next to none of a few pictures show a person.
+
+    Searches where nobody is take longest, so this is known before all pictures are searched.
+    """
+    needed = min(_LEAST_SHOWN, len(pictures))
+    shown = 0
+    for picture in pictures:
+        shown += is_somebody(picture)
+        if shown == needed:
+            return
+    raise DataError(
+        f"{capture.path}: nobody was found in {len(pictures) - shown} of {len(pictures)} pictures "
+        f"looked at first, {_NOBODY}"
+    )
 
 
 def refuse_nobody(
@@ -34,9 +61,7 @@ def refuse_nobody(
     missed = sum(not person.is_person for person in found)
     if 2 * missed > len(pictures):
         raise DataError(
-            f"{capture.path}: nobody was found in {missed} of {len(pictures)} pictures, expected "
-            "one person in most of them; look at them with evsplat inspect, and give key points of "
-            "another tool with --keypoints if there is one to be seen."
+            f"{capture.path}: nobody was found in {missed} of {len(pictures)} pictures, {_NOBODY}"
         )
 
 

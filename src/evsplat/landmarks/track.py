@@ -16,6 +16,7 @@ from evsplat.landmarks.motion import Motion
 from evsplat.landmarks.network import LandmarkNetwork
 from evsplat.landmarks.pictures import SharpPicture
 from evsplat.landmarks.refusals import (
+    refuse_empty,
     refuse_half_out_of_view,
     refuse_moving_camera,
     refuse_nobody,
@@ -31,6 +32,8 @@ _TURNS = (0.0, np.pi / 2, -np.pi / 2, np.pi)
 _CLEAR = 0.008
 """Beyond this doubt other uprights are tried."""
 _LOOKS = 2
+_FIRST_LOOKS = 6
+"""Pictures in which somebody is searched for before all are read."""
 _LEAST_FOLLOWED = 0.3
 _BOX_MARGIN = 1.25
 _SETTLED = 0.08
@@ -59,6 +62,7 @@ def find_landmarks(
     capture = coded(capture)
     motion = Motion(capture)
     tracker = _Tracker(network, motion)
+    refuse_empty(capture, _spread(pictures), lambda picture: tracker.search_anew(picture).is_person)
     found = [
         tracker.find(picture)
         for picture in tqdm(
@@ -89,6 +93,14 @@ def find_landmarks(
     )
 
 
+def _spread(pictures: Sequence[SharpPicture]) -> list[SharpPicture]:
+    """A few of the pictures that are the sharpest, over all of their time."""
+    sharpest = min(picture.sigma for picture in pictures)
+    clear = [picture for picture in pictures if picture.sigma == sharpest]
+    chosen = np.unique(np.linspace(0, len(clear) - 1, _FIRST_LOOKS).round().astype(int))
+    return [clear[k] for k in chosen]
+
+
 class _Tracker:
     """Finds the person in one picture after the other."""
 
@@ -103,11 +115,14 @@ class _Tracker:
             around = Region(best.region.centre, best.region.side)
             best = min(best, self.search(picture.image, [around]), key=_badness)
         if best is None or best.flag < SURE:
-            starts = starts_of(self._motion, picture)
-            searched = self.search(picture.image, list(starts))
+            searched = self.search_anew(picture)
             best = searched if best is None else min(best, searched, key=_badness)
         self._last = best.region if best.flag >= SURE else None
         return best
+
+    def search_anew(self, picture: SharpPicture) -> Found:
+        """The clearest person in a picture, wherever somebody may be."""
+        return self.search(picture.image, list(starts_of(self._motion, picture)))
 
     def look_back(self, pictures: Sequence[SharpPicture], found: list[Found]) -> None:
         """Read doubtful pictures again in the regions of clear ones after them."""

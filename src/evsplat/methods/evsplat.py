@@ -202,7 +202,8 @@ class EvsplatConfig:
     """Errors of the given poses."""
 
     l1_weight: Weight = 0.8
-    """Weight of the mean absolute difference to the blurry frame, sRGB."""
+    """Weight of the mean absolute difference to the blurry frame, sRGB, and again of half of
+    the sum of those of Y, R - Y and B - Y."""
     dssim_weight: Weight = 0.2
     """Weight of 1 - SSIM."""
     semantic_weight: Weight = 0.1
@@ -278,6 +279,7 @@ def build(
         objectives=objectives,
         weights={
             "l1": config.l1_weight,
+            "opponent": config.l1_weight,
             "dssim": config.dssim_weight,
             "semantic": config.semantic_weight,
             "binarise": config.binarise_weight,

@@ -17,7 +17,8 @@ _PIECES = torch.tensor(
 ) / 6  # fmt: skip
 
 _REACH, _BLOCK = 24, 256
-"""Keys that a piece of the spline through keys knows on either side; pieces made at a time."""
+"""Keys that a piece of the spline through keys knows on either side; pieces made, and times
+evaluated, at a time."""
 
 
 class PoseSpline(nn.Module):
@@ -69,8 +70,8 @@ class PoseSpline(nn.Module):
         if len(held_us) > 1:
             self.held_s = 1e-6 * (torch.tensor(held_us, dtype=torch.float64) - span_us[0])
             self.held, self.held_first = self._through(held_us)
-        elif len(centred_us):
-            self.mean = self.weights(centred_us).mean(0)
+        elif len(centred_us) and not math.isinf(knot_us):
+            self.mean = self._mean(torch.as_tensor(centred_us, dtype=torch.float64))
         starts = {
             "rotations": torch.zeros(self.count, joints, 3),
             "translations": torch.zeros(self.count, 3),
@@ -87,14 +88,29 @@ class PoseSpline(nn.Module):
         times = send(torch.as_tensor(times_us, dtype=torch.float64), device)
         if math.isinf(self.knot_us):
             return torch.ones(len(times), 1, device=device)
-        first, four = self._four(times)
-        index = first[:, None] + torch.arange(4, device=device)
         found = torch.zeros(len(times), self.count, dtype=torch.float64, device=device)
-        found.scatter_(1, index, four)
+        for index, share in self._local(times):
+            found.scatter_add_(1, index, share)
+        return found.float() - self.mean
+
+    def _local(self, times: Float[Tensor, "T"]) -> list[tuple[Tensor, Tensor]]:
+        """Control points that count at each time, and their weights, of which there are two sorts.
+
+        The mean is not taken off.
+        """
+        first, four = self._four(times)
+        parts = [(first[:, None] + torch.arange(4, device=times.device), four)]
         if len(self.held):
             index, through = self._through_keys(times)
-            found.scatter_add_(1, index, -through)
-        return found.float() - self.mean
+            parts.append((index, -through))
+        return parts
+
+    def _mean(self, times: Float[Tensor, "T"]) -> Float[Tensor, "K"]:
+        """Mean weights, without a matrix of all times and control points."""
+        total = torch.zeros(self.count, dtype=torch.float64)
+        for index, share in self._local(times):
+            total.index_add_(0, index.flatten(), share.flatten())
+        return (total / len(times)).float()
 
     def _four(self, times: Float[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Float[Tensor, "T 4"]]:
         """The first of the four control points that count at each time, and their weights."""
@@ -153,5 +169,26 @@ class PoseSpline(nn.Module):
         self, times_us: Sequence[int] | Tensor
     ) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T 3"]]:
         """Values of the joints and of the root's place."""
-        weights = self.weights(times_us)
-        return torch.einsum("tk,kjc->tjc", weights, self.rotations), weights @ self.translations
+        if len(times_us) <= _BLOCK or math.isinf(self.knot_us):
+            weights = self.weights(times_us)
+            return torch.einsum("tk,kjc->tjc", weights, self.rotations), weights @ self.translations
+        times = send(torch.as_tensor(times_us, dtype=torch.float64), self.mean.device)
+        points = torch.cat((self.rotations.flatten(1), self.translations), 1)
+        found = self._in_blocks(times, points) - self.mean @ points
+        return found[:, :-3].unflatten(1, (-1, 3)), found[:, -3:]
+
+    def _in_blocks(
+        self, times: Float[Tensor, "T"], points: Float[Tensor, "K D"]
+    ) -> Float[Tensor, "T D"]:
+        """Sums over the control points near each block of times: linear in the recording."""
+        pieces, rows = points.split(_BLOCK), []
+        for block in times.split(_BLOCK):
+            parts = self._local(block)
+            first = min(int(index.min()) for index, _ in parts) // _BLOCK
+            last = max(int(index.max()) for index, _ in parts) // _BLOCK
+            near = torch.cat(pieces[first : last + 1])
+            found = torch.zeros(len(block), len(near), dtype=torch.float64, device=block.device)
+            for index, share in parts:
+                found.scatter_add_(1, index - first * _BLOCK, share)
+            rows.append(found.to(near) @ near)
+        return torch.cat(rows)

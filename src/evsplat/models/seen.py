@@ -18,6 +18,8 @@ from evsplat.render import Splats, render
 
 LITTLE_PX = 0.3
 """A Gaussian with smaller `Seen.squares` counts as little seen."""
+MOST_FRAMES = 240
+"""Training frames that are looked at, evenly spread over a longer recording."""
 _DRAWS = 4
 """Random signs per frame that the squares are estimated with."""
 _NEIGHBOURS = 8
@@ -68,13 +70,17 @@ class Seen:
 def seen_by(model: Model, capture: TrainingCapture) -> Seen:
     """What the training frames showed of the person as ``model`` draws it at their middles.
 
+    Of more than `MOST_FRAMES` some stand for all, so that the end of an hour's training is no later
+    than that of a minute's.
+
     A picture's derivative by a Gaussian's colour is its share of the pixels. The gradient of the
     sum over all pixels is thus the sum of the shares, and that of a sum with random signs has the
     sum of their squares as its mean square (Hutchinson 1990).
     """
     generator = torch.Generator().manual_seed(0)
     sums: list[Tensor] = []
-    for frame in capture.train_frames:
+    frames = capture.train_frames[:: -(-len(capture.train_frames) // MOST_FRAMES)]
+    for frame in frames:
         camera = capture.camera(frame).to(model.device)
         with torch.no_grad():
             layers = model.at([frame.mid_us], camera.center(), hard_semantics=True)
@@ -85,7 +91,8 @@ def seen_by(model: Model, capture: TrainingCapture) -> Seen:
         directions = normalize((back @ toward[..., None])[..., 0], dim=-1) * weight[:, None]
         values = [weight, squares, directions]
         sums = [a + b for a, b in zip(sums, values, strict=True)] if sums else values
-    return Seen(*(value.detach() for value in sums))
+    each = len(capture.train_frames) / len(frames)
+    return Seen(*(each * value.detach() for value in sums))
 
 
 def shares_in(

@@ -4,13 +4,14 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.devices import DeviceCache
 from evsplat.objectives.base import Objective, Step, picture
-from evsplat.pictures import encode, mean_light
+from evsplat.pictures import BT601, encode, mean_light
 from evsplat.similarity.psnr_ssim import l1_and_ssim
 
 DARKEST_LINEAR = 1e-6
@@ -37,8 +38,25 @@ def renders_for(motion: float, px_per_render: float, most: int) -> int:
     return 2 * int((wanted - 1) / 2 + 0.5) + 1
 
 
+def opponent_difference(
+    image: Float[Tensor, "H W 3"], reference: Float[Tensor, "H W 3"]
+) -> Float[Tensor, ""]:
+    """Half the sum of the mean absolute differences in Y, R - Y and B - Y (ITU-R BT.601), coded.
+
+    The slope of the last two has no part along grey: they move hue, not brightness.
+    """
+    red, green, blue = (image - reference).unbind(-1)
+    luma = BT601[0] * red + BT601[1] * green + BT601[2] * blue
+    return 0.5 * (luma.abs() + (red - luma).abs() + (blue - luma).abs()).mean()
+
+
 class Exposure(Objective):
     """L1 and D-SSIM between a blurry frame and the mean, in linear light, of K renders.
+
+    The slope of L1 is the sign of each channel's error. Where brightness errs by more than hue, as
+    it does wherever something fast is not yet in its place, the three signs are the same and L1
+    does not see the hue at all; so brightness and hue are compared apart as well
+    (`opponent_difference`).
 
     The exposure is cut into K equal strata; a render lies at a random place of each but the middle
     one, whose is the middle. K grows with how far the body moves in the exposure, so that
@@ -69,13 +87,16 @@ class Exposure(Objective):
         data.prefetch(*picture(self.capture, frame))
 
     def loss(self, step: Step) -> dict[str, Tensor]:
-        """``l1`` and ``dssim`` of the drawn frame."""
+        """``l1``, ``dssim`` and ``opponent`` of the drawn frame."""
         start, end = step.frame.exposure_us
         first, last = (bisect_left(step.times_us, time) for time in (start, end))
         # Times of other objectives lie outside. A shutter adds light up before it is coded.
         mean = mean_light(step.rgb[first:last], step.transfer)
-        l1, similarity = l1_and_ssim(
-            encode(mean.clamp_min(DARKEST_LINEAR), step.transfer),
-            step.observed(step.frame),
-        )
-        return {"l1": l1, "dssim": 1 - similarity}
+        blurry = encode(mean.clamp_min(DARKEST_LINEAR), step.transfer)
+        observed = step.observed(step.frame)
+        l1, similarity = l1_and_ssim(blurry, observed)
+        return {
+            "l1": l1,
+            "dssim": 1 - similarity,
+            "opponent": opponent_difference(blurry, observed),
+        }

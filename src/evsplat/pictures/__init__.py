@@ -2,6 +2,7 @@
 
 from evsplat.pictures.colours import error_map, signed_map, to_bytes
 from evsplat.pictures.light import (
+    BT601,
     Transfer,
     decode,
     encode,
@@ -15,6 +16,7 @@ from evsplat.pictures.light import (
 )
 
 __all__ = [
+    "BT601",
     "Transfer",
     "decode",
     "encode",

@@ -17,6 +17,8 @@ Transfer = Literal["power", "srgb", "linear"]
 TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
 GAMMA = 2.2
 REC709 = (0.2126, 0.7152, 0.0722)
+BT601 = (0.299, 0.587, 0.114)
+"""Weights of coded channels in luma, from which colour differences are taken."""
 DARKEST = 1.0 / 255.0
 """Coded values are clamped here first: below one 8-bit level the logarithm only sees rounding."""
 _BLACK = 1e-6

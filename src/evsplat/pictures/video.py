@@ -18,13 +18,18 @@ _LIMITED_RANGE = 1
 
 
 def write_video(
-    path: Path | str, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], *, fps: float, crf: int = 16
+    path: Path | str,
+    pictures: Iterable[UInt8[np.ndarray, "H W 3"]],
+    *,
+    fps: float,
+    crf: int = 16,
+    preset: str = "medium",
 ) -> int:
     """Encode sRGB pictures as an mp4 (H.264, yuv420p, BT.709) and return how many there were.
 
     Odd sizes are made even by repeating the last row or column, as yuv420p asks for. ``fps`` is
     the playing speed in pictures per second; ``crf`` is x264's quality, lower is better (16 is
-    hard to tell from the original).
+    hard to tell from the original), ``preset`` its effort.
     """
     import av
 
@@ -39,7 +44,7 @@ def write_video(
     with atomic_path(path) as temporary:
         container = av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"})
         even = map(_even, pictures)
-        count = _encode(container, "libx264", even, fps, "ITU709", crf=str(crf), preset="medium")
+        count = _encode(container, "libx264", even, fps, "ITU709", crf=str(crf), preset=preset)
         if not count:
             raise DataError(f"{path}: there is no picture to write.")
     return count

@@ -30,7 +30,7 @@ from evsplat.landmarks import (
 )
 from evsplat.options import PoseSearch
 from evsplat.options.declare import given
-from evsplat.posing.fit import PoseFit, fit_focal, fit_landmarks
+from evsplat.posing.fit import FocalFit, PoseFit, fit_focal, fit_landmarks
 from evsplat.posing.page import poses_page
 from evsplat.posing.problem import FitSettings
 from evsplat.posing.refine import Refined, refine
@@ -38,9 +38,8 @@ from evsplat.posing.rig import Rig, default_rig, make_rig
 
 logger = logging.getLogger(__name__)
 
-_FIRST_FOCAL = 1.2
-_FOCALS = np.geomspace(0.6, 2.4, 7)
-"""Focal lengths of which `--focal auto` seeks the best, beginning at the first; in widths."""
+_USUAL_FOCAL = 1.0
+"""Focal length from which `--focal auto` begins, in longer sides of the pictures."""
 _FRAME_S = 2.0
 """Time for the refinement, per frame."""
 _BETAS = 10
@@ -112,9 +111,11 @@ def find_poses(
     rig = _rig(search.body)
     capture = load_capture(path, needs_body=False)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
+    focal: FocalFit | None = None
     focal_px = search.focal_px
     if search.focal == "auto":
-        focal_px = _FIRST_FOCAL * capture.camera(capture.frames[0]).width
+        camera = capture.camera(capture.frames[0])
+        focal_px = _USUAL_FOCAL * max(camera.width, camera.height)
     seen = _seen(capture, policy, focal_px)
     limit_s = _refinement_s(seen, search)
     stages = _Stages()
@@ -126,8 +127,11 @@ def find_poses(
         with stages(bar, "fit"):
             fitted = _fit(seen, landmarks, rig, search)
             if search.focal == "auto":
-                focal_px, fitted = _best_focal(fitted, seen.camera(seen.frames[0]).width)
+                assert focal_px is not None
+                focal = fit_focal(fitted, focal_px)
+                focal_px, fitted = focal.focal_px, focal.fit
                 seen = _seen(capture, policy, focal_px)
+                logger.warning("%s", _rough(focal))
         track = fitted.track(key_times(seen))
         refined: Refined | None = None
         if limit_s > 0:
@@ -148,6 +152,8 @@ def find_poses(
         if focal_px is not None:
             _set_focal(making, focal_px)
             made["focal_px"] = round(focal_px, 2)
+        if focal is not None:
+            made["focal_std_share"] = round(focal.std_share, 3)
         making.document["provenance"] = {**capture.provenance, "poses": made}
         page = poses_page(capture.name, seen, pictures, landmarks, track, fitted, made)
         write_text(making.folder / "poses.html", page)
@@ -230,11 +236,12 @@ def _fit(capture: TrainingCapture, landmarks: Landmarks, rig: Rig, search: PoseS
     return fit_landmarks(landmarks, cameras, _span(capture), rig=rig, settings=settings)
 
 
-def _best_focal(fitted: PoseFit, width: int) -> tuple[float, PoseFit]:
-    """The focal length in pixels at which the landmarks are fitted best, and that fit."""
-    coarse, _ = fit_focal(fitted, [width * share for share in _FOCALS])
-    step = float(_FOCALS[1] / _FOCALS[0]) ** 0.4
-    return fit_focal(fitted, [coarse / step, coarse, coarse * step])
+def _rough(focal: FocalFit) -> str:
+    return (
+        f"focal length: {focal.focal_px:.0f} pixels by the person's own perspective, give or take "
+        f"{focal.std_share:.0%}, and the distance with it; --focal PX of a calibration, or of the "
+        "EXIF data of a picture taken alike, is better."
+    )
 
 
 def _cameras(capture: TrainingCapture, times_us: Sequence[int]) -> list[Camera]:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -81,40 +82,67 @@ def ssim_map(
     image: Float[Tensor, "H W C"], reference: Float[Tensor, "H W C"], settings: Ssim
 ) -> Float[Tensor, "C h w"]:
     """Structural similarity at every window position; float64 input keeps its precision."""
-    _check_same_shape(image, reference)
-    size = settings.size
-    if size % 2 == 0:
-        raise ValueError(f"the window's side must be odd, not {size}")
-    if settings.padding == "valid" and min(image.shape[:2]) < size:
-        raise ValueError(f"the {size}-pixel window is larger than the image")
+    return SsimReference(reference, settings).map(image)
 
-    kernel = _window(settings)
+
+@dataclass(frozen=True, eq=False)
+class SsimReference:
+    """A picture that others are compared with, whose moments are found once."""
+
+    picture: Float[Tensor, "H W C"]
+    settings: Ssim = GAUSSIAN_SSIM
+
+    def map(self, image: Float[Tensor, "H W C"]) -> Float[Tensor, "C h w"]:
+        """As `ssim_map`.
+
+        A ValueError where shapes differ, or no window fits into the picture.
+        """
+        settings = self.settings
+        _check_same_shape(image, self.picture)
+        if settings.size % 2 == 0:
+            raise ValueError(f"the window's side must be odd, not {settings.size}")
+        if settings.padding == "valid" and min(image.shape[:2]) < settings.size:
+            raise ValueError(f"the {settings.size}-pixel window is larger than the image")
+        x, y = image.movedim(-1, 0), self.picture.movedim(-1, 0)
+        mean_x, mean_xx, mean_xy = self._means(x, x * x, x * y)
+        mean_y, mean_yy = self._moments
+        count = settings.size**2
+        unbias = count / (count - 1) if settings.sample_covariance else 1.0
+        variance_x = unbias * (mean_xx - mean_x**2)
+        variance_y = unbias * (mean_yy - mean_y**2)
+        covariance = unbias * (mean_xy - mean_x * mean_y)
+        c1, c2 = settings.stabilisers
+        luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+        structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
+        return luminance * structure
+
+    @cached_property
+    def _moments(self) -> tuple[Float[Tensor, "C h w"], ...]:
+        """Means of the picture and of its square in each window."""
+        y = self.picture.movedim(-1, 0)
+        return self._means(y, y * y)
+
+    def _means(self, *values: Float[Tensor, "C H W"]) -> tuple[Float[Tensor, "C h w"], ...]:
+        """Weighted means in each window."""
+        planes = torch.cat(values)
+        # A CPU's cache holds a plane; on a GPU it is the number of operations that counts.
+        pieces = planes.split(1 if planes.device.type == "cpu" else len(planes))
+        return torch.cat([_smooth(piece, self.settings) for piece in pieces]).split(len(values[0]))
+
+
+def _smooth(planes: Float[Tensor, "C H W"], settings: Ssim) -> Float[Tensor, "C h w"]:
+    # Shifted sums: torch's convolution is many times slower in float64.
+    size, kernel = settings.size, _window(settings)
     pad = size // 2 if settings.padding == "zero" else 0
-
-    def smooth(planes: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
-        # Shifted sums: torch's convolution is many times slower in float64.
-        padded = F.pad(planes, (pad, pad, pad, pad))
-        rows, columns = padded.shape[1] - size + 1, padded.shape[2] - size + 1
-        down = kernel[0] * padded[:, :rows]
-        for k in range(1, size):
-            down = torch.add(down, padded[:, k : k + rows], alpha=kernel[k])
-        across = kernel[0] * down[:, :, :columns]
-        for k in range(1, size):
-            across = torch.add(across, down[:, :, k : k + columns], alpha=kernel[k])
-        return across
-
-    x, y = image.movedim(-1, 0), reference.movedim(-1, 0)
-    # One call for all five: on a GPU it is the number of operations that counts.
-    smoothed = smooth(torch.cat([x, y, x * x, y * y, x * y])).split(len(x))
-    mean_x, mean_y, mean_xx, mean_yy, mean_xy = smoothed
-    unbias = size**2 / (size**2 - 1) if settings.sample_covariance else 1.0
-    variance_x = unbias * (mean_xx - mean_x**2)
-    variance_y = unbias * (mean_yy - mean_y**2)
-    covariance = unbias * (mean_xy - mean_x * mean_y)
-    c1, c2 = settings.stabilisers
-    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
-    structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
-    return luminance * structure
+    padded = F.pad(planes, (pad, pad, pad, pad))
+    rows, columns = padded.shape[1] - size + 1, padded.shape[2] - size + 1
+    down = kernel[0] * padded[:, :rows]
+    for k in range(1, size):
+        down.add_(padded[:, k : k + rows], alpha=kernel[k])
+    across = kernel[0] * down[:, :, :columns]
+    for k in range(1, size):
+        across.add_(down[:, :, k : k + columns], alpha=kernel[k])
+    return across
 
 
 def ssim(

@@ -85,7 +85,10 @@ class Compositor:
     ) -> Picture:
         """A run's picture with everything laid over it."""
         time_us, motion, look = request.time_us, request.motion, request.look
-        picture = np.array(viewed.picture(pane.camera, time_us, motion, look, draft=draft))
+        free = request.recording_camera is None
+        picture = np.array(
+            viewed.picture(pane.camera, time_us, motion, look, draft=draft, elsewhere=free)
+        )
         if pane.box is not None:
             dim_outside(picture, pane.box)
             if motion.is_recorded:

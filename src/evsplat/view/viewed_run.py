@@ -21,6 +21,7 @@ from evsplat.export.cloud import SplatCloud
 from evsplat.export.gaussians import cloud_at
 from evsplat.film import Look, load_motion_of
 from evsplat.film.looks import depth_colours
+from evsplat.film.surroundings import Room
 from evsplat.methods.reconstruction import Parts
 from evsplat.pictures import Transfer
 from evsplat.render import Backdrop
@@ -43,6 +44,7 @@ class ViewedRun:
         self.name = name
         self.capture = run.capture
         self._motions: dict[str, BodyTrack] = {}
+        self._rooms: dict[str | None, Room] = {}
         self._clear_caches()
 
     def reload(self, state: Path) -> None:
@@ -70,12 +72,21 @@ class ViewedRun:
         return self._motions[motion]
 
     def picture(
-        self, camera: Camera, time_us: int, motion: Motion, look: Look, *, draft: bool
+        self,
+        camera: Camera,
+        time_us: int,
+        motion: Motion,
+        look: Look,
+        *,
+        draft: bool,
+        elsewhere: bool = False,
     ) -> Float[np.ndarray, "H W 3"]:
         """One instant, sRGB in [0, 1].
 
         A ``draft`` evaluates networks for a part of the Gaussians only and has softer shadows. A
-        run that cannot tell what it saw, its training going on, shows colours for certainty.
+        run that cannot tell what it saw, its training going on, shows colours for certainty. From
+        ``elsewhere`` than where a camera recorded, person and scene stand in a calm room, as in
+        films.
         """
         if look.shown == "certainty" and self.run.reconstruction.seen is None:
             look = replace(look, shown="rgb")
@@ -83,6 +94,8 @@ class ViewedRun:
         if draft:
             drawn = replace(drawn, shadow_step_px=_DRAFT_SHADOW_STEP_PX)
         with torch.no_grad():
+            if look.shown == "rgb" and look.parts == "all" and elsewhere:
+                return self._in_a_room(drawn, camera, time_us, motion)
             if look.shown == "rgb":
                 rgb = drawn.render(camera, [time_us], parts=look.parts).rgb[0]
                 return self.capture.shown(rgb).numpy()
@@ -91,6 +104,22 @@ class ViewedRun:
         if look.shown == "depth":
             exposure = depth_colours(exposure, self._nearest_m)
         return exposure.astype(np.float32) / 255
+
+    def _in_a_room(
+        self, drawn: GaussianReconstruction, camera: Camera, time_us: int, motion: Motion
+    ) -> Float[np.ndarray, "H W 3"]:
+        """Holes show a floor and an even gradient, and what hides the person fades."""
+        room = self._rooms.get(motion.name)
+        if room is None:
+            frame = self.capture.frames[0]
+            recording = self.capture.camera(frame) if self.capture.is_static_camera else None
+            recorded = self.run.reconstruction.track.to("cpu")
+            room = Room.of(recorded, self.track(motion.name).to("cpu"), recording)
+            self._rooms[motion.name] = room
+        shown = drawn.changed_by(room.clear, room.soften).render(camera, [time_us])
+        holes = 1 - shown.alpha[0].cpu().clamp(0, 1)[..., None]
+        picture = self.capture.shown(shown.rgb[0].cpu())
+        return (picture + holes * room.behind_coarsely(camera, time_us)).clamp(0, 1).numpy()
 
     def cloud(self, camera: Camera, time_us: int, motion: Motion, parts: Parts) -> SplatCloud:
         """The Gaussians of one instant in the world, coloured as ``camera`` sees them."""

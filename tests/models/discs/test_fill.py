@@ -1,6 +1,7 @@
 """What the end of training decides where little was seen; pictures and learned values stay."""
 
 import copy
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -102,6 +103,27 @@ def test_every_kind_of_model_is_filled(tiny_capture, settings):
     assert f"gaussians.{model.gaussians.colour}" in found
     assert all(value.shape == state[name].shape for name, value in found.items())
     assert all(bool(value.isfinite().all()) for value in found.values())
+
+
+def test_of_many_frames_some_stand_for_all(spoilt, monkeypatch):
+    model, capture, _ = spoilt
+    frame, looked = capture.train_frames[0], []
+
+    def camera(frame):
+        looked.append(frame)
+        return capture.camera(frame)
+
+    def seen_of(count):
+        looked.clear()
+        return seen_by(model, SimpleNamespace(train_frames=(frame,) * count, camera=camera))
+
+    one = seen_of(1)
+    monkeypatch.setattr("evsplat.models.seen.MOST_FRAMES", 2)
+    seven = seen_of(7)
+    assert len(looked) == 2
+    torch.testing.assert_close(seven.weight, 7 * one.weight)
+    torch.testing.assert_close(seven.directions, 7 * one.directions)
+    assert float(seven.squares.sum()) == pytest.approx(7 * float(one.squares.sum()), rel=0.2)
 
 
 def test_a_run_is_drawn_filled_and_goes_on_unfilled(tiny_capture, tmp_path):

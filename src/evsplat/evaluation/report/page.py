@@ -18,6 +18,7 @@ from evsplat.evaluation.report.figures import (
     references,
 )
 from evsplat.evaluation.report.frames import frame_by_frame, test_frames
+from evsplat.evaluation.report.made import films_and_pages
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import words_of
 from evsplat.pages import (
@@ -67,6 +68,7 @@ def page(source: Source) -> str:
         _curves(source),
         configuration(source),
         made_with(source),
+        films_and_pages(source),
         _next_steps(source),
     ]
     title = f"{source.metrics['capture']} · {source.metrics['method']}"
