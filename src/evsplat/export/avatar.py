@@ -20,6 +20,7 @@ from evsplat.camera import Camera
 from evsplat.errors import DataError
 from evsplat.export.cloud import SplatCloud, cloud_of
 from evsplat.export.formats import write_ply
+from evsplat.export.presets import joint_labels, presets, quaternions_of
 from evsplat.files import new_folder, write_json, write_text
 from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.models.correctives import Correctives
@@ -177,6 +178,7 @@ def avatar_document(
         },
         "skeleton": {
             "names": list(body.joint_names),
+            "labels": joint_labels(body),
             "parents": body.parents.tolist(),
             "rest": body.rest_joints.tolist(),
             "rest_from_canonical": [row.tolist() for row in inverse.float()],
@@ -188,6 +190,14 @@ def avatar_document(
         },
         "light": None if light is None else _light(light),
         "correctives": None if correctives is None else _correctives(correctives),
+        "presets": [
+            {
+                "name": preset.name,
+                "rotations": quaternions_of(preset.rotations),
+                "transl": preset.transl.tolist(),
+            }
+            for preset in presets(track, int(track.times_us[len(track.times_us) // 2]))
+        ],
         "clips": [
             {
                 "name": clip.name,

@@ -11,7 +11,7 @@ const clips = avatar.clips.map((clip) => ({
   length: (clip.count - 1) / clip.rate_hz,
 }));
 const joints = skeleton.names.length;
-const state = { clip: 0, time: 0, playing: true, speed: 1, rest: false, scene: true, exact: null };
+const state = { clip: 0, time: 0, playing: true, speed: 1, rest: false, scene: true, exact: null, preset: null };
 
 const canvas = find("picture");
 const chosen = bytes(avatar.skin.bones), weights = bytes(avatar.skin.weights);
@@ -43,6 +43,7 @@ try {
 const orbit = new Orbit(canvas, avatar.up);
 
 function pose() {
+  if (state.preset) return state.preset;
   const moving = skeleton.at(clips[state.clip], state.time);
   if (!state.rest) return moving;
   return { rotations: moving.rotations.map((turn, joint) => (joint ? [1, 0, 0, 0] : turn)), transl: moving.transl };
@@ -84,12 +85,21 @@ function seek(seconds) {
   find("clock").textContent = `${seconds.toFixed(2)} s`;
 }
 
+// A pose of the list in place of the motion; null goes back to it.
+function choosePreset(number) {
+  if (number !== null) play(false);
+  state.preset = number === null ? null : avatar.presets[number];
+  [...find("presets").children].forEach((button, k) => button.setAttribute("aria-pressed", String(k === number)));
+}
+
 function play(on) {
+  if (on) choosePreset(null);
   state.playing = on;
   find("play").textContent = on ? "❚❚" : "▶";
 }
 
 function chooseClip(number) {
+  choosePreset(null);
   state.clip = number;
   find("time").max = clips[number].length;
   find("clip").value = number;
@@ -109,14 +119,24 @@ function setOffset(joint, degrees) {
   showJoint();
 }
 
-skeleton.names.forEach((name, joint) => find("joint").add(new Option(name, joint)));
+// Joints that people have a name for come first; the others keep that of the file.
+const labels = avatar.skeleton.labels;
+const named = skeleton.names.map((_, joint) => joint).sort((a, b) => !labels[a] - !labels[b] || a - b);
+named.forEach((joint) => find("joint").add(new Option(labels[joint] ?? skeleton.names[joint], joint)));
+avatar.presets.forEach(({ name }, number) => {
+  const button = document.createElement("button");
+  button.textContent = name;
+  button.onclick = () => choosePreset(state.preset === avatar.presets[number] ? null : number);
+  find("presets").append(button);
+});
+choosePreset(null);
 clips.forEach((clip, number) => find("clip").add(new Option(clip.name, number)));
 find("clip").hidden = clips.length < 2;
 find("scene-row").hidden = !avatar.scene;
 find("note").textContent = avatar.note ?? "";
 document.title = avatar.capture ? `${avatar.capture} – avatar` : "Avatar";
 find("play").onclick = () => play(!state.playing);
-find("time").oninput = (event) => { play(false); seek(Number(event.target.value)); };
+find("time").oninput = (event) => { choosePreset(null); play(false); seek(Number(event.target.value)); };
 find("clip").onchange = (event) => chooseClip(Number(event.target.value));
 find("speed").onchange = (event) => { state.speed = Number(event.target.value); };
 find("home").onclick = goHome;
@@ -156,7 +176,7 @@ requestAnimationFrame(frame);
 globalThis.avatarPlayer = {
   names: skeleton.names, clips: clips.map(({ name, length }) => ({ name, length })),
   seek: (seconds) => { play(false); seek(seconds); },
-  play, setOffset, chooseClip, orbit, draw,
+  play, setOffset, chooseClip, choosePreset, orbit, draw,
   showScene: (on) => { state.scene = on; },
   look: (camera) => { state.exact = camera; draw(); },
 };
