@@ -130,7 +130,8 @@ def _local(
             wanted = axes @ (np.array(direction) * [sign, 1, 1])
             turned[joint] = smallest_rotation(_unit(rest[end] - rest[joint]), _unit(wanted))
         turned[skeleton.limbs[f"{side}_foot"]] = np.eye(3)
-    local, world = np.tile(np.eye(3), (len(parents), 1, 1)), {}
+    local = np.tile(np.eye(3), (len(parents), 1, 1))
+    world: dict[int, np.ndarray] = {}
     for joint in topological_order(parents):
         above = world[parents[joint]] if parents[joint] >= 0 else np.eye(3)
         world[joint] = turned.get(joint, above)

@@ -112,10 +112,7 @@ def find_poses(
     capture = load_capture(path, needs_body=False)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
     focal: FocalFit | None = None
-    focal_px = search.focal_px
-    if search.focal == "auto":
-        camera = capture.camera(capture.frames[0])
-        focal_px = _USUAL_FOCAL * max(camera.width, camera.height)
+    focal_px = _first_focal(capture) if search.focal == "auto" else search.focal_px
     seen = _seen(capture, policy, focal_px)
     limit_s = _refinement_s(seen, search)
     stages = _Stages()
@@ -157,14 +154,13 @@ def find_poses(
         making.document["provenance"] = {**capture.provenance, "poses": made}
         page = poses_page(capture.name, seen, pictures, landmarks, track, fitted, made)
         write_text(making.folder / "poses.html", page)
-    return FoundPoses(
-        out,
-        track,
-        fitted,
-        landmarks,
-        stages.seconds,
-        _summary(out, track, landmarks, stages.seconds),
-    )
+    said = _summary(out, track, landmarks, stages.seconds)
+    return FoundPoses(out, track, fitted, landmarks, stages.seconds, said)
+
+
+def _first_focal(capture: Capture) -> float:
+    camera = capture.camera(capture.frames[0])
+    return _USUAL_FOCAL * max(camera.width, camera.height)
 
 
 def _landmarks(
