@@ -88,7 +88,8 @@ class FilmPlan:
         changes = [room.clear] if film.path in ("orbit", "swing") else []
         if surroundings is not None and cameras[0] is not cameras[-1]:
             changes.append(room.soften)
-        reconstruction = reconstruction.changed_by(*changes)
+        if changes:
+            reconstruction = reconstruction.changed_by(*changes)
         cameras = _of_height(cameras, film.size)
         frames = [FilmFrame(*fields) for fields in zip(names, times, clock, cameras, strict=True)]
         return cls(
