@@ -51,6 +51,7 @@ from evsplat.methods.settings import (
 from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start, scene_start
 from evsplat.models.discs import DiscModel
 from evsplat.models.discs.fill import filled
+from evsplat.models.discs.first_colours import first_colours
 from evsplat.objectives import (
     EventChange,
     EventNoise,
@@ -251,6 +252,11 @@ def build(
         picture = capture.median_background().to(device)
         steps = config.scene.prefit_steps
         fit_scene(model.gaussians, camera, picture, steps, low_pass=config.low_pass)
+    if fit:
+        colours = first_colours(model, capture)
+        with torch.no_grad():
+            gaussians = model.gaussians
+            gaussians.get_parameter(gaussians.colour)[gaussians.human, :3] = colours
 
     def renders(frame: Frame) -> int:
         motion = motion_px(capture.camera(frame), poses.track, frame)

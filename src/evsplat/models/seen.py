@@ -111,6 +111,17 @@ def shares_in(
     return gradient[0]
 
 
+@torch.no_grad()
+def facing(layers: Layers, normals: Float[Tensor, "H 3"], camera: Camera) -> Float[Tensor, " H"]:
+    """Cosine between the person's surface at the first time and the way to the camera.
+
+    ``normals``: of the surface in canonical space.
+    """
+    turned = (layers.transforms[0, :, :3, :3] @ normals[..., None])[..., 0]
+    toward = camera.center() - layers.human.means[0]
+    return (normalize(turned, dim=-1) * normalize(toward, dim=-1)).sum(-1)
+
+
 def draw_values(
     layers: Layers,
     camera: Camera,

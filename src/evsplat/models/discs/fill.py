@@ -11,23 +11,19 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.gaussians.surface_graph import closest, harmonic, laplacian, mirror_plane
+from evsplat.models.discs.first_colours import EVEN, LEAST, MOST, MOST_FRAMES
 from evsplat.models.discs.model import DiscModel
 from evsplat.models.layers import Layers
-from evsplat.models.seen import Seen, draw_values, shares_in
+from evsplat.models.seen import Seen, draw_values, facing, shares_in
 
-MOST_FRAMES = 24
-"""Training frames that hold the colours, spread evenly: drawing them takes the time."""
 STEPS = 5
 """Of conjugate gradients, twice."""
 MOST_BEHIND = 0.25
 """Largest difference to what neighbours say where a surface was seen from behind alone."""
-EVEN = 0.1
-"""Strength of a link between neighbours, against the squared shares that were seen (`Seen`)."""
 CALM = 0.0005
 """Weight of the squares of the light's numbers, the constant one apart, against the mean squared
 change of the factors that were seen."""
@@ -37,7 +33,6 @@ side that is filmed is mostly the one in the light. The weight is against all th
 _BACK = -0.1
 """Cosine to the camera under which a surface turns its back."""
 _FAST = 1e6
-_LEAST, _MOST = 0.5 / 255, 1 - 0.5 / 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +86,11 @@ def filled(
     # What is seen through the front alone must not glare; the front makes up for it.
     behind = facing < 0
     limited = told + (colours - told).clamp(-MOST_BEHIND, MOST_BEHIND)
-    start = torch.where(behind[:, None], limited, colours).clamp(_LEAST, _MOST)
+    start = torch.where(behind[:, None], limited, colours).clamp(LEAST, MOST)
     held = held.masked_fill(behind, _FAST)
     colours = closest(start, pictures.missing(start), pictures.twice, diagonal, held, STEPS)
     with torch.no_grad():
-        new.gaussians.get_parameter(gaussians.colour)[rows, :3] = colours.clamp(
-            _LEAST, _MOST
-        ).logit()
+        new.gaussians.get_parameter(gaussians.colour)[rows, :3] = colours.clamp(LEAST, MOST).logit()
     state = new.state_dict()
     return {name: state[name].detach().clone() for name in names}
 
@@ -120,9 +113,7 @@ def _views(
         with torch.no_grad():
             picture = draw_values(layers, camera, person, scene)
         weight = shares_in(layers, camera, generator, draws=0)[:, 0]
-        turned = normalize((layers.transforms[0, :, :3, :3] @ normals[..., None])[..., 0], dim=-1)
-        toward = normalize(camera.center() - layers.human.means[0], dim=-1)
-        away = (turned * toward).sum(-1) < _BACK
+        away = facing(layers, normals, camera) < _BACK
         views.append(_View(frame, camera, picture, weight, away))
     return views
 
