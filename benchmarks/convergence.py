@@ -5,8 +5,9 @@
 
 Every method is trained for 500, 1,000, 2,000 ... steps, each time with its whole schedule, until a
 doubling brings less than `--gain` dB of the person's crop on test frames. A baseline is trained
-twice at each length, with its released rates and with these times the square root of 15,000 /
-steps; the better of both is the one whose pictures come closer to the recorded training frames.
+twice at the two first lengths, with its released rates and with these times the square root of
+15,000 / steps; the better of both is the one whose pictures come closer to the recorded training
+frames, and from the third length on, where both grow alike, the one that was better last is run.
 What was made weaker for quick tables is undone: 50,000 points of a person at the start, HUGS's own
 limit of growth. A length that would take longer than `--hours`, by the one before it, is not
 begun. What exists is not made again, so the command can be stopped and gone on with; two of them
@@ -103,8 +104,10 @@ def curve(capture: Path, method: str, options: argparse.Namespace) -> list[dict[
     """The better cell of each length, until a doubling brings little or would take too long."""
     points: list[dict[str, Any]] = []
     steps = options.first
+    kinds = ("released", "scaled") if scaled_rates(method, steps) else ("released",)
     while steps <= options.most:
-        kinds = ("released", "scaled") if scaled_rates(method, steps) else ("released",)
+        if len(points) >= 2:
+            kinds = (points[-1]["rates"],)
         cells = [
             cell(capture, method, kind, steps, options.out, options.threads, options.seed)
             for kind in kinds

@@ -1,7 +1,7 @@
 """A run's person from eight directions in other motions: speckle, holes and shreds.
 
     python benchmarks/directions.py RUN [--motions NAME ...] [--times 4] [--size 360]
-        [--learned] [--out FOLDER]
+        [--learned] [--out FOLDER] [--avatar --node-modules FOLDER/node_modules]
 
 The person alone, as films show them, every 45 degrees around the body of each motion. Printed for
 each motion, over the directions: *speckle*, the mean step of Cb and Cr from pixel to pixel inside
@@ -9,13 +9,18 @@ the body's outline in one direction against that from the front, the larger of t
 behind (135 to 225 degrees) and of all; *holes*, the share of the outline's inside through which one
 sees (opacity below a half); *shreds*, the share of what is drawn that lies farther from the outline
 than 4 % of the picture's height, where clothes and hair are not. ``--learned`` shows what was
-learned, before the sides that nothing showed were filled. FOLDER/MOTION.png is a sheet, a row per
-time, a column per direction. The last line is one JSON object.
+learned, before the sides that nothing showed were filled. ``--avatar`` looks at the exported avatar
+page in headless Chromium instead (`npm install --prefix FOLDER playwright-core`).
+FOLDER/MOTION.png is a sheet, a row per time, a column per direction. The last line is one JSON
+object.
 """
 
 import argparse
 import json
 import math
+import shutil
+import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,21 +29,26 @@ import numpy as np
 import torch
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
-from evsplat.body import silhouette, up_axis
+import evsplat as ev
+from evsplat.body import BodyTrack, silhouette, up_axis
 from evsplat.camera import Camera
-from evsplat.evaluation.chroma import chroma
 from evsplat.film.following import follow
 from evsplat.film.motion import load_motion_of
-from evsplat.pictures import to_bytes
+from evsplat.pictures import chroma, to_bytes
 from evsplat.pictures.files import save_png
 from evsplat.training.checkpoint import load_checkpoint, load_latest, load_model
 from evsplat.training.run import Run, load_run
+from export import photograph, read, seen_from
 
 MOTIONS = ("walk", "run", "jump", "kick", "spin", "dance_a")
 DIRECTIONS = 8
 BEHIND = (3, 4, 5)
 OUTSIDE = 0.04
 """Of the picture's height: clothes and hair reach as far beyond the bare body."""
+View = tuple[int, Camera]
+"""Time, microseconds, and camera."""
+Picture = tuple[torch.Tensor, np.ndarray]
+"""sRGB (H, W, 3) over black and opacity (H, W)."""
 _INSET_PX = 2
 _GREY = 0.75
 
@@ -65,34 +75,76 @@ def steps(rgb: torch.Tensor, inside: np.ndarray) -> float:
     return float(np.concatenate(found).mean())
 
 
-def measured(run: Run, motion: str, options: argparse.Namespace) -> dict[str, float]:
-    """Figures of a motion; its sheet is written."""
-    recorded = run.reconstruction.track
-    track = load_motion_of(motion, recorded, fps=None, in_place=True)
+def by_model(run: Run, track: BodyTrack, views: list[View]) -> list[Picture]:
+    """The person as films show it."""
     drawn = run.reconstruction.following(track)
+    shown = [drawn.render(camera, [time], parts="human") for time, camera in views]
+    return [(picture.rgb[0], picture.alpha[0].numpy()) for picture in shown]
+
+
+def by_page(
+    motion: str, options: argparse.Namespace, track: BodyTrack, views: list[View]
+) -> list[Picture]:
+    """The person in the exported page: over black, and over white for its opacity."""
+    with tempfile.TemporaryDirectory() as folder:
+        site, out = Path(folder) / "site", Path(folder) / "pictures"
+        site.mkdir()
+        out.mkdir()
+        page = site / "avatar.html"
+        ev.export_run(options.run, "avatar", motion=motion, parts="human", out=page, device="cpu")
+        first = int(track.times_us[0])
+        shots = [
+            {
+                "page": page.name,
+                "clip": 1,
+                "seconds": (time - first) / 1e6,
+                "timed": 0,
+                "camera": seen_from(camera, np.eye(3)) | {"background": [ground] * 3},
+                "picture": f"{k}-{ground}.png",
+            }
+            for k, (time, camera) in enumerate(views)
+            for ground in (0, 1)
+        ]
+        photograph(options, site, shots, out)
+        pictures = []
+        for k in range(len(views)):
+            black, white = (read(out / f"{k}-{ground}.png") for ground in (0, 1))
+            pictures.append((torch.from_numpy(black), 1 - (white - black).mean(-1)))
+    return pictures
+
+
+def measured(
+    run: Run, track: BodyTrack, draw: Callable[[list[View]], list[Picture]], out: Path,
+    options: argparse.Namespace,
+) -> dict[str, float]:  # fmt: skip
+    """Figures of a motion; its sheet is written to ``out``."""
     first, last = int(track.times_us[0]), int(track.times_us[-1])
     times = np.linspace(first, last, options.times + 2)[1:-1].astype(int).tolist()
     start = sized(run.capture.camera(run.capture.train_frames[0]), options.size)
-    speckle = np.zeros((len(times), DIRECTIONS))
-    holes, shreds, rows = [], [], []
-    for row, time in enumerate(times):
-        pictures = []
-        for column in range(DIRECTIONS):
-            angle = 2 * math.pi * column / DIRECTIONS
-            camera = follow(start, track, [time], up_axis(recorded), partial(turned_by, angle))[0]
-            shown = drawn.render(camera, [time], parts="human")
-            alpha = shown.alpha[0].numpy()
-            outline = silhouette(track.vertices(time), track.body.faces, camera).numpy()
-            inside = binary_erosion(outline, iterations=_INSET_PX)
-            speckle[row, column] = steps(shown.rgb[0], inside)
-            holes.append(float((alpha[inside] < 0.5).mean()))
-            away = distance_transform_edt(~binary_dilation(outline)) > OUTSIDE * options.size
-            shreds.append(float(alpha[away].sum() / alpha.sum()))
-            pictures.append(shown.rgb[0] + _GREY * (1 - shown.alpha[0][..., None]))
-        rows.append(torch.cat(pictures, 1))
-    save_png(options.out / f"{motion}.png", to_bytes(torch.cat(rows).clamp(0, 1)))
-    front = speckle[:, :1].mean()
-    against = speckle.mean(0) / front
+    up = up_axis(run.reconstruction.track)
+    angles = [2 * math.pi * column / DIRECTIONS for column in range(DIRECTIONS)]
+    views = [
+        (time, follow(start, track, [time], up, partial(turned_by, angle))[0])
+        for time in times
+        for angle in angles
+    ]
+    speckle: list[float] = []
+    holes, shreds, pictures = [], [], []
+    for (time, camera), (rgb, alpha) in zip(views, draw(views), strict=True):
+        outline = silhouette(track.vertices(time), track.body.faces, camera).numpy()
+        inside = binary_erosion(outline, iterations=_INSET_PX)
+        speckle.append(steps(rgb, inside))
+        holes.append(float((alpha[inside] < 0.5).mean()))
+        away = distance_transform_edt(~binary_dilation(outline)) > OUTSIDE * options.size
+        shreds.append(float(alpha[away].sum() / alpha.sum()))
+        pictures.append(rgb + _GREY * (1 - torch.from_numpy(alpha)[..., None]))
+    rows = [
+        torch.cat(pictures[row * DIRECTIONS : (row + 1) * DIRECTIONS], 1)
+        for row in range(len(times))
+    ]
+    save_png(out, to_bytes(torch.cat(rows).clamp(0, 1)))
+    table = np.array(speckle).reshape(len(times), DIRECTIONS)
+    against = table.mean(0) / table[:, 0].mean()
     return {
         "speckle_behind_ratio": round(float(against[list(BEHIND)].max()), 3),
         "speckle_most_ratio": round(float(against.max()), 3),
@@ -112,7 +164,12 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=360)
     parser.add_argument("--learned", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("bench/directions"))
+    parser.add_argument("--avatar", action="store_true")
+    parser.add_argument("--node-modules", type=Path)
+    parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium")
     options = parser.parse_args()
+    if options.avatar and (options.learned or options.node_modules is None):
+        parser.error("--avatar takes --node-modules, and not --learned")
     options.out.mkdir(parents=True, exist_ok=True)
     run = load_run(options.run)
     if options.learned:
@@ -122,7 +179,11 @@ def main() -> None:
         load_model(run.reconstruction.model, tensors, state["human_count"])
     found = {}
     for motion in options.motions:
-        found[motion] = measured(run, motion, options)
+        recorded = run.reconstruction.track
+        track = load_motion_of(motion, recorded, fps=None, in_place=not options.avatar)
+        draw = partial(by_page, motion, options) if options.avatar else partial(by_model, run)
+        out = options.out / f"{motion}.png"
+        found[motion] = measured(run, track, partial(draw, track), out, options)
         print(f"{motion:10}", *(f"{name} {value:.2f} " for name, value in found[motion].items()))
     keys = found[options.motions[0]]
     worst = {key: max(values[key] for values in found.values()) for key in keys}

@@ -1,12 +1,16 @@
-"""Exported files drawn by renderers that others wrote, and the avatar page, beside our own picture.
+r"""Exported files drawn by renderers of others, and the avatar page, beside our own picture.
 
-    npm install --prefix FOLDER @sparkjsdev/spark@2.2.0 three@0.187.0 playwright-core
+    npm install --prefix FOLDER @sparkjsdev/spark@2.2.0 three@0.187.0 playwright-core \
+        @babylonjs/core@9.35.0 @babylonjs/loaders@9.35.0 gsplat@1.2.9 playcanvas@2.23.3 \
+        @mkkellogg/gaussian-splats-3d@0.4.7
     python benchmarks/export.py RUN --node-modules FOLDER/node_modules [--out PICTURES]
 
 A test frame is exported as .ply, .spz and .splat, drawn by Spark (WebGL) in headless Chromium
 from the recording camera, and compared with evsplat's own picture: with Spark set to the rules of
-3DGS, and as it comes. The avatar page is compared with the same avatar drawn by our rasteriser,
-and timed. The files are also read by gsply where that is installed. The last line is JSON.
+3DGS, and as it comes. Babylon.js, gsplat.js, PlayCanvas and GaussianSplats3D, all as they come,
+draw the .ply, and it exported with `--low-pass 0.075` and `0.3`. The avatar page is compared with
+the same avatar drawn by our rasteriser, and timed. The files are also read by gsply where that is
+installed. The last line is JSON.
 """
 
 import argparse
@@ -39,6 +43,8 @@ CHROMIUM = (
     "--disable-sync --no-first-run"
 ).split()
 HERE = Path(__file__).parent / "browser"
+VIEWERS = ("babylon", "gsplat", "playcanvas", "gaussian-splats-3d")
+"""Pages beside `HERE` that draw a .ply by the defaults of its viewer."""
 
 
 def main() -> None:
@@ -79,13 +85,23 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
                 {"page": "spark.html", "file": f"run.{kind}", "rules": rules, "camera": view,
                  "low_pass": source.low_pass, "picture": f"spark-{kind}-{rules}.png"}
             )  # fmt: skip
+    for low_pass in (None, 0.075, 0.3):
+        name = "run.ply" if low_pass is None else f"run-{low_pass}.ply"
+        options = {"frame": frame.name, "low_pass": low_pass, "device": "cpu"}
+        ev.export_run(run.path, "ply", out=site / name, **options)
+        view = seen_from(camera, file_rotation(source.track, "ply", None))
+        for viewer in VIEWERS:
+            shots.append(
+                {"page": f"{viewer}.html", "file": name, "camera": view,
+                 "picture": f"{viewer}{name[3:-4]}.png"}
+            )  # fmt: skip
     page = site / "avatar.html"
     ev.export_run(arguments.run, "avatar", parts="all", out=page, device="cpu")
     first = min(f.mid_us for f in capture.frames)
     seconds = (frame.mid_us - first) / 1e6
     shots.append(
-        {"page": "avatar.html", "seconds": seconds, "camera": seen_from(camera, np.eye(3)),
-         "picture": "avatar.png"}
+        {"page": "avatar.html", "clip": 0, "seconds": seconds, "timed": 10,
+         "camera": seen_from(camera, np.eye(3)), "picture": "avatar.png"}
     )  # fmt: skip
     seen = photograph(arguments, site, shots, out)
 
@@ -124,7 +140,8 @@ def photograph(
     arguments: argparse.Namespace, site: Path, shots: list[dict], out: Path
 ) -> dict[str, float]:
     """Let Chromium draw the shots from a local server; returns what the script measured."""
-    shutil.copy(HERE / "spark.html", site)
+    for page in (*HERE.glob("*.html"), HERE / "settled.js"):
+        shutil.copy(page, site)
     (site / "node_modules").symlink_to(arguments.node_modules.resolve())
     handler = partial(QuietHandler, directory=str(site))
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)

@@ -60,7 +60,14 @@ def test_unsorted_joints_and_their_poses_move_together():
     errors = rng.random((3, 9)), rng.random((3, 3))
     stated = {"source": "markers", "pose_std_rad": errors[0], "transl_std_m": errors[1]}
     file = body_file(times_us=times, poses=poses, transl=transl, **rig, **stated)
-    track = load_body_track(SimpleNamespace(body_file=file))
+    views = [torch.eye(4), torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))]
+    capture = SimpleNamespace(
+        body_file=file,
+        frames=[0, 1, 1, 1],
+        camera=lambda frame: SimpleNamespace(world_to_camera=views[frame]),
+    )
+    track = load_body_track(capture)
+    assert track.camera_up.tolist() == [0.0, 0.5, 0.0]
     order = load_body(file)[1]
     assert order != sorted(order)
     assert np.array_equal(track.errors.joint_rad, errors[0][:, order])

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from evsplat.objectives import Exposure, renders_for
+from evsplat.objectives.exposure import CHROMA_START
 from evsplat.similarity import ssim
 
 
@@ -41,6 +42,7 @@ def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
     pictures = torch.rand(4, 20, 24, 3, generator=generator, dtype=torch.float64)
     observed = torch.rand(20, 24, 3, generator=generator, dtype=torch.float64)
     step = SimpleNamespace(
+        nominal=CHROMA_START,
         transfer="power",
         frame=frame(),
         times_us=(500, 2_000, 16_000, 30_999),
@@ -51,6 +53,12 @@ def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
     blurry = (pictures[1:] ** 2.2).mean(0) ** (1 / 2.2)
     assert float(terms["l1"]) == pytest.approx(float((blurry - observed).abs().mean()), rel=1e-9)
     assert float(terms["dssim"]) == pytest.approx(1 - float(ssim(blurry, observed)), rel=1e-9)
+    # The matrix of JFIF, to its six digits.
+    matrix = torch.tensor([[-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]]).double()
+    tint = ((blurry - observed) @ matrix.T).abs().mean()
+    assert float(terms["chroma"]) == pytest.approx(float(tint), rel=1e-5)
+    step.nominal = CHROMA_START - 1
+    assert set(Exposure(None, lambda frame: 3, generator).loss(step)) == {"l1", "dssim"}
 
 
 @pytest.mark.parametrize("before", [0, 1, 3])
@@ -70,6 +78,7 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
     coded = pictures.clone().requires_grad_()
     observed = torch.rand(16, 16, 3, generator=generator, dtype=torch.float64)
     step = SimpleNamespace(
+        nominal=CHROMA_START,
         transfer="power",
         frame=frame(),
         times_us=tuple(times),
@@ -88,6 +97,7 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
 def test_a_black_exposure_has_a_finite_gradient():
     pictures = torch.zeros(3, 16, 16, 3, requires_grad=True)
     step = SimpleNamespace(
+        nominal=CHROMA_START,
         transfer="power",
         frame=frame(),
         times_us=(2_000, 16_000, 30_000),

@@ -17,6 +17,10 @@ from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.devices import send
 from evsplat.errors import DataError
 
+_MOST_KEYS = 24
+"""Key poses that tell which way is up, at most."""
+_CAMERA_UP_WEIGHT = 0.5
+
 
 class BodyTrack:
     """Pose of a body over time, twice continuously differentiable between first and last key.
@@ -35,6 +39,7 @@ class BodyTrack:
         *,
         source: str = "body track",
         errors: PoseErrors | None = None,
+        camera_up: Float[Tensor, "3"] | None = None,
     ) -> None:
         times = np.asarray(times_us, dtype=np.int64)
         poses = np.asarray(poses, dtype=np.float64)
@@ -45,6 +50,9 @@ class BodyTrack:
         self.body = body
         self.errors = errors
         """How far the key poses err; None where nobody says."""
+        self.camera_up = camera_up
+        """Mean of the unit vectors in the world that lie upwards in the pictures of the cameras
+        that recorded the body; None where none did."""
         self.times_us = times
         self.poses, self.transl = poses, transl
         device = body.rest_joints.device
@@ -92,7 +100,11 @@ class BodyTrack:
 
 
 def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
-    """The signed world axis nearest to the body's own up direction in the middle of the track."""
+    """The signed world axis nearest to the body's own up direction, on average over the track.
+
+    Somebody who turns cartwheels points nowhere on average; so what the cameras show upwards counts
+    as well, half as much, since cameras may be turned by 90 degrees.
+    """
     body = track.body
     legs = find_legs(body.parents.tolist(), body.joint_names)
     rest = body.canonical_vertices()
@@ -101,8 +113,12 @@ def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
         below = rest[:, tallest] < rest[:, tallest].mean()
     else:
         below = _leg_share(body, (legs.left, legs.right)) > 0.5
-    posed = track.vertices(int(track.times_us[len(track.times_us) // 2]))
-    direction = posed[~below].mean(0) - posed[below].mean(0)
+    times = track.times_us[:: -(-len(track.times_us) // _MOST_KEYS)]
+    posed = [track.vertices(int(time)) for time in times]
+    directions = torch.stack([v[~below].mean(0) - v[below].mean(0) for v in posed]).cpu()
+    direction = torch.nn.functional.normalize(directions, dim=1).mean(0)
+    if track.camera_up is not None:
+        direction = direction + _CAMERA_UP_WEIGHT * track.camera_up.to(direction)
     up = torch.zeros(3)
     axis = int(direction.abs().argmax())
     up[axis] = direction[axis].sign()

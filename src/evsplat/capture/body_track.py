@@ -3,6 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from evsplat.body.body import Body
 from evsplat.body.make import default_body, make_body
@@ -43,7 +46,14 @@ def load_body_track(capture: Capture | TrainingCapture, *, dense: bool = False) 
         file.transl,
         source=str(file.path),
         errors=errors,
+        camera_up=_camera_up(capture),
     )
+
+
+def _camera_up(capture: Capture | TrainingCapture) -> Float[Tensor, "3"]:
+    """Mean over the frames of the unit vectors in the world that lie upwards in their pictures."""
+    upwards = [-capture.camera(frame).world_to_camera[1, :3] for frame in capture.frames]
+    return torch.stack(upwards).mean(0).cpu()
 
 
 def load_body(file: BodyFile) -> tuple[Body, list[int]]:

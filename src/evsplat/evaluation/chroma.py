@@ -5,16 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from evsplat.evaluation.protocols import PSNR_CEILING_DB, eight_bit
-from evsplat.pictures import BT601
-
-_LARGEST_BLUE, _LARGEST_RED = 2 * (1 - BT601[2]), 2 * (1 - BT601[0])
-
-
-def chroma(rgb: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 2"]:
-    """Cb and Cr (ITU-R BT.601) of sRGB values, each of range 1."""
-    luma = rgb @ torch.tensor(BT601, dtype=rgb.dtype, device=rgb.device)
-    blue, red = (rgb[..., 2] - luma) / _LARGEST_BLUE, (rgb[..., 0] - luma) / _LARGEST_RED
-    return torch.stack((blue, red), -1)
+from evsplat.pictures import chroma
 
 
 def chroma_psnr(

@@ -28,6 +28,8 @@ _SHADOW, _SHADOW_M = 0.4, 0.4
 """Depth and standard deviation of the soft spot below the person."""
 _CLEAR_M = (0.45, 0.15)
 """What is nearer to the camera than the person's nearest point by these begins and ends to fade."""
+_COARSE_PX = 64
+"""Side of the pictures in a hurry, at least: with less the horizon and the spot are steps."""
 _FLOOR_STAYS_M = 0.12
 """Height above the floor of what never fades: it hides nobody."""
 _EDGE = 0.08
@@ -78,9 +80,11 @@ class Room:
         return torch.where(below[..., None], floor * spot[..., None], colour)
 
     def behind_coarsely(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
-        """The same, computed for one pixel in 16 and smooth between: for pictures in a hurry."""
+        """The same, smooth between one pixel in 16 of a large picture: for pictures in a hurry."""
         K = camera.K.clone()
-        width, height = max(2, camera.width // 4), max(2, camera.height // 4)
+        width, height = (
+            max(size // 4, min(size, _COARSE_PX)) for size in (camera.width, camera.height)
+        )
         K[0] *= width / camera.width
         K[1] *= height / camera.height
         picture = self.behind(replace(camera, width=width, height=height, K=K), time_us)

@@ -10,11 +10,14 @@ from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.devices import DeviceCache
 from evsplat.objectives.base import Objective, Step, picture
-from evsplat.pictures import encode, mean_light
+from evsplat.pictures import chroma, encode, mean_light
 from evsplat.similarity.psnr_ssim import l1_and_ssim
 
 DARKEST_LINEAR = 1e-6
 """Below this the slope of the transfer curve grows without bound; an 8-bit level is 5e-6."""
+CHROMA_START = 8_000
+"""First nominal iteration of the colour differences. While limbs are not yet where they belong they
+would rather fade than show a tint in the wrong place."""
 VERTEX_STRIDE = 13
 """Every so many vertices are enough to know how far the body moves."""
 
@@ -39,6 +42,8 @@ def renders_for(motion: float, px_per_render: float, most: int) -> int:
 
 class Exposure(Objective):
     """L1 and D-SSIM between a blurry frame and the mean, in linear light, of K renders.
+
+    In the end L1 of Cb and Cr as well, which nothing else decides: events see luminance alone.
 
     The exposure is cut into K equal strata; a render lies at a random place of each but the middle
     one, whose is the middle. K grows with how far the body moves in the exposure, so that
@@ -69,13 +74,15 @@ class Exposure(Objective):
         data.prefetch(*picture(self.capture, frame))
 
     def loss(self, step: Step) -> dict[str, Tensor]:
-        """``l1`` and ``dssim`` of the drawn frame."""
+        """``l1`` and ``dssim`` of the drawn frame, from `CHROMA_START` on ``chroma`` as well."""
         start, end = step.frame.exposure_us
         first, last = (bisect_left(step.times_us, time) for time in (start, end))
         # Times of other objectives lie outside. A shutter adds light up before it is coded.
         mean = mean_light(step.rgb[first:last], step.transfer)
-        l1, similarity = l1_and_ssim(
-            encode(mean.clamp_min(DARKEST_LINEAR), step.transfer),
-            step.observed(step.frame),
-        )
-        return {"l1": l1, "dssim": 1 - similarity}
+        drawn = encode(mean.clamp_min(DARKEST_LINEAR), step.transfer)
+        observed = step.observed(step.frame)
+        l1, similarity = l1_and_ssim(drawn, observed)
+        terms = {"l1": l1, "dssim": 1 - similarity}
+        if step.nominal >= CHROMA_START:
+            terms["chroma"] = chroma(drawn - observed).abs().mean()
+        return terms

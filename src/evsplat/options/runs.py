@@ -187,7 +187,7 @@ class ExportOptions:
     low_pass: Annotated[
         float | None, Within(0, 1), option("PX2", default="what training added")
     ] = None
-    """Make up for a viewer that adds so many px^2 (most: 0.3), at the recording's size."""
+    """Make up for a viewer that adds so many px^2, at the recording's size (docs/export.md)."""
     motion: Annotated[str | None, option("NAME", default="the recorded one alone")] = None
     """Another motion for avatar, bvh or skeleton, as 'evsplat render' takes it."""
     fps: Annotated[float, Within(1, 120), option("HZ")] = 24.0

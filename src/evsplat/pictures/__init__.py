@@ -4,6 +4,7 @@ from evsplat.pictures.colours import error_map, signed_map, to_bytes
 from evsplat.pictures.light import (
     BT601,
     Transfer,
+    chroma,
     decode,
     encode,
     log_brightness,
@@ -18,6 +19,7 @@ from evsplat.pictures.light import (
 __all__ = [
     "BT601",
     "Transfer",
+    "chroma",
     "decode",
     "encode",
     "error_map",

@@ -79,6 +79,14 @@ def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
     return REC709[0] * red + REC709[1] * green + REC709[2] * blue
 
 
+def chroma(coded: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 2"]:
+    """Cb and Cr (ITU-R BT.601) of coded RGB, each of range 1."""
+    red, green, blue = coded.unbind(-1)
+    luma = BT601[0] * red + BT601[1] * green + BT601[2] * blue
+    largest_blue, largest_red = 2 * (1 - BT601[2]), 2 * (1 - BT601[0])
+    return torch.stack(((blue - luma) / largest_blue, (red - luma) / largest_red), -1)
+
+
 def mean_light(
     coded: Sequence[Float[Tensor, "H W 3"]], transfer: Transfer = "power"
 ) -> Float[Tensor, "H W 3"]:

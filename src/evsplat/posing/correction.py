@@ -84,6 +84,7 @@ class Correction(nn.Module):
             transl.double().numpy(),
             source="corrected motion",
             errors=errors,
+            camera_up=self.track.camera_up,
         )
 
     @property

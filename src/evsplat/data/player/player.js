@@ -72,7 +72,7 @@ function draw() {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
   const columns = new Float32Array([0, 1, 2, 3].flatMap((c) => view.map((row) => row[c])));
   const count = state.scene ? renderer.count : avatar.person.count;
-  const background = state.exact || (avatar.scene && state.scene) ? [0, 0, 0] : [0.08, 0.086, 0.1];
+  const background = state.exact?.background ?? (state.exact || (avatar.scene && state.scene) ? [0, 0, 0] : [0.08, 0.086, 0.1]);
   const posed = pose();
   const shares = correctives
     ? correctives.shares(posed.rotations.map((_, joint) => skeleton.turned(posed.rotations, joint))) : [];
