@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import UInt8
 from PIL import Image
 
@@ -44,7 +45,11 @@ def write_video(
     with atomic_path(path) as temporary:
         container = av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"})
         even = map(_even, pictures)
-        count = _encode(container, "libx264", even, fps, "ITU709", crf=str(crf), preset=preset)
+        options = {"crf": str(crf), "preset": preset}
+        if torch.backends.cpu.get_cpu_capability() == "AVX512":
+            # With AVX-512 the macroblock tree of PyAV's x264 differs from run to run.
+            options["x264-params"] = "asm=avx2"
+        count = _encode(container, "libx264", even, fps, "ITU709", **options)
         if not count:
             raise DataError(f"{path}: there is no picture to write.")
     return count
