@@ -91,3 +91,25 @@ def test_untrained_rows_come_first_and_only_once(tmp_path, tiny_capture):
         make_plan(suite, BenchFolder(tmp_path), captures=captures, only=["b"])
     with pytest.raises(ConfigError, match="--captures: two captures are named one"):
         make_plan(suite, BenchFolder(tmp_path), captures=[captures[0], captures[0]])
+
+
+def test_a_row_has_its_own_number_of_steps_unless_the_bench_is_given_one(tmp_path, tiny_capture):
+    suite = read_suite(
+        write(
+            tmp_path,
+            "name: s\niterations: 40\nrows: [{name: a, method: paper}, "
+            "{name: b, method: paper, iterations: 10}, {name: m, method: median_background}]",
+        )
+    )
+
+    captures = [tiny_capture("one")]
+
+    def steps(**options) -> dict[str, tuple[int | None, float | None]]:
+        plan = make_plan(suite, BenchFolder(tmp_path), captures=captures, **options)
+        return {cell.row: (cell.iterations, cell.max_minutes) for cell in plan.cells}
+
+    assert steps() == {"a": (40, None), "b": (10, None), "m": (None, None)}
+    assert steps(iterations=7) == {"a": (7, None), "b": (7, None), "m": (None, None)}
+    assert steps(max_minutes=2) == {"a": (None, 2), "b": (None, 2), "m": (None, None)}
+    both = steps(max_minutes=2, iterations=7)
+    assert both == {"a": (7, 2), "b": (7, 2), "m": (None, None)}

@@ -50,8 +50,8 @@ def make_plan(
 ) -> Plan:
     """Cells of a suite; what options or ``changes`` give replaces what the suite says.
 
-    A time limit replaces the suite's number of steps unless a number is given as well. ``named`` is
-    how the suite was asked for, where that is not its name.
+    A time limit or a number of steps replaces the numbers of steps of the suite and of its rows.
+    ``named`` is how the suite was asked for, where that is not its name.
 
     Raises:
         ConfigError: A row does not exist, or a number is out of range.
@@ -63,10 +63,10 @@ def make_plan(
     iterations, seeds, only = options.iterations, options.seeds, options.only
     suite = replace(suite, draw=draw)
     suite = _with_captures(suite, options)
-    if options.max_minutes is not None:
-        suite = replace(suite, max_minutes=options.max_minutes, iterations=iterations)
-    elif iterations is not None:
-        suite = replace(suite, iterations=iterations)
+    if options.max_minutes is not None or iterations is not None:
+        minutes = options.max_minutes or suite.max_minutes
+        rows = tuple(replace(row, iterations=None) for row in suite.rows)
+        suite = replace(suite, rows=rows, iterations=iterations, max_minutes=minutes)
     if seeds:
         suite = replace(suite, seeds=tuple(dict.fromkeys(seeds)))
     if only:
@@ -184,7 +184,7 @@ def _cell(suite: Suite, source: CaptureSource, row: SuiteRow, seed: int) -> Cell
         row.method,
         row.restore,
         row.settings if trains else (),
-        suite.iterations if trains else None,
+        (row.iterations or suite.iterations) if trains else None,
         suite.max_minutes if trains else None,
         row.backdrop,
         None if pictures is None else str(pictures.resolve()),

@@ -56,6 +56,8 @@ class SuiteRow:
     black says nothing on a full frame."""
     settings: tuple[str, ...] = ()
     """Settings of the method as for ``--set``: ``event_weight=0``."""
+    iterations: Annotated[int | None, AtLeast(1)] = None
+    """Training steps of this row in place of the suite's: methods need different numbers."""
     published: Published | None = None
     pictures: str | None = None
     """Folder with pictures that were made elsewhere, for method ``pictures``: one folder per
@@ -91,7 +93,7 @@ class Suite:
     title: str = ""
     seeds: tuple[int, ...] = (0,)
     iterations: Annotated[int | None, AtLeast(1)] = None
-    """Training steps of every row; None: the method's own."""
+    """Training steps of every row that names none itself; None: the method's own."""
     max_minutes: Annotated[float | None, Above(0)] = None
     """Minutes of training of every cell; the schedule is shortened to be finished by then."""
     published: PublishedTable | None = field(default=None)
