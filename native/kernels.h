@@ -146,7 +146,7 @@ struct GaussianGrads {
     KERNEL(void, shadow_splat_backward, (const ShadowSplat&, float* grid, const SplatGrads&)) \
     /* Places [begin, end); back, it adds to grids and writes (lamps, kViewSums) sums and the shares'. */ \
     KERNEL(void, shadow_on_scene, (const ShadowLook&, size_t begin, size_t end, float* factor)) \
-    KERNEL(void, shadow_on_scene_backward, (const ShadowLook&, size_t begin, size_t end, const float* above, float* const* grids, float* sums, float* share)) \
+    KERNEL(void, shadow_on_scene_backward, (const ShadowLook&, size_t begin, size_t end, const float* above, float* const* grids, float* sums, float* share, float* places)) \
     KERNEL(void, shadow_on_body, (const ShadowLook&, size_t begin, size_t end, float* lit)) \
     KERNEL(void, shadow_on_body_backward, (const ShadowLook&, size_t begin, size_t end, const float* above, float* grid, float* sums)) \
     KERNEL(void, sensor_step, (const SensorPiece&))

@@ -163,6 +163,7 @@ void cast_shadow_backward(const Shadow& s, const ShadowPlaces& places, const flo
     // Of each lamp, time and piece.
     Buffer<float> grid_parts(slots * pieces * s.grid()), sum_parts(slots * pieces * kViewSums);
     Buffer<float> share_parts(slots * pieces);
+    Buffer<float> place_parts(grads.places ? s.times * places.count * 3 : 0);
     const auto slot = [&](size_t lamp, size_t time, size_t piece) { return (lamp * s.times + time) * pieces + piece; };
     run(threads, (s.layered ? slots : s.times) * pieces, [&](size_t task) {
         const size_t piece = task % pieces, begin = piece * size, end = std::min(places.count, begin + size);
@@ -180,13 +181,19 @@ void cast_shadow_backward(const Shadow& s, const ShadowPlaces& places, const flo
             return;
         }
         float sums[kMaxLamps * kViewSums], share[kMaxLamps];
-        kernels.shadow_on_scene_backward(looks.look, begin, end, above + time * places.count, to.data(), sums, share);
+        float* by_place = grads.places ? place_parts.data() + time * places.count * 3 : nullptr;
+        kernels.shadow_on_scene_backward(looks.look, begin, end, above + time * places.count, to.data(), sums, share,
+                                         by_place);
         for (size_t l = 0; l < count; ++l) {
             share_parts[slot(l, time, piece)] = share[l];
             std::copy_n(sums + l * kViewSums, kViewSums, sum_parts.data() + slot(l, time, piece) * kViewSums);
         }
     });
 
+    for (size_t i = 0; grads.places && i < places.count * 3; ++i) {
+        grads.places[i] = place_parts.data()[i];
+        for (size_t t = 1; t < s.times; ++t) grads.places[i] += place_parts.data()[t * places.count * 3 + i];
+    }
     struct Totals {
         double lamp[3] = {}, width = 0;
     };

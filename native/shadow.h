@@ -49,6 +49,7 @@ struct ShadowPlaces {
 
 struct ShadowGrads {
     float *body, *lamp, *width, *share;  // body may be null; share is null with layers; written
+    float* places;                       // (places, 3), summed over the times; null with layers, and may be; written
 };
 
 // Writes the grids (lamps, times, grid) and the result.

@@ -139,6 +139,14 @@ INLINE void places_of(const float* at, uint32_t count, F (&place)[3]) {
     for (int r = 0; r < 3; ++r) place[r] = gather<3>(at + r, count);
 }
 
+INLINE void store_places(float* to, const F (&place)[3], uint32_t count) {
+    for (int r = 0; r < 3; ++r) {
+        float one[W];
+        store(one, place[r]);
+        for (uint32_t l = 0; l < count; ++l) to[3 * l + r] = one[l];
+    }
+}
+
 // A coordinate between two cells; NaN is at the border.
 struct Between {
     I cell;
@@ -190,8 +198,9 @@ INLINE void scatter(float* plane, I index, F row, F column, F by, uint64_t lanes
     }
 }
 
-// Adds the gradient of W places on the plane (by metres there) and along the axis to a view's sums.
-INLINE void add_to_view(const LampView& view, const Seen& s, F by_row, F by_column, F by_b, F* sums) {
+// Adds the gradient of W places on the plane (by metres there) and along the axis to a view's sums, and to `place`
+// that of the places themselves.
+INLINE void add_to_view(const LampView& view, const Seen& s, F by_row, F by_column, F by_b, F* sums, F* place = nullptr) {
     const F by_u = by_row * kShadowScale, by_v = by_column * kShadowScale;
     const F by_spread = by_u * s.u + by_v * s.v, per = 1.f / s.along;
     const F u = by_u * s.spread, v = by_v * s.spread;
@@ -201,6 +210,7 @@ INLINE void add_to_view(const LampView& view, const Seen& s, F by_row, F by_colu
         sums[kByU + r] += u * s.q[r];
         sums[kByV + r] += v * s.q[r];
         sums[kByB + r] += b * s.q[r];
+        if (place) place[r] += u * view.across[0][r] + v * view.across[1][r] + b * view.axis[r];
     }
     sums[kU] += u, sums[kV] += v, sums[kB] += b;
 }
@@ -317,7 +327,7 @@ void shadow_on_scene(const ShadowLook& look, size_t begin, size_t end, float* fa
 }
 
 void shadow_on_scene_backward(const ShadowLook& look, size_t begin, size_t end, const float* above, float* const* grids,
-                              float* sums, float* share) {
+                              float* sums, float* share, float* places) {
     F view_sums[kMaxLamps][kViewSums] = {}, share_sums[kMaxLamps] = {};
     for (size_t n = begin; n < end; n += W) {
         const uint32_t count = lanes(n, end);
@@ -335,7 +345,7 @@ void shadow_on_scene_backward(const ShadowLook& look, size_t begin, size_t end, 
             before[l] = all;
             all *= light[l];
         }
-        F after = splat(1.f);
+        F after = splat(1.f), by_place[3] = {};
         for (int l = look.lamps - 1; l >= 0; --l) {
             const F by = before[l] * after;
             after *= light[l];
@@ -347,8 +357,9 @@ void shadow_on_scene_backward(const ShadowLook& look, size_t begin, size_t end, 
             scatter(grids[l], found[l].index, found[l].row, found[l].column, by_value, touched);
             const F by_b = by_depth * found[l].value * fade[l] * (1.f - fade[l]) * (1.f / kShadowFade);
             add_to_view(look.views[l], seen[l], by_value * found[l].by_row, by_value * found[l].by_column, by_b,
-                        view_sums[l]);
+                        view_sums[l], by_place);
         }
+        if (places) store_places(places + 3 * n, by_place, count);
     }
     for (int l = 0; l < look.lamps; ++l) {
         for (int k = 0; k < kViewSums; ++k) sums[l * kViewSums + k] = sum(view_sums[l][k]);

@@ -32,17 +32,19 @@ void py_cast(In body, In places, In lamps, In widths, std::optional<In> shares, 
 }
 
 void py_cast_backward(In body, In places, In lamps, In widths, std::optional<In> shares, float strength, In grids,
-                      In above, std::optional<Out> body_grad, Out lamps_grad, Out widths_grad,
-                      std::optional<Out> shares_grad, int threads) {
+                      In above, std::optional<Out> body_grad, std::optional<Out> places_grad, Out lamps_grad,
+                      Out widths_grad, std::optional<Out> shares_grad, int threads) {
     const Shadow shadow = shadow_of(body, lamps, widths, strength, !shares, grids);
     const ShadowPlaces at = places_of(shadow, places, shares, above.size());
     require(!body_grad || body_grad->size() == body.size(), "the body's gradient");
+    require(!places_grad || (!shadow.layered && places_grad->size() == places.size()), "the places' gradient");
     require(lamps_grad.size() == lamps.size() && widths_grad.size() == widths.size() &&
                 shares_grad.has_value() == shares.has_value() && (!shares || shares_grad->size() == shares->size()),
             "the lamps' gradients");
     nb::gil_scoped_release release;
     cast_shadow_backward(shadow, at, grids.data(), above.data(), threads,
-                         {data_of(body_grad), lamps_grad.data(), widths_grad.data(), data_of(shares_grad)});
+                         {data_of(body_grad), lamps_grad.data(), widths_grad.data(), data_of(shares_grad),
+                          data_of(places_grad)});
 }
 
 }  // namespace
@@ -55,8 +57,9 @@ void bind_shadow(nb::module_& m) {
           "Shadows of a body on the scene or, without shares, on itself; writes what going back needs.");
     m.def("cast_shadow_backward", &py_cast_backward, nb::arg("body"), nb::arg("places"), nb::arg("lamps"),
           nb::arg("widths"), nb::arg("shares").none(), nb::arg("strength"), nb::arg("grids"), nb::arg("above"),
-          nb::arg("body_grad").none(), nb::arg("lamps_grad"), nb::arg("widths_grad"), nb::arg("shares_grad").none(),
-          nb::arg("threads"), "Gradients of the body's points, the lamps, their widths and shares.");
+          nb::arg("body_grad").none(), nb::arg("places_grad").none(), nb::arg("lamps_grad"), nb::arg("widths_grad"),
+          nb::arg("shares_grad").none(), nb::arg("threads"),
+          "Gradients of the body's points, the scene's places, the lamps, their widths and shares.");
 }
 
 }  // namespace evsplat

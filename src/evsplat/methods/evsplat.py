@@ -232,7 +232,8 @@ def build(
     fit = purpose == "train"
     generator = start_of_randomness(seed)
     poses = prepare_poses(config.pose, capture, fit=fit)
-    times_us = [frame.mid_us for frame in capture.train_frames]
+    frames = capture.train_frames
+    times_us = [frame.mid_us for frame in frames]
     model = DiscModel(
         poses.track,
         times_us,
@@ -245,6 +246,7 @@ def build(
         lamps=config.lamps,
         self_shadow=config.self_shadow,
         scene_network=config.scene.kind == "random_cube",
+        camera=None if config.scene.kind == "random_cube" else capture.camera(frames[0]),
         residual=poses.correction,
         residual_start=config.pose.start,
     ).to(device)
@@ -344,6 +346,7 @@ def _learning(rates: DiscRates, model: DiscModel) -> Learning:
         (model.shading, rates.shading, False),
         (model.shadow, rates.shadow, False),
         (model.lamps, rates.shadow, False),
+        (model.relief, rates.shadow, False),
         (model.sensor, rates.sensor, False),
     )
     networks = [

@@ -115,11 +115,11 @@ def test_no_share_of_the_light_is_no_shadow():
     assert torch.equal(lit, torch.ones(1, 41, 41, dtype=torch.float64))
 
 
-def test_gradients_of_lamps_and_body_equal_finite_differences():
-    shadow, places = make(lamps=2), floor()[10:31:5, 10:31:5]
+def test_gradients_of_lamps_body_and_places_equal_finite_differences():
+    shadow, places = make(lamps=2), floor()[10:31:5, 10:31:5].clone().requires_grad_()
     parameters = dict(shadow.named_parameters())
 
-    def factor(body, lamps, *values):
+    def factor(body, places, lamps, *values):
         named = dict(zip(parameters, values, strict=True))
         return torch.func.functional_call(shadow, named, (body, places, lamps))
 
@@ -128,7 +128,7 @@ def test_gradients_of_lamps_and_body_equal_finite_differences():
     values = [value.detach().requires_grad_() for value in parameters.values()]
     on_body = column(1)[:, :5]
     # Bilinear look-up has kinks at the cells' borders, which a small step does not meet.
-    assert torch.autograd.gradcheck(factor, (body, lamps, *values), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(factor, (body, places, lamps, *values), eps=1e-7, atol=1e-5)
     with torch.no_grad():
         shadow.own_widths_log.fill_(-1.5)
     lit = lambda body, lamps: shadow.lit(body, on_body, lamps)  # noqa: E731
@@ -177,13 +177,14 @@ def test_the_compiled_shadow_and_its_gradients_are_those_of_the_plain_one(
     results = []
     for dtype in (torch.float64, torch.float32):
         shadow.to(dtype).zero_grad()
-        points, lights = (value.to(dtype, copy=True).requires_grad_() for value in (body, lamps))
+        given = (value.to(dtype, copy=True).requires_grad_() for value in (body, lamps, floor(0.1)))
+        points, lights, places = given
         if where == "scene":
-            result = shadow(points, floor(0.1).to(dtype), lights)
+            result = shadow(points, places, lights)
         else:
             result = shadow.lit(points.detach(), own.to(dtype), lights)
         (result * above.to(dtype)).sum().backward()
-        gradients = [points.grad, lights.grad, *(p.grad for p in shadow.parameters())]
+        gradients = [points.grad, lights.grad, places.grad, *(p.grad for p in shadow.parameters())]
         results.append([result, *(value.clone() for value in gradients if value is not None)])
     exact, compiled = results
     assert compiled[0].std() > 0.05

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from evsplat.body import BodyTrack, skin, up_axis
 from evsplat.capture import Camera, Frame
 from evsplat.gaussians import GaussianSet
+from evsplat.models.discs.relief import Relief, strengthened
 from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.models.discs.shadow import BodyShadow, Lamps
 from evsplat.models.drawing import Drawing, draw
@@ -33,6 +34,8 @@ CASTERS = 400
 """Points of the body that hide lights."""
 _PLACES_REFRESH = 8
 """Steps after which the places that shadows fall on are drawn anew."""
+_RELIEF_START = 500.0
+"""Nominal iteration from which shadows tell where the scene lies; lamps need to be found first."""
 _DIRECTION_DROPOUT = 0.5
 """Share of the steps that hide the view direction from the scene's network."""
 
@@ -66,6 +69,7 @@ class DiscModel(PosedModel):
         lamps: int,
         self_shadow: bool,
         scene_network: bool = False,
+        camera: Camera | None = None,
         residual: PoseCorrection | None = None,
         residual_start: float = 0.0,
     ) -> None:
@@ -76,6 +80,7 @@ class DiscModel(PosedModel):
         matters. It is told of the direction in half of the steps. The person's are then the first
         three of their features.
 
+        ``camera``: the recording one where it stands still, which sees no depth of its scene.
         ``frame_times_us``: mid-exposures of the training frames, for where the person goes.
         ``width`` of the non-rigid network, used from nominal iteration ``non_rigid_start`` on.
         ``pose_noise``: standard deviation of what training adds to the matrices that it sees.
@@ -101,6 +106,7 @@ class DiscModel(PosedModel):
             self.lamps = Lamps(middle, up_axis(track), lamps)
             casters = body.sample_surface(CASTERS, generator)
             self.shadow = BodyShadow(casters, lamps, on_body=self_shadow and shading)
+        self.relief = Relief(camera) if camera is not None and lamps else None
         self.shading: Shading | None = None
         if shading:
             radius = max(1.0, float((roots - middle).norm(dim=-1).max()))
@@ -287,4 +293,12 @@ class DiscModel(PosedModel):
         shadow, lamps = self.shadow, self.lamps
         if shadow is None or lamps is None or casters is None:
             return None
-        return lambda places: shadow(casters, places, lamps.places())
+        relief = self.relief
+        if relief is None or float(self.nominal) < _RELIEF_START:
+            return lambda places: shadow(casters, places, lamps.places())
+
+        def in_relief(places: Float[Tensor, "H W 3"]) -> Float[Tensor, "T H W"]:
+            there, exponents = relief(places)
+            return strengthened(shadow(casters, there, lamps.places()), exponents)
+
+        return in_relief

@@ -43,7 +43,7 @@ def shadow_on_scene(
     A lamp's ``shares`` of the light, in 0..1, gets lost times ``1 - exp(-depth)`` behind the points
     of the ``body``, Gaussians of standard deviation ``widths`` (metres).
     """
-    if _all_native(body, lamps, widths, shares) and _fixed(places):
+    if _all_native(body, lamps, widths, shares) and runs_native(places):
         factors: Tensor = _Cast.apply(body, places.flatten(0, 1), lamps, widths, shares)
         return factors.unflatten(1, places.shape[:2])
     views = _LampViews.of(lamps, body)
@@ -131,8 +131,9 @@ class _Cast(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         *given, grids = ctx.saved_tensors
-        body, _, lamps, widths, shares = given
+        body, places, lamps, widths, shares = given
         to_body = torch.empty_like(body) if ctx.needs_input_grad[0] else None
+        to_places = torch.empty_like(places) if ctx.needs_input_grad[1] else None
         to_shares = None if shares is None else torch.empty_like(shares)
         to_lamps, to_widths = torch.empty_like(lamps), torch.empty_like(widths)
         native.cast_shadow_backward(
@@ -141,12 +142,13 @@ class _Cast(torch.autograd.Function):
             grids,
             upstream[0].contiguous(),
             to_body,
+            to_places,
             to_lamps,
             to_widths,
             to_shares,
             torch.get_num_threads(),
         )
-        return to_body, None, to_lamps, to_widths, to_shares
+        return to_body, to_places, to_lamps, to_widths, to_shares
 
 
 @dataclass(frozen=True, eq=False)

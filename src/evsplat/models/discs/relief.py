@@ -1,0 +1,60 @@
+"""Where along the rays of a camera at rest its scene lies, as the shadows on it tell."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from evsplat.camera import Camera
+
+_COARSE, _FINE = 8, 64
+"""Cells along each side of the picture; the coarse ones move as one what many pixels agree on."""
+_LOG_DEPTH, _LOG_STRENGTH = 0.2, 0.5
+"""Units of what is learned."""
+_NEAREST_M = 0.1
+_DARKEST = 1e-3
+
+
+class Relief(nn.Module):
+    """What a camera at rest cannot see of its scene, but the person's shadow on it tells.
+
+    Such a scene starts on a floor and a wall, and its pictures are the same wherever along the
+    camera's rays it is: furniture stands farther forward. A shadow that falls on it there has
+    another shape. How dark it is depends on how a surface is turned to the lamps. Both are learned
+    on a grid over the recorded picture; a place of any other view is looked up where it is in it.
+    """
+
+    center: Tensor
+    to_picture: Tensor
+
+    def __init__(self, camera: Camera) -> None:
+        """Start at the places that are given, of strength 1. ``camera``: the recording one."""
+        super().__init__()
+        half = torch.tensor([camera.width, camera.height]) / 2
+        to_unit = torch.diag(torch.cat([1 / half, torch.ones(1)]))
+        to_unit[:2, 2] = -1.0
+        pose = camera.world_to_camera.cpu()
+        self.register_buffer("center", camera.center().cpu(), persistent=False)
+        self.register_buffer("to_picture", to_unit @ camera.K @ pose[:3], persistent=False)
+        self.coarse = nn.Parameter(torch.zeros(1, 2, _COARSE, _COARSE))
+        self.fine = nn.Parameter(torch.zeros(1, 2, _FINE, _FINE))
+
+    def forward(
+        self, places: Float[Tensor, "H W 3"]
+    ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+        """Where the scene of ``places`` (world, metres) is, and the exponents of its shadows."""
+        spread = F.interpolate(self.coarse, (_FINE, _FINE), mode="bilinear", align_corners=False)
+        seen = places @ self.to_picture[:, :3].T + self.to_picture[:, 3]
+        at = seen[..., :2] / seen[..., 2:].clamp_min(_NEAREST_M)
+        learned = F.grid_sample(
+            self.fine + spread, at[None], padding_mode="border", align_corners=False
+        )[0]
+        farther = (_LOG_DEPTH * learned[0]).exp()[..., None]
+        return self.center + (places - self.center) * farther, (_LOG_STRENGTH * learned[1]).exp()
+
+
+def strengthened(
+    factors: Float[Tensor, "T H W"], exponents: Float[Tensor, "H W"]
+) -> Float[Tensor, "T H W"]:
+    """Shadows as dark as the place makes them."""
+    return factors.clamp_min(_DARKEST) ** exponents
