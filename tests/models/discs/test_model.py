@@ -83,7 +83,7 @@ def test_own_colours_on_the_body_surface_need_no_network(tiny_capture, seed):
     assert torch.equal(layers.scene.channels[0, :, :3], colours)
     assert torch.equal(layers.scene.means[0], gaussians.means[gaussians.scene])
     names = {name.partition(".")[0] for name, _ in model.named_parameters()}
-    assert names == {"gaussians", "deformation", "residual", "lamps", "shadow", "sensor"}
+    assert names == {"gaussians", "deformation", "residual", "lamps", "shadow", "sensor", "relief"}
 
 
 def test_before_the_non_rigid_network_the_person_is_blend_skinned(tiny_capture):

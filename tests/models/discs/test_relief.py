@@ -5,7 +5,7 @@ import torch
 
 from evsplat.body import SurfaceSamples
 from evsplat.camera import Camera
-from evsplat.models.discs.relief import Relief, strengthened
+from evsplat.models.discs.relief import Relief
 from evsplat.models.discs.shadow import BodyShadow
 from evsplat.models.scene_places import places_of
 
@@ -35,7 +35,8 @@ def test_at_the_start_places_are_as_given_and_shadows_as_they_are():
     there, exponents = Relief(CAMERA)(places)
     torch.testing.assert_close(there, places, atol=1e-6, rtol=0)
     factors = torch.rand(3, *exponents.shape)
-    torch.testing.assert_close(strengthened(factors, exponents), factors.clamp_min(1e-3))
+    shaded = Relief(CAMERA).shade(places, lambda at: factors)
+    torch.testing.assert_close(shaded, factors.clamp_min(1e-3))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -102,8 +103,7 @@ def test_a_box_before_the_wall_is_found_by_the_shadows_that_fall_on_it():
     optimiser = torch.optim.Adam(relief.parameters(), lr=0.02)
     for _ in range(120):
         drawn = torch.randint(len(bodies), (4,), generator=generator)
-        there, exponents = relief(sheet)
-        factors = strengthened(shadow(bodies[drawn], there, lamp), exponents)
+        factors = relief.shade(sheet, lambda at, rows=drawn: shadow(bodies[rows], at, lamp))
         optimiser.zero_grad()
         (factors - seen[drawn]).abs().mean().backward()
         optimiser.step()

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from evsplat.body import BodyTrack, skin, up_axis
 from evsplat.capture import Camera, Frame
 from evsplat.gaussians import GaussianSet
-from evsplat.models.discs.relief import Relief, strengthened
+from evsplat.models.discs.relief import Relief
 from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.models.discs.shadow import BodyShadow, Lamps
 from evsplat.models.drawing import Drawing, draw
@@ -293,12 +293,6 @@ class DiscModel(PosedModel):
         shadow, lamps = self.shadow, self.lamps
         if shadow is None or lamps is None or casters is None:
             return None
-        relief = self.relief
-        if relief is None or float(self.nominal) < _RELIEF_START:
-            return lambda places: shadow(casters, places, lamps.places())
-
-        def in_relief(places: Float[Tensor, "H W 3"]) -> Float[Tensor, "T H W"]:
-            there, exponents = relief(places)
-            return strengthened(shadow(casters, there, lamps.places()), exponents)
-
-        return in_relief
+        cast: SceneShadow = lambda places: shadow(casters, places, lamps.places())  # noqa: E731
+        relief = self.relief if float(self.nominal) >= _RELIEF_START else None
+        return cast if relief is None else lambda places: relief.shade(places, cast)

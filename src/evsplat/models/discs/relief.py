@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evsplat.camera import Camera
+from evsplat.models.layers import SceneShadow
 
 _COARSE, _FINE = 8, 64
 """Cells along each side of the picture; the coarse ones move as one what many pixels agree on."""
@@ -52,9 +53,7 @@ class Relief(nn.Module):
         farther = (_LOG_DEPTH * learned[0]).exp()[..., None]
         return self.center + (places - self.center) * farther, (_LOG_STRENGTH * learned[1]).exp()
 
-
-def strengthened(
-    factors: Float[Tensor, "T H W"], exponents: Float[Tensor, "H W"]
-) -> Float[Tensor, "T H W"]:
-    """Shadows as dark as the place makes them."""
-    return factors.clamp_min(_DARKEST) ** exponents
+    def shade(self, places: Float[Tensor, "H W 3"], shadow: SceneShadow) -> Float[Tensor, "T H W"]:
+        """Factors on the scene's colours where its ``places`` are, as dark as it is turned."""
+        there, exponents = self(places)
+        return shadow(there).clamp_min(_DARKEST) ** exponents
