@@ -60,6 +60,7 @@ from evsplat.objectives import (
     HeldOutWindows,
     Objective,
     PosePrior,
+    ReliefPrior,
     RenderedSemantics,
     minute_around,
     motion_px,
@@ -81,6 +82,8 @@ SCENE_NETWORK_RATE = 1e-3
 """Learning rate of the network of a random cube's colours."""
 CHROMA_WEIGHT = 1.6
 """Weight of the mean absolute difference of Cb and Cr to the blurry frame, twice that of sRGB."""
+RELIEF_WEIGHT = 3e-3
+"""Weight of the roughness of the scene's relief."""
 ERRORS_RATE = 0.3
 """Learning rate of the poses' errors as a share of that of the motion between exact key poses:
 three splines add up to them, and all move at once."""
@@ -264,6 +267,8 @@ def build(
     ]
     if poses.correction is not None:
         objectives.append(PosePrior())
+    if model.relief is not None:
+        objectives.append(ReliefPrior())
     windows = None
     if config.event_weight != 0.0 and capture.events is None:
         logger.warning(
@@ -284,6 +289,7 @@ def build(
             "semantic": config.semantic_weight,
             "binarise": config.binarise_weight,
             "pose_prior": config.pose.prior,
+            "relief": RELIEF_WEIGHT,
             "event": config.event_weight,
             "contrast": config.contrast_weight,
         },

@@ -7,7 +7,7 @@ from evsplat.objectives.event_windows import EventWindows, HeldOutWindows
 from evsplat.objectives.exposure import Exposure, motion_px, renders_for
 from evsplat.objectives.isometry import Isometry
 from evsplat.objectives.photometric import Alpha, Photometric
-from evsplat.objectives.priors import PosePrior, SkinningPrior
+from evsplat.objectives.priors import PosePrior, ReliefPrior, SkinningPrior
 from evsplat.objectives.semantic import PackedBounds, RenderedSemantics
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "PackedBounds",
     "Photometric",
     "PosePrior",
+    "ReliefPrior",
     "RenderedSemantics",
     "SkinningPrior",
     "Step",

@@ -20,6 +20,15 @@ class PosePrior(Objective):
         return {"pose_prior": step.model.residual.price()}
 
 
+class ReliefPrior(Objective):
+    """Roughness of the scene's relief."""
+
+    def loss(self, step: Step[DiscModel]) -> dict[str, Tensor]:
+        """``relief``: see `Relief.price`."""
+        assert step.model.relief is not None
+        return {"relief": step.model.relief.price()}
+
+
 class SkinningPrior(Objective):
     """Mean over surface points of the squared weight error, summed over joints (1.6)."""
 

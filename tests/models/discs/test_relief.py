@@ -127,3 +127,19 @@ def test_a_camera_that_moves_has_none_and_a_checkpoint_keeps_it(tiny_capture):
     cube = built("evsplat", capture, "scene.kind=random_cube", "scene.cube_count=50").model
     assert cube.relief is None
     assert built("evsplat", capture, "lamps=0").model.relief is None
+
+
+def test_the_price_is_of_steps_between_neighbours_and_draws_what_nothing_tells_to_the_sheet():
+    relief = Relief(CAMERA)
+    with torch.no_grad():
+        relief.fine[0, 0, 10, 20] = 3.0
+    cells, pairs = 2 * 64 * 64, 2 * 63 * 64
+    # One cell differs from its four neighbours.
+    assert relief.price().item() == pytest.approx(4 * 9 / pairs + 0.1 * 9 / cells)
+    relief = shaken(0)
+    optimiser = torch.optim.Adam(relief.parameters(), lr=0.02)
+    for _ in range(300):
+        optimiser.zero_grad()
+        relief.price().backward()
+        optimiser.step()
+    assert relief.price() < 1e-3 * shaken(0).price()

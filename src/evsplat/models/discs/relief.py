@@ -12,6 +12,8 @@ _COARSE, _FINE = 8, 64
 """Cells along each side of the picture; the coarse ones move as one what many pixels agree on."""
 _LOG_DEPTH, _LOG_STRENGTH = 0.2, 0.5
 """Units of what is learned."""
+_ABSOLUTE = 0.1
+"""Weight of a value against that of its difference to a neighbour."""
 _NEAREST_M = 0.1
 _DARKEST = 1e-3
 
@@ -44,14 +46,27 @@ class Relief(nn.Module):
         self, places: Float[Tensor, "H W 3"]
     ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
         """Where the scene of ``places`` (world, metres) is, and the exponents of its shadows."""
-        spread = F.interpolate(self.coarse, (_FINE, _FINE), mode="bilinear", align_corners=False)
         seen = places @ self.to_picture[:, :3].T + self.to_picture[:, 3]
         at = seen[..., :2] / seen[..., 2:].clamp_min(_NEAREST_M)
         learned = F.grid_sample(
-            self.fine + spread, at[None], padding_mode="border", align_corners=False
+            self._learned(), at[None], padding_mode="border", align_corners=False
         )[0]
         farther = (_LOG_DEPTH * learned[0]).exp()[..., None]
         return self.center + (places - self.center) * farther, (_LOG_STRENGTH * learned[1]).exp()
+
+    def price(self) -> Float[Tensor, ""]:
+        """Differences of neighbours, squared, and a tenth of the squares; to be kept small.
+
+        Adam moves cells that next to no shadow reaches as far as any other.
+        """
+        learned = self._learned()
+        steps = [learned.diff(dim=axis).square().mean() for axis in (2, 3)]
+        return steps[0] + steps[1] + _ABSOLUTE * learned.square().mean()
+
+    def _learned(self) -> Float[Tensor, "1 2 C C"]:
+        """Depth and strength of all cells."""
+        size = self.fine.shape[2:]
+        return self.fine + F.interpolate(self.coarse, size, mode="bilinear", align_corners=False)
 
     def shade(self, places: Float[Tensor, "H W 3"], shadow: SceneShadow) -> Float[Tensor, "T H W"]:
         """Factors on the scene's colours where its ``places`` are, as dark as it is turned."""
