@@ -140,6 +140,32 @@ def test_a_background_is_a_colour_or_a_picture(tmp_path, recorded):
         Painted.of("no such colour")
 
 
+def test_a_wall_stands_behind_all_that_the_filmed_person_does_and_looks_the_same(recorded):
+    camera = camera_before(recorded, away=4.0)
+    room = Room.of(recorded, recorded, camera)
+    times = recorded.times_us.tolist()
+    deepest = max(float(camera.project(recorded.vertices(t))[1].max()) for t in times)
+    rays, center = pixel_rays(camera), camera.center()
+    wall = center + 0.8 * deepest * rays[::8, ::8].flatten(0, 1)
+    wall = wall[wall @ room.up > room.floor_m + 0.2]
+    far = center + 2 * deepest * rays[0, :5]
+    floor = wall[:3] + (room.floor_m - wall[:3] @ room.up)[:, None] * room.up
+    floor = center + 0.7 * (floor - center)
+    floor += (room.floor_m - floor @ room.up)[:, None] * room.up
+    means = torch.cat([wall, far, floor])
+    layers = Layers(splats(recorded.vertices(0)[None]), splats(means[None]), torch.eye(4)[None])
+    scene = room.stand_back(layers, camera).scene
+    pixels, depth = camera.project(scene.means[0])
+    before, depth_before = camera.project(means)
+    torch.testing.assert_close(pixels, before, atol=1e-3, rtol=0)
+    assert depth[: len(wall)].min() > deepest
+    torch.testing.assert_close(scene.means[0, len(wall) :], means[len(wall) :])
+    torch.testing.assert_close(
+        scene.scales[0, :, 0] / depth, torch.full_like(depth, 0.01) / depth_before
+    )
+    assert Room.of(recorded, recorded).stand_back(layers, camera) is layers
+
+
 def test_the_rim_of_what_was_recorded_fades_as_the_camera_goes_away(recorded):
     camera = camera_before(recorded, away=4.0)
     room = Room.of(recorded, recorded, camera)

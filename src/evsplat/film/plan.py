@@ -85,7 +85,9 @@ class FilmPlan:
             cameras = [camera_at(capture, view, time) for time in times]
         else:
             cameras = [start] * len(times)
-        changes = [room.clear] if film.path in ("orbit", "swing") else []
+        changes = [room.stand_back] if film.motion is not None else []
+        if film.path in ("orbit", "swing"):
+            changes.append(room.clear)
         if surroundings is not None and cameras[0] is not cameras[-1]:
             changes.append(room.soften)
         if changes:

@@ -6,6 +6,7 @@ than the person fades.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ _COARSE_PX = 64
 """Side of the pictures in a hurry, at least: with less the horizon and the spot are steps."""
 _FLOOR_STAYS_M = 0.12
 """Height above the floor of what never fades: it hides nobody."""
+_BEHIND, _WALL = 1.05, 0.97
+"""Depth of a wall as a share of the person's largest; share of its depth from which it is one."""
 _EDGE = 0.08
 """Width of the rim of the recorded picture that fades, in its shorter side."""
 _ELSEWHERE = (0.3, 0.15)
@@ -54,9 +57,9 @@ class Room:
     def of(cls, recorded: BodyTrack, filmed: BodyTrack, recording: Camera | None = None) -> "Room":
         """The floor is where the recorded person's lowest point is."""
         up = up_axis(recorded).float().cpu()
-        first, last = int(recorded.times_us[0]), int(recorded.times_us[-1])
-        times = np.linspace(first, last, 16).round().astype(int).tolist()
-        lowest = min(float((recorded.vertices(time).cpu() @ up).min()) for time in times)
+        lowest = min(
+            float((recorded.vertices(time).cpu() @ up).min()) for time in _spread(recorded)
+        )
         return cls(filmed, up, lowest, recording)
 
     def behind(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
@@ -101,6 +104,34 @@ class Room:
         height = scene.means[0] @ self.up.to(scene.means) - self.floor_m
         share = torch.where(height < _FLOOR_STAYS_M, 1.0, share)
         return replace(layers, scene=replace(scene, opacities=scene.opacities * share))
+
+    def stand_back(self, layers: Layers, camera: Camera) -> Layers:
+        """Put a wall that somebody would walk through behind all that the filmed person does.
+
+        A camera that stood still has not seen how far away the wall is, and recorded the same.
+        """
+        if self.recording is None:
+            return layers
+        scene, recording = layers.scene, self.recording.to(layers.scene.means.device)
+        depth = recording.project(scene.means[0])[1]
+        height = scene.means[0] @ self.up.to(scene.means) - self.floor_m
+        high = height > _FLOOR_STAYS_M
+        wall = depth[high].median() if high.any() else depth.max()
+        factor = (_BEHIND * self._deepest_m / depth.clamp_min(0.1)).clamp_min(1.0)
+        factor = torch.where(high | (depth > _WALL * wall), factor, 1.0)[:, None]
+        center = recording.center()
+        means = center + (scene.means - center) * factor
+        return replace(layers, scene=replace(scene, means=means, scales=scene.scales * factor))
+
+    @cached_property
+    def _deepest_m(self) -> float:
+        """How far from the recording camera the filmed person gets."""
+        assert self.recording is not None
+        recording = self.recording.to("cpu")
+        return max(
+            float(recording.project(self.track.vertices(time).cpu())[1].max())
+            for time in _spread(self.track)
+        )
 
     def soften(self, layers: Layers, camera: Camera) -> Layers:
         """Fade the scene towards the edge of what was recorded, the more the camera went away."""
@@ -150,6 +181,12 @@ class Painted:
         left, top = (size[0] - camera.width) // 2, (size[1] - camera.height) // 2
         image = image.crop((left, top, left + camera.width, top + camera.height))
         return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
+
+
+def _spread(track: BodyTrack) -> list[int]:
+    """Times over all of a motion."""
+    first, last = int(track.times_us[0]), int(track.times_us[-1])
+    return np.linspace(first, last, 16).round().astype(int).tolist()
 
 
 def _eased(share: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
