@@ -1,7 +1,7 @@
 """How far each method comes with more steps: person-crop PSNR until a doubling brings little.
 
     python benchmarks/convergence.py CAPTURE [CAPTURE ...] [--methods NAME ...] [--out FOLDER]
-        [--first 500] [--most 16000] [--gain 0.2] [--hours 2] [--threads 1]
+        [--points FOLDER] [--first 500] [--most 16000] [--gain 0.2] [--hours 2] [--threads 1]
 
 Every method is trained for 500, 1,000, 2,000 ... steps, each time with its whole schedule, until a
 doubling brings less than `--gain` dB of the person's crop on test frames. A baseline is trained
@@ -10,25 +10,29 @@ twice at the two first lengths, with its released rates and with these times the
 frames, and from the third length on, where both grow alike, the one that was better last is run.
 What was made weaker for quick tables is undone: 50,000 points of a person at the start, HUGS's own
 limit of growth. A length that would take longer than `--hours`, by the one before it, is not
-begun. What exists is not made again, so the command can be stopped and gone on with; two of them
-with different `--methods` may share a folder. Printed: a line per cell, then the knees; the curves
-are drawn to FOLDER/convergence.png. The last line is one JSON object.
+begun. Every point is kept as a small file in `--points` (the repository's docs/results/convergence)
+and not made again, so the command can be stopped and gone on with; two of them with different
+`--methods` may share the folders. tools/results.py draws what is kept. Printed: a line per cell,
+then the knees; the curves are drawn to OUT/convergence.png. The last line is one JSON object.
 """
 
 import argparse
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import evsplat as ev
+from evsplat.benching.origin import code, machine
 from evsplat.capture import load_capture
 from evsplat.evaluation.run import evaluate_run
-from evsplat.files import write_json
+from evsplat.files import make_folder, write_json
 from evsplat.methods import NOMINAL_ITERATIONS
 from evsplat.methods.avatar_parts import RELEASED_RATES
 
+ROOT = Path(__file__).resolve().parents[1]
 _NO_LPIPS = ("terms.perceptual=none",)
 METHODS: dict[str, tuple[str, ...]] = {
     "avatar3dgs_semantic": (*_NO_LPIPS, "human.count=50000"),
@@ -57,14 +61,15 @@ def scaled_rates(method: str, steps: int) -> tuple[str, ...]:
 
 
 def cell(
-    capture: Path, method: str, rates: str, steps: int, folder: Path, threads: int, seed: int
+    capture: Path, method: str, rates: str, steps: int, options: argparse.Namespace
 ) -> dict[str, Any]:
     """Figures of one training, made where they are not kept yet."""
+    seed, threads = options.seed, options.threads
     name = f"{capture.name}-{method}-{rates}-{steps:05d}-{seed}"
-    kept = folder / "cells" / f"{name}.json"
+    kept = options.points / f"{name}.json"
     if kept.exists():
         return dict(json.loads(kept.read_text("utf-8")))
-    run = folder / "runs" / name
+    run = options.out / "runs" / name
     settings = METHODS[method] + (scaled_rates(method, steps) if rates == "scaled" else ())
     if run.exists():
         ev.train(capture, out=run, resume=True)
@@ -95,7 +100,10 @@ def cell(
         "gaussians": test["gaussians"],
         "threads": threads,
         "policy": test["policy"],
+        "code": code(),
+        "machine": machine(),
     }
+    make_folder(kept.parent)
     write_json(kept, found)
     return found
 
@@ -108,10 +116,7 @@ def curve(capture: Path, method: str, options: argparse.Namespace) -> list[dict[
     while steps <= options.most:
         if len(points) >= 2:
             kinds = (points[-1]["rates"],)
-        cells = [
-            cell(capture, method, kind, steps, options.out, options.threads, options.seed)
-            for kind in kinds
-        ]
+        cells = [cell(capture, method, kind, steps, options) for kind in kinds]
         for found in cells:
             print(
                 f"{found['capture']:24} {method:20} {found['rates']:9} {steps:6} steps  "
@@ -120,13 +125,36 @@ def curve(capture: Path, method: str, options: argparse.Namespace) -> list[dict[
                 f"{found['train_recorded_crop_psnr_db']:.2f}  {found['train_s'] / 60:.1f} min",
                 flush=True,
             )
-        points.append(max(cells, key=lambda found: found["train_recorded_crop_psnr_db"]))
+        points.append(_better(cells))
         if len(points) > 1 and _gain(points) < options.gain:
             break
         if 2 * points[-1]["train_s"] > 3600 * options.hours:
             break
         steps *= 2
     return points
+
+
+def _better(cells: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Of runs of one length that which comes closer to its training frames: no test frame tells."""
+    return max(cells, key=lambda found: found["train_recorded_crop_psnr_db"])
+
+
+def read_points(folder: Path) -> list[dict[str, Any]]:
+    """All points that are kept in a folder."""
+    return [json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("*.json"))]
+
+
+def curves_of(points: Iterable[dict[str, Any]]) -> dict[str, dict[str, list[dict[str, Any]]]]:
+    """The better point of each length, by capture and method."""
+    curves: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    order = list(METHODS)
+    for point in sorted(points, key=lambda p: (p["capture"], order.index(p["method"]), p["steps"])):
+        found = curves.setdefault(point["capture"], {}).setdefault(point["method"], [])
+        if found and found[-1]["steps"] == point["steps"]:
+            found[-1] = _better((found[-1], point))
+        else:
+            found.append(point)
+    return curves
 
 
 def _gain(points: list[dict[str, Any]]) -> float:
@@ -186,6 +214,7 @@ def main() -> None:
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--out", type=Path, default=Path("bench/convergence"))
+    parser.add_argument("--points", type=Path, default=ROOT / "docs" / "results" / "convergence")
     parser.add_argument("--first", type=int, default=500)
     parser.add_argument("--most", type=int, default=16_000)
     parser.add_argument("--gain", type=float, default=0.2)

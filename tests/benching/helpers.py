@@ -24,7 +24,7 @@ def write_suite(path: Path, captures: dict[str, Path], *rows: dict, iterations: 
 
 def records(folder: Path) -> dict[str, dict]:
     """Record of every cell without what depends on the clock."""
-    timed = {"seconds", "train_seconds", "peak_memory_mb"}
+    timed = {"seconds", "train_seconds", "train_cpu_seconds", "peak_memory_mb"}
     found = {}
     for path in sorted((folder / "cells").rglob("*.json")):
         record = json.loads(path.read_text())

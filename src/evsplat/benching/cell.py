@@ -4,6 +4,8 @@ import logging
 import resource
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -13,12 +15,13 @@ import torch
 
 import evsplat
 from evsplat.benching.folder import BenchFolder, exclusive
-from evsplat.benching.given_pictures import PICTURES, GivenPictures
+from evsplat.benching.given_pictures import OWN_PICTURE, PICTURES, GivenPictures, OwnPicture
+from evsplat.benching.origin import code, machine
 from evsplat.capture import Capture, Policy, load_capture
 from evsplat.config import override, to_dict
 from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.evaluation.evaluator import evaluate
-from evsplat.files import remove_folder, write_json
+from evsplat.files import remove_file, remove_folder, write_json
 from evsplat.methods import method_config
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
@@ -30,7 +33,7 @@ from evsplat.untrusted.records import Shape, misfit, read_record
 logger = logging.getLogger(__name__)
 
 DONE, FAILED = "done", "failed"
-UNTRAINED = (*TRIVIAL, PICTURES)
+UNTRAINED = (*TRIVIAL, OWN_PICTURE, PICTURES)
 """Methods of rows that need no training."""
 _RECORD = {"status": str, "cell": {"seed": int}}
 _OF_STATUS: dict[str, Shape] = {
@@ -145,6 +148,8 @@ def run_cell(folder: Path, cell: Cell, *, threads: int | None, device: str) -> N
                 "seconds": time.perf_counter() - started,
                 "peak_memory_mb": _peak_memory_mb(),
                 "evsplat": evsplat.__version__,
+                "code": code(),
+                "machine": machine(),
             },
         )
 
@@ -167,14 +172,18 @@ def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) 
         reconstruction, facts = _trained(run, trained_on, cell, threads, device)
     elif cell.pictures is not None:
         reconstruction = GivenPictures(Path(cell.pictures), recorded)
+    elif cell.method == OWN_PICTURE:
+        reconstruction = OwnPicture(recorded)
     else:
         reconstruction = TRIVIAL[cell.method](load_capture(trained_on).for_training(cell.policy))
     if cell.backdrop:
         reconstruction = OnMedianBackground(reconstruction, seen)
     measured = evaluate(recorded, reconstruction, out_dir=run, device=device, test_frames_only=True)
     kept = ("frames", "protocols", "per_frame", "reasons", "weights", "protocol_notes")
-    # Of pictures that were made elsewhere nobody knows what they were made from.
-    terms = None if cell.pictures else to_dict(seen.terms)
+    # Of pictures that were made elsewhere nobody knows what they were made from; the camera's own
+    # are what is held out.
+    of_a_method = cell.method not in (OWN_PICTURE, PICTURES)
+    terms = to_dict(seen.terms) if of_a_method else None
     return {**facts, "policy": terms, **{key: measured[key] for key in kept}}
 
 
@@ -207,18 +216,44 @@ def _trained(
         max_minutes=cell.max_minutes,
         threads=threads,
     )
-    if resume:
-        go(resume=True)
-    else:
-        go(method=cell.method, overrides=settings, seed=cell.seed)
+    with _cpu_time(run, resume) as cpu_seconds:
+        if resume:
+            go(resume=True)
+        else:
+            go(method=cell.method, overrides=settings, seed=cell.seed)
+    used = cpu_seconds()
     trained = load_run(run, device=device)
     return trained.reconstruction, {
         "iteration": trained.iteration,
         "train_seconds": trained.train_seconds,
+        "train_cpu_seconds": used,
         "gaussians": trained.gaussians,
         "device": trained.device,
         "threads": torch.get_num_threads(),
     }
+
+
+@contextmanager
+def _cpu_time(run: Path, resume: bool) -> Iterator[Callable[[], float | None]]:
+    """CPU time of the block, s, and of the processes before it that were stopped and saved.
+
+    None where one of them was killed: nobody knows what it had used.
+    """
+    spent = run / "cpu_seconds.json"
+    before: float | None = None if resume else 0.0
+    if resume and spent.exists():
+        before = read_record(spent, {"seconds": float}, "remove the run")["seconds"]
+        remove_file(spent)
+    begun = time.process_time()
+
+    def used() -> float | None:
+        return None if before is None else before + time.process_time() - begun
+
+    try:
+        yield used
+    finally:
+        if used() is not None and run.exists():
+            write_json(spent, {"seconds": used()})
 
 
 def _recorded(bench: BenchFolder, source: CaptureSource) -> Path:

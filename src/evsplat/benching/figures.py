@@ -26,8 +26,8 @@ class Records:
         """Read the record of every cell that has one."""
         found = {}
         for cell in plan.cells:
-            path = folder.record_of(cell.id)
-            if path.exists():
+            path = folder.record_there(cell.id)
+            if path is not None:
                 found[cell.capture.name, cell.row, cell.seed] = read_cell_record(path)
         return cls(plan, found)
 
@@ -43,6 +43,11 @@ class Records:
             for (one, other, _), record in sorted(self.by_cell.items())
             if (one, other) == (capture, row) and record["status"] == DONE
         ]
+
+    def drawn(self, capture: str, row: str) -> list[Record]:
+        """Those of `of` with pictures in the results folder: kept records have none."""
+        found = self.of(capture, row)
+        return [r for r in found if all("pictures" in entry for entry in r["per_frame"])]
 
     def figure(
         self, row: str, value: Callable[[Record], float | None], captures: Iterable[str]
@@ -64,8 +69,9 @@ class Records:
     def reason_for_gap(self, capture: str, row: str) -> str:
         """The reason why a place in the table is empty."""
         for (one, other, _), record in self.by_cell.items():
-            if (one, other) == (capture, row) and record["status"] != DONE:
-                return f"failed: {record['reason']}"
+            if (one, other) == (capture, row):
+                done = record["status"] == DONE
+                return "measured; pictures not kept" if done else f"failed: {record['reason']}"
         return "not run"
 
     def failures(self) -> dict[tuple[str, str], list[str]]:

@@ -15,6 +15,8 @@ class BenchFolder:
     """Paths of the parts of a bench; ``id`` is a cell's ``capture/row/seed0``."""
 
     path: Path
+    kept: Path | None = None
+    """Records that are kept elsewhere and count as its own (`benching.kept`)."""
 
     @property
     def captures(self) -> Path:
@@ -24,6 +26,15 @@ class BenchFolder:
     def record_of(self, id: str) -> Path:  # noqa: A002 - the cell's own word
         """Outcome of a cell, JSON; there when the cell is over."""
         return self.path / "cells" / f"{id}.json"
+
+    def kept_record_of(self, id: str) -> Path | None:  # noqa: A002
+        """Record of a cell among the kept ones, there or not; None where nothing is kept."""
+        return None if self.kept is None else self.kept / f"{id}.json"
+
+    def record_there(self, id: str) -> Path | None:  # noqa: A002
+        """The record of a cell that is over, its own or a kept one."""
+        paths = (self.record_of(id), self.kept_record_of(id))
+        return next((path for path in paths if path is not None and path.exists()), None)
 
     def run_of(self, id: str) -> Path:  # noqa: A002
         """Run folder of a cell: checkpoints and pictures."""

@@ -1,6 +1,7 @@
-"""Pictures of test frames that were made elsewhere, measured as any method is."""
+"""Pictures of test frames that no method drew, measured as any method's are."""
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,10 +20,28 @@ from evsplat.untrusted.pictures import image_size, read_picture
 
 PICTURES = "pictures"
 """Method of a row whose pictures are given."""
+OWN_PICTURE = "own_picture"
+"""Method of a row with the blurry pictures that the camera took at test times."""
 _REMEDY = "write it again as an 8-bit RGB PNG"
 
 
-class GivenPictures:
+class _OfTestFrames(ABC):
+    """Whole pictures, one for the view and the time of each test frame."""
+
+    def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
+        """The pictures; of other views, times or parts there are none (`DataError`)."""
+        if parts != "all":
+            raise DataError("pictures that were made elsewhere do not tell person from scene.")
+        rgb = torch.stack([self._picture(camera, time) for time in times_us])
+        alpha = torch.ones(rgb.shape[:3])
+        return Rendering(rgb, alpha, torch.zeros_like(alpha))
+
+    @abstractmethod
+    def _picture(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
+        """The picture of a view at a time."""
+
+
+class GivenPictures(_OfTestFrames):
     """Test frames as somebody else's program drew them.
 
     ``folder`` holds ``FRAME.png`` for every test frame, of the frame's own size, coded as the
@@ -56,14 +75,6 @@ class GivenPictures:
                 )
             self._places.append((camera, frame.mid_us, path))
 
-    def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
-        """The given pictures; of other views, times or parts there are none (`DataError`)."""
-        if parts != "all":
-            raise DataError("pictures that were made elsewhere do not tell person from scene.")
-        rgb = torch.stack([self._picture(camera, time) for time in times_us])
-        alpha = torch.ones(rgb.shape[:3])
-        return Rendering(rgb, alpha, torch.zeros_like(alpha))
-
     def _picture(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
         for view, time, path in self._places:
             if time == time_us and same_view(view, camera):
@@ -72,6 +83,21 @@ class GivenPictures:
                 )
                 return torch.from_numpy(pixels.astype(np.float32) / 255)
         raise DataError(f"no picture was given of this view at {time_us} us.")
+
+
+class OwnPicture(_OfTestFrames):
+    """What the camera itself recorded of each test frame, blurry: nobody else sees it."""
+
+    name = OWN_PICTURE
+
+    def __init__(self, capture: Capture) -> None:
+        self._capture = capture
+
+    def _picture(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
+        for frame in self._capture.test_frames:
+            if frame.mid_us == time_us and same_view(self._capture.camera(frame), camera):
+                return self._capture.image(frame)
+        raise DataError(f"no picture was recorded of this view at {time_us} us.")
 
 
 def digest_of(folder: Path) -> str:

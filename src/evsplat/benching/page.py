@@ -41,7 +41,7 @@ def page(records: Records, tables: Sequence[Table], folder: BenchFolder) -> str:
     captures = {
         name: load_capture(source.path)
         for name, source in records.plan.sources.items()
-        if any(records.of(name, row.name) for row in suite.rows)
+        if any(records.drawn(name, row.name) for row in suite.rows)
     }
     budget = _PIXELS // max(len(captures), 1)
     pictures = "".join(
@@ -64,7 +64,7 @@ def _capture(
     """All test frames of a capture, each with every row."""
     rows = []
     for row in records.plan.suite.rows:
-        found = records.of(name, row.name)
+        found = records.drawn(name, row.name)
         record = found[0] if found else None
         run = "" if record is None else f"{name}/{row.name}/seed{record['cell']['seed']}"
         rows.append(_Row(row.label, record, run, records.reason_for_gap(name, row.name)))

@@ -83,7 +83,7 @@ def make_plan(
             sources[capture.name] = source
         else:
             missing[capture.name] = source
-    cells = tuple(_cells(suite, sources.values()))
+    cells = tuple(cells_of(suite, sources.values()))
     for row in suite.rows:
         if row.pictures and sources and not any(cell.row == row.name for cell in cells):
             raise ConfigError(
@@ -103,8 +103,8 @@ def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]
     """
     todo = []
     for cell in plan.cells:
-        path = folder.record_of(cell.id)
-        if not path.exists():
+        path = folder.record_there(cell.id)
+        if path is None:
             todo.append(cell)
             continue
         record = read_cell_record(path)
@@ -161,7 +161,8 @@ def _added(rows: Sequence[SuiteRow], added: Sequence[str]) -> list[SuiteRow]:
     return found
 
 
-def _cells(suite: Suite, sources: Iterable[CaptureSource]) -> list[Cell]:
+def cells_of(suite: Suite, sources: Iterable[CaptureSource]) -> list[Cell]:
+    """All cells of a suite on these captures, in the order they are run."""
     cells = [
         _cell(suite, source, row, seed)
         for seed in suite.seeds
@@ -224,7 +225,9 @@ def _check_same_request(
 ) -> None:
     for key, value in asked.items():
         if there.get(key) != value:
+            own = path.is_relative_to(folder.path)
             raise ConfigError(
                 f"{path}: was made with {key} {there.get(key)!r}, and {value!r} is asked for; "
-                f"choose another --out, or remove {folder.path} to begin anew."
+                f"choose another {'--out' if own else '--records'}, or remove "
+                f"{folder.path if own else 'this file'} to begin anew."
             )

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from evsplat.benching.cell import FAILED, Cell
 from evsplat.benching.figures import Records
 from evsplat.benching.folder import BenchFolder, exclusive
+from evsplat.benching.kept import keep
 from evsplat.benching.local import LocalPool
 from evsplat.benching.page import page
 from evsplat.benching.plan import Plan, make_plan, pending_cells
@@ -60,20 +61,21 @@ def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any
     """
     options = given(BenchOptions, options, changes)
     read = read_suite(suite)
-    folder = BenchFolder(Path(options.out or Path("bench") / read.name))
+    folder = BenchFolder(Path(options.out or Path("bench") / read.name), options.records)
     try_target(folder.path)
     plan = make_plan(read, folder, options, named=suite)
     if not plan.cells:
         raise ConfigError("\n".join(plan.missing.values()))
     with exclusive(folder.lock_of("bench"), wait=False):
         todo = pending_cells(plan, folder, retry=options.retry)
+        keep(plan, folder, plan.cells)
         # Of all cells, done or not: how many threads a cell has decides its last bits.
         executor = _executor(folder, len(plan.cells), options)
         try:
             _run(plan, todo, folder, executor)
         except KeyboardInterrupt:
             write_output(plan, folder)
-            done = sum(folder.record_of(cell.id).exists() for cell in plan.cells)
+            done = sum(folder.record_there(cell.id) is not None for cell in plan.cells)
             raise Stopped(folder.path, done, len(plan.cells)) from None
         write_output(plan, folder)
     return folder.path
@@ -90,6 +92,7 @@ def _run(plan: Plan, todo: Sequence[Cell], folder: BenchFolder, executor: Execut
                 record = {"status": FAILED, "reason": reason or "it ended without a record"}
                 write_json(folder.record_of(cell.id), {"cell": cell.request(), **record})
             progress.ended(cell, read_json(folder.record_of(cell.id)))
+            keep(plan, folder, [cell])
 
 
 def _executor(folder: BenchFolder, cells: int, options: BenchOptions) -> Executor:

@@ -30,7 +30,7 @@ def write_strips(records: Records, folder: BenchFolder) -> list[Path]:
     """Write ``strips/CAPTURE.png`` of every capture that some row was measured on."""
     written = []
     for name, source in records.plan.sources.items():
-        if not any(records.of(name, row.name) for row in records.plan.suite.rows):
+        if not any(records.drawn(name, row.name) for row in records.plan.suite.rows):
             continue
         capture = load_capture(source.path)
         if not capture.test_frames:
@@ -87,7 +87,7 @@ def _tiles(records: Records, capture: Capture, name: str, folder: BenchFolder) -
     box = HumanRegions(capture).crop(frame)
     tiles: list[Tile] = [("recorded", "", _cut(_shown(capture, frame, "image"), box))]
     for row in records.plan.suite.rows:
-        for record in records.of(name, row.name)[:1]:
+        for record in records.drawn(name, row.name)[:1]:
             entry = next((e for e in record["per_frame"] if e["frame"] == frame.name), None)
             if entry is None:
                 continue

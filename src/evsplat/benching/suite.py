@@ -46,7 +46,8 @@ class SuiteRow:
     name: str
     """The row's name in files and for ``--only``."""
     method: str
-    """A method that is trained, ``median_background``, ``nearest_frame`` or ``pictures``."""
+    """A method that is trained, ``median_background``, ``nearest_frame``, ``pictures`` or
+    ``own_picture``: what the camera itself recorded of a test frame."""
     title: str | None = None
     """The row's title in tables; the name where it is not given."""
     restore: str | None = None

@@ -7,6 +7,7 @@ from statistics import fmean
 from typing import Any
 
 from evsplat.benching.figures import Record, Records, metric
+from evsplat.benching.given_pictures import OWN_PICTURE
 from evsplat.benching.suite import PublishedTable, SuiteRow
 from evsplat.capture.policy import STRICT_TERMS, policy_of
 from evsplat.evaluation.protocols import PROTOCOLS
@@ -69,6 +70,8 @@ def _means(records: Records, protocol: str) -> Table:
     # All three are None for rows that do not train.
     training: dict[tuple[str, int], Callable[[Record], float | None]] = {
         ("minutes", 1): lambda r: r["train_seconds"] and r["train_seconds"] / 60,
+        # Of the processor, which other work beside it lengthens little.
+        ("CPU minutes", 1): lambda r: r.get("train_cpu_seconds") and r["train_cpu_seconds"] / 60,
         ("steps", 0): lambda r: r["iteration"],
         ("Gaussians", 0): lambda r: r["gaussians"] and sum(r["gaussians"].values()),
     }
@@ -162,11 +165,12 @@ def _table(
     rows = []
     for row in records.plan.suite.rows:
         done = sum(bool(records.of(c, row.name)) for c in captures)
+        whole = done == len(captures) and row.method != OWN_PICTURE
         figures = []
         for heading, read in columns:
-            figure, competes = read(row), done == len(captures) or heading.group == _PUBLISHED
+            figure, competes = read(row), whole or heading.group == _PUBLISHED
             figures.append(figure and replace(figure, competes=competes))
-        row_title = "; ".join([row.label, *_own_terms(records, row, captures)])
+        row_title = title_of(records, row, captures)
         if 0 < done < len(captures):
             row_title += f" ({done} of {len(captures)} captures)"
         elif not done:
@@ -199,10 +203,36 @@ def _terms(records: Records, captures: Sequence[str]) -> str:
     return " ".join(sentences)
 
 
-def _own_terms(records: Records, row: SuiteRow, captures: Sequence[str]) -> list[str]:
-    """Departures of a row's policy from the strict terms."""
+def title_of(records: Records, row: SuiteRow, captures: Sequence[str]) -> str:
+    """A row's title, and behind it where its policy departs from the strict terms."""
     policies = [policy_of(r) for c in captures for r in records.of(c, row.name)]
-    return list(dict.fromkeys(text for p in policies if p for text in p.departures))
+    departures = dict.fromkeys(text for p in policies if p for text in p.departures)
+    return "; ".join([row.label, *departures])
+
+
+def origins(records: Records) -> list[str]:
+    """Which commit and machine the records of trained rows are from, oldest commit first."""
+    rows: dict[tuple[str, str], list[str]] = {}
+    machines: set[str] = set()
+    for row in records.plan.suite.rows:
+        of_row = [r for c in records.captures for r in records.of(c, row.name) if r["iteration"]]
+        for record in of_row:
+            code = record.get("code") or {"date": "", "commit": f"release {record['evsplat']}"}
+            titles = rows.setdefault((code["date"], code["commit"]), [])
+            titles += [row.label] if row.label not in titles else []
+            if record.get("machine"):
+                machines.add(f"{record['machine']}, {_threads(record)}")
+    by_code = []
+    for (date, commit), titles in sorted(rows.items()):
+        whose = f" ({'; '.join(titles)})" if len(rows) > 1 else ""
+        by_code.append(commit + (f" of {date}" if date else "") + whose)
+    notes = [f"Code: {', '.join(by_code)}."] if by_code else []
+    return notes + [f"Trained on {text} a cell." for text in sorted(machines)]
+
+
+def _threads(record: Record) -> str:
+    threads = record.get("threads") or 1
+    return f"{threads} thread{'s' if threads > 1 else ''}"
 
 
 def _footnotes(records: Records) -> list[str]:
@@ -216,6 +246,7 @@ def _footnotes(records: Records) -> list[str]:
     left = len(records.plan.cells) - len(records.by_cell)
     if left:
         notes.append(f"{left} of {len(records.plan.cells)} cells have not been run yet.")
+    notes += origins(records)
     given = [row.label for row in records.plan.suite.rows if row.pictures]
     if given:
         notes.append(f"{', '.join(given)}: made elsewhere; what training saw is not known.")

@@ -211,6 +211,8 @@ class BenchOptions:
 
     out: Annotated[Path | None, option("FOLDER", default="bench/SUITE")] = None
     """Results folder: tables.md, tables.tex, index.html, one JSON per cell."""
+    records: Annotated[Path | None, option("FOLDER", default="none")] = None
+    """Kept records, a few KB each: cells there count as done, finished cells are kept there."""
     captures: Annotated[tuple[Path, ...], option("[CAPTURE ...]", default="the suite's")] = ()
     """Captures in place of the suite's, or names of some of the suite's."""
     draw_seed: Annotated[

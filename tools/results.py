@@ -1,0 +1,257 @@
+"""Write the tables of README.md and the docs from the records that the repository keeps.
+
+    python tools/results.py [--check]
+
+Each place between ``<!-- results: NAME -->`` and ``<!-- end of results -->`` in `PAGES` is made
+anew from docs/results, and the convergence figure is drawn. ``--check`` writes nothing and ends
+with 1 where a page says something else. Records come there by ``evsplat bench SUITE --records
+docs/results/SUITE`` and by benchmarks/convergence.py.
+"""
+
+import argparse
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+from convergence import curves_of, draw, knee, read_points  # noqa: E402
+
+from evsplat.benching.figures import Records, metric  # noqa: E402
+from evsplat.benching.folder import BenchFolder  # noqa: E402
+from evsplat.benching.kept import plan_of_kept  # noqa: E402
+from evsplat.benching.plan import pending_cells  # noqa: E402
+from evsplat.benching.suite import SuiteRow, read_suite  # noqa: E402
+from evsplat.benching.tables import make_tables, origins, title_of  # noqa: E402
+from evsplat.capture.policy import STRICT_TERMS  # noqa: E402
+from evsplat.evaluation.tables import LEGEND, REGION_TITLES, markdown  # noqa: E402
+
+KEPT = ROOT / "docs" / "results"
+PAGES = ("README.md", "docs/bench.md", "docs/results.md")
+FIGURE = ROOT / "docs" / "images" / "convergence.png"
+COMPARED = ("man_dance_hard_256", "woman_dance_b_256", "real_beam_256")
+"""Captures that every method is compared on."""
+FOUND = "_found_poses"
+"""Ends the name of a capture whose poses `evsplat poses` found in place of the given ones."""
+GAIN_DB = 0.2
+"""Less than so much from a doubling of the steps ends a curve of benchmarks/convergence.py."""
+_OF_POINT = ("full_psnr_db", "crop_psnr_db", "mask_psnr_db")
+_PLACE = re.compile(r"(<!-- results: ([a-z-]+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
+
+
+def kept_records(suite: str) -> Records:
+    """Everything kept of a suite; a record that it asks for otherwise is a `ConfigError`."""
+    folder = BenchFolder(ROOT / "build" / "results" / suite, KEPT / suite)
+    plan = plan_of_kept(read_suite(suite), suite, KEPT / suite)
+    pending_cells(plan, folder, retry=False)
+    return Records.read(plan, folder)
+
+
+def _only(records: Records, captures: Sequence[str]) -> Records:
+    """What is recorded of some captures, in their order."""
+    sources = {n: records.plan.sources[n] for n in captures if n in records.plan.sources}
+    cells = tuple(cell for cell in records.plan.cells if cell.capture.name in sources)
+    found = {key: record for key, record in records.by_cell.items() if key[0] in sources}
+    return Records(replace(records.plan, sources=sources, cells=cells), found)
+
+
+def trio(records: Records, row: str, capture: str) -> str:
+    """PSNR of full frame / person crop / person mask, the largest spread over seeds behind it."""
+    found = [
+        figure
+        for region in REGION_TITLES
+        if (figure := records.figure(row, metric("standard", region, "psnr"), [capture]))
+    ]
+    spreads = [figure.spread for figure in found if figure.spread is not None]
+    text = " / ".join(f"{figure.mean:.2f}" for figure in found) or "–"
+    return text + (f" (± {max(spreads):.2f})" if spreads else "")
+
+
+def methods(records: Records) -> str:
+    """Every row on the captures that all methods are compared on."""
+    lines = [
+        f"| method | steps | {' | '.join(COMPARED)} | CPU minutes |",
+        f"|---|---:|{'---|' * len(COMPARED)}---:|",
+    ]
+    missing = []
+    for row, title, captures in _rows(records):
+        figures = [trio(records, row.name, capture) for capture in captures]
+        gaps = [name for name, figure in zip(COMPARED, figures, strict=True) if figure == "–"]
+        if gaps:
+            where = "" if len(gaps) == len(COMPARED) else f" on {', '.join(gaps)}"
+            missing.append(title + where)
+        if len(gaps) == len(COMPARED):
+            continue
+        steps = records.figure(row.name, lambda r: r["iteration"], captures)
+        seconds = records.figure(row.name, lambda r: r.get("train_cpu_seconds"), captures)
+        lines.append(
+            f"| {title} | {f'{steps.mean:,.0f}' if steps else '–'} | {' | '.join(figures)} | "
+            f"{f'{seconds.mean / 60:.1f}' if seconds else '–'} |"
+        )
+    notes = [
+        "PSNR in dB of full frame / person crop / person mask, protocol `standard`, "
+        f"{_test_frames(records)} test frames; one seed where no ± follows, which is the largest "
+        f"standard deviation of the three over seeds. {STRICT_TERMS}",
+        *origins(records),
+        "CPU minutes are the processor's of the training alone, which ran beside other work; the "
+        "mean over what the row has.",
+    ]
+    if missing:
+        notes.append(f"Not run yet: {'; '.join(missing)}.")
+    return "\n".join([*lines, "", " ".join(notes)])
+
+
+def _rows(records: Records) -> Iterator[tuple[SuiteRow, str, list[str]]]:
+    """Rows, their titles and captures; a second time those that ran with found poses."""
+    for row in records.plan.suite.rows:
+        yield row, title_of(records, row, COMPARED), list(COMPARED)
+        found = [capture + FOUND for capture in COMPARED]
+        if any(records.of(capture, row.name) for capture in found):
+            yield row, f"{title_of(records, row, found)}; poses found by `evsplat poses`", found
+
+
+def _test_frames(records: Records) -> str:
+    counts = []
+    for capture in COMPARED:
+        found = [r for row in records.plan.suite.rows for r in records.of(capture, row.name)]
+        counts += [str(found[0]["frames"]["test"])] if found else []
+    return " + ".join(counts)
+
+
+def captures(records: Records) -> str:
+    """`evsplat` and `paper` on every capture, beside what needs no method."""
+    rows = ("evsplat", "paper", "nearest_frame", "own_picture")
+    names = [name for name in records.captures if not name.endswith(FOUND)]
+    lines = [
+        "| capture | `evsplat` | `paper` | nearest training frame | own blurry picture |",
+        "|---|---|---|---|---|",
+        *(f"| {n} | {' | '.join(trio(records, row, n) for row in rows)} |" for n in names),
+    ]
+    return "\n".join(lines)
+
+
+def grid(records: Records) -> str:
+    """The table of captures drawn at random, and below it who wins how often."""
+    tables = [table for table in make_tables(records) if table.by_row]
+    if not tables:
+        return "Too few captures have run yet."
+    return _body(markdown("", "", tables, origins(records))).partition("\n")[2].strip()
+
+
+def grid_summary(records: Records) -> str:
+    """How `evsplat` and `paper` compare on the captures that both ran on."""
+    value = metric("standard", "person_mask", "psnr")
+    pairs = {}
+    for capture in records.captures:
+        ours, theirs = (records.figure(row, value, [capture]) for row in ("evsplat", "paper"))
+        if ours and theirs:
+            pairs[capture] = ours.mean, theirs.mean
+    if not pairs:
+        return "No capture of the grid has both methods yet."
+    drawn = records.plan.suite.draw
+    total = drawn.captures if drawn else len(pairs)
+    of_ours, of_theirs = zip(*pairs.values(), strict=True)
+    gaps = {capture: a - b for capture, (a, b) in pairs.items()}
+    least = min(gaps, key=lambda capture: gaps[capture])
+    wins = sum(gap > 0 for gap in gaps.values())
+    return (
+        f"On the {len(pairs)} of {total} captures drawn at random that both have run on, person's "
+        f"pixels: `evsplat` {fmean(of_ours):.2f} dB in the mean and {min(of_ours):.2f} at worst, "
+        f"`paper` {fmean(of_theirs):.2f} and {min(of_theirs):.2f}; `evsplat` is ahead on {wins} of "
+        f"{len(pairs)}, by {gaps[least]:+.2f} dB where by least ({least})."
+    )
+
+
+def suite_tables(records: Records) -> str:
+    """All tables of a suite as the bench itself writes them."""
+    intro = LEGEND.format(second="in italics")
+    return _body(markdown("", intro, make_tables(records))).replace("## ", "### ")
+
+
+def _body(page: str) -> str:
+    """A Markdown page without its title."""
+    return page.partition("\n")[2].strip()
+
+
+def cells(suites: Sequence[Records]) -> str:
+    """Every kept cell with its commit and its record."""
+    lines = ["| suite | capture | row | seed | steps | full / crop / mask | CPU minutes | code | |"]
+    lines.append("|---|---|---|---:|---:|---|---:|---|---|")
+    for records in suites:
+        for (capture, row, seed), record in sorted(records.by_cell.items()):
+            regions = record["protocols"]["standard"]
+            values = [regions[region]["psnr"] for region in REGION_TITLES]
+            cpu, suite = record.get("train_cpu_seconds"), records.plan.suite.name
+            words = (
+                suite,
+                capture,
+                row,
+                str(seed),
+                f"{record['iteration']:,}" if record["iteration"] else "–",
+                " / ".join("–" if value is None else f"{value:.2f}" for value in values),
+                f"{cpu / 60:.1f}" if cpu else "–",
+                (record.get("code") or {}).get("commit", "–"),
+                f"[record](results/{suite}/{capture}/{row}/seed{seed}.json)",
+            )
+            lines.append(f"| {' | '.join(words)} |")
+    return "\n".join(lines)
+
+
+def convergence() -> str:
+    """Where doubling the steps stops to pay, of the points that are kept."""
+    curves = curves_of(read_points(KEPT / "convergence"))
+    lines = ["| capture | method | steps | full / crop / mask | |", "|---|---|---:|---|---|"]
+    for capture, of_method in curves.items():
+        for method, points in of_method.items():
+            at = knee(points, GAIN_DB)
+            psnr = " / ".join(f"{at[key]:.2f}" for key in _OF_POINT)
+            said = "the knee" if at["converged"] else "no knee seen yet: the longest run"
+            lines.append(f"| {capture} | {method} | {at['steps']:,} | {psnr} | {said} |")
+    return "\n".join(lines) if curves else "No points are kept yet."
+
+
+def texts() -> dict[str, str]:
+    """Every place by its name."""
+    stage, drawn = kept_records("stage"), kept_records("grid")
+    return {
+        "methods": methods(stage),
+        "captures": captures(stage),
+        "grid": grid(drawn),
+        "grid-summary": grid_summary(drawn),
+        "stage-tables": suite_tables(_only(stage, COMPARED)),
+        "cells": cells([stage, drawn]),
+        "convergence": convergence(),
+    }
+
+
+def filled(page: str, made: dict[str, str]) -> str:
+    """A page with all its places made anew."""
+    return _PLACE.sub(lambda found: f"{found[1]}\n{made[found[2]]}\n\n{found[3]}", page)
+
+
+def main() -> int:
+    """Write or check all pages; 1 where one is older than the records."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="write nothing, compare")
+    check = parser.parse_args().check
+    made, older = texts(), []
+    for name in PAGES:
+        path = ROOT / name
+        there = path.read_text("utf-8")
+        if filled(there, made) != there:
+            older.append(name)
+            if not check:
+                path.write_text(filled(there, made), "utf-8")
+    curves = curves_of(read_points(KEPT / "convergence"))
+    if curves and not check:
+        draw(curves, FIGURE)
+    print(f"{'older than the records' if check else 'written'}: {', '.join(older) or 'none'}")
+    return int(check and bool(older))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
