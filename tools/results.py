@@ -52,11 +52,14 @@ def kept_records(suite: str) -> Records:
 
 
 def _only(records: Records, captures: Sequence[str]) -> Records:
-    """What is recorded of some captures, in their order."""
-    sources = {n: records.plan.sources[n] for n in captures if n in records.plan.sources}
-    cells = tuple(cell for cell in records.plan.cells if cell.capture.name in sources)
+    """Some captures in their order, and the rows that have run on one of them."""
+    plan = records.plan
+    sources = {name: plan.sources[name] for name in captures if name in plan.sources}
+    cells = tuple(cell for cell in plan.cells if cell.capture.name in sources)
     found = {key: record for key, record in records.by_cell.items() if key[0] in sources}
-    return Records(replace(records.plan, sources=sources, cells=cells), found)
+    run = {row for _, row, _ in found}
+    suite = replace(plan.suite, rows=tuple(row for row in plan.suite.rows if row.name in run))
+    return Records(replace(plan, suite=suite, sources=sources, cells=cells), found)
 
 
 def trio(records: Records, row: str, capture: str) -> str:
@@ -83,7 +86,7 @@ def methods(records: Records) -> str:
         gaps = [name for name, figure in zip(COMPARED, figures, strict=True) if figure == "–"]
         if gaps:
             where = "" if len(gaps) == len(COMPARED) else f" on {', '.join(gaps)}"
-            missing.append(title + where)
+            missing.append(f"`{row.name}`{where}")
         if len(gaps) == len(COMPARED):
             continue
         steps = records.figure(row.name, lambda r: r["iteration"], captures)

@@ -217,7 +217,8 @@ def origins(records: Records) -> list[str]:
     for row in records.plan.suite.rows:
         of_row = [r for c in records.captures for r in records.of(c, row.name) if r["iteration"]]
         for record in of_row:
-            code = record.get("code") or {"date": "", "commit": f"release {record['evsplat']}"}
+            release = f"release {record.get('evsplat', 'unknown')}"
+            code = record.get("code") or {"date": "", "commit": release}
             titles = rows.setdefault((code["date"], code["commit"]), [])
             titles += [row.label] if row.label not in titles else []
             if record.get("machine"):

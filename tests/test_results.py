@@ -1,0 +1,40 @@
+"""Published tables say what the records that the repository keeps say, and nothing else."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from evsplat.benching.cell import DONE, read_cell_record
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+
+import results  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def made() -> dict[str, str]:
+    return results.texts()
+
+
+@pytest.mark.parametrize("page", results.PAGES)
+def test_every_table_is_the_one_that_its_records_make(made, page):
+    text = (ROOT / page).read_text("utf-8")
+    assert results.filled(text, made) == text, "python tools/results.py writes it anew"
+
+
+def test_every_kept_record_is_small_and_says_where_it_is_from():
+    paths = [*results.KEPT.glob("stage/*/*/*.json"), *results.KEPT.glob("grid/*/*/*.json")]
+    for path in paths:
+        record = read_cell_record(path)
+        assert path.stat().st_size < 12_000, path
+        assert record["status"] == DONE and record["machine"], path
+        assert not record["code"]["commit"].endswith("+"), path
+
+
+def test_a_page_keeps_what_stands_between_its_tables(made):
+    page = "a\n<!-- results: grid-summary -->\nold\n<!-- end of results -->\nb\n"
+    filled = results.filled(page, made)
+    assert filled.startswith("a\n") and filled.endswith("\nb\n")
+    assert made["grid-summary"] in filled and "old" not in filled
