@@ -107,7 +107,7 @@ def test_the_commit_is_the_last_one_that_changed_what_decides_figures(tmp_path, 
     git("add", ".")
     git("commit", "-qm", "one")
     first = git("log", "-1", "--format=%h")
-    monkeypatch.setattr(origin.evsplat, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(origin, "_ROOT", tmp_path)
     (package / "view" / "page.py").write_text("two")
     git("commit", "-qam", "a view changes no figure")
     assert origin.code.__wrapped__()["commit"] == first
@@ -115,7 +115,7 @@ def test_the_commit_is_the_last_one_that_changed_what_decides_figures(tmp_path, 
     assert origin.code.__wrapped__()["commit"] == first + "+"
     git("commit", "-qam", "a model does")
     assert origin.code.__wrapped__()["commit"] == git("log", "-1", "--format=%h")
-    monkeypatch.setattr(origin.evsplat, "__file__", str(tmp_path.parent / "a" / "b" / "c.py"))
+    monkeypatch.setattr(origin, "_ROOT", tmp_path / "nowhere")
     assert origin.code.__wrapped__() is None
 
 

@@ -4,9 +4,10 @@ import subprocess
 from functools import cache
 from pathlib import Path
 
-import evsplat
 from evsplat.devices import hardware
 
+_ROOT = Path(__file__).parents[3]
+"""The repository, where the package is not installed apart from it."""
 _NO_FIGURE = ("benching", "cli", "export", "film", "importers", "inspection", "options", "view")
 """Folders of the package that change no figure of a cell."""
 
@@ -17,15 +18,14 @@ def code() -> dict[str, str] | None:
 
     Changes that are not committed are told by a ``+`` behind the commit.
     """
-    root = Path(evsplat.__file__).parents[2]
     scope = ["native", "src/evsplat", *(f":!src/evsplat/{name}" for name in _NO_FIGURE)]
-    if not (root / ".git").exists():
+    if not (_ROOT / ".git").exists():
         return None
-    last = _git(root, "log", "-1", "--format=%h %cs", "--", *scope)
+    last = _git("log", "-1", "--format=%h %cs", "--", *scope)
     if not last:
         return None
     commit, date = last.split()
-    changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", *scope)
+    changed = _git("status", "--porcelain", "--untracked-files=no", "--", *scope)
     return {"commit": commit + "+" * bool(changed), "date": date}
 
 
@@ -36,10 +36,10 @@ def machine() -> str:
     return ", ".join([*names, f"{found['cpu_cores']} cores"])
 
 
-def _git(root: Path, *words: str) -> str:
+def _git(*words: str) -> str:
     """Output of git; empty where it fails or is not installed."""
     try:
-        done = subprocess.run(["git", "-C", root, *words], capture_output=True, text=True)
+        done = subprocess.run(["git", "-C", _ROOT, *words], capture_output=True, text=True)
     except OSError:
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""
