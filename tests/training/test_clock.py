@@ -39,3 +39,22 @@ def test_given_iterations_are_kept_and_cut_off_by_the_time_limit():
         clock.advance(0.125)
     assert clock.iteration == 10
     assert clock.nominal == pytest.approx(1_500)
+
+
+def test_a_finished_run_goes_on_by_more_steps():
+    clock = Clock(iterations=60)
+    while not clock.done:
+        clock.advance(0.1)
+    clock.go_by(200)
+    assert clock.fraction == 60 / 200
+    while not clock.done:
+        clock.advance(0.1)
+    assert clock.iteration == 200
+
+
+def test_a_run_that_is_longer_than_its_new_schedule_is_finished():
+    clock = Clock(iterations=60)
+    while not clock.done:
+        clock.advance(0.1)
+    clock.go_by(50)
+    assert clock.done and clock.fraction == 1.0

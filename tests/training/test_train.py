@@ -107,6 +107,17 @@ def test_ctrl_c_finishes_the_step_saves_and_says_how_to_resume(tiny_capture, tmp
     assert load_run(out).iteration >= 2
 
 
+def test_a_finished_run_goes_on_where_more_steps_are_asked_for(tiny_capture, tmp_path):
+    capture = tiny_capture(frames=10)
+    out = train(capture, out=tmp_path / "run", iterations=4, overrides=small("evsplat"))
+    train(capture, out=out, resume=True)
+    assert load_run(out).iteration == 4
+    train(capture, out=out, resume=True, iterations=8)
+    assert load_run(out).iteration == 8
+    _, state = load_checkpoint(latest_checkpoint(out / "checkpoints"))
+    assert state["clock"]["iterations"] == 8 and state["clock"]["fraction"] == 1.0
+
+
 def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(tiny_capture, tmp_path):
     capture = tiny_capture(frames=10)
     runs = {}

@@ -61,10 +61,15 @@ class Clock:
         self.seconds += step_seconds
         self.iteration += 1
         if not self.shrink:
-            # From the integer, so that a thousand additions leave no rounding behind.
-            self.fraction = self.iteration / self.iterations
+            self.go_by(self.iterations)
         else:
             self.fraction += (1 - self.fraction) / max(self._steps_left(), 1.0)
+
+    def go_by(self, iterations: int) -> None:
+        """Stand where a schedule of so many steps is after those made, finished as this may be."""
+        self.iterations = iterations
+        # From the integer, so that a thousand additions leave no rounding behind.
+        self.fraction = min(1.0, self.iteration / iterations)
 
     def _steps_left(self) -> float:
         left = (1 - self.fraction) * self.iterations

@@ -151,7 +151,9 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
             raise DataError(f"{checkpoint}: {wrong}; train again, without --resume.")
         with misfits_of(checkpoint):
             trainer.load_state(tensors, state)
-        if iterations is None and max_minutes is None:
+        if iterations is not None:
+            clock.go_by(iterations)
+        elif max_minutes is None:
             clock.iterations = state["clock"]["iterations"]
     folder.truncate_log(clock.iteration)
     state_bytes = sum(value.nbytes for value in trainer.model.state_dict().values())
