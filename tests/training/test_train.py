@@ -279,7 +279,7 @@ def test_everything_trains_where_it_is_asked_for_and_no_figure_is_made(
     tiny_capture, tmp_path, capsys
 ):
     path, out = tiny_capture(frames=10), tmp_path / "run"
-    settings = [f"--set={setting}" for setting in small("paper")]
+    settings = ["--set", *small("paper")]
     command = ["train", str(path), "--out", str(out), "--iterations", "12", "--method", "paper"]
     assert main([*command, "--use", "everything", *settings]) == 0
     assert "No test figures. Every frame and every event trained" in capsys.readouterr().out
