@@ -319,7 +319,8 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
 class Stopwatch:
     """Time of the parts' calls, without the calls of parts inside, and of their gradients."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.clock = clock
         self.forward: Counter[str] = Counter()
         self.backward: Counter[str] = Counter()
         self.nodes: dict[Any, str] = {}
@@ -331,13 +332,13 @@ class Stopwatch:
 
         def outer(*args: Any, **kwargs: Any) -> Any:
             self._inner.append(0.0)
-            start = time.perf_counter()
+            start = self.clock()
             result = call(*args, **kwargs)
-            own = time.perf_counter() - start
+            own = self.clock() - start
             self.forward[part] += own - self._inner.pop()
             self._claim(result, part)
             # What is spent on watching belongs to nobody.
-            self._inner[-1] += time.perf_counter() - start
+            self._inner[-1] += self.clock() - start
             return result
 
         setattr(owner, name, outer)
@@ -353,10 +354,10 @@ class Stopwatch:
             since = [0.0]
 
             def before(_: Any, since: list[float] = since) -> None:
-                since[0] = time.perf_counter()
+                since[0] = self.clock()
 
             def after(_: Any, __: Any, since: list[float] = since) -> None:
-                self.backward[part] += time.perf_counter() - since[0]
+                self.backward[part] += self.clock() - since[0]
 
             node.register_prehook(before)
             node.register_hook(after)

@@ -22,7 +22,7 @@ from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_r
 from evsplat.pictures.light import Transfer, shown
 from evsplat.untrusted.arrays import read_plain_npz
 
-IMAGE_CACHE_BYTES = 512 << 20
+IMAGE_CACHE_BYTES = 192 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
 _MEDIAN_FRAMES = 255
 

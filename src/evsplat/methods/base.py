@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Literal, Protocol
 
 import torch
@@ -17,6 +17,9 @@ from evsplat.methods.settings import Weight
 from evsplat.models.at_rest import Skinned
 from evsplat.models.seen import Seen
 from evsplat.objectives import Objective, PackedBounds
+
+_KEPT_BOUNDS_BYTES = 32 << 20
+"""Of the person's places in frames, which are found again when their frame comes again."""
 
 Purpose = Literal["train", "resume", "draw"]
 """``train``: from the start, with the cheap fits before it. ``resume``: a checkpoint brings all
@@ -103,13 +106,17 @@ def semantic_bounds(
     """Places of the person by the posed body, for each training frame's mid-exposure.
 
     ``band_px_at_256``: width of the undecided band around it, for a picture 256 pixels high. They
-    are found when they are first asked for.
+    are found when they are asked for, and those of the frames asked for last are kept.
     """
+    frames = capture.train_frames
+    sizes = {capture.camera(frame).height * capture.camera(frame).width for frame in frames}
+    each = max(sizes, default=1) // 4
 
+    @lru_cache(max(1, _KEPT_BOUNDS_BYTES // max(each, 1)))
     def found(frame: Frame) -> PackedBounds:
         camera = capture.camera(frame)
         mask = silhouette(track.vertices(frame.mid_us), track.body.faces, camera)
         band = max(1, round(band_px_at_256 * camera.height / 256))
         return PackedBounds.of(mask.numpy(), band)
 
-    return {frame.mid_us: cache(partial(found, frame)) for frame in capture.train_frames}
+    return {frame.mid_us: partial(found, frame) for frame in frames}

@@ -19,6 +19,8 @@ SHARES = {"constant": 0.3, "slow": 0.5, "fast": 0.2}
 wanders with pose and view, and a little anew in every picture."""
 SLOW_US = 200_000
 """Least time between knots of the slow part: no less than two key poses, either."""
+_PRICED = 1_024
+"""Keys whose price is asked at a time: an hour's would take as long as the rest of the step."""
 
 
 class PoseCorrection(nn.Module):
@@ -114,12 +116,16 @@ class PoseCorrection(nn.Module):
             turns, shifts = self.between.values(times)
         return turns * self.between_rad[:, None], shifts * self.between_m
 
-    def price(self) -> Float[Tensor, ""]:
+    def price(self, generator: torch.Generator | None = None) -> Float[Tensor, ""]:
         """Squares in units of what is expected, averaged over moving joints, root, axes and keys.
 
-        A part with fewer knots than keys costs the less: each knot is one unknown.
+        A part with fewer knots than keys costs the less: each knot is one unknown. Of more than
+        `_PRICED` keys a stretch drawn from ``generator`` stands for all.
         """
         keys, price = self.key_us, self.joint_rad.new_zeros(())
+        if generator is not None and len(keys) > _PRICED:
+            stretches = keys.tensor_split(-(-len(keys) // _PRICED))
+            keys = stretches[int(torch.randint(len(stretches), (), generator=generator))]
         if not bool(self.exact):
             moving = (self.joint_rad > 0).any(0)
             parts = dict(self._errors())

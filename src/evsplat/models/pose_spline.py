@@ -16,9 +16,11 @@ _PIECES = torch.tensor(
     [[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], dtype=torch.float64
 ) / 6  # fmt: skip
 
-_REACH, _BLOCK = 24, 256
+_REACH, _BLOCK = 14, 256
 """Keys that a piece of the spline through keys knows on either side; pieces made, and times
 evaluated, at a time."""
+_DENSE = 8 * _BLOCK
+"""Control points up to which each time weighs all of them; of more only those near it."""
 
 
 class PoseSpline(nn.Module):
@@ -61,7 +63,7 @@ class PoseSpline(nn.Module):
         """Number of control points."""
         buffers = {
             "mean": torch.zeros(self.count),
-            "held": torch.zeros(0, 4, 0, dtype=torch.float64),
+            "held": torch.zeros(0, 4, 0),
             "held_first": torch.zeros(0, dtype=torch.long),
             "held_s": torch.zeros(0, dtype=torch.float64),
         }
@@ -127,7 +129,7 @@ class PoseSpline(nn.Module):
 
         Per piece those of the `_REACH` keys before and after: farther ones count less than a
         rounding error, since a spline forgets three quarters of a value from one key to the next.
-        So memory grows with the number of keys, not with its square.
+        So memory grows with the number of keys, not with its square: 1 kB a key.
         """
         index, four = self._four(torch.tensor(keys_us, dtype=torch.float64))
         first, seconds, pieces = index.numpy(), self.held_s.numpy(), len(keys_us) - 1
@@ -135,7 +137,7 @@ class PoseSpline(nn.Module):
         highs = np.minimum(np.arange(pieces) + _REACH + 1, pieces)
         width = int((first[highs] + 4 - first[lows]).max())
         starts = np.minimum(first[lows], self.count - width)
-        held = np.zeros((pieces, 4, width))
+        held = np.zeros((pieces, 4, width), dtype=np.float32)
         for begin in range(0, pieces, _BLOCK):
             end = min(begin + _BLOCK, pieces)
             # Beside the block as many keys again, at whose ends the spline may bend otherwise.
@@ -169,12 +171,14 @@ class PoseSpline(nn.Module):
         self, times_us: Sequence[int] | Tensor
     ) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T 3"]]:
         """Values of the joints and of the root's place."""
-        if len(times_us) <= _BLOCK or math.isinf(self.knot_us):
+        if (len(times_us) <= _BLOCK and self.count <= _DENSE) or math.isinf(self.knot_us):
             weights = self.weights(times_us)
             return torch.einsum("tk,kjc->tjc", weights, self.rotations), weights @ self.translations
         times = send(torch.as_tensor(times_us, dtype=torch.float64), self.mean.device)
         points = torch.cat((self.rotations.flatten(1), self.translations), 1)
-        found = self._in_blocks(times, points) - self.mean @ points
+        found = self._in_blocks(times, points)
+        if not len(self.held):  # what is held at keys is not centred
+            found = found - self.mean @ points
         return found[:, :-3].unflatten(1, (-1, 3)), found[:, -3:]
 
     def _in_blocks(

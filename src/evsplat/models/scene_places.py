@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from evsplat.camera import Camera
+from evsplat.models.kept import Unchanged
 from evsplat.models.layers import Layers
 from evsplat.render import render, same_values
 
@@ -27,6 +28,7 @@ class ScenePlaces:
         self.refresh, self.age = refresh, 0
         self.kept = torch.zeros(0, 0, 3)
         self.seen: list[Tensor] = []
+        self._given = Unchanged()
 
     @torch.no_grad()
     def of(self, layers: Layers, camera: Camera, step: int) -> Float[Tensor, "h w 3"]:
@@ -34,23 +36,21 @@ class ScenePlaces:
         shape = -(-camera.height // step), -(-camera.width // step), 3
         # A camera on a GPU is not compared, for which the host would have to wait.
         kept = tuple(self.kept.shape) == shape and layers.scene.means.device.type == "cpu"
-        if not (kept and self._same(layers, camera)):
-            self.kept = places_of(scene_depth(layers, camera), camera, step)
-            self.seen, self.age = self._given(layers, camera), 0
-        self.age += 1
-        return self.kept
-
-    def _given(self, layers: Layers, camera: Camera) -> list[Tensor]:
         given = [camera.K, camera.world_to_camera]
         if self.refresh is None:
             scene = layers.scene
             given += [scene.means, scene.quaternions, scene.scales, scene.opacities]
-        return [tensor.detach().clone() for tensor in given]
+        if not (kept and self._same(given)):
+            self.kept = places_of(scene_depth(layers, camera), camera, step)
+            self.seen, self.age = [tensor.detach().clone() for tensor in given], 0
+        self.age += 1
+        return self.kept
 
-    def _same(self, layers: Layers, camera: Camera) -> bool:
+    def _same(self, given: list[Tensor]) -> bool:
         if self.refresh is not None and self.age >= self.refresh:
             return False
-        given = self._given(layers, camera)
+        if self._given.again(given) and self.seen:
+            return True
         return len(given) == len(self.seen) and all(map(same_values, given, self.seen))
 
     def rows_changed(self) -> None:

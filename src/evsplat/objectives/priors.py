@@ -17,7 +17,7 @@ class PosePrior(Objective):
         """``pose_prior``, once residuals are learned; see `PoseCorrection.price`."""
         if step.model.residual is None or not step.model.residual_active:
             return {}
-        return {"pose_prior": step.model.residual.price()}
+        return {"pose_prior": step.model.residual.price(step.generator)}
 
 
 class ReliefPrior(Objective):

@@ -1,7 +1,7 @@
 """Drawing posed Gaussians: one function, several backends that give the same numbers."""
 
 from evsplat.render.api import BackendName, choose_device, render
-from evsplat.render.job import Backdrop, same_values
+from evsplat.render.job import Backdrop, same_memory, same_values
 from evsplat.render.native import rows_in_view
 from evsplat.render.splats import LOW_PASS, RenderOutput, Splats, split_channels
 
@@ -14,6 +14,7 @@ __all__ = [
     "choose_device",
     "render",
     "rows_in_view",
+    "same_memory",
     "same_values",
     "split_channels",
 ]

@@ -78,6 +78,11 @@ def same_values(new: Tensor, old: Tensor) -> bool:
     """True for tensors that hold the same; they are not read where they are one in memory."""
     if new.shape != old.shape or new.dtype != old.dtype or new.device != old.device:
         return False
-    if new.data_ptr() == old.data_ptr() and new.stride() == old.stride():
-        return True
-    return torch.equal(new, old)
+    return same_memory(new, old) or torch.equal(new, old)
+
+
+def same_memory(new: Tensor, old: Tensor) -> bool:
+    """True for two views of the same values; ``old`` was held, so that its memory is no other's."""
+    if new.shape != old.shape or new.dtype != old.dtype or new.device != old.device:
+        return False
+    return new.data_ptr() == old.data_ptr() and new.stride() == old.stride()

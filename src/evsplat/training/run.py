@@ -327,6 +327,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     with misfits_of(path):
         load_model(composition.model, tensors, progress["human_count"], filled=True)
         seen = _seen(tensors, progress)
+    composition.model.requires_grad_(False)
     return Run(
         path=folder.path,
         config=config,
@@ -347,6 +348,7 @@ def reload_run(run: Run, state: Path) -> Run:
     with misfits_of(state):
         load_model(model, tensors, progress["human_count"], filled=True)
         seen = _seen(tensors, progress)
+    model.requires_grad_(False)
     reconstruction = replace(run.reconstruction, seen=seen)
     return replace(run, reconstruction=reconstruction, **_progress(model, progress))
 

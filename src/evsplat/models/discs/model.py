@@ -8,6 +8,7 @@ bends beyond that. Light falls on the person from lamps, which it hides from the
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -19,8 +20,10 @@ from evsplat.gaussians import GaussianSet
 from evsplat.models.discs.relief import Relief
 from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.models.discs.shadow import BodyShadow, Lamps
+from evsplat.models.discs.still import Still
 from evsplat.models.drawing import Drawing, draw
-from evsplat.models.layers import Layers, SceneShadow, human_splats, scene_splats
+from evsplat.models.kept import Kept
+from evsplat.models.layers import Layers, SceneShadow, human_splats
 from evsplat.models.model import PosedModel, RowCache
 from evsplat.models.networks.colour import SceneColour, scene_rgb
 from evsplat.models.networks.non_rigid import PoseDeformation, draw_pose_noise
@@ -87,7 +90,7 @@ class DiscModel(PosedModel):
         """
         super().__init__(track)
         body = track.body
-        self.gaussians = gaussians
+        self.gaussians, self._kept = gaussians, Kept()
         self.non_rigid_start, self.pose_noise = non_rigid_start, pose_noise
         self.low_pass = low_pass
         self.deformation = PoseDeformation(body, width=width, feature_dim=0)
@@ -199,44 +202,38 @@ class DiscModel(PosedModel):
 
         ``lit_at``: the times, one or all, at which shadows on the person are looked up.
         """
-        gaussians = self.gaussians
-        means, scene_means = gaussians.of_parts(gaussians.means)
-        scales_log, scene_scales_log = gaussians.of_parts(gaussians.scales_log)
-        quaternions, scene_quaternions = gaussians.of_parts(gaussians.quaternions)
-        colours, scene_colours = gaussians.of_parts(gaussians.get_parameter(gaussians.colour))
-        opacities, scene_opacities = gaussians.of_parts(gaussians.opacities())
-        labels = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
-        semantics, scene_semantics = gaussians.of_parts(labels)
-
+        still = self._still(view, hard_semantics=hard_semantics)
+        means, scales_log, quaternions = still.means, still.scales_log, still.quaternions
         if float(self.nominal) >= self.non_rigid_start:
             centers, scales, turned, _ = self.deformation(means, scales_log, quaternions, rotations)
         else:
             centers, scales, turned = means[None], scales_log.exp()[None], quaternions[None]
         world, transforms = skin(centers, self.surface.weights(means)[None], bones)
         casters = None if self.shadow is None else self.shadow.place(bones)
-        scene_scales = scene_scales_log.exp()
-        rgb = colours[:, :3].sigmoid()[None] * self._light(world, transforms, casters, lit_at)
+        rgb = still.rgb[None] * self._light(world, transforms, casters, lit_at)
         return Layers(
-            human_splats(world, turned, scales, opacities, rgb, semantics, transforms),
-            scene_splats(
-                scene_means,
-                scene_quaternions,
-                scene_scales,
-                scene_opacities,
-                self._scene_rgb(scene_colours, scene_means, scene_scales, view),
-                scene_semantics,
-            ),
+            human_splats(world, turned, scales, still.opacities, rgb, still.semantics, transforms),
+            still.scene,
             transforms,
             self._scene_shadow(casters),
             self.low_pass,
         )
 
+    def _still(self, view: _View, *, hard_semantics: bool) -> Still:
+        """What is the same at all times, kept from one picture to the next where nobody learns."""
+        colours = partial(self._scene_rgb, view)
+        make = partial(Still.of, self.gaussians, colours, hard_semantics=hard_semantics)
+        # A network's colours depend on the view; soft labels are asked for in training alone.
+        if self.scene_colour is not None or not hard_semantics:
+            return make()
+        return self._kept.of([*self.gaussians.parameters()], make)
+
     def _scene_rgb(
         self,
+        view: _View,
         colours: Float[Tensor, "S C"],
         means: Float[Tensor, "S 3"],
         scales: Float[Tensor, "S 3"],
-        view: _View,
     ) -> Float[Tensor, "S 3"]:
         """Colours of the scene; those by the network may be black outside of the picture."""
         if self.scene_colour is None:

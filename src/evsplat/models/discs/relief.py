@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evsplat.camera import Camera
+from evsplat.models.kept import Kept
 from evsplat.models.layers import SceneShadow
 
 _COARSE, _FINE = 8, 64
@@ -41,6 +42,7 @@ class Relief(nn.Module):
         self.register_buffer("to_picture", to_unit @ camera.K @ pose[:3], persistent=False)
         self.coarse = nn.Parameter(torch.zeros(1, 2, _COARSE, _COARSE))
         self.fine = nn.Parameter(torch.zeros(1, 2, _FINE, _FINE))
+        self._kept = Kept()
 
     def forward(
         self, places: Float[Tensor, "H W 3"]
@@ -70,5 +72,6 @@ class Relief(nn.Module):
 
     def shade(self, places: Float[Tensor, "H W 3"], shadow: SceneShadow) -> Float[Tensor, "T H W"]:
         """Factors on the scene's colours where its ``places`` are, as dark as it is turned."""
-        there, exponents = self(places)
+        given = (places, self.coarse, self.fine)
+        there, exponents = self._kept.of(given, lambda: self(places))
         return shadow(there).clamp_min(_DARKEST) ** exponents

@@ -1,5 +1,6 @@
 """Non-rigid change of canonical Gaussians by the pose: clothes and muscles (paper eq. 1)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from evsplat.body import Body, bounding_box
 from evsplat.body.rotations import quaternion_multiply
 from evsplat.compiled import native, runs_native
 from evsplat.devices import send
+from evsplat.models.kept import Kept
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.networks.pose_encoder import PoseEncoder, normalise_joints
 
@@ -167,9 +169,14 @@ class NonRigidNetwork(nn.Module):
             last_std=last_layer_std,
         )
 
-    def forward(self, positions: Float[Tensor, "N 3"], pose: Float[Tensor, "T P"]) -> NonRigid:
-        """Deformation of points at normalised positions in [-1, 1] under each pose."""
-        return NonRigid(self.mlp(self.encoding(0.5 * (positions + 1)), pose))
+    def encode(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N D"]:
+        """What the network is told of points at normalised positions in [-1, 1]."""
+        encoded: Tensor = self.encoding(0.5 * (positions + 1))
+        return encoded
+
+    def forward(self, encoded: Float[Tensor, "N D"], pose: Float[Tensor, "T P"]) -> NonRigid:
+        """Deformation of encoded points under each pose."""
+        return NonRigid(self.mlp(encoded, pose))
 
 
 class PoseDeformation(nn.Module):
@@ -197,6 +204,7 @@ class PoseDeformation(nn.Module):
             last_layer_std=last_std,
         )
         low, high = bounding_box(body)
+        self._encoded = Kept()
         self.register_buffer("box_low", low.float())
         self.register_buffer("box_high", high.float())
 
@@ -216,7 +224,8 @@ class PoseDeformation(nn.Module):
         rotations: Float[Tensor, "T J 3 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Centres, scales (metres), quaternions and colour feature under each pose, T leading."""
-        changes = self.network(self.normalise(means), self.pose_encoder(rotations))
+        encode: Callable[[], Tensor] = lambda: self.network.encode(self.normalise(means))  # noqa: E731
+        changes = self.network(self._encoded.of([means], encode), self.pose_encoder(rotations))
         return changes.shape(means, scales_log, quaternions)
 
 
