@@ -6,6 +6,7 @@ import torch
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Camera
 from evsplat.gaussians.initialise import (
+    _extremes,
     backdrop_depth,
     facing,
     gaussians_at,
@@ -36,7 +37,7 @@ def body_points() -> torch.Tensor:
 
 
 def test_backdrop_is_a_floor_below_the_feet_and_a_wall_behind():
-    depth = backdrop_depth(camera(), body_points(), up=torch.tensor([0.0, 0.0, 1.0]), margin=0.15)
+    depth = backdrop_depth(camera(), [body_points()], up=torch.tensor([0.0, 0.0, 1.0]), margin=0.15)
     _, behind = camera().project(body_points())
     wall = float(behind.max()) * 1.15
     assert float(depth.max()) == pytest.approx(wall, rel=1e-5)
@@ -47,12 +48,21 @@ def test_backdrop_is_a_floor_below_the_feet_and_a_wall_behind():
     assert float(depth[-1, 32]) == pytest.approx(float(along), rel=0.02)
 
 
+@pytest.mark.parametrize("kept", [200_000, 7])
+def test_a_backdrop_is_the_same_by_pieces_of_any_size(kept, monkeypatch):
+    monkeypatch.setattr("evsplat.gaussians.initialise._MOST_LOW", kept)
+    up, points = torch.tensor([0.0, 0.0, 1.0]), body_points()
+    deepest, floor = _extremes(camera(), points.split(41), up)
+    assert deepest == float(camera().project(points)[1].max())
+    assert floor == pytest.approx(float(torch.quantile(points @ up, 0.002)), rel=1e-6)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_backdrop_looks_like_the_median_from_the_camera_before_any_fit(seed):
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.rand(1, 3, 6, 8, generator=generator)
     picture = torch.nn.functional.interpolate(coarse, (48, 64), mode="bilinear")[0].permute(1, 2, 0)
-    depth = backdrop_depth(camera(), body_points(), up=torch.tensor([0.0, 0.0, 1.0]), margin=0.15)
+    depth = backdrop_depth(camera(), [body_points()], up=torch.tensor([0.0, 0.0, 1.0]), margin=0.15)
     points, scales, colours = median_backdrop(camera(), picture, depth, stride=2, edge_points=500)
     values = gaussians_at(
         points, scales, opacity=0.9, semantic_logit=-2.0, rgb_srgb=colours, feature_dim=None

@@ -312,3 +312,23 @@ def test_weight_files_cannot_run_code(tmp_path):
 
 def sha256(path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_one_that_keeps_features_gives_the_same_distances(tmp_path):
+    save(tmp_path / "alex.pth", random_state("alex"))
+    metric = load_lpips("alex", tmp_path / "alex.pth")
+    shown = []
+    network, features = metric.network, type(metric.network).features
+    keeping = metric.keeping(1 << 30)
+    first, second, third = images(0, 3)
+    pairs = [(first, second), (second, first), (third, second), (first.clone(), third)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(network), "features", lambda *a: (shown.append(1), features(*a))[1])
+        found = [float(keeping(*pair)) for pair in pairs]
+        assert len(shown) == 3
+        short = metric.keeping(1)
+        assert [float(short(*pair)) for pair in pairs] == found
+        assert len(shown) == 3 + 8
+        assert [float(metric(*pair)) for pair in pairs] == found
+        first.mul_(0.5)
+        assert float(keeping(first, second)) == float(metric(first, second))

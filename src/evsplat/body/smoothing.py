@@ -15,6 +15,7 @@ from evsplat.body.track import BodyTrack
 
 FEWEST_KEYS = 8
 """Fewer key poses give no estimate of their noise."""
+_MOST_SPLINE_KEYS = 4_096
 FEWEST_SPLINE_KEYS = 5
 """Fewer key poses give no estimate of the spline's error."""
 _ERROR_RATIO = 4.0
@@ -113,14 +114,19 @@ class SplineError:
 def spline_error(track: BodyTrack) -> SplineError:
     """Error of the spline between its keys, from the spline through every other one of them.
 
-    What the sparser spline misses at the keys that it leaves out, divided by `_ERROR_RATIO`.
+    What the sparser spline misses at the keys that it leaves out, divided by `_ERROR_RATIO`. Of a
+    long recording the keys in its middle tell.
     """
-    keys = len(track.times_us)
-    joints = track.poses.shape[1]
+    first = max(0, len(track.times_us) - _MOST_SPLINE_KEYS) // 2
+    times_us, poses, transl = (
+        values[first : first + _MOST_SPLINE_KEYS]
+        for values in (track.times_us, track.poses, track.transl)
+    )
+    keys, joints = poses.shape[:2]
     if keys < FEWEST_SPLINE_KEYS:
         return SplineError(np.zeros(joints, np.float32), 0.0)
-    sparse = BodyTrack(track.body, track.times_us[::2], track.poses[::2], track.transl[::2])
-    left_out = track.times_us[1 : keys - (keys % 2 == 0) : 2]
+    sparse = BodyTrack(track.body, times_us[::2], poses[::2], transl[::2])
+    left_out = times_us[1 : keys - (keys % 2 == 0) : 2]
     times = torch.from_numpy(left_out)
     (turned, moved), (true_turn, true_move) = sparse.at(times), track.at(times)
     apart = matrix_to_quaternion(turned.transpose(-1, -2) @ true_turn)

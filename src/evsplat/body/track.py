@@ -20,6 +20,8 @@ from evsplat.errors import DataError
 _MOST_KEYS = 24
 """Key poses that tell which way is up, at most."""
 _CAMERA_UP_WEIGHT = 0.5
+_TIMES_AT_ONCE = 1_024
+"""On the way to a pose there are ten times as many numbers as in it."""
 
 
 class BodyTrack:
@@ -77,8 +79,13 @@ class BodyTrack:
         self, times_us: Int[Tensor, "T"] | Sequence[int]
     ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
         """Rotations local to the parent (root: in the world) and root translation, float32."""
-        device = self._seconds.device
-        times = send(torch.as_tensor(times_us, dtype=torch.int64), device)
+        times = send(torch.as_tensor(times_us, dtype=torch.int64), self._seconds.device)
+        if len(times) <= _TIMES_AT_ONCE:
+            return self._at(times)
+        rotations, places = zip(*map(self._at, times.split(_TIMES_AT_ONCE)), strict=True)
+        return torch.cat(rotations), torch.cat(places)
+
+    def _at(self, times: Int[Tensor, "T"]) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
         seconds = (times - int(self.times_us[0])).double() * 1e-6
         seconds = seconds.clamp(self._seconds[0], self._seconds[-1])
         index = torch.searchsorted(self._seconds, seconds, right=True) - 1

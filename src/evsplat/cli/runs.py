@@ -153,12 +153,11 @@ class Evaluate:
     """Device that draws and compares."""
 
     def __call__(self) -> None:
-        from evsplat.evaluation.run import evaluate_run, write_report
+        from evsplat.evaluation.run import evaluate_and_report
 
-        metrics = evaluate_run(
+        metrics, report = evaluate_and_report(
             self.run, lpips_weights=self.lpips_weights, device=self.device, split=self.split
         )
-        report = write_report(self.run, split=self.split)
         _print_summary(metrics, run=self.run, report=report)
 
 

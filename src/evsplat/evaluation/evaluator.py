@@ -47,6 +47,9 @@ BLURRY_INPUT = "blurry_input"
 COMPOSITED = "on_median_background"
 """The person of a method without scene, before the median of the training frames."""
 
+_KEPT_BYTES = 128 << 20
+"""Of each network's features: rows share pictures, and a picture is compared more than once."""
+
 Picture = Callable[[Frame], Float[Tensor, "H W 3"]]
 
 _TRIVIAL_SEES = Policy()
@@ -376,6 +379,6 @@ def _load_networks(
             networks[name] = Absent(f"no weights: see weights.{name}.reason")
             weights[name] = {"sha256": None, "reason": str(error)}
         else:
-            networks[name] = network
+            networks[name] = network.keeping(_KEPT_BYTES)
             weights[name] = {"sha256": network.sha256, "reason": None}
     return networks, weights

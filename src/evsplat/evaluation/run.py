@@ -1,6 +1,7 @@
 """A trained run measured, and its report page: what ``evsplat evaluate`` and ``report`` do."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ from evsplat.evaluation.splits import name_of
 from evsplat.evaluation.tables import write_tables
 from evsplat.files import try_target, write_json, write_text
 from evsplat.options.runs import Split
-from evsplat.render import choose_device
-from evsplat.training.run import load_run
+from evsplat.render import Backdrop
+from evsplat.training.run import Run, load_run
 from evsplat.untrusted.faults import MISFITS, broken_as
 
 
@@ -30,16 +31,44 @@ def evaluate_run(
     measures the training frames against their sharp truth; its files are metrics_train.json and so
     on, beside those of the test frames.
     """
-    start = time.monotonic()
-    device = choose_device(device)
+    return _measured(_loaded(run_dir, device), lpips_weights, split)
+
+
+def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
+    """Write report.html (report_train.html) of an evaluated run and return its path.
+
+    Figures and rendered pictures come from what `evaluate_run` wrote; the clip is drawn anew.
+    """
+    return _reported(_loaded(run_dir, "auto"), split)
+
+
+def evaluate_and_report(
+    run_dir: Path | str,
+    *,
+    lpips_weights: Path | str | None = None,
+    device: str = "auto",
+    split: Split = "test",
+) -> tuple[dict[str, Any], Path]:
+    """`evaluate_run` and `write_report` of a run that is read once."""
+    run = _loaded(run_dir, device)
+    return _measured(run, lpips_weights, split), _reported(run, split)
+
+
+def _loaded(run_dir: Path | str, device: str) -> Run:
+    """The run, to be drawn one picture after another from cameras that mostly stand still."""
     run = load_run(Path(run_dir), device=device)
+    return replace(run, reconstruction=replace(run.reconstruction, backdrop=Backdrop()))
+
+
+def _measured(run: Run, lpips_weights: Path | str | None, split: Split) -> dict[str, Any]:
+    start = time.monotonic()
     try_target(run.path)
     measured = evaluate(
         run.capture,
         run.reconstruction,
         out_dir=run.path,
         lpips_weights=lpips_weights,
-        device=device,
+        device=run.reconstruction.model.device,
         human_only=run.human_only,
         split=split,
     )
@@ -56,21 +85,16 @@ def evaluate_run(
         "seen": run.what_was_seen(),
         **measured,
     }
-    write_json(Path(run.path) / name_of("metrics", split, ".json"), metrics)
-    write_tables(Path(run.path), metrics)
+    write_json(run.path / name_of("metrics", split, ".json"), metrics)
+    write_tables(run.path, metrics)
     return metrics
 
 
-def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
-    """Write report.html (report_train.html) of an evaluated run and return its path.
-
-    Figures and rendered pictures come from what `evaluate_run` wrote; the clip is drawn anew.
-    """
-    run = load_run(Path(run_dir))
-    path = Path(run_dir) / name_of("report", split, ".html")
-    source = Source.read(Path(run_dir), run.capture, run.reconstruction, split)
+def _reported(run: Run, split: Split) -> Path:
+    path = run.path / name_of("report", split, ".html")
+    source = Source.read(run.path, run.capture, run.reconstruction, split)
     with broken_as(
-        Path(run_dir),
+        run.path,
         "its figures are not as evsplat evaluate writes them",
         "evaluate the run again",
         kinds=MISFITS,

@@ -1,6 +1,7 @@
 """Starts of Gaussians: on the body's surface, in a random cube, or on the median backdrop."""
 
 import math
+from collections.abc import Iterable
 
 import torch
 from jaxtyping import Float
@@ -9,6 +10,11 @@ from torch import Tensor
 from evsplat.capture import Camera
 from evsplat.gaussians.gaussian_set import FEATURE_DIM
 from evsplat.neighbours import nearest
+
+_FEET = 500
+"""One point of the body in so many lies below the floor."""
+_MOST_LOW = 200_000
+"""Lowest points that are kept: enough for the floor of a hundred million."""
 
 
 def logit(probability: float) -> float:
@@ -75,24 +81,47 @@ def random_cube(
 
 
 def backdrop_depth(
-    camera: Camera, body_points: Float[Tensor, "M 3"], *, up: Float[Tensor, "3"], margin: float
+    camera: Camera,
+    body_points: Iterable[Float[Tensor, "M 3"]],
+    *,
+    up: Float[Tensor, "3"],
+    margin: float,
 ) -> Float[Tensor, "H W"]:
     """Depth per pixel, metres, of a floor under the body and a wall behind it.
+
+    ``body_points`` of the whole recording come in pieces, so that an hour's are never all there.
 
     With one static camera depth cannot be seen, and for that camera any surface that the person
     never passes will do. The wall stands ``margin`` (a fraction) behind the deepest body point,
     facing the camera; the floor is the plane through the lowest body points, orthogonal to ``up``.
     """
-    _, depth = camera.project(body_points)
-    wall = float(depth.max()) * (1 + margin)
-    height = body_points @ up
-    floor_height = torch.quantile(height, 0.002)
+    deepest, floor_height = _extremes(camera, body_points, up)
+    wall = deepest * (1 + margin)
     rays = pixel_rays(camera)
     camera_height = camera.center() @ up
     fall = rays @ up
     # A ray meets the floor in front of the camera only where it falls.
     floor = torch.where(fall < -1e-3, (floor_height - camera_height) / fall, torch.inf)
     return torch.where(floor > 0, floor, torch.inf).clamp_max(wall)
+
+
+def _extremes(
+    camera: Camera, pieces: Iterable[Float[Tensor, "M 3"]], up: Float[Tensor, "3"]
+) -> tuple[float, float]:
+    """The largest depth of all points, and the height that one in `_FEET` lies below, metres."""
+    deepest, count, low = -math.inf, 0, torch.zeros(0)
+    for points in pieces:
+        deepest = max(deepest, float(camera.project(points)[1].max()))
+        count += len(points)
+        low = torch.cat([low, points @ up])
+        # No more than these can be among the lowest of all that may still come.
+        if len(low) > 2 * _MOST_LOW:
+            low = low.topk(_MOST_LOW, largest=False).values
+    place = (count - 1) / _FEET
+    lowest = low.sort().values
+    first = min(int(place), len(lowest) - 1)
+    after = min(first + 1, len(lowest) - 1)
+    return deepest, float(torch.lerp(lowest[first], lowest[after], place - int(place)))
 
 
 def pixel_rays(camera: Camera) -> Float[Tensor, "H W 3"]:

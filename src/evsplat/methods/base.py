@@ -18,6 +18,8 @@ from evsplat.models.at_rest import Skinned
 from evsplat.models.seen import Seen
 from evsplat.objectives import Objective, PackedBounds
 
+_MOST_BODY_FRAMES = 512
+"""Frames that tell where a Gaussian dwells which changes its class."""
 _KEPT_BOUNDS_BYTES = 32 << 20
 """Of the person's places in frames, which are found again when their frame comes again."""
 
@@ -96,8 +98,9 @@ def refuse_masks(policy: Policy, method: str) -> None:
 
 
 def body_frames(track: BodyTrack, times_us: Sequence[int]) -> BodyFrames:
-    """The body as given at the training frames."""
-    return BodyFrames(track.body, track.bones(list(times_us)))
+    """The body as given at the training frames; of many, at some that are evenly spread."""
+    times = list(times_us)[:: max(1, -(-len(times_us) // _MOST_BODY_FRAMES))]
+    return BodyFrames(track.body, track.bones(times))
 
 
 def semantic_bounds(

@@ -1,13 +1,15 @@
 """Starts of a method's Gaussians: the person's on the body, the scene's behind it."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.body import BodyTrack, up_axis
-from evsplat.capture import TrainingCapture
+from evsplat.body import BodyTrack, skin, up_axis
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.config import Above, AtLeast, ReadIf
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM
@@ -28,6 +30,9 @@ BACKDROP_EDGE_SHARE = 0.18
 """Share of all pixels, those of strongest gradient, that get a Gaussian of their own."""
 BACKDROP_MARGIN = 0.15
 """Distance of the wall behind the deepest body point, as a fraction of its depth."""
+
+_STRIDE, _FRAMES_AT_ONCE = 7, 64
+"""Of the vertices of the body that lie before the backdrop, and of frames, in one piece."""
 
 _CUBE = ReadIf("scene.kind", "random_cube", lambda kind: kind == "random_cube")
 _BACKDROP = ReadIf("scene.kind", "median_backdrop", lambda kind: kind == "median_backdrop")
@@ -132,6 +137,16 @@ def cube(start: SceneStart, capture: TrainingCapture, track: BodyTrack) -> tuple
     return middle, start.cube_half_side_m or max(2.0, 1.5 * distance)
 
 
+def _posed(track: BodyTrack, frames: Sequence[Frame]) -> Iterator[Float[Tensor, "M 3"]]:
+    """Every `_STRIDE`-th vertex of the body at the frames, some frames at a time."""
+    points, weights = (
+        values[::_STRIDE] for values in (track.body.canonical_vertices(), track.body.weights)
+    )
+    for first in range(0, len(frames), _FRAMES_AT_ONCE):
+        times = [frame.mid_us for frame in frames[first : first + _FRAMES_AT_ONCE]]
+        yield skin(points, weights, track.bones(times))[0].flatten(0, 1)
+
+
 def scene_start(
     start: SceneStart,
     capture: TrainingCapture,
@@ -153,8 +168,9 @@ def scene_start(
                 f"{capture.path}: scene.kind is median_backdrop, which needs one static camera; "
                 "this capture's camera moves. Pass --set scene.kind=random_cube."
             )
-        body = torch.cat([track.vertices(frame.mid_us)[::7] for frame in frames])
-        depth = backdrop_depth(camera, body, up=up_axis(track), margin=BACKDROP_MARGIN)
+        depth = backdrop_depth(
+            camera, _posed(track, frames), up=up_axis(track), margin=BACKDROP_MARGIN
+        )
         points, scales, colours = median_backdrop(
             camera,
             capture.median_background(),

@@ -134,7 +134,7 @@ def _smooth(planes: Float[Tensor, "C H W"], settings: Ssim) -> Float[Tensor, "C 
     # Shifted sums: torch's convolution is many times slower in float64.
     size, kernel = settings.size, _window(settings)
     pad = size // 2 if settings.padding == "zero" else 0
-    padded = F.pad(planes, (pad, pad, pad, pad))
+    padded = F.pad(planes, (pad, pad, pad, pad)) if pad else planes
     rows, columns = padded.shape[1] - size + 1, padded.shape[2] - size + 1
     down = kernel[0] * padded[:, :rows]
     for k in range(1, size):

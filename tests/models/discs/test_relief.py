@@ -5,7 +5,7 @@ import torch
 
 from evsplat.body import SurfaceSamples
 from evsplat.camera import Camera
-from evsplat.models.discs.relief import Relief
+from evsplat.models.discs.relief import Relief, _Power
 from evsplat.models.discs.shadow import BodyShadow
 from evsplat.models.scene_places import places_of
 
@@ -143,3 +143,19 @@ def test_the_price_is_of_steps_between_neighbours_and_draws_what_nothing_tells_t
         relief.price().backward()
         optimiser.step()
     assert relief.price() < 1e-3 * shaken(0).price()
+
+
+def test_the_power_is_torchs_with_its_gradients_and_darkness_has_none():
+    generator = torch.Generator().manual_seed(0)
+    factors = torch.rand(3, 5, 7, generator=generator, dtype=torch.float64)
+    factors[0, 0, :2] = torch.tensor([0.0, 5e-4])
+    exponents = 0.5 + torch.rand(5, 7, generator=generator, dtype=torch.float64)
+    upstream = torch.randn(3, 5, 7, generator=generator, dtype=torch.float64)
+    found = []
+    for power in (_Power.apply, lambda f, e: f.clamp_min(1e-3) ** e):
+        given = [factors.clone().requires_grad_(), exponents.clone().requires_grad_()]
+        result = power(*given)
+        found.append([result, *torch.autograd.grad((result * upstream).sum(), given)])
+    for own, torchs in zip(*found, strict=True):
+        torch.testing.assert_close(own, torchs)
+    assert found[0][1][0, 0, :2].tolist() == [0.0, 0.0]

@@ -1,8 +1,11 @@
 """Where along the rays of a camera at rest its scene lies, as the shadows on it tell."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from evsplat.camera import Camera
@@ -74,4 +77,26 @@ class Relief(nn.Module):
         """Factors on the scene's colours where its ``places`` are, as dark as it is turned."""
         given = (places, self.coarse, self.fine)
         there, exponents = self._kept.of(given, lambda: self(places))
-        return shadow(there).clamp_min(_DARKEST) ** exponents
+        shaded: Tensor = _Power.apply(shadow(there), exponents)
+        return shaded
+
+
+class _Power(torch.autograd.Function):
+    """Factors, at least `_DARKEST`, to the power of exponents; one logarithm serves both ways."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, factors: Float[Tensor, "T H W"], exponents: Float[Tensor, "H W"]
+    ) -> Float[Tensor, "T H W"]:
+        logs = factors.clamp_min(_DARKEST).log_()
+        result = (logs * exponents).exp_()
+        ctx.save_for_backward(factors, exponents, logs, result)
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, Tensor]:
+        factors, exponents, logs, result = ctx.saved_tensors
+        slope = upstream[0] * result
+        by_factors = (slope * exponents).div_(factors.clamp_min(_DARKEST)).mul_(factors > _DARKEST)
+        return by_factors, slope.mul_(logs).sum(0)
