@@ -1,12 +1,14 @@
 """Memory and start of a run by the length of its recording: 20 steps after 1, 10 and 60 minutes.
 
-    python benchmarks/length.py [--minutes 1 10 60] [--steps 20] [--keep 50] [--threads 1]
+    python benchmarks/length.py [--minutes 1 10 60] [--steps 20] [--visit 2500] [--keep 50]
 
 The recording is the demo capture again and again, with every ``--keep``-th of its events: 54
 million an hour at 50. It is written in pieces, and each training runs in a process of its own, so
 that its peak memory is its own: Python and PyTorch are about 300 MB of it, the model the same
-at every length. Printed for each length: frames, events, seconds to the first step (reading,
-checks, estimates and the fits before training), and peak memory. The last line is JSON.
+at every length. Beside the steps the pictures, silhouettes and events of up to ``--visit`` training
+frames are read, evenly spread, which fills every cache as a long training does. Printed for each
+length: frames, events, seconds to the first step (reading, checks, estimates and the fits before
+training), CPU time of a step, and peak memory. The last line is JSON.
 """
 
 import evsplat as ev
@@ -17,6 +19,7 @@ import json
 import os
 import resource
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -27,6 +30,8 @@ import h5py
 import numpy as np
 
 from evsplat.devices import use_threads
+from evsplat.objectives import RenderedSemantics
+from evsplat.objectives.event_windows import EventWindows
 from evsplat.shipped import demo_capture
 from evsplat.training.trainer import Trainer
 
@@ -38,12 +43,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, nargs="+", default=[1.0, 10.0, 60.0])
     parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--visit", type=int, default=2_500, metavar="N", help="frames")
     parser.add_argument("--keep", type=int, default=50, metavar="N", help="one event in N")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.run:
-        print(json.dumps(one_training(options.run, options.steps, options.threads)))
+        use_threads(options.threads)
+        print(json.dumps(one_training(options.run, options.steps, options.visit)))
         return
     points = []
     for minutes in options.minutes:
@@ -51,32 +58,55 @@ def main() -> None:
             path = Path(folder) / "capture"
             frames, events = write_recording(path, minutes, options.keep)
             command = [sys.executable, __file__, "--run", str(path)]
-            numbers = ["--steps", str(options.steps), "--threads", str(options.threads)]
-            done = subprocess.run([*command, *numbers], check=True, stdout=subprocess.PIPE)
+            for name in ("steps", "visit", "threads"):
+                command += [f"--{name}", str(getattr(options, name))]
+            done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
             point = {"minutes": minutes, "frames": frames, "events": events}
             points.append(point | json.loads(done.stdout.splitlines()[-1]))
         print(
             f"{minutes:6g} min  {frames:6,d} frames  {events:12,d} events  first step after "
-            f"{points[-1]['first_step_s']:6.1f} s  peak {points[-1]['peak_rss_mb']:6,d} MB",
+            f"{points[-1]['first_step_s']:6.1f} s ({points[-1]['first_step_cpu_s']:.1f} of CPU)  "
+            f"step {points[-1]['step_cpu_ms']} ms of CPU  peak {points[-1]['peak_rss_mb']:6,d} MB",
             flush=True,
         )
     print(json.dumps({"steps": options.steps, "threads": options.threads, "points": points}))
 
 
-def one_training(capture: Path, steps: int, threads: int) -> dict[str, float]:
+def one_training(capture: Path, steps: int, visited: int) -> dict[str, float]:
     """Seconds until the first step and peak memory of a training of ``steps``."""
-    use_threads(threads)
-    started, first = time.perf_counter(), []
+    started, first, spent = time.perf_counter(), [], []
     step = Trainer.step
 
     def noted(self: Trainer) -> object:
-        first.append(time.perf_counter() - started)
-        return step(self)
+        first.append((time.perf_counter() - started, time.process_time()))
+        report = step(self)
+        spent.append(1e3 * (time.process_time() - first[-1][1]))
+        if len(first) == steps:
+            fill_caches(self, visited)
+        return report
 
     Trainer.step = noted  # type: ignore[method-assign, assignment]
     ev.train(capture, out=capture.parent / "run", iterations=steps)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {"first_step_s": round(first[0], 1), "peak_rss_mb": round(peak / 1e3)}
+    return {
+        "first_step_s": round(first[0][0], 1),
+        "first_step_cpu_s": round(first[0][1], 1),
+        "step_cpu_ms": round(statistics.median(spent)),
+        "peak_rss_mb": round(peak / 1e3),
+    }
+
+
+def fill_caches(trainer: Trainer, visited: int) -> None:
+    """Read what steps of so many frames would read."""
+    frames = trainer.capture.train_frames
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(visited, len(frames))).round())
+    for frame in (frames[int(number)] for number in chosen):
+        trainer.capture.image(frame)
+        for objective in trainer.composition.objectives:
+            if isinstance(objective, RenderedSemantics):
+                objective.bounds[frame.mid_us]()
+            if isinstance(objective, EventWindows):
+                objective.events.between(*frame.exposure_us)
 
 
 def write_recording(folder: Path, minutes: float, keep: int) -> tuple[int, int]:

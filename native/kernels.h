@@ -136,7 +136,7 @@ struct GaussianGrads {
     KERNEL(void, sh_rows, (const ShRows&, size_t begin, size_t end)) \
     KERNEL(void, tree_softmax, (const TreeSoftmax&, size_t begin, size_t end, float* scratch)) \
     /* Points [begin, end). */ \
-    KERNEL(void, skin, (const Skinning&, size_t begin, size_t end, float* moved, float* blended)) \
+    KERNEL(void, skin, (const Skinning&, size_t begin, size_t end, float* moved, float* blended, float* linear)) \
     KERNEL(void, skin_backward, (const Skinning&, const SkinningGrads&, const float* blended, size_t begin, size_t end)) \
     KERNEL(void, surface_light, (const SurfaceLight&, size_t begin, size_t end, float* factors)) \
     /* Sums over the points, and the gradient of the shares unless `lit` is null. */ \

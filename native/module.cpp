@@ -339,27 +339,31 @@ Skinning skinning(const In& position, const In& weight, const In& bones) {
             weight.shape(0) == 1 ? 0 : points * joints, bones.data()};
 }
 
-void blend_skin(In position, In weight, In bones, Out moved, Out blended, int threads) {
+void blend_skin(In position, In weight, In bones, Out moved, Out blended, std::optional<Out> linear, int threads) {
     const Skinning job = skinning(position, weight, bones);
-    require(moved.size() == job.times * job.points * 3 && blended.size() == job.times * job.points * 16, "the result");
+    const size_t rows = job.times * job.points;
+    require(moved.size() == rows * 3 && blended.size() == rows * 16 && (!linear || linear->size() == rows * 9),
+            "the result");
     nb::gil_scoped_release release;
-    skin(job, threads, moved.data(), blended.data());
+    skin(job, threads, moved.data(), blended.data(), data_of(linear));
 }
 
 void blend_skin_backward(In position, In weight, In bones, In blended, std::optional<In> moved_grad,
-                         std::optional<In> blended_grad, std::optional<Out> position_grad,
-                         std::optional<Out> weight_grad, std::optional<Out> bones_grad, int threads) {
+                         std::optional<In> blended_grad, std::optional<In> linear_grad,
+                         std::optional<Out> position_grad, std::optional<Out> weight_grad,
+                         std::optional<Out> bones_grad, int threads) {
     const Skinning job = skinning(position, weight, bones);
     const size_t rows = job.times * job.points;
     require(blended.size() == rows * 16 && (!moved_grad || moved_grad->size() == rows * 3) &&
-                (!blended_grad || blended_grad->size() == rows * 16),
+                (!blended_grad || blended_grad->size() == rows * 16) &&
+                (!linear_grad || linear_grad->size() == rows * 9),
             "the result's gradient");
     require((!position_grad || position_grad->size() == position.size()) &&
                 (!weight_grad || weight_grad->size() == weight.size()) &&
                 (!bones_grad || bones_grad->size() == bones.size()),
             "the gradients");
-    const SkinningGrads grads = {data_of(moved_grad),  data_of(blended_grad), data_of(position_grad),
-                                 data_of(weight_grad), data_of(bones_grad),   nullptr, 0};
+    const SkinningGrads grads = {data_of(moved_grad),    data_of(blended_grad), data_of(linear_grad),
+                                 data_of(position_grad), data_of(weight_grad),  data_of(bones_grad), nullptr, 0};
     nb::gil_scoped_release release;
     skin_backward(job, blended.data(), grads, threads);
 }
@@ -415,10 +419,10 @@ NB_MODULE(_native, m) {
           nb::arg("darkest"), nb::arg("eps"), nb::arg("value"), nb::arg("slope").none(), nb::arg("threads"),
           "Logarithm of the luminance of (3, H, W) coded values, and its slope by each.");
     m.def("skin", &blend_skin, nb::arg("position"), nb::arg("weight"), nb::arg("bones"), nb::arg("moved"),
-          nb::arg("blended"), nb::arg("threads"), "Linear blend skinning.");
+          nb::arg("blended"), nb::arg("linear").none(), nb::arg("threads"), "Linear blend skinning.");
     m.def("skin_backward", &blend_skin_backward, nb::arg("position"), nb::arg("weight"), nb::arg("bones"),
           nb::arg("blended"), nb::arg("moved_grad").none(), nb::arg("blended_grad").none(),
-          nb::arg("position_grad").none(), nb::arg("weight_grad").none(), nb::arg("bones_grad").none(),
+          nb::arg("linear_grad").none(), nb::arg("position_grad").none(), nb::arg("weight_grad").none(), nb::arg("bones_grad").none(),
           nb::arg("threads"), "Writes the gradients of skin.");
     bind_sensor(m);
     bind_shadow(m);

@@ -11,9 +11,9 @@ namespace evsplat {
 static constexpr size_t kPoints = 512;  // of a block; fixes the order of sums over points
 static constexpr size_t kLanes = 16;
 
-void skin(const Skinning& s, int threads, float* moved, float* blended) {
+void skin(const Skinning& s, int threads, float* moved, float* blended, float* linear) {
     const auto kernel = select_kernels().skin;
-    in_pieces(threads, s.points, kPoints, [&](size_t begin, size_t end) { kernel(s, begin, end, moved, blended); });
+    in_pieces(threads, s.points, kPoints, [&](size_t begin, size_t end) { kernel(s, begin, end, moved, blended, linear); });
 }
 
 void skin_backward(const Skinning& s, const float* blended, SkinningGrads g, int threads) {

@@ -15,14 +15,15 @@ struct Skinning {
 
 // What a block of points does; `bones_columns` are the bones as (T, 12, padded J).
 struct SkinningGrads {
-    const float *moved, *blended;           // gradients of the results: (T, N, 3), (T, N, 16); may be null
+    const float *moved, *blended, *linear;  // gradients of the results: (T, N, 3), (T, N, 16), (T, N, 9); may be null
     float *position, *weight;               // like the inputs, written; may be null
     float* bones;                           // (T, J, 16); a block adds to its own; may be null
     const float* bones_columns;
     size_t padded_joints;
 };
 
-void skin(const Skinning&, int threads, float* moved, float* blended);
+// `linear` is null or takes the blended matrices' 3x3 parts.
+void skin(const Skinning&, int threads, float* moved, float* blended, float* linear);
 
 // `blended` as `skin` wrote it; `bones` of the gradients is the whole sum, written.
 void skin_backward(const Skinning&, const float* blended, SkinningGrads, int threads);

@@ -27,16 +27,18 @@ INLINE void for_joints(const float* weight, size_t joints, Function f) {
 
 }  // namespace
 
-void skin(const Skinning& s, size_t begin, size_t end, float* moved, float* blended) {
+void skin(const Skinning& s, size_t begin, size_t end, float* moved, float* blended, float* linear) {
     for (size_t t = 0; t < s.times; ++t) {
         const float* bones = s.bones + t * s.joints * 16;
         for (size_t n = begin; n < end; ++n) {
             const float* weight = s.weight + t * s.weight_step + n * s.joints;
             F sum[V] = {};
-            for (size_t j = 0; j < s.joints; ++j) add_matrix(sum, weight[j], bones + 16 * j);
+            for_joints(weight, s.joints, [&](size_t j) { add_matrix(sum, weight[j], bones + 16 * j); });
             float b[16];
             __builtin_memcpy(b, sum, sizeof b);
             __builtin_memcpy(blended + (t * s.points + n) * 16, b, sizeof b);
+            for (int r = 0; linear && r < 3; ++r)
+                __builtin_memcpy(linear + (t * s.points + n) * 9 + 3 * r, b + 4 * r, 3 * sizeof *b);
             const float* p = s.position + t * s.position_step + n * 3;
             for (int r = 0; r < 3; ++r)
                 moved[(t * s.points + n) * 3 + r] = b[4 * r] * p[0] + b[4 * r + 1] * p[1] + b[4 * r + 2] * p[2] + b[4 * r + 3];
@@ -52,6 +54,10 @@ void skin_backward(const Skinning& s, const SkinningGrads& g, const float* blend
             // Rows of the blended matrix's gradient; narrow vectors, which are read back as they were written.
             F4 by_row[4] = {}, by_position = {};
             if (g.blended) __builtin_memcpy(by_row, g.blended + (t * s.points + n) * 16, sizeof by_row);
+            if (g.linear) {
+                const float* v = g.linear + (t * s.points + n) * 9;
+                for (int r = 0; r < 3; ++r) by_row[r] += F4{v[3 * r], v[3 * r + 1], v[3 * r + 2], 0.f};
+            }
             if (g.moved) {
                 const float* v = g.moved + (t * s.points + n) * 3;
                 const F4 at = {p[0], p[1], p[2], 1.f};

@@ -10,6 +10,7 @@ from evsplat.body import (
     default_body,
     make_body,
     skin,
+    skin_with_linear,
 )
 from evsplat.body.canonical import leg_spread_rotations
 
@@ -143,16 +144,21 @@ def test_compiled_skinning_and_its_gradients_equal_plain_torch_in_float64(
     """Whether points hang on all joints or on a few."""
     generator = torch.Generator().manual_seed(seed)
     shapes = ((point_times, 700, 3), (weight_times, 700, 17), (3, 17, 4, 4), (3, 700, 3))
-    *inputs, by_moved, by_blended = (
-        torch.randn(shape, generator=generator) for shape in (*shapes, (3, 700, 4, 4))
+    *inputs, by_moved, by_blended, by_linear = (
+        torch.randn(shape, generator=generator)
+        for shape in (*shapes, (3, 700, 4, 4), (3, 700, 3, 3))
     )
     inputs[1] *= torch.rand(inputs[1].shape, generator=generator) < share
     results = []
     for dtype in (torch.float32, torch.float64):
         leaves = [value.to(dtype).requires_grad_() for value in inputs]
-        moved, blended = skin(*leaves)
+        moved, blended, linear = skin_with_linear(*leaves)
+        assert torch.equal(linear, blended[..., :3, :3])
         total = (moved * by_moved).sum() + (blended * by_blended).sum()
-        results.append((moved, blended, *torch.autograd.grad(total, leaves)))
+        drawn = (moved * by_moved).sum() + (linear * by_linear).sum()
+        results.append((moved, blended, *torch.autograd.grad(total + drawn, leaves)))
+        alone = skin(*leaves)
+        assert torch.equal(alone[0], moved) and torch.equal(alone[1], blended)
     for compiled, plain in zip(*results, strict=True):
         assert (compiled - plain).norm() < 1e-6 * plain.norm()
 

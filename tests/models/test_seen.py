@@ -25,7 +25,7 @@ def stacked(opacity):
     wide = torch.tensor([200.0, 200.0, 0.01]).expand(1, 2, 3)
     alike = torch.full((2,), opacity), torch.full((1, 2, 3), 0.5), torch.ones(2)
     transforms = torch.eye(4).expand(1, 2, 4, 4)
-    human = human_splats(means, turned, wide, *alike, transforms)
+    human = human_splats(means, turned, wide, *alike, transforms[..., :3, :3])
     away = torch.tensor([[0.0, 0, -5]]), turned[0, :1], wide[0, :1]
     scene = scene_splats(*away, torch.ones(1), torch.zeros(1, 3), torch.zeros(1))
     return Layers(human, scene, transforms), camera

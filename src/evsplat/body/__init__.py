@@ -1,6 +1,6 @@
 """Body models behind one small interface, body tracks over time, skinning."""
 
-from evsplat.body.body import Body, bounding_box, skin
+from evsplat.body.body import Body, bounding_box, skin, skin_with_linear
 from evsplat.body.make import default_body, make_body
 from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.body.retarget import SkeletonMotion, retarget
@@ -33,5 +33,6 @@ __all__ = [
     "retarget",
     "silhouette",
     "skin",
+    "skin_with_linear",
     "up_axis",
 ]

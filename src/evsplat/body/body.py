@@ -148,17 +148,33 @@ def skin(
     Returns the moved points and the blended matrices, whose 3x3 part is not a rotation where
     bones disagree (the shear is kept; method.md 1.6).
     """
+    moved, blended, _ = _skinned(points, weights, bones, linear=False)
+    return moved, blended
+
+
+def skin_with_linear(
+    points: Float[Tensor, "N 3"] | Float[Tensor, "T N 3"],
+    weights: Float[Tensor, "N J"] | Float[Tensor, "T N J"],
+    bones: Float[Tensor, "T J 4 4"],
+) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N 4 4"], Float[Tensor, "T N 3 3"]]:
+    """`skin`, and the 3x3 part of the matrices for itself, as a rasteriser takes it."""
+    return _skinned(points, weights, bones, linear=True)
+
+
+def _skinned(
+    points: Tensor, weights: Tensor, bones: Tensor, *, linear: bool
+) -> tuple[Tensor, Tensor, Tensor]:
     if all(map(runs_native, (points, weights, bones))):
-        matrices: Tensor
-        moved, matrices = _NativeSkin.apply(
+        skinned: tuple[Tensor, Tensor, Tensor] = _NativeSkin.apply(
             points.expand(1, -1, -1) if points.dim() == 2 else points,
             weights.expand(1, -1, -1) if weights.dim() == 2 else weights,
             bones,
+            linear,
         )
-        return moved, matrices
+        return skinned
     blended = (weights @ bones.flatten(-2)).unflatten(-1, (4, 4))
     moved = (blended[..., :3, :3] * points[..., None, :]).sum(-1) + blended[..., :3, 3]
-    return moved, blended
+    return moved, blended, blended[..., :3, :3]
 
 
 class _NativeSkin(torch.autograd.Function):
@@ -166,15 +182,16 @@ class _NativeSkin(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, weights: Tensor, bones: Tensor
-    ) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N 4 4"]]:
+        ctx: Any, points: Tensor, weights: Tensor, bones: Tensor, with_linear: bool
+    ) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N 4 4"], Float[Tensor, "T N 3 3"] | None]:
         given = [tensor.detach().contiguous() for tensor in (points, weights, bones)]
         times, count = len(bones), points.shape[1]
         moved, blended = bones.new_empty(times, count, 3), bones.new_empty(times, count, 4, 4)
-        native.skin(*given, moved, blended, torch.get_num_threads())
+        linear = bones.new_empty(times, count, 3, 3) if with_linear else None
+        native.skin(*given, moved, blended, linear, torch.get_num_threads())
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*given, blended)
-        return moved, blended
+        return moved, blended, linear
 
     @staticmethod
     @once_differentiable
@@ -182,11 +199,11 @@ class _NativeSkin(torch.autograd.Function):
         *given, blended = ctx.saved_tensors
         grads = [
             torch.empty_like(tensor) if needed else None
-            for tensor, needed in zip(given, ctx.needs_input_grad, strict=True)
+            for tensor, needed in zip(given, ctx.needs_input_grad[:3], strict=True)
         ]
         above = [None if grad is None else grad.contiguous() for grad in upstream]
         native.skin_backward(*given, blended, *above, *grads, torch.get_num_threads())
-        return tuple(grads)
+        return *grads, None
 
 
 def bounding_box(body: Body, margin: float = 0.1) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

@@ -59,12 +59,10 @@ class BodyTrack:
         self.poses, self.transl = poses, transl
         device = body.rest_joints.device
         seconds = (times - times[0]) * 1e-6
-        keys, rates = _rotation_polynomials(seconds, poses)
-        shifts = _translation_polynomials(seconds, transl)
+        keys, polynomials = _polynomials(seconds, poses, transl)
         # float64 throughout: a few hundred numbers per call, and exact at the keys.
         self._seconds = torch.from_numpy(seconds).to(device)
         self._keys = torch.from_numpy(keys).to(device)
-        polynomials = np.concatenate((rates, shifts[:, None]), axis=1)
         self._polynomials = torch.from_numpy(polynomials).to(device)
 
     def to(self, device: torch.device | str) -> "BodyTrack":
@@ -132,31 +130,30 @@ def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
     return up
 
 
-def _rotation_polynomials(
-    seconds: Float[np.ndarray, "P"], poses: Float[np.ndarray, "P J 3"]
-) -> tuple[Float[np.ndarray, "I J 3 3"], Float[np.ndarray, "I J 4 3"]]:
-    """Rotation at the start of each interval and cubic coefficients (highest first) from there."""
+def _polynomials(
+    seconds: Float[np.ndarray, "P"],
+    poses: Float[np.ndarray, "P J 3"],
+    transl: Float[np.ndarray, "P 3"],
+) -> tuple[Float[np.ndarray, "I J 3 3"], Float[np.ndarray, "I J+1 4 3"]]:
+    """Rotation at the start of each interval, and cubic coefficients (highest first) from there.
+
+    The last ones are of the place.
+    """
     count, joints = poses.shape[:2]
     if count == 1:
         matrices = Rotation.from_rotvec(poses[0]).as_matrix()
-        return matrices[None], np.zeros((1, joints, 4, 3))
+        still = np.zeros((1, joints + 1, 4, 3))
+        still[0, -1, -1] = transl[0]
+        return matrices[None], still
     keys = np.empty((count - 1, joints, 3, 3))
-    polynomials = np.empty((count - 1, joints, 4, 3))
+    polynomials = np.empty((count - 1, joints + 1, 4, 3))
+    polynomials[:, -1] = CubicSpline(seconds, transl).c.transpose(1, 0, 2)
     for joint in range(joints):
         rotations = Rotation.from_rotvec(poses[:, joint])
         keys[:, joint] = rotations[:-1].as_matrix()
         coefficients = RotationSpline(seconds, rotations).interpolator.c
         polynomials[:, joint] = coefficients.transpose(1, 0, 2)
     return keys, polynomials
-
-
-def _translation_polynomials(
-    seconds: Float[np.ndarray, "P"], transl: Float[np.ndarray, "P 3"]
-) -> Float[np.ndarray, "I 4 3"]:
-    """Cubic coefficients (highest first) of each interval."""
-    if len(seconds) == 1:
-        return np.concatenate((np.zeros((3, 3)), transl))[None]
-    return CubicSpline(seconds, transl).c.transpose(1, 0, 2).copy()
 
 
 def _check(

@@ -2,12 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
+from torch import Tensor
 
 from evsplat.render import LOW_PASS, Splats
 
@@ -47,33 +45,16 @@ def human_splats(
     opacities: Float[Tensor, " H"],
     rgb: Float[Tensor, "#T H 3"],
     semantics: Float[Tensor, " H"],
-    transforms: Float[Tensor, "T H 4 4"],
+    linear: Float[Tensor, "T H 3 3"],
 ) -> Splats:
     """The person's layer; what is the same at all times may have an axis of one time.
 
     Rotations and scales keep it: they are drawn, and their gradients summed, without copies.
+    ``linear``: the blended matrices' 3x3 part, see `skin_with_linear`.
     """
     times = (len(means), -1, -1)
     channels = torch.cat([rgb.expand(times), semantics[None, :, None].expand(times)], -1)
-    return Splats(means, quaternions, scales, opacities, channels, _linear(transforms))
-
-
-def _linear(transforms: Float[Tensor, "T H 4 4"]) -> Float[Tensor, "T H 3 3"]:
-    part: Tensor = _Linear.apply(transforms)
-    return part
-
-
-class _Linear(torch.autograd.Function):
-    """The 3x3 part; its gradient is put into place in one pass."""
-
-    @staticmethod
-    def forward(ctx: Any, transforms: Tensor) -> Tensor:
-        return transforms[..., :3, :3].contiguous()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
-        return nn.functional.pad(upstream[0], (0, 1, 0, 1))
+    return Splats(means, quaternions, scales, opacities, channels, linear)
 
 
 def scene_splats(

@@ -88,6 +88,10 @@ class Model(Protocol):
         """All that is learned, the rows of the sets among it."""
         ...
 
+    def requires_grad_(self, requires_grad: bool = True) -> Any:
+        """Whether anything of it is learned from now on; what follows from the rest is kept."""
+        ...
+
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
         """Take back what `state_dict` gave; the sets have as many rows already."""
         ...

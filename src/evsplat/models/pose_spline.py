@@ -175,24 +175,23 @@ class PoseSpline(nn.Module):
             weights = self.weights(times_us)
             return torch.einsum("tk,kjc->tjc", weights, self.rotations), weights @ self.translations
         times = send(torch.as_tensor(times_us, dtype=torch.float64), self.mean.device)
-        points = torch.cat((self.rotations.flatten(1), self.translations), 1)
-        found = self._in_blocks(times, points)
+        near = [self._near(block) for block in times.split(_BLOCK)]
+        turns, shifts = (torch.cat(blocks) for blocks in zip(*near, strict=True))
         if not len(self.held):  # what is held at keys is not centred
-            found = found - self.mean @ points
-        return found[:, :-3].unflatten(1, (-1, 3)), found[:, -3:]
+            turns = turns - torch.einsum("k,kjc->jc", self.mean, self.rotations)
+            shifts = shifts - self.mean @ self.translations
+        return turns, shifts
 
-    def _in_blocks(
-        self, times: Float[Tensor, "T"], points: Float[Tensor, "K D"]
-    ) -> Float[Tensor, "T D"]:
-        """Sums over the control points near each block of times: linear in the recording."""
-        pieces, rows = points.split(_BLOCK), []
-        for block in times.split(_BLOCK):
-            parts = self._local(block)
-            first = min(int(index.min()) for index, _ in parts) // _BLOCK
-            last = max(int(index.max()) for index, _ in parts) // _BLOCK
-            near = torch.cat(pieces[first : last + 1])
-            found = torch.zeros(len(block), len(near), dtype=torch.float64, device=block.device)
-            for index, share in parts:
-                found.scatter_add_(1, index - first * _BLOCK, share)
-            rows.append(found.to(near) @ near)
-        return torch.cat(rows)
+    def _near(
+        self, times: Float[Tensor, "T"]
+    ) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T 3"]]:
+        """Sums over the control points near the times alone; the mean is not taken off."""
+        parts = self._local(times)
+        first = min(int(index.min()) for index, _ in parts)
+        end = max(int(index.max()) for index, _ in parts) + 1
+        found = torch.zeros(len(times), end - first, dtype=torch.float64, device=times.device)
+        for index, share in parts:
+            found.scatter_add_(1, index - first, share)
+        weights = found.to(self.rotations)
+        turns = torch.einsum("tk,kjc->tjc", weights, self.rotations[first:end])
+        return turns, weights @ self.translations[first:end]

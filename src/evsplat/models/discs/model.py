@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from evsplat.body import BodyTrack, skin, up_axis
+from evsplat.body import BodyTrack, skin_with_linear, up_axis
 from evsplat.capture import Camera, Frame
 from evsplat.gaussians import GaussianSet
 from evsplat.models.discs.relief import Relief
@@ -208,11 +208,12 @@ class DiscModel(PosedModel):
             centers, scales, turned, _ = self.deformation(means, scales_log, quaternions, rotations)
         else:
             centers, scales, turned = means[None], scales_log.exp()[None], quaternions[None]
-        world, transforms = skin(centers, self.surface.weights(means)[None], bones)
+        weights = self.surface.weights(means)[None]
+        world, transforms, linear = skin_with_linear(centers, weights, bones)
         casters = None if self.shadow is None else self.shadow.place(bones)
         rgb = still.rgb[None] * self._light(world, transforms, casters, lit_at)
         return Layers(
-            human_splats(world, turned, scales, still.opacities, rgb, still.semantics, transforms),
+            human_splats(world, turned, scales, still.opacities, rgb, still.semantics, linear),
             still.scene,
             transforms,
             self._scene_shadow(casters),

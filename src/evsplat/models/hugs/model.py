@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from evsplat.body import BodyTrack, skin
+from evsplat.body import BodyTrack, skin_with_linear
 from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import Camera, Frame
 from evsplat.devices import send
@@ -133,7 +133,9 @@ class HugsModel(PosedModel):
     ) -> Layers:
         human, scene = self.human, self.scene
         _, bones = self.pose(times_us)
-        world, transforms = skin(human.means + decoded.offsets, decoded.weights, bones)
+        world, transforms, linear = skin_with_linear(
+            human.means + decoded.offsets, decoded.weights, bones
+        )
         return Layers(
             human_splats(
                 world,
@@ -142,7 +144,7 @@ class HugsModel(PosedModel):
                 decoded.opacities,
                 decoded.rgb[None],
                 torch.ones_like(decoded.opacities),
-                transforms,
+                linear,
             ),
             scene_splats(
                 scene.means,

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.body import BodyTrack, skin
+from evsplat.body import BodyTrack, skin_with_linear
 from evsplat.capture import Camera, Frame
 from evsplat.devices import send
 from evsplat.gaussians import GaussianSet
@@ -205,7 +205,7 @@ class PaperModel(PosedModel):
             human if rows is None else torch.cat([human, scene[rows]]) for human, scene in parts
         ]
         centers, scales, quaternions, feature = self._deformed(posed, rotations, noise)
-        world, transforms = skin(centers, weights_at(centers), bones)
+        world, transforms, linear = skin_with_linear(centers, weights_at(centers), bones)
         human_means, scene_means = self.placement.places(gaussians, rows, world, scene_means)
 
         people = slice(0, gaussians.human_count)
@@ -229,7 +229,7 @@ class PaperModel(PosedModel):
                 opacities,
                 rgb,
                 semantics,
-                transforms[:, people],
+                linear[:, people],
             ),
             scene_splats(
                 scene_means,
