@@ -1,7 +1,6 @@
 """A trained run measured, and its report page: what ``evsplat evaluate`` and ``report`` do."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from evsplat.evaluation.splits import name_of
 from evsplat.evaluation.tables import write_tables
 from evsplat.files import try_target, write_json, write_text
 from evsplat.options.runs import Split
-from evsplat.render import Backdrop
+from evsplat.render import choose_device
 from evsplat.training.run import Run, load_run
 from evsplat.untrusted.faults import MISFITS, broken_as
 
@@ -31,7 +30,8 @@ def evaluate_run(
     measures the training frames against their sharp truth; its files are metrics_train.json and so
     on, beside those of the test frames.
     """
-    return _measured(_loaded(run_dir, device), lpips_weights, split)
+    device = choose_device(device)
+    return _measured(load_run(Path(run_dir), device=device), device, lpips_weights, split)
 
 
 def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
@@ -39,7 +39,7 @@ def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
 
     Figures and rendered pictures come from what `evaluate_run` wrote; the clip is drawn anew.
     """
-    return _reported(_loaded(run_dir, "auto"), split)
+    return _reported(load_run(Path(run_dir)), Path(run_dir), split)
 
 
 def evaluate_and_report(
@@ -50,17 +50,15 @@ def evaluate_and_report(
     split: Split = "test",
 ) -> tuple[dict[str, Any], Path]:
     """`evaluate_run` and `write_report` of a run that is read once."""
-    run = _loaded(run_dir, device)
-    return _measured(run, lpips_weights, split), _reported(run, split)
-
-
-def _loaded(run_dir: Path | str, device: str) -> Run:
-    """The run, to be drawn one picture after another from cameras that mostly stand still."""
+    device = choose_device(device)
     run = load_run(Path(run_dir), device=device)
-    return replace(run, reconstruction=replace(run.reconstruction, backdrop=Backdrop()))
+    metrics = _measured(run, device, lpips_weights, split)
+    return metrics, _reported(run, Path(run_dir), split)
 
 
-def _measured(run: Run, lpips_weights: Path | str | None, split: Split) -> dict[str, Any]:
+def _measured(
+    run: Run, device: str, lpips_weights: Path | str | None, split: Split
+) -> dict[str, Any]:
     start = time.monotonic()
     try_target(run.path)
     measured = evaluate(
@@ -68,7 +66,7 @@ def _measured(run: Run, lpips_weights: Path | str | None, split: Split) -> dict[
         run.reconstruction,
         out_dir=run.path,
         lpips_weights=lpips_weights,
-        device=run.reconstruction.model.device,
+        device=device,
         human_only=run.human_only,
         split=split,
     )
@@ -90,11 +88,11 @@ def _measured(run: Run, lpips_weights: Path | str | None, split: Split) -> dict[
     return metrics
 
 
-def _reported(run: Run, split: Split) -> Path:
-    path = run.path / name_of("report", split, ".html")
-    source = Source.read(run.path, run.capture, run.reconstruction, split)
+def _reported(run: Run, folder: Path, split: Split) -> Path:
+    path = folder / name_of("report", split, ".html")
+    source = Source.read(folder, run.capture, run.reconstruction, split)
     with broken_as(
-        run.path,
+        folder,
         "its figures are not as evsplat evaluate writes them",
         "evaluate the run again",
         kinds=MISFITS,

@@ -334,7 +334,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         method=method,
         policy=shown.terms,
         capture=capture,
-        reconstruction=GaussianReconstruction(method, composition.model, seen),
+        reconstruction=GaussianReconstruction(method, composition.model, seen, Backdrop()),
         device=facts["device"],
         human_only=isinstance(composition.capture, MaskedCapture),
         **_progress(composition.model, progress),
