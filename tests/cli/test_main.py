@@ -140,7 +140,7 @@ def test_ctrl_c_during_evaluation_says_that_the_training_is_safe(capsys, monkeyp
         raise KeyboardInterrupt
 
     monkeypatch.setattr(evsplat.training, "train", lambda capture, options, **_: tmp_path)
-    monkeypatch.setattr(evsplat.evaluation.run, "evaluate_run", interrupted)
+    monkeypatch.setattr(evsplat.evaluation.run, "evaluate_and_report", interrupted)
     code, _, stderr = _outcome(capsys, "train", str(demo_capture()))
     assert code == 130
     assert f"evsplat evaluate {tmp_path}" in stderr
