@@ -8,11 +8,13 @@ each motion, over the directions: *speckle*, the mean step of Cb and Cr from pix
 the body's outline in one direction against that from the front, the larger of the three directions
 behind (135 to 225 degrees) and of all; *holes*, the share of the outline's inside through which one
 sees (opacity below a half); *shreds*, the share of what is drawn that lies farther from the outline
-than 4 % of the picture's height, where clothes and hair are not. ``--learned`` shows what was
-learned, before the sides that nothing showed were filled. ``--avatar`` looks at the exported avatar
-page in headless Chromium instead (`npm install --prefix FOLDER playwright-core`).
-FOLDER/MOTION.png is a sheet, a row per time, a column per direction. The last line is one JSON
-object.
+than 4 % of the picture's height, where clothes and hair are not. Of the Gaussians themselves, not
+of the pictures: *size*, the largest standard deviation of one against that at rest; *torn*, the
+share of those that leave a neighbour on the surface (the eight nearest, normals within 60 degrees)
+by 1.5 cm and to 2.5 times its distance at rest. ``--learned`` shows what was learned, before the
+sides that nothing showed were filled. ``--avatar`` looks at the exported avatar page in headless
+Chromium instead (`npm install --prefix FOLDER playwright-core`). FOLDER/MOTION.png is a sheet, a
+row per time, a column per direction. The last line is one JSON object.
 """
 
 import argparse
@@ -31,9 +33,11 @@ from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_ed
 
 import evsplat as ev
 from evsplat.body import BodyTrack, silhouette, up_axis
+from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.camera import Camera
 from evsplat.film.following import follow
 from evsplat.film.motion import load_motion_of
+from evsplat.neighbours import nearest
 from evsplat.pictures import chroma, to_bytes
 from evsplat.pictures.files import save_png
 from evsplat.training.checkpoint import load_checkpoint, load_latest, load_model
@@ -49,6 +53,9 @@ View = tuple[int, Camera]
 """Time, microseconds, and camera."""
 Picture = tuple[torch.Tensor, np.ndarray]
 """sRGB (H, W, 3) over black and opacity (H, W)."""
+TORN_M, TORN_RATIO = 0.015, 2.5
+_NEIGHBOURS = 8
+_ALIKE = 0.5
 _INSET_PX = 2
 _GREY = 0.75
 
@@ -58,6 +65,12 @@ def sized(camera: Camera, height: int) -> Camera:
     K = camera.K * (height / camera.height)
     K[0, 2], K[1, 2], K[2, 2] = height / 2, height / 2, 1
     return replace(camera, width=height, height=height, K=K)
+
+
+def film_times(track: BodyTrack, count: int) -> list[int]:
+    """Even times inside a motion, microseconds."""
+    first, last = int(track.times_us[0]), int(track.times_us[-1])
+    return np.linspace(first, last, count + 2)[1:-1].astype(int).tolist()
 
 
 def turned_by(angle: float, share: float) -> float:
@@ -77,7 +90,7 @@ def steps(rgb: torch.Tensor, inside: np.ndarray) -> float:
 
 def by_model(run: Run, track: BodyTrack, views: list[View]) -> list[Picture]:
     """The person as films show it."""
-    drawn = run.reconstruction.following(track)
+    drawn = run.reconstruction.in_new_motion(track)
     shown = [drawn.render(camera, [time], parts="human") for time, camera in views]
     return [(picture.rgb[0], picture.alpha[0].numpy()) for picture in shown]
 
@@ -113,13 +126,34 @@ def by_page(
     return pictures
 
 
+@torch.no_grad()
+def pulled(run: Run, track: BodyTrack, times: list[int]) -> dict[str, float]:
+    """How large Gaussians of the person get in a motion, and how many leave their neighbours."""
+    model = run.reconstruction.model
+    gaussians, rows = model.gaussians, model.gaussians.human
+    means, rest = gaussians.means[rows], gaussians.scales_log[rows].exp().amax(-1)
+    normals = model.surface.normals(means)
+    apart, index = nearest(means, _NEIGHBOURS)
+    alike = (normals[:, None] * normals[index]).sum(-1) > _ALIKE
+    moving = run.reconstruction.in_new_motion(track).model
+    sizes, torn = [], []
+    for time in times:
+        person = moving.at([time], means.new_zeros(3), hard_semantics=True).human.with_times()
+        axes = quaternion_to_matrix(person.quaternions[0]) * person.scales[0][:, None]
+        sizes.append(float((torch.linalg.svdvals(person.linear[0] @ axes)[:, 0] / rest).max()))
+        posed = person.means[0]
+        now = (posed[:, None] - posed[index]).norm(dim=-1)
+        left = alike & (now > TORN_RATIO * apart) & (now > apart + TORN_M)
+        torn.append(100 * float(left.any(1).float().mean()))
+    return {"size_most_ratio": round(max(sizes), 3), "torn_most_pct": round(max(torn), 3)}
+
+
 def measured(
     run: Run, track: BodyTrack, draw: Callable[[list[View]], list[Picture]], out: Path,
     options: argparse.Namespace,
 ) -> dict[str, float]:  # fmt: skip
     """Figures of a motion; its sheet is written to ``out``."""
-    first, last = int(track.times_us[0]), int(track.times_us[-1])
-    times = np.linspace(first, last, options.times + 2)[1:-1].astype(int).tolist()
+    times = film_times(track, options.times)
     start = sized(run.capture.camera(run.capture.train_frames[0]), options.size)
     up = up_axis(run.reconstruction.track)
     angles = [2 * math.pi * column / DIRECTIONS for column in range(DIRECTIONS)]
@@ -184,6 +218,8 @@ def main() -> None:
         draw = partial(by_page, motion, options) if options.avatar else partial(by_model, run)
         out = options.out / f"{motion}.png"
         found[motion] = measured(run, track, partial(draw, track), out, options)
+        if not options.avatar:
+            found[motion] |= pulled(run, track, film_times(track, options.times))
         print(f"{motion:10}", *(f"{name} {value:.2f} " for name, value in found[motion].items()))
     keys = found[options.motions[0]]
     worst = {key: max(values[key] for values in found.values()) for key in keys}

@@ -43,7 +43,7 @@ class _Lamp:
             rgb = rgb * alpha[..., None]
         return Rendering(rgb, alpha, alpha)
 
-    def following(self, track):
+    def in_new_motion(self, track):
         return _Lamp(track)
 
     def changed_by(self, *changes):

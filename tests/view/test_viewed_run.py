@@ -104,7 +104,7 @@ def test_gaussians_of_an_instant_are_those_that_are_drawn(run):
     rotations, transl = track.at([time_us])
     pose = HeldPose(track)
     pose.hold(turned(viewed.sliders, angles, rotations[0])[None], transl)
-    model = run.reconstruction.following(pose).model
+    model = run.reconstruction.in_new_motion(pose).model
     with torch.no_grad():
         expected = model.at([time_us], camera.center(), hard_semantics=True).human
     np.testing.assert_allclose(cloud.means, expected.means[0].numpy(), atol=1e-6)

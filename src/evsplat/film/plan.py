@@ -51,7 +51,7 @@ class FilmPlan:
             track = load_motion_of(
                 film.motion, recorded, fps=film.motion_fps, in_place=film.in_place
             )
-            reconstruction = reconstruction.following(track)
+            reconstruction = reconstruction.in_new_motion(track)
             poses = (
                 track.times_us,
                 *(value.numpy() for value in track.at(track.times_us.tolist())),

@@ -80,6 +80,10 @@ class Skinned(Model, Protocol):
         """A copy whose person does what ``track`` says; see `Model`."""
         ...
 
+    def stay_together(self) -> None:
+        """Keep neighbours on the person together in poses that were not recorded."""
+        ...
+
     def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4)."""
         ...

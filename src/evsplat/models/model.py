@@ -144,6 +144,9 @@ class PosedModel(nn.Module):
         """Whether training has reached the start of the pose residual."""
         return self.residual is not None and float(self.nominal) >= self.residual_start
 
+    def stay_together(self) -> None:
+        """Nothing; for models whose weights are tied to single points of the surface."""
+
     def pose(self, times_us: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Local rotations (T, J, 3, 3) and bone transforms canonical to world (T, J, 4, 4)."""
         rotations, translation = self.track.at(torch.as_tensor(times_us))

@@ -145,7 +145,7 @@ class ViewedRun:
         if not motion.is_recorded:
             if self._posed is None:
                 held = HeldPose(made.track)
-                self._posed = _cached(made.following(held)), held
+                self._posed = _cached(made.in_new_motion(held)), held
             drawn, pose = self._posed
             rotations, transl = self.track(motion.name).at([time_us])
             if any(motion.angles):

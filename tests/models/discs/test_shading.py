@@ -113,6 +113,30 @@ def test_gradcheck():
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_evened_weights_stay_shares_and_jump_between_no_neighbours(seed):
+    generator = torch.Generator().manual_seed(seed)
+    points = sphere(4_000, generator).points
+    upper = (points[:, 2:] > 0).float()
+    surface = NearestSurface(SurfaceSamples(points, points / 2, torch.cat([upper, 1 - upper], -1)))
+    before, apart = surface.weights(points), torch.cdist(points, points)
+    surface.even_out(points)
+    after = surface.weights(points)
+    assert torch.equal(surface.normals(points), points / 2)
+    assert torch.allclose(after.sum(-1), torch.ones(len(points)), atol=1e-5)
+    assert float(after.min()) > -1e-6
+    closest = apart.fill_diagonal_(torch.inf).argmin(1)
+    jumps = lambda weights: (weights[closest] - weights)[:, 0].abs()  # noqa: E731
+    assert float(jumps(before).max()) == 1
+    # Two alone, linked by 1, would be left a third apart; others pull at them.
+    assert float(jumps(after).max()) < 0.6
+    # What lies farther from the rim than a few neighbours is as it was.
+    far = points[:, 2].abs() > 0.8
+    assert torch.allclose(after[far], before[far], atol=0.01)
+    surface.rows_changed()
+    assert torch.equal(surface.weights(points), before)
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_what_the_nearest_surface_gives_follows_changed_rows(seed):
     generator = torch.Generator().manual_seed(seed)
     surface = NearestSurface(sphere(20_000, generator))

@@ -177,8 +177,7 @@ class DiscModel(PosedModel):
         if self.scene_colour is not None:
             hidden = float(torch.rand((), generator=generator)) < _DIRECTION_DROPOUT
             view = _View(camera.center(), hidden, camera)
-        lit_at = slice(nearest, nearest + 1)
-        layers = self._layers(bones, rotations, lit_at, view, hard_semantics=False)
+        layers = self._layers(bones, rotations, slice(nearest, nearest + 1), view)
         return draw(layers, camera, center_gradients=True, places=self.places)
 
     def following(self, track: BodyTrack) -> "DiscModel":
@@ -189,6 +188,10 @@ class DiscModel(PosedModel):
             model.residual.forget()
         return model
 
+    def stay_together(self) -> None:
+        """Weights of the bones without jumps from disc to disc, for poses beyond the recorded."""
+        self.surface.even_out(self.gaussians.means[self.gaussians.human])
+
     def _layers(
         self,
         bones: Float[Tensor, "T J 4 4"],
@@ -196,7 +199,7 @@ class DiscModel(PosedModel):
         lit_at: slice,
         view: _View,
         *,
-        hard_semantics: bool,
+        hard_semantics: bool = False,
     ) -> Layers:
         """Both classes under ``bones``; the non-rigid network sees ``rotations``.
 
@@ -281,9 +284,8 @@ class DiscModel(PosedModel):
         self, light: SurfaceLight, places: Float[Tensor, "T H 3"], casters: Tensor | None
     ) -> Float[Tensor, "L T H"] | None:
         """Share of the lamps' light that the body leaves its own places; None: all of it."""
-        if self.shadow is None or not self.shadow.on_body or light.lamps is None:
+        if self.shadow is None or casters is None or not self.shadow.on_body or light.lamps is None:
             return None
-        assert casters is not None
         return self.shadow.lit(casters.detach(), places, light.lamps)
 
     def _scene_shadow(self, casters: Float[Tensor, "T P 3"] | None) -> SceneShadow | None:

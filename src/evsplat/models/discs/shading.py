@@ -10,12 +10,15 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body.surface import SurfaceSamples
 from evsplat.compiled import native, runs_native
+from evsplat.gaussians.surface_graph import harmonic, laplacian
 from evsplat.models.networks.spherical_harmonics import sh_basis
 from evsplat.neighbours import nearest
 
 _NORMAL_DIM = 9
 _DARKEST, _BRIGHTEST = 0.2, 3.0
 _NEAREST_M = 0.3
+_EVEN = 1.0
+"""Strength of a link between neighbours in `NearestSurface.even_out`, against a weight's own."""
 
 
 class Shading(nn.Module):
@@ -206,6 +209,18 @@ class NearestSurface:
     def weights(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Skinning weights at the canonical centres of all Gaussians."""
         return self._at_all(means)[1]
+
+    def even_out(self, means: Float[Tensor, "N 3"]) -> None:
+        """Let weights change evenly along the surface, until rows change.
+
+        Each is drawn to those of the neighbours whose normals agree as much as to its own. Where
+        bones meet, as under an arm, neighbouring Gaussians may have found points of the surface
+        that go different ways.
+        """
+        normals, weights = self._at_all(means)
+        rough = laplacian(means, normals, torch.ones_like(normals[:, :1]), None)
+        even = harmonic(weights, torch.ones_like(weights[:, 0]), _EVEN * rough)
+        self._found = (normals, even, self.index)
 
     def _at_all(self, means: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor]:
         if self.surface.points.device != means.device:
