@@ -257,6 +257,32 @@ def work(trainer: Trainer, steps: int) -> tuple[float, float]:
 def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], dict[str, float]]:
     """Milliseconds per step: forward and backward by part, and the stages of render."""
     watch = Stopwatch()
+    watch_parts(watch, trainer)
+    jobs: list[Any] = []
+
+    def keep(*inputs: Any) -> Any:
+        jobs.append(_native.Render(*inputs))
+        return jobs[-1]
+
+    native_backend.native = SimpleNamespace(Render=keep, rows_in_view=_native.rows_in_view)
+    for _ in range(steps):
+        trainer.step()
+        watch.nodes.clear()
+    native_backend.native = _native
+    threads = torch.get_num_threads()
+    stages: dict[str, float] = defaultdict(float)
+    for job in jobs:
+        for stage, seconds in job.seconds.items():
+            stages[stage] += 1e3 * seconds / threads / steps
+
+    def per_step(seconds: Counter[str]) -> Counter[str]:
+        return Counter({part: 1e3 * value / steps for part, value in seconds.items()})
+
+    return per_step(watch.forward), per_step(watch.backward), dict(stages)
+
+
+def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
+    """Let it look at all parts of a step."""
     model = trainer.model
     watch.calls(model, "pose", "body pose")
     watch.calls(model.deformation.pose_encoder, "forward", "pose encoder")
@@ -293,31 +319,13 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
     watch.calls(trainer, "_count", "densification")
     watch.calls(trainer.optimiser, "step", "optimiser")
     watch.calls(trainer.optimiser, "finite", "finite check")
-    jobs: list[Any] = []
-
-    def keep(*inputs: Any) -> Any:
-        jobs.append(_native.Render(*inputs))
-        return jobs[-1]
-
-    native_backend.native = SimpleNamespace(Render=keep, rows_in_view=_native.rows_in_view)
-    for _ in range(steps):
-        trainer.step()
-        watch.nodes.clear()
-    native_backend.native = _native
-    threads = torch.get_num_threads()
-    stages: dict[str, float] = defaultdict(float)
-    for job in jobs:
-        for stage, seconds in job.seconds.items():
-            stages[stage] += 1e3 * seconds / threads / steps
-
-    def per_step(seconds: Counter[str]) -> Counter[str]:
-        return Counter({part: 1e3 * value / steps for part, value in seconds.items()})
-
-    return per_step(watch.forward), per_step(watch.backward), dict(stages)
 
 
 class Stopwatch:
-    """Time of the parts' calls, without the calls of parts inside, and of their gradients."""
+    """Time of the parts' calls, without the calls of parts inside, and of their gradients.
+
+    ``clock`` may count something else than seconds.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.clock = clock

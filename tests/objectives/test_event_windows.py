@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from evsplat.devices import DeviceCache
 from evsplat.events import ALWAYS, EventStream, window_counts
 from evsplat.objectives import EventNoise, EventSensor, EventWindows
 from evsplat.pictures import luminance
@@ -69,6 +70,8 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
 class StepAt(SimpleNamespace):
     """A step whose pictures are known in linear light."""
 
+    data = DeviceCache("cpu", 0)
+
     def log_luminance(self, which: slice, eps: float) -> torch.Tensor:
         return torch.log(luminance(self.linear[which]) + eps)
 
@@ -111,6 +114,36 @@ def test_learned_thresholds_come_back(seed):
         objective.loss(step)["event"].backward()
         adam.step()
     assert torch.allclose(objective.sensor.logs.exp(), torch.tensor([0.3, 0.2]).double(), rtol=0.05)
+
+
+@pytest.mark.parametrize("ramp_us", [0, 4_000])
+@pytest.mark.parametrize("late_us", [None, 120.0])
+def test_events_counted_on_a_device_give_the_same_differences(ramp_us, late_us):
+    capture, step = scene(0)
+    objective = make(capture, 0.25, 0.25, ramp_us, late_us=late_us)
+    found = []
+    for data in (step.data, Elsewhere()):
+        step.data = data
+        objective.sensor.zero_grad()
+        loss = objective.loss(step)["event"]
+        loss.backward()
+        learned = [p.grad for p in objective.sensor.parameters() if p.grad is not None]
+        found.append([loss.detach(), *(grad.clone() for grad in learned)])
+        objective.prefetch(SimpleNamespace(mid_us=5_000, exposure_us=(4_000, 6_000)), 5_000, data)
+    for ours, expected in zip(*found, strict=True):
+        assert torch.allclose(ours, expected, rtol=1e-4, atol=1e-6)
+
+
+class Elsewhere:
+    """A cache that calls the CPU another device."""
+
+    device = torch.device("meta")
+
+    def get(self, key, make):
+        return make()
+
+    def prefetch(self, key, make):
+        assert make().dtype == torch.int32
 
 
 def test_thresholds_are_held_where_they_started():

@@ -139,16 +139,25 @@ def offsets(pairs, images, across, down):
     return found.view(images, down, across)
 
 
-def _pixels(means2d, conics, colors, opacities, width, height, tile_size, starts, order):
-    """Colours and alpha, differentiable; the sums run front to back over each tile's list."""
+def _pixels(means2d, conics, colors, opacities, masks, width, height, tile_size, starts, order):
+    """Colours and alpha, differentiable; the sums run front to back over each tile's list.
+
+    Where ``masks`` says no, colours are 0 and nothing is written to alpha.
+    """
     images, down, across = starts.shape
     ends = torch.cat([starts.flatten()[1:], torch.tensor([len(order)])]).view_as(starts)
-    flat = [value.reshape(-1, *value.shape[2:]) for value in (means2d, conics, colors, opacities)]
+    flat = [means2d, conics, colors, opacities]
+    if means2d.dim() > 2:
+        flat = [value.flatten(0, 1) for value in flat]
     picture = colors.new_zeros(images, height, width, colors.shape[-1] + 1)
     for image in range(images):
         for row in range(down):
             for column in range(across):
                 top, left = row * tile_size, column * tile_size
+                if masks is not None and not masks[image, row, column]:
+                    hidden = picture[image, top : top + tile_size, left : left + tile_size]
+                    hidden[..., -1] = math.nan
+                    continue
                 y = torch.arange(top, min(top + tile_size, height))
                 x = torch.arange(left, min(left + tile_size, width))
                 start, end = starts[image, row, column], ends[image, row, column]
@@ -175,10 +184,10 @@ def _pixels(means2d, conics, colors, opacities, width, height, tile_size, starts
 def rasterize(
     means2d, conics, colors, opacities, backgrounds, masks, width, height, tile_size, starts, order
 ):
-    assert backgrounds is None and masks is None and starts.dtype == order.dtype == torch.int32
+    assert backgrounds is None and starts.dtype == order.dtype == torch.int32
     assert all(value.is_contiguous() for value in (means2d, conics, colors, opacities))
     colours, alpha = _pixels(
-        means2d, conics, colors, opacities, width, height, tile_size, starts, order
+        means2d, conics, colors, opacities, masks, width, height, tile_size, starts, order
     )
     return colours, alpha, torch.zeros(alpha.shape[:-1], dtype=torch.int32)
 
@@ -189,7 +198,11 @@ def rasterize_backward(
 ):  # fmt: skip
     leaves = [value.detach().requires_grad_() for value in (means2d, conics, colors, opacities)]
     with torch.enable_grad():
-        colours, alpha = _pixels(*leaves, width, height, tile_size, starts, order)
-        total = (colours * v_colors).sum() + (alpha * v_alphas).sum()
+        colours, alpha = _pixels(*leaves, masks, width, height, tile_size, starts, order)
+        # Tiles that are masked have no gradient, whatever comes for them.
+        total = sum(
+            torch.where(value.isnan(), 0.0, value * upstream).sum()
+            for value, upstream in ((colours, v_colors), (alpha, v_alphas))
+        )
     found = torch.autograd.grad(total, leaves)
     return None, *found

@@ -99,6 +99,41 @@ def test_a_static_layer_is_drawn_at_every_time(seed, device, random_scene, all_g
     assert_alike(ours, all_gradients(moving, camera, backend="native", **options), static)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_stands_still_is_shared_by_all_times_but_around_what_moves(
+    seed, device, random_scene, all_gradients, monkeypatch
+):
+    """Its rows are there once, it is binned once, and again in the box around the moving ones."""
+    size = dict(width=120, height=100, needle=MILD)
+    moving, _ = random_scene(seed, count=12, times=4, **size)
+    closer = torch.tensor([0.1, 0.1, 1.0])
+    small = replace(moving, means=moving.means * closer, scales=0.1 * moving.scales)
+    static, camera = random_scene(seed + 100, count=100, **size)
+    static = replace(static, scales=0.3 * static.scales)
+    rows, pairs, composite = [], [], cuda._composite
+
+    class Watched:
+        def __init__(self, gsplat):
+            self.gsplat = gsplat
+
+        def __getattr__(self, name):
+            return getattr(self.gsplat, name)
+
+        def rasterize_to_pixels(self, centers, *rest, **options):
+            rows.append(len(centers))
+            pairs.append(len(rest[7]))
+            return self.gsplat.rasterize_to_pixels(centers, *rest, **options)
+
+    monkeypatch.setattr(cuda, "_composite", lambda gsplat, *rest: composite(Watched(gsplat), *rest))
+    options = dict(dtype=torch.float32, static=static)
+    ours = all_gradients(small, camera, backend="gsplat", device=device, **options)
+    assert_alike(ours, all_gradients(small, camera, backend="native", **options), static)
+    for alone in (static, small):
+        all_gradients(alone, camera, backend="gsplat", device=device, dtype=torch.float32)
+    assert rows == [4 * 12 + 100, 100, 4 * 12]
+    assert pairs[1] + pairs[2] <= pairs[0] < 2.5 * pairs[1] + pairs[2]
+
+
 def test_needles_lose_digits_in_float32(device, random_scene, all_gradients):
     """Up to 4 m long a metre away: gsplat's quadratic form cancels, native's does not."""
     splats, camera = random_scene(0, needle=20)

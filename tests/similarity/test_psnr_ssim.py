@@ -188,3 +188,16 @@ def test_a_second_gradient_of_the_same_ssim_is_refused():
     torch.autograd.grad(value, image, retain_graph=True)
     with pytest.raises(RuntimeError, match="asked for twice"):
         torch.autograd.grad(value, image)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_gradient_in_plain_torch_is_that_of_autograd_through_the_map(seed):
+    first, second = (torch.from_numpy(picture) for picture in random_pair(seed))
+    second.requires_grad_()
+    values = l1_and_ssim(second, first)
+    expected = (second - first).abs().mean(), ssim_map(second, first, GAUSSIAN_SSIM).mean()
+    gradients = []
+    for l1, similarity in (values, expected):
+        gradients += torch.autograd.grad(0.8 * l1 - 0.2 * similarity, second)
+    for value, wanted in zip((*values, gradients[0]), (*expected, gradients[1]), strict=True):
+        assert torch.allclose(value, wanted, atol=1e-14, rtol=1e-10)

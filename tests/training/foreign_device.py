@@ -2,9 +2,13 @@
 
 Tensors on it are PyTorch's fake ones: they have shapes and a device, but no data. An operation on
 tensors of two devices, and one that needs the data on the host (``.item()``, ``nonzero``, indexing
-with a mask), raises; a copy between host and device for which the host waits raises here.
+with a mask), raises; a copy between host and device for which the host waits raises here. What a
+GPU would launch is counted.
 """
 
+from contextlib import contextmanager
+from functools import partial
+from importlib import import_module
 from types import SimpleNamespace
 
 import torch
@@ -17,9 +21,13 @@ from torch._subclasses.fake_tensor import (
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from evsplat.render import api, cuda
+
 NAME = "lazy"  # a device type that CPU builds of PyTorch know and never use
 NEEDS_DATA = (DataDependentOutputException, DynamicOutputShapeException)
 COPIES = (torch.ops.aten._to_copy.default, torch.ops.aten.copy_.default)
+_IDLE = {"empty", "empty_like", "new_empty", "empty_strided", "new_empty_strided", "_unsafe_view"}
+"""Operations that are no views and yet launch nothing."""
 
 
 class HostWaits(AssertionError):
@@ -33,6 +41,18 @@ class ForeignDevice(TorchDispatchMode):
         super().__init__()
         self.fake = FakeTensorMode(allow_non_fake_inputs=True)
         self.may_wait = True
+        self.launches = 0
+        """Operations so far that make a GPU work: all but views and memory that is only taken."""
+        self.counting = True
+
+    @contextmanager
+    def uncounted(self):
+        """What runs within is no launch."""
+        self.counting = False
+        try:
+            yield
+        finally:
+            self.counting = True
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
@@ -49,23 +69,66 @@ class ForeignDevice(TorchDispatchMode):
             scalar = func is COPIES[1] and args[1].ndim == 0  # travels with the launch
             if len(devices) > 1 and waits and not scalar:
                 raise HostWaits(f"{func} between {devices}, which the host waits for")
+        name = func._schema.name.removeprefix("aten::")
+        if self.counting and func.namespace == "aten" and not func.is_view and name not in _IDLE:
+            self.launches += 1
         with self.fake:
             return func(*args, **kwargs)
 
 
-class Descent(torch.optim.SGD):
-    """In place of PyTorch's fused Adam, which refuses the device."""
+class _Kernel(torch.autograd.Function):
+    """One of gsplat's functions as shapes: nothing that it does is a launch of ours."""
 
-    def __init__(self, groups, **_):
-        super().__init__(groups, lr=0.1)
-        self.found_inf = 0.0
+    @staticmethod
+    def forward(ctx, device, call, keywords, *given):
+        ctx.set_materialize_grads(False)
+        ctx.device, ctx.given = device, given
+        with device.uncounted():
+            results = call(*given, **keywords)
+        if isinstance(results, torch.Tensor):
+            return results
+        whole = (r for r in results if r is not None and not r.is_floating_point())
+        ctx.mark_non_differentiable(*whole)
+        return results
 
-    @torch.no_grad()
-    def step(self):
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                if parameter.grad is not None:
-                    parameter.sub_(0.1 * (1 - self.found_inf) * parameter.grad)
+    @staticmethod
+    def backward(ctx, *upstream):
+        needed = zip(ctx.given, ctx.needs_input_grad[3:], strict=True)
+        with ctx.device.uncounted():
+            return None, None, None, *(torch.zeros_like(v) if n else None for v, n in needed)
+
+
+def as_on_a_gpu(device, monkeypatch, width, height):
+    """Let render draw on the device, at one size, and optimisers take it for a GPU."""
+    kernels = {
+        name: partial(_Kernel.apply, device, call)
+        for name, call in vars(drawing(width, height)).items()
+    }
+    gsplat = SimpleNamespace(
+        **{name: lambda *g, run=run, **k: run(k, *g) for name, run in kernels.items()}
+    )
+    backends = api._BACKENDS | {"gsplat": lambda job: cuda.draw(gsplat, job)}
+    monkeypatch.setattr(api, "_BACKENDS", backends)
+    monkeypatch.setattr(api, "_BACKEND_OF_DEVICE", {NAME: "gsplat"})
+    for user, kind in (("optim.optimizer", "fused"), ("utils._foreach_utils", "foreach")):
+        name = f"_get_{kind}_kernels_supported_devices"
+        monkeypatch.setattr(import_module(f"torch.{user}"), name, lambda: ["cpu", NAME])
+    monkeypatch.setattr(torch.__future__, "get_overwrite_module_params_on_conversion", lambda: True)
+
+
+class Here:
+    """In place of `DeviceCache`, whose thread does not know the device."""
+
+    def __init__(self):
+        self.device, self.data = torch.device(NAME), {}
+
+    def prefetch(self, key, make):
+        self.get(key, make)
+
+    def get(self, key, make):
+        if key not in self.data:
+            self.data[key] = make().to(NAME, non_blocking=True)
+        return self.data[key]
 
 
 def drawing(width, height):
@@ -85,12 +148,15 @@ def drawing(width, height):
     def offsets(pairs, times, across, down):
         return torch.zeros(times, down, across, dtype=torch.int32, device=pairs.device)
 
-    def composite(centers, conics, colours, opacities, wide, high, size, starts, order):
-        assert (wide, high) == (width, height)
+    def composite(
+        centers, conics, colours, opacities, wide, high, size, starts, order, *, masks, packed
+    ):
+        assert (wide, high) == (width, height) and packed
+        assert masks is None or masks.shape == starts.shape
         light = opacities * (centers.sum(-1) + conics.sum(-1))
-        colour = (light[..., None] * colours).sum(1)[:, None, None]
-        alpha = light.sum(1)[:, None, None, None]
-        return colour.expand(-1, high, wide, -1), alpha.expand(-1, high, wide, 1)
+        shape = (len(starts), high, wide, -1)
+        colour = (light[:, None] * colours).sum(0)
+        return colour.expand(shape), light.sum().expand(len(starts), high, wide, 1)
 
     return SimpleNamespace(
         fully_fused_projection=project,

@@ -10,15 +10,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from evsplat.body.canonical import leg_spread_rotations
+from evsplat.body.kinematics import Kinematics
 from evsplat.body.surface import SurfaceSamples, sample_mesh
-from evsplat.body.tree import Level, level_inverse, tree_levels
 from evsplat.compiled import native, runs_native
 
 _DERIVED = (
-    "_level_inverse",
-    "_bone_vectors",
+    "_kinematics",
     "_canonical_bones",
-    "_inverse_canonical_bones",
+    "_to_rest",
+    "_to_canonical",
     "_canonical_vertices",
 )
 
@@ -42,7 +42,7 @@ class Body:
         moved = replace(self, **{name: getattr(self, name).to(device) for name in tensors})
         # What follows from them moves along: to derive it anew would read the tree back.
         derived = {name: getattr(self, name).to(device) for name in _DERIVED}
-        vars(moved).update(derived, _levels=tuple(level.to(device) for level in self._levels))
+        vars(moved).update(derived)
         return moved
 
     def joint_transforms(
@@ -53,15 +53,13 @@ class Body:
         ``R_j = R_parent r_j``, ``t_j = t_parent + R_parent (rest_j - rest_parent)``; the root
         stands at ``rest_0 + transl``.
         """
-        return _rigid(*self._kinematics(rotations, transl))
+        return self._kinematics.frames(rotations, transl)
 
     def bone_transforms(
         self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
     ) -> Float[Tensor, "*T J 4 4"]:
         """Transforms of each bone, rest pose to world: ``B_j = [R_j | t_j - R_j rest_j]``."""
-        turned, origins = self._kinematics(rotations, transl)
-        rest = self.rest_joints.to(turned.dtype)
-        return _rigid(turned, origins - (turned @ rest[:, :, None]).squeeze(-1))
+        return self.joint_transforms(rotations, transl) @ self._to_rest.to(rotations.dtype)
 
     def canonical_bone_transforms(self) -> Float[Tensor, "J 4 4"]:
         """Transforms of each bone, rest pose to canonical pose (legs apart)."""
@@ -75,8 +73,7 @@ class Body:
         self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
     ) -> Float[Tensor, "*T J 4 4"]:
         """Transforms of each bone, canonical pose to world (method.md 1.3)."""
-        bones = self.bone_transforms(rotations, transl)
-        return bones @ self._inverse_canonical_bones.to(bones.dtype)
+        return self.joint_transforms(rotations, transl) @ self._to_canonical.to(rotations.dtype)
 
     def sample_surface(
         self, count: int, generator: torch.Generator | None = None
@@ -85,22 +82,15 @@ class Body:
         return sample_mesh(self._canonical_vertices, self.faces, self.weights, count, generator)
 
     @cached_property
-    def _levels(self) -> tuple[Level, ...]:
-        device = self.rest_joints.device
-        return tuple(level.to(device) for level in tree_levels(self.parents.tolist()))
+    def _kinematics(self) -> Kinematics:
+        return Kinematics.of(self.parents.tolist(), self.rest_joints)
 
     @cached_property
-    def _level_inverse(self) -> Int[Tensor, "J"]:
-        return level_inverse(self._levels)
-
-    @cached_property
-    def _bone_vectors(self) -> Float[Tensor, "J 3 1"]:
-        """Rest joint minus rest joint of its parent; the root's own place for the root."""
-        above = self.rest_joints[self.parents.clamp_min(0)]
-        bones = torch.where(
-            (self.parents >= 0)[:, None], self.rest_joints - above, self.rest_joints
-        )
-        return bones[:, :, None]
+    def _to_rest(self) -> Float[Tensor, "J 4 4"]:
+        """Rest pose to the joint's own frame: its place becomes the origin."""
+        shifts = torch.eye(4).repeat(len(self.parents), 1, 1).to(self.rest_joints)
+        shifts[:, :3, 3] = -self.rest_joints
+        return shifts
 
     @cached_property
     def _canonical_bones(self) -> Float[Tensor, "J 4 4"]:
@@ -108,34 +98,14 @@ class Body:
         return self.bone_transforms(local, self.rest_joints.new_zeros(3))
 
     @cached_property
-    def _inverse_canonical_bones(self) -> Float[Tensor, "J 4 4"]:
-        return torch.linalg.inv(self._canonical_bones.double()).to(self._canonical_bones.dtype)
+    def _to_canonical(self) -> Float[Tensor, "J 4 4"]:
+        """Canonical pose to the joint's own frame."""
+        canonical = torch.linalg.inv(self._canonical_bones.double())
+        return (self._to_rest.double() @ canonical).to(self._canonical_bones.dtype)
 
     @cached_property
     def _canonical_vertices(self) -> Float[Tensor, "V 3"]:
         return skin(self.rest_vertices, self.weights, self._canonical_bones[None])[0][0]
-
-    def _kinematics(
-        self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
-    ) -> tuple[Float[Tensor, "*T J 3 3"], Float[Tensor, "*T J 3"]]:
-        """World rotation and place of every joint, one batched product per level of the tree."""
-        bones = self._bone_vectors.to(rotations.dtype)
-        turned, origins = [], []
-        for depth, level in enumerate(self._levels):
-            local = rotations.index_select(-3, level.joints)
-            if depth == 0:
-                turned.append(local)
-                origins.append(transl[..., None, :] + bones[level.joints, :, 0])
-                continue
-            above = turned[-1].index_select(-3, level.parent_slots)
-            start = origins[-1].index_select(-2, level.parent_slots)
-            turned.append(above @ local)
-            origins.append(start + (above @ bones[level.joints]).squeeze(-1))
-        inverse = self._level_inverse
-        return (
-            torch.cat(turned, -3).index_select(-3, inverse),
-            torch.cat(origins, -2).index_select(-2, inverse),
-        )
 
 
 def skin(
@@ -172,9 +142,39 @@ def _skinned(
             linear,
         )
         return skinned
-    blended = (weights @ bones.flatten(-2)).unflatten(-1, (4, 4))
-    moved = (blended[..., :3, :3] * points[..., None, :]).sum(-1) + blended[..., :3, 3]
+    moved, blended = _PlainSkin.apply(points, weights, bones)
     return moved, blended, blended[..., :3, :3]
+
+
+class _PlainSkin(torch.autograd.Function):
+    """`skin` in plain torch; both results' gradients are one of the matrices before they go on."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: Tensor, weights: Tensor, bones: Tensor
+    ) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N 4 4"]]:
+        blended = (weights @ bones.flatten(-2)).unflatten(-1, (4, 4))
+        moved = (blended[..., :3, :3] * points[..., None, :]).sum(-1) + blended[..., :3, 3]
+        ctx.save_for_backward(points, weights, bones, blended)
+        return moved, blended
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        points, weights, bones, blended = ctx.saved_tensors
+        pad, (by_moved, by_blended) = torch.nn.functional.pad, upstream
+        moving = by_moved[..., None] * pad(points, (0, 1), value=1.0)[..., None, :]
+        flat = (by_blended + pad(moving, (0, 0, 0, 1))).flatten(-2)
+        to_points, to_weights, to_bones = ctx.needs_input_grad
+        given = [
+            (blended[..., :3, :3] * by_moved[..., None]).sum(-2) if to_points else None,
+            flat @ bones.flatten(-2).mT if to_weights else None,
+            (weights.mT @ flat).unflatten(-1, (4, 4)) if to_bones else None,
+        ]
+        return tuple(
+            None if grad is None else grad.sum_to_size(like.shape)
+            for grad, like in zip(given, (points, weights, bones), strict=True)
+        )
 
 
 class _NativeSkin(torch.autograd.Function):
@@ -212,12 +212,3 @@ def bounding_box(body: Body, margin: float = 0.1) -> tuple[Float[Tensor, "3"], F
     low, high = vertices.amin(0), vertices.amax(0)
     extent = high - low
     return low - margin * extent, high + margin * extent
-
-
-def _rigid(
-    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 4 4"]:
-    top = torch.cat((rotation, translation[..., None]), -1)
-    # Made on the device: a host array would have to be waited for.
-    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3].expand(*top.shape[:-2], 1, 4)
-    return torch.cat((top, bottom), -2)

@@ -57,31 +57,36 @@ class BodyTrack:
         that recorded the body; None where none did."""
         self.times_us = times
         self.poses, self.transl = poses, transl
-        device = body.rest_joints.device
         seconds = (times - times[0]) * 1e-6
         keys, polynomials = _polynomials(seconds, poses, transl)
-        # float64 throughout: a few hundred numbers per call, and exact at the keys.
-        self._seconds = torch.from_numpy(seconds).to(device)
-        self._keys = torch.from_numpy(keys).to(device)
-        self._polynomials = torch.from_numpy(polynomials).to(device)
+        # float64 throughout: a few hundred numbers per call, and exact at the keys. They stay on
+        # the host, since a GPU would take a launch per operation for them.
+        self._seconds = torch.from_numpy(seconds)
+        self._keys = torch.from_numpy(keys)
+        self._polynomials = torch.from_numpy(polynomials)
 
     def to(self, device: torch.device | str) -> "BodyTrack":
-        """The same track computing on ``device``."""
+        """The same track, whose poses are for ``device``."""
         moved = copy.copy(self)
         moved.body = self.body.to(device)
-        for name in ("_seconds", "_keys", "_polynomials"):
-            setattr(moved, name, getattr(self, name).to(device))
         return moved
+
+    @property
+    def device(self) -> torch.device:
+        """Of the body, and of the poses that `at` gives."""
+        return self.body.rest_joints.device
 
     def at(
         self, times_us: Int[Tensor, "T"] | Sequence[int]
     ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
         """Rotations local to the parent (root: in the world) and root translation, float32."""
-        times = send(torch.as_tensor(times_us, dtype=torch.int64), self._seconds.device)
+        times = torch.as_tensor(times_us, dtype=torch.int64, device="cpu")
         if len(times) <= _TIMES_AT_ONCE:
-            return self._at(times)
-        rotations, places = zip(*map(self._at, times.split(_TIMES_AT_ONCE)), strict=True)
-        return torch.cat(rotations), torch.cat(places)
+            rotations, places = self._at(times)
+        else:
+            parts = zip(*map(self._at, times.split(_TIMES_AT_ONCE)), strict=True)
+            rotations, places = (torch.cat(part) for part in parts)
+        return send(rotations, self.device), send(places, self.device)
 
     def _at(self, times: Int[Tensor, "T"]) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
         seconds = (times - int(self.times_us[0])).double() * 1e-6

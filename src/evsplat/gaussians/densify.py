@@ -73,9 +73,10 @@ class ScreenStatistics:
         """
         # The T renders share one mean loss; 3DGS's threshold is for the loss of a single view.
         half = torch.tensor([width / 2, height / 2], dtype=centers_gradient.dtype)
-        scale = send(half, centers_gradient.device) * len(centers_gradient)
+        scale = send(half * len(centers_gradient), centers_gradient.device)
         visible = radii > 0
-        norms = (centers_gradient * scale).norm(dim=-1) * visible
+        # What is not drawn may have no number.
+        norms = (centers_gradient * scale).norm(dim=-1).masked_fill(~visible, 0)
         self.gradient_sum[rows] += norms.sum(0)
         self.seen[rows] += visible.sum(0)
         radius = self.radius_px[rows]

@@ -41,7 +41,6 @@ class PoseCorrection(nn.Module):
     exact: Tensor
     started: Tensor
     """True where the errors began at what was found before training: they count from the start."""
-    key_us: Tensor
     joint_rad: Tensor
     root_m: Tensor
     between_rad: Tensor
@@ -78,14 +77,9 @@ class PoseCorrection(nn.Module):
         if between is not None:
             self.between = PoseSpline(span, gap / 2, joints, held_us=times.tolist())
             self.between_m = between.translation_m
-        buffers = {
-            "key_us": torch.from_numpy(times).double(),
-            "between_rad": torch.zeros(joints)
-            if between is None
-            else torch.from_numpy(between.rotation_rad),
-        }
-        for name, value in buffers.items():
-            self.register_buffer(name, value, persistent=False)
+        self.key_us = torch.from_numpy(times).double()  # on the host, where splines are weighed
+        rad = torch.zeros(joints) if between is None else torch.from_numpy(between.rotation_rad)
+        self.register_buffer("between_rad", rad, persistent=False)
         self.register_buffer("joint_rad", torch.as_tensor(joint_rad).float())
         self.register_buffer("root_m", torch.as_tensor(root_m).float())
         self.register_buffer("exact", torch.tensor(exact))
@@ -101,7 +95,7 @@ class PoseCorrection(nn.Module):
         self, times_us: Sequence[int] | Tensor
     ) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T 3"]]:
         """Axis-angle vectors, radians, and shifts of the root, metres."""
-        times = send(torch.as_tensor(times_us, dtype=torch.float64), self.key_us.device)
+        times = torch.as_tensor(times_us, dtype=torch.float64, device="cpu")
         turns = self.joint_rad.new_zeros(len(times), self.joint_rad.shape[1], 3)
         shifts = self.root_m.new_zeros(len(times), 3)
         if not bool(self.exact):
@@ -162,6 +156,8 @@ class PoseCorrection(nn.Module):
         upper = torch.searchsorted(self.key_us, times_us).clamp(1, len(self.key_us) - 1)
         early, late = self.key_us[upper - 1], self.key_us[upper]
         part = ((times_us - early) / (late - early)).clamp(0, 1).float()[:, None]
+        device = self.joint_rad.device
+        upper, part = send(upper, device), send(part, device)
         return tuple(  # type: ignore[return-value]
             torch.lerp(sizes[upper - 1], sizes[upper], part)
             for sizes in (self.joint_rad, self.root_m)

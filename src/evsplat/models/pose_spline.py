@@ -36,10 +36,6 @@ class PoseSpline(nn.Module):
 
     rotations: Tensor
     translations: Tensor
-    mean: Tensor
-    held: Tensor
-    held_first: Tensor
-    held_s: Tensor
 
     def __init__(
         self,
@@ -61,14 +57,12 @@ class PoseSpline(nn.Module):
         self.segments = max(1, math.ceil((span_us[1] - span_us[0]) / self.knot_us - 1e-9))
         self.count = 1 if math.isinf(knot_us) else self.segments + 3
         """Number of control points."""
-        buffers = {
-            "mean": torch.zeros(self.count),
-            "held": torch.zeros(0, 4, 0),
-            "held_first": torch.zeros(0, dtype=torch.long),
-            "held_s": torch.zeros(0, dtype=torch.float64),
-        }
-        for name, value in buffers.items():
-            self.register_buffer(name, value, persistent=False)
+        # No buffers: weights are found on the host, as each of their many small operations would
+        # be a launch on a GPU.
+        self.mean = torch.zeros(self.count)
+        self.held = torch.zeros(0, 4, 0)
+        self.held_first = torch.zeros(0, dtype=torch.long)
+        self.held_s = torch.zeros(0, dtype=torch.float64)
         if len(held_us) > 1:
             self.held_s = 1e-6 * (torch.tensor(held_us, dtype=torch.float64) - span_us[0])
             self.held, self.held_first = self._through(held_us)
@@ -85,15 +79,15 @@ class PoseSpline(nn.Module):
                 self.register_buffer(name, value)
 
     def weights(self, times_us: Sequence[int] | Tensor) -> Float[Tensor, "T K"]:
-        """Weights of the control points at given times."""
-        device = self.mean.device
-        times = send(torch.as_tensor(times_us, dtype=torch.float64), device)
+        """Weights of the control points at given times, on the device of the control points."""
+        device = self.rotations.device
         if math.isinf(self.knot_us):
-            return torch.ones(len(times), 1, device=device)
-        found = torch.zeros(len(times), self.count, dtype=torch.float64, device=device)
+            return torch.ones(len(times_us), 1, device=device)
+        times = _on_host(times_us)
+        found = torch.zeros(len(times), self.count, dtype=torch.float64)
         for index, share in self._local(times):
             found.scatter_add_(1, index, share)
-        return found.float() - self.mean
+        return send(found.float() - self.mean, device)
 
     def _local(self, times: Float[Tensor, "T"]) -> list[tuple[Tensor, Tensor]]:
         """Control points that count at each time, and their weights, of which there are two sorts.
@@ -101,7 +95,7 @@ class PoseSpline(nn.Module):
         The mean is not taken off.
         """
         first, four = self._four(times)
-        parts = [(first[:, None] + torch.arange(4, device=times.device), four)]
+        parts = [(first[:, None] + torch.arange(4), four)]
         if len(self.held):
             index, through = self._through_keys(times)
             parts.append((index, -through))
@@ -120,7 +114,7 @@ class PoseSpline(nn.Module):
         segment = place.floor().clamp(max=self.segments - 1)
         step = place - segment
         powers = torch.stack([torch.ones_like(step), step, step**2, step**3], 1)
-        return segment.long(), powers @ send(_PIECES, times.device)
+        return segment.long(), powers @ _PIECES
 
     def _through(
         self, keys_us: Sequence[int]
@@ -164,7 +158,7 @@ class PoseSpline(nn.Module):
         piece = piece.clamp(0, len(self.held) - 1)
         step = (seconds - self.held_s[piece])[:, None]
         c3, c2, c1, c0 = self.held[piece].unbind(1)
-        index = self.held_first[piece, None] + torch.arange(c0.shape[1], device=times.device)
+        index = self.held_first[piece, None] + torch.arange(c0.shape[1])
         return index, ((c3 * step + c2) * step + c1) * step + c0
 
     def values(
@@ -174,12 +168,12 @@ class PoseSpline(nn.Module):
         if (len(times_us) <= _BLOCK and self.count <= _DENSE) or math.isinf(self.knot_us):
             weights = self.weights(times_us)
             return torch.einsum("tk,kjc->tjc", weights, self.rotations), weights @ self.translations
-        times = send(torch.as_tensor(times_us, dtype=torch.float64), self.mean.device)
-        near = [self._near(block) for block in times.split(_BLOCK)]
+        near = [self._near(block) for block in _on_host(times_us).split(_BLOCK)]
         turns, shifts = (torch.cat(blocks) for blocks in zip(*near, strict=True))
         if not len(self.held):  # what is held at keys is not centred
-            turns = turns - torch.einsum("k,kjc->jc", self.mean, self.rotations)
-            shifts = shifts - self.mean @ self.translations
+            mean = send(self.mean, self.rotations.device)
+            turns = turns - torch.einsum("k,kjc->jc", mean, self.rotations)
+            shifts = shifts - mean @ self.translations
         return turns, shifts
 
     def _near(
@@ -189,9 +183,13 @@ class PoseSpline(nn.Module):
         parts = self._local(times)
         first = min(int(index.min()) for index, _ in parts)
         end = max(int(index.max()) for index, _ in parts) + 1
-        found = torch.zeros(len(times), end - first, dtype=torch.float64, device=times.device)
+        found = torch.zeros(len(times), end - first, dtype=torch.float64)
         for index, share in parts:
             found.scatter_add_(1, index - first, share)
-        weights = found.to(self.rotations)
+        weights = send(found.to(self.rotations.dtype), self.rotations.device)
         turns = torch.einsum("tk,kjc->tjc", weights, self.rotations[first:end])
         return turns, weights @ self.translations[first:end]
+
+
+def _on_host(times_us: Sequence[int] | Tensor) -> Float[Tensor, "T"]:
+    return torch.as_tensor(times_us, dtype=torch.float64, device="cpu")

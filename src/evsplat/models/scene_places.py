@@ -29,33 +29,38 @@ class ScenePlaces:
         self.kept = torch.zeros(0, 0, 3)
         self.seen: list[Tensor] = []
         self._given = Unchanged()
+        self.camera: Camera | None = None
+        """The one of the kept places."""
 
     @torch.no_grad()
     def of(self, layers: Layers, camera: Camera, step: int) -> Float[Tensor, "h w 3"]:
         """Places at every ``step``-th pixel; no gradients, as a shadow is not to move the scene."""
         shape = -(-camera.height // step), -(-camera.width // step), 3
-        # A camera on a GPU is not compared, for which the host would have to wait.
-        kept = tuple(self.kept.shape) == shape and layers.scene.means.device.type == "cpu"
+        kept = tuple(self.kept.shape) == shape
         given = [camera.K, camera.world_to_camera]
         if self.refresh is None:
             scene = layers.scene
             given += [scene.means, scene.quaternions, scene.scales, scene.opacities]
-        if not (kept and self._same(given)):
+        if not (kept and self._same(given, camera)):
             self.kept = places_of(scene_depth(layers, camera), camera, step)
             self.seen, self.age = [tensor.detach().clone() for tensor in given], 0
+            self.camera = camera
         self.age += 1
         return self.kept
 
-    def _same(self, given: list[Tensor]) -> bool:
+    def _same(self, given: list[Tensor], camera: Camera) -> bool:
         if self.refresh is not None and self.age >= self.refresh:
             return False
+        if given[1].device.type != "cpu":
+            # To compare values the host would have to wait for the GPU.
+            return self.refresh is not None and self.camera is camera
         if self._given.again(given) and self.seen:
             return True
         return len(given) == len(self.seen) and all(map(same_values, given, self.seen))
 
     def rows_changed(self) -> None:
         """The scene has other Gaussians now."""
-        self.seen = []
+        self.seen, self.camera = [], None
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that a resume needs."""

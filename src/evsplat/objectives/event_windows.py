@@ -13,8 +13,9 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.compiled import native, runs_native
-from evsplat.devices import send
-from evsplat.events import polarity_counts, window_counts
+from evsplat.devices import DeviceCache, send
+from evsplat.events import Span, polarity_counts, window_counts
+from evsplat.events.on_device import EventBlocks
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event_sensor import EventNoise, EventSensor
 
@@ -62,6 +63,7 @@ class EventWindows(Objective):
         """
         assert capture.events is not None
         self.events = capture.events.keeping(_KEPT_BYTES)
+        self.blocks = EventBlocks(self.events)
         self.sensor, self.generator = sensor, generator
         self.start, self.eps = start, eps
         mids = [frame.mid_us for frame in capture.frames]
@@ -85,6 +87,15 @@ class EventWindows(Objective):
         if after < 1 or (draw[1] < 0.5 and before >= 1):
             return (start - 1 - int(draw[0] * (before - 1)),)
         return (end + int(draw[0] * after),)
+
+    def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
+        """The events that any times around the frame could ask for."""
+        if nominal < self.start or data.device.type == "cpu":
+            return
+        low, high = self.events.readable_around(frame.mid_us)
+        reach = int(self.reach_us) + max(_RATE_US, self.ramp_us)
+        start, end = (time + self._late_us for time in frame.exposure_us)
+        self.blocks.prefetch(data, max(start - reach, low), min(end + reach, high))
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``event``: mean over windows, pixels and the whole span; ``contrast``: `apart`."""
@@ -131,21 +142,37 @@ class EventWindows(Objective):
         # A sensor compares logarithms of light, before any transfer curve of a camera.
         brightness = step.log_luminance(kept, self.eps)
         reach = max(_RATE_US, self.ramp_us)
-        stream = self.events.between(max(late[0] - reach, low), min(late[-1] + reach, high))
-        size = self.events.height, self.events.width
-        ramp_us = self.ramp_us if self.events.has_polarity else 0
-        counts = window_counts(stream, late, *size, reach_us=ramp_us)
+        within = max(late[0] - reach, low), min(late[-1] + reach, high)
+        # Events per microsecond at each instant tell what a later clock would have counted.
+        around = [(max(time - _RATE_US, low), min(time + _RATE_US, high)) for time in late]
+        drifts = self.sensor.offset_us is not None and self.events.has_polarity
+        counts, maps = self._counted(step.data, late, within, around if drifts else [])
         drift = None
-        if self.sensor.offset_us is not None and self.events.has_polarity:
-            # Events per microsecond at each instant tell what a later clock would have counted.
-            around = [(max(time - _RATE_US, low), min(time + _RATE_US, high)) for time in late]
-            maps = torch.stack([polarity_counts(stream.between(*ends), *size) for ends in around])
+        if maps is not None:
             lasting = torch.tensor([end - start for start, end in around], dtype=torch.float32)
-            rates = send(maps / lasting[:, None, None, None], brightness.device)
+            rates = (
+                send(maps, brightness.device)
+                / send(lasting, brightness.device)[:, None, None, None]
+            )
             with torch.no_grad():
                 rate = self.sensor.change(*rates.unbind(1))
                 drift = rate[1:] - rate[:-1]
         return _Seen(brightness, send(counts, brightness.device), drift)
+
+    def _counted(
+        self, data: DeviceCache, late_us: Sequence[int], within_us: Span, around_us: Sequence[Span]
+    ) -> tuple[Float[Tensor, "T-1 2 H W"], Float[Tensor, "T 2 H W"] | None]:
+        """Events between times, and those in the spans around them if there are any."""
+        ramp_us = self.ramp_us if self.events.has_polarity else 0
+        if data.device.type != "cpu":
+            events = self.blocks.between(data, *within_us)
+            counts = events.window_counts(late_us, within_us, reach_us=ramp_us)
+            return counts, events.counts_around(around_us) if around_us else None
+        size = self.events.height, self.events.width
+        stream = self.events.between(*within_us)
+        counts = window_counts(stream, late_us, *size, reach_us=ramp_us)
+        maps = [polarity_counts(stream.between(*span), *size) for span in around_us]
+        return counts, torch.stack(maps) if maps else None
 
     def _differences(self, seen: "_Seen") -> Float[Tensor, "T-1 H W"]:
         changes = seen.brightness[1:] - seen.brightness[:-1]

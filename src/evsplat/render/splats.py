@@ -113,8 +113,22 @@ class _SplitChannels(torch.autograd.Function):
         if given is None:
             return None, None
         times, height, width, channels = ctx.shape
+        if given.device.type != "cpu":
+            # A GPU counts operations, and takes any layout.
+            starts = range(0, len(upstream), times)
+            return torch.cat(
+                [
+                    _stacked(upstream[k : k + times], given.new_zeros(height, width, size))
+                    for k, size in zip(starts, ctx.sizes, strict=True)
+                ],
+                -1,
+            ), None
         gradient = given.new_empty(times, channels, height, width).permute(0, 2, 3, 1)
         parts = [part[t] for part in gradient.split(ctx.sizes, -1) for t in range(times)]
         for part, value in zip(parts, upstream, strict=True):
             part.zero_() if value is None else part.copy_(value)
         return gradient, None
+
+
+def _stacked(pictures: Sequence[Tensor | None], nothing: Tensor) -> Float[Tensor, "T H W c"]:
+    return torch.stack([nothing if picture is None else picture for picture in pictures])

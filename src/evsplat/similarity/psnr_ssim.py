@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from evsplat.compiled import native, runs_native
+from evsplat.devices import send
 
 
 def psnr(
@@ -124,16 +125,26 @@ class SsimReference:
 
     def _means(self, *values: Float[Tensor, "C H W"]) -> tuple[Float[Tensor, "C h w"], ...]:
         """Weighted means in each window."""
-        planes = torch.cat(values)
-        # A CPU's cache holds a plane; on a GPU it is the number of operations that counts.
-        pieces = planes.split(1 if planes.device.type == "cpu" else len(planes))
-        return torch.cat([_smooth(piece, self.settings) for piece in pieces]).split(len(values[0]))
+        pad = self.settings.size // 2 if self.settings.padding == "zero" else 0
+        return _smooth(torch.cat(values), self.settings, pad).split(len(values[0]))
 
 
-def _smooth(planes: Float[Tensor, "C H W"], settings: Ssim) -> Float[Tensor, "C h w"]:
-    # Shifted sums: torch's convolution is many times slower in float64.
+def _smooth(planes: Float[Tensor, "C H W"], settings: Ssim, pad: int) -> Float[Tensor, "C h w"]:
+    """Weighted means in each window, ``pad`` pixels of zeros around the planes."""
+    if planes.device.type != "cpu":
+        # The number of operations counts there; channels apart, as no tensor cores round those.
+        weights = send(planes.new_tensor(_window(settings), device="cpu"), planes.device)
+        down = weights.expand(len(planes), 1, -1)[..., None]
+        smooth = F.conv2d(planes[None], down, padding=(pad, 0), groups=len(planes))
+        return F.conv2d(smooth, down.mT, padding=(0, pad), groups=len(planes))[0]
+    # Shifted sums: torch's convolution is many times slower in float64. A cache holds a plane.
+    return torch.cat([_shifted_sums(plane, settings, pad) for plane in planes.split(1)])
+
+
+def _shifted_sums(
+    planes: Float[Tensor, "C H W"], settings: Ssim, pad: int
+) -> Float[Tensor, "C h w"]:
     size, kernel = settings.size, _window(settings)
-    pad = size // 2 if settings.padding == "zero" else 0
     padded = F.pad(planes, (pad, pad, pad, pad)) if pad else planes
     rows, columns = padded.shape[1] - size + 1, padded.shape[2] - size + 1
     down = kernel[0] * padded[:, :rows]
@@ -165,6 +176,10 @@ def l1_and_ssim(
     """Mean absolute difference, and `ssim` of `GAUSSIAN_SSIM`, for the cost of the latter."""
     if _runs_native(image, reference):
         return _native_l1_ssim(image, reference)
+    fits = min(image.shape[:2]) >= GAUSSIAN_SSIM.size
+    if fits and image.requires_grad and not reference.requires_grad:
+        l1, similarity = _PlainL1Ssim.apply(image, reference)
+        return l1, similarity
     return (image - reference).abs().mean(), ssim_map(image, reference, GAUSSIAN_SSIM).mean()
 
 
@@ -222,6 +237,50 @@ class _NativeL1Ssim(torch.autograd.Function):
         by_difference, scale = float(upstream[0]) / x.numel(), float(upstream[1]) / ctx.positions
         native.add_sign(x, y, by_difference, scale, gradient, torch.get_num_threads())
         return gradient.movedim(0, -1), None
+
+
+class _PlainL1Ssim(torch.autograd.Function):
+    """`l1_and_ssim` of `GAUSSIAN_SSIM` in plain torch; gradients are found on the way forward.
+
+    Autograd would take three times as many operations, which is what a GPU waits for.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+        x, y = (picture.detach().movedim(-1, 0) for picture in (image, reference))
+        y = y.to(x.dtype)
+        settings, (c1, c2) = GAUSSIAN_SSIM, GAUSSIAN_SSIM.stabilisers
+        planes = torch.cat([x, y, x * x + y * y, x * y])
+        mean_x, mean_y, squares, product = _smooth(planes, settings, 0).split(len(x))
+        means, both = 2 * mean_x * mean_y, torch.addcmul(mean_x * mean_x, mean_y, mean_y)
+        over = (means + c1, 2 * product - means + c2)
+        under = (both + c1, squares - both + c2)
+        divisor = under[0] * under[1]
+        similarity = over[0] * over[1] / divisor
+        # Slopes by the three means that the picture is in.
+        by_square = -similarity / under[1]
+        by_product = 2 * over[0] / divisor
+        by_mean = torch.addcmul(
+            2 * mean_y * (over[1] - over[0]) / divisor,
+            mean_x,
+            similarity / under[0] + by_square,
+            value=-2,
+        )
+        slopes = torch.cat([by_mean, by_square, by_product])
+        # Windows are even: the sum over the windows of a pixel is again one of these means.
+        back = _smooth(slopes, settings, settings.size - 1).split(len(x))
+        gradient = torch.addcmul(torch.addcmul(back[0], x, back[1], value=2), y, back[2])
+        apart = x - y
+        ctx.windows = similarity.numel()
+        ctx.save_for_backward(gradient, apart)
+        return apart.abs().mean(), similarity.mean()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        gradient, apart = ctx.saved_tensors
+        by_l1, by_similarity = upstream[0] / apart.numel(), upstream[1] / ctx.windows
+        return torch.addcmul(gradient * by_similarity, apart.sign(), by_l1).movedim(0, -1), None
 
 
 def _check_same_shape(image: Tensor, reference: Tensor) -> None:

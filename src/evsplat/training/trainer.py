@@ -1,7 +1,7 @@
 """The training loop: draw a frame, render what the objectives need, compare, step, densify."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Frame, TrainingCapture
-from evsplat.devices import DeviceCache, default_cache_bytes
+from evsplat.capture import Camera, Frame, TrainingCapture
+from evsplat.devices import DeviceCache, default_cache_bytes, send
 from evsplat.gaussians import GaussianSet, Part, Rows, ScreenStatistics, densify, flip_labels
 from evsplat.methods.base import Composition
 from evsplat.methods.settings import weight_at
@@ -88,6 +88,7 @@ class Trainer:
         self.data = DeviceCache(
             self.device, default_cache_bytes(self.device) if cache_bytes is None else cache_bytes
         )
+        self._cameras: dict[Hashable, Camera] = {}
         self.queue: list[int] = []
         self.bad = BadSteps(self.device, str(capture.path))
         self.previous_nominal = 0.0
@@ -127,7 +128,7 @@ class Trainer:
     def _drawn(self, frame: Frame, objectives: Sequence[Objective], nominal: float) -> Step:
         """Pictures of a frame at all times that objectives ask for."""
         times = sorted({t for o in objectives for t in o.times(frame, nominal)})
-        camera = self.capture.camera(frame).to(self.device)
+        camera = self._camera(frame)
         generator = self.composition.generator
         drawing = self.model.training_drawing(times, frame, camera, generator)
         return Step(
@@ -141,11 +142,17 @@ class Trainer:
             self.data,
         )
 
+    def _camera(self, frame: Frame) -> Camera:
+        """On the device; the same object at every visit, of all frames of a camera at rest."""
+        key = frame.camera if frame.world_to_camera is None else (frame.camera, frame.name)
+        if key not in self._cameras:
+            self._cameras[key] = self.capture.camera(frame).to(self.device)
+        return self._cameras[key]
+
     def _weighted(self, terms: dict[str, Tensor], nominal: float) -> Tensor:
-        weights = self.composition.weights
-        return torch.stack(
-            [weight_at(weights[name], nominal) * value for name, value in terms.items()]
-        ).sum()
+        values = torch.stack(list(terms.values()))
+        weights = [weight_at(self.composition.weights[name], nominal) for name in terms]
+        return (values * send(values.new_tensor(weights, device="cpu"), values.device)).sum()
 
     def _learn_held_out(self, nominal: float) -> None:
         """Now and then a step of what frames teach whose pictures stay unseen."""
@@ -244,7 +251,7 @@ class Trainer:
                 if place.start == place.stop:
                     continue
                 if if_sound is not None:
-                    gradient, radius = (torch.where(if_sound, v, 0) for v in (gradient, radius))
+                    radius = radius.masked_fill(~if_sound, 0)  # nothing is drawn
                 self.statistics[name].add(place, gradient, radius, width, height)
 
     def _edit(self, nominal: float) -> None:

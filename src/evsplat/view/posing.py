@@ -90,8 +90,7 @@ class HeldPose(BodyTrack):
     ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
         """The pose that is held, at each of the times."""
         count = len(times_us)
-        device = self._seconds.device
-        rotations, transl = (self._held[name].to(device) for name in ("rotations", "transl"))
+        rotations, transl = (self._held[name].to(self.device) for name in ("rotations", "transl"))
         return rotations.expand(count, -1, -1, -1), transl.expand(count, -1)
 
 

@@ -214,12 +214,13 @@ class DiscModel(PosedModel):
         weights = self.surface.weights(means)[None]
         world, transforms, linear = skin_with_linear(centers, weights, bones)
         casters = None if self.shadow is None else self.shadow.place(bones)
-        rgb = still.rgb[None] * self._light(world, transforms, casters, lit_at)
+        light = self.surface_light()
+        rgb = still.rgb[None] * self._light(light, world, transforms, casters, lit_at)
         return Layers(
             human_splats(world, turned, scales, still.opacities, rgb, still.semantics, linear),
             still.scene,
             transforms,
-            self._scene_shadow(casters),
+            self._scene_shadow(light, casters),
             self.low_pass,
         )
 
@@ -254,13 +255,13 @@ class DiscModel(PosedModel):
 
     def _light(
         self,
+        light: SurfaceLight | None,
         world: Float[Tensor, "T H 3"],
         transforms: Float[Tensor, "T H 4 4"],
         casters: Float[Tensor, "T P 3"] | None,
         lit_at: slice,
     ) -> Float[Tensor, "T H 3"] | float:
         """Factors on the person's colours; 1 without shading."""
-        light = self.surface_light()
         if light is None:
             return 1.0
         # Detached: a colour must not be bought by moving or turning the body.
@@ -288,11 +289,14 @@ class DiscModel(PosedModel):
             return None
         return self.shadow.lit(casters.detach(), places, light.lamps)
 
-    def _scene_shadow(self, casters: Float[Tensor, "T P 3"] | None) -> SceneShadow | None:
+    def _scene_shadow(
+        self, light: SurfaceLight | None, casters: Tensor | None
+    ) -> SceneShadow | None:
         """The shadow that the body throws on places of the scene."""
-        shadow, lamps = self.shadow, self.lamps
-        if shadow is None or lamps is None or casters is None:
+        shadow = self.shadow
+        if shadow is None or self.lamps is None or casters is None:
             return None
-        cast: SceneShadow = lambda places: shadow(casters, places, lamps.places())  # noqa: E731
+        lamps = self.lamps.places() if light is None or light.lamps is None else light.lamps
+        cast: SceneShadow = lambda places: shadow(casters, places, lamps)  # noqa: E731
         relief = self.relief if float(self.nominal) >= _RELIEF_START else None
         return cast if relief is None else lambda places: relief.shade(places, cast)

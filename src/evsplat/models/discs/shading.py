@@ -32,12 +32,14 @@ class Shading(nn.Module):
 
     center: Tensor
     radius_m: Tensor
+    quadratic: Tensor
 
     def __init__(self, center: Float[Tensor, "3"], radius_m: float, lamps: int = 0) -> None:
         """Places are relative to ``center``, in units of ``radius_m``: where the person goes."""
         super().__init__()
         self.register_buffer("center", center.clone())
         self.register_buffer("radius_m", torch.tensor(float(radius_m)))
+        self.register_buffer("quadratic", _quadratic().float(), persistent=False)
         self.coefficients = nn.Parameter(torch.zeros(4, _NORMAL_DIM, 3))
         self.intensities = nn.Parameter(torch.zeros(lamps, 3))
 
@@ -52,27 +54,24 @@ class Shading(nn.Module):
 
         Weights of the first 36 are `coefficients`, place by normal, and of the rest `intensities`.
         """
-        turned = torch.cat([torch.ones_like(normals[..., :1]), sh_basis(normals, degree=2)], -1)
+        ends = nn.functional.pad(normals, (0, 1), value=1.0)
+        turned = (ends[..., :, None] * ends[..., None, :]).flatten(-2) @ self.quadratic
         moved = ((places - self.center) / self.radius_m).clamp(-2, 2)
-        around = torch.cat([torch.ones_like(moved[..., :1]), moved], -1)
+        around = nn.functional.pad(moved, (1, 0), value=1.0)
         terms = (around[..., :, None] * turned[..., None, :]).flatten(-2)
         if lamps is None:
-            return torch.cat([terms, terms.new_zeros(*terms.shape[:-1], len(self.intensities))], -1)
-        shares = places.new_ones(len(lamps), 1, 1) if lit is None else lit
-        each = [
-            self._falling(lamp, normals, places) * share
-            for lamp, share in zip(lamps, shares, strict=True)
-        ]
-        return torch.cat([terms, torch.stack(each, -1)], -1)
+            return nn.functional.pad(terms, (0, len(self.intensities)))
+        each = self._falling(lamps[:, None, None], normals, places)
+        return torch.cat([terms, (each if lit is None else each * lit).movedim(0, -1)], -1)
 
     def _falling(
-        self, lamp: Float[Tensor, "3"], normals: Float[Tensor, "T N 3"], places: Tensor
-    ) -> Float[Tensor, "T N"]:
-        """Light of a lamp that hides nowhere, of intensity 1."""
-        ray = lamp - places
+        self, lamps: Float[Tensor, "L 1 1 3"], normals: Float[Tensor, "T N 3"], places: Tensor
+    ) -> Float[Tensor, "L T N"]:
+        """Light of lamps that hide nowhere, of intensity 1."""
+        ray = lamps - places
         square = ray.square().sum(-1)
         facing = (ray * normals).sum(-1).clamp_min(0) * square.rsqrt()
-        return facing * ((lamp - self.center).square().sum() / square.clamp_min(_NEAREST_M**2))
+        return facing * ((lamps - self.center).square().sum(-1) / square.clamp_min(_NEAREST_M**2))
 
     def forward(
         self,
@@ -85,20 +84,19 @@ class Shading(nn.Module):
 
         ``lit``: share of each lamp's light that reaches the places; all of it without.
         """
-        turned = torch.cat([torch.ones_like(normals[..., :1]), sh_basis(normals, degree=2)], -1)
-        moved = ((places - self.center) / self.radius_m).clamp(-2, 2)
-        # First all coefficients at the normals, then their sum at the places: nothing of size
-        # T x N x 36 is ever there.
-        at_normals = (turned @ self.coefficients.movedim(1, 0).flatten(1)).unflatten(-1, (4, 3))
-        bent = at_normals[..., 0, :] + (moved[..., None] * at_normals[..., 1:, :]).sum(-2)
-        factor = 1 + bent
-        if lamps is None:
-            return factor.clamp(_DARKEST, _BRIGHTEST)
-        shares = places.new_ones(len(lamps), 1, 1) if lit is None else lit
-        for lamp, share, intensity in zip(lamps, shares, self.intensities, strict=True):
-            falling = self._falling(lamp, normals, places)
-            factor = factor + (falling * share)[..., None] * intensity
-        return factor.clamp(_DARKEST, _BRIGHTEST)
+        terms = self.terms(normals, places, lamps, lit)
+        weights = torch.cat([self.coefficients.flatten(0, 1), self.intensities])
+        return (1 + terms @ weights).clamp(_DARKEST, _BRIGHTEST)
+
+
+def _quadratic() -> Float[Tensor, "16 9"]:
+    """The basis of normals n as sums over the products of (n, 1) with itself."""
+    points = torch.randn(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = nn.functional.normalize(points, dim=-1)
+    ends = nn.functional.pad(points, (0, 1), value=1.0)
+    products = (ends[:, :, None] * ends[:, None, :]).flatten(1)
+    basis = torch.cat([torch.ones(100, 1, dtype=torch.float64), sh_basis(points, degree=2)], -1)
+    return torch.linalg.pinv(products) @ basis
 
 
 @dataclass(frozen=True, eq=False)

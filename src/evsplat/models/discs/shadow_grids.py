@@ -5,28 +5,16 @@ faces the lamp. A sum of those on a grid is a product of two matrices; the compi
 to the cells that it reaches.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from evsplat.compiled import native, runs_native
+from evsplat.models.discs.plain_shadow import AREA_M2, DENSITY, light_on_places, shadow_on_places
 
-_REACH_M = 1.5
-"""Half side of the square around the body, across the light, outside of which nothing is shaded."""
-_CELLS = 49
-_LAYERS = 31
-"""Of the space around the body along the light, in which it shades itself."""
-_LAYER_EDGE_M = 0.03
-_OWN_SURFACE_M = 0.12
-"""How far nearer to the lamp a part of the body must be to shade another."""
-_NEAREST_M = 0.1
-_DENSITY = 3.0
-"""Optical depth through the middle of a body that covers `_AREA_M2` across the light."""
-_AREA_M2 = 0.5
 _MOST_LAMPS = 16
 """That the compiled module takes."""
 
@@ -46,19 +34,8 @@ def shadow_on_scene(
     if _all_native(body, lamps, widths, shares) and runs_native(places):
         factors: Tensor = _Cast.apply(body, places.flatten(0, 1), lamps, widths, shares)
         return factors.unflatten(1, places.shape[:2])
-    views = _LampViews.of(lamps, body)
-    across, down = _bells(views.project(body)[0], widths)
-    density = _scale(body, widths) * across @ down.transpose(-1, -2)
-    at, behind = views.project(places.flatten(0, 1)[None])
-    # grid_sample wants the coordinate along the last axis first.
-    sampled = nn.functional.grid_sample(
-        density.flatten(0, 1)[:, None],
-        at.flatten(0, 1)[:, None].flip(-1) / _REACH_M,
-        align_corners=True,
-    )
-    depth = sampled.view(behind.shape) * torch.sigmoid((behind + 0.2) / 0.1)
-    factor = 1 - shares[:, None, None] * (1 - torch.exp(-depth))
-    return factor.prod(0).unflatten(1, places.shape[:2])
+    factors = shadow_on_places(body, places.flatten(0, 1), lamps, widths, shares)
+    return factors.unflatten(1, places.shape[:2])
 
 
 def light_on_body(
@@ -75,21 +52,7 @@ def light_on_body(
     if _all_native(lamps, widths) and _fixed(body) and _fixed(places):
         light: Tensor = _Cast.apply(body, places, lamps, widths, None)
         return light
-    views = _LampViews.of(lamps, body)
-    at, behind = views.project(body)
-    layers = torch.linspace(-_REACH_M, _REACH_M, _LAYERS, dtype=lamps.dtype, device=lamps.device)
-    nearer = torch.sigmoid((layers[:, None] - behind[:, :, None]) / _LAYER_EDGE_M)
-    across, down = _bells(at, widths)
-    rows = (nearer[:, :, :, None] * across[:, :, None]).flatten(2, 3)
-    density = _scale(body, widths) * rows @ down.transpose(-1, -2)
-    at, behind = views.project(places)
-    seen = torch.cat([at.flip(-1), (behind - _OWN_SURFACE_M)[..., None]], -1)
-    depth = nn.functional.grid_sample(
-        density.flatten(0, 1).unflatten(1, (1, _LAYERS, _CELLS)),
-        seen.flatten(0, 1)[:, None, None] / _REACH_M,
-        align_corners=True,
-    )
-    return torch.exp(-depth.view(behind.shape))
+    return light_on_places(body, places, lamps, widths)
 
 
 def _all_native(*tensors: Tensor) -> bool:
@@ -118,7 +81,7 @@ class _Cast(torch.autograd.Function):
             for tensor in (body, places, lamps, widths, shares)
         ]
         count, times, layered = len(lamps), len(body), shares is None
-        strength = _DENSITY * _AREA_M2 / (body.shape[1] * 2 * torch.pi)
+        strength = DENSITY * AREA_M2 / (body.shape[1] * 2 * torch.pi)
         grids = body.new_empty(count, times, native.shadow_grid(layered))
         size = (count, times, places.shape[1]) if layered else (times, len(places))
         result = body.new_empty(size)
@@ -149,56 +112,3 @@ class _Cast(torch.autograd.Function):
             torch.get_num_threads(),
         )
         return to_body, to_places, to_lamps, to_widths, to_shares
-
-
-@dataclass(frozen=True, eq=False)
-class _LampViews:
-    """Views of the lamps: the planes through the body's middle that face them."""
-
-    lamps: Float[Tensor, "L 3"]
-    axis: Float[Tensor, "L T 3"]
-    across: Float[Tensor, "L T 2 3"]
-    distance: Float[Tensor, "L T"]
-
-    @classmethod
-    def of(cls, lamps: Float[Tensor, "L 3"], body: Float[Tensor, "T P 3"]) -> "_LampViews":
-        ray = body.mean(1) - lamps[:, None]
-        distance = ray.norm(dim=-1)
-        axis = ray / distance[..., None]
-        return cls(lamps, axis, _across(axis), distance)
-
-    def project(
-        self, points: Float[Tensor, "#T N 3"]
-    ) -> tuple[Float[Tensor, "L T N 2"], Float[Tensor, "L T N"]]:
-        """Points on the plane, and how far behind it they are, metres."""
-        rays = points - self.lamps[:, None, None]
-        along = (rays @ self.axis[..., None])[..., 0]
-        distance = self.distance[..., None]
-        spread = distance / along.clamp_min(_NEAREST_M)
-        at = (rays @ self.across.transpose(-1, -2)) * spread[..., None]
-        return at, along - distance
-
-
-def _bells(
-    at: Float[Tensor, "L T P 2"], widths: Float[Tensor, "L"]
-) -> tuple[Float[Tensor, "L T C P"], Float[Tensor, "L T C P"]]:
-    """Round Gaussians at points of the plane, one factor per axis, at the cells of the grid."""
-    grid = torch.linspace(-_REACH_M, _REACH_M, _CELLS, dtype=at.dtype, device=at.device)
-    away = (grid[:, None, None] - at[:, :, None]) / widths[:, None, None, None, None]
-    bells = torch.exp(-0.5 * away.square())
-    return bells[..., 0], bells[..., 1]
-
-
-def _scale(body: Float[Tensor, "T P 3"], widths: Float[Tensor, "L"]) -> Float[Tensor, "L 1 1 1"]:
-    scale = _DENSITY * _AREA_M2 / (body.shape[1] * 2 * torch.pi * widths.square())
-    return scale[:, None, None, None]
-
-
-def _across(axis: Float[Tensor, "*T 3"]) -> Float[Tensor, "*T 2 3"]:
-    """Two unit vectors at right angles to ``axis`` and each other (Duff et al. 2017, JCGT 6)."""
-    x, y, z = axis.unbind(-1)
-    sign = torch.copysign(torch.ones_like(z), z.detach())
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], -1)
-    return torch.stack([first, torch.stack([b, sign + y * y * a, -y], -1)], -2)

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from evsplat.body import Body, bounding_box
-from evsplat.body.rotations import quaternion_multiply
 from evsplat.compiled import native, runs_native
 from evsplat.devices import send
 from evsplat.models.kept import Kept
@@ -29,27 +28,59 @@ class OneBlobEncoding(nn.Module):
     (reference 1.5); the smooth one generalises better to held-out poses.
     """
 
+    between: Tensor
+    edges: Tensor
+
     def __init__(self, bins: int = 16) -> None:
         super().__init__()
         if bins < 3:
             raise ValueError(f"bins is {bins}, expected at least 3: a bump touches three of them")
         self.bins = bins
         self.dim = 3 * bins
+        # Each bin has what lies between its edges; the ends fall into the bins of the other side.
+        between = torch.eye(bins + 1)[:, 1:] - torch.eye(bins + 1)[:, :-1]
+        between[0, -1] += 1
+        between[-1, 0] -= 1
+        self.register_buffer("between", between, persistent=False)
+        self.register_buffer("edges", torch.arange(bins + 1.0), persistent=False)
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch D"]:
         """Encode positions in [0, 1]."""
         if runs_native(positions):
             encoded: Tensor = _NativeOneBlob.apply(positions, self.bins)
             return encoded
-        scaled = positions.clamp(0, 1) * self.bins
-        cell = scaled.detach().floor().clamp_max(self.bins - 1)
-        # The bump's centre lies in `cell`, its ends in the two neighbours: three bins are not zero.
-        below = _quartic_cdf(cell - scaled)
-        upto = _quartic_cdf(cell + 1 - scaled)
-        shares = torch.stack((below, upto - below, 1 - upto), -1)
-        index = cell.long()[..., None] + torch.arange(-1, 2, device=cell.device)
-        empty = shares.new_zeros(*positions.shape, self.bins)
-        return empty.scatter(-1, index % self.bins, shares).flatten(-2)
+        plain: Tensor = _PlainOneBlob.apply(
+            positions, self.edges.to(positions.dtype), self.between.to(positions.dtype)
+        )
+        return plain
+
+
+class _PlainOneBlob(torch.autograd.Function):
+    """`OneBlobEncoding` in plain torch: few operations, each of all bins."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, positions: Tensor, edges: Tensor, between: Tensor
+    ) -> Float[Tensor, "*batch D"]:
+        bins = len(edges) - 1
+        u = (edges - bins * positions.clamp(0, 1)[..., None]).clamp(-1, 1)
+        square = u * u
+        # The integral from -1 to u of 15/16 (1 - v^2)^2.
+        upto = 0.5 + u * (square * (0.1875 * square - 0.625) + 0.9375)
+        encoded = upto @ between
+        encoded[..., 0] += 1
+        ctx.save_for_backward(positions, square, between)
+        return encoded.flatten(-2)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        positions, square, between = ctx.saved_tensors
+        bins = between.shape[1]
+        above = upstream[0].unflatten(-1, (-1, bins)) @ between.T
+        slopes = (above * (1 - square).square()).sum(-1)
+        inside = (positions - 0.5).abs() <= 0.5
+        return slopes * inside * (-0.9375 * bins), None, None
 
 
 class _NativeOneBlob(torch.autograd.Function):
@@ -74,12 +105,6 @@ class _NativeOneBlob(torch.autograd.Function):
         return gradient, None
 
 
-def _quartic_cdf(u: Tensor) -> Tensor:
-    """Integral from -1 to u of ``15/16 (1 - v^2)^2``, for u in [-1, 1]."""
-    square = u * u
-    return 0.5 + u * (0.9375 + square * (0.1875 * square - 0.625))
-
-
 @dataclass(frozen=True)
 class NonRigid:
     """Changes of each Gaussian at each time, to apply in canonical space before skinning."""
@@ -99,10 +124,48 @@ class NonRigid:
         if all(map(runs_native, given)):
             moved, scales, rotations, feature = _NativeShape.apply(*given)
             return moved, scales, rotations, feature
-        offset, scaled, turn, feature = self.changes.tensor_split((3, 6, 9), -1)
-        turn = torch.cat((torch.ones_like(turn[..., :1]), turn), -1)
-        turned = quaternion_multiply(turn, nn.functional.normalize(quaternions, dim=-1))
-        return means + offset, (scales_log + scaled).exp(), turned, feature
+        moved, scales, rotations, feature = _PlainShape.apply(*given)
+        return moved, scales, rotations, feature
+
+
+class _PlainShape(torch.autograd.Function):
+    """`NonRigid.shape` in plain torch, with the gradient of a product of quaternions as products.
+
+    The product p q is P q with the matrix P of p; its gradients are P^T and Q^T times what comes,
+    with the matrix Q that multiplies from the right.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Tensor) -> tuple[Tensor, ...]:
+        changes, means, scales_log, quaternions = (tensor.detach() for tensor in inputs)
+        offset, scaled, turn, feature = changes.tensor_split((3, 6, 9), -1)
+        length = quaternions.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        unit, scales = quaternions / length, (scales_log + scaled).exp()
+        matrix = _product_matrix(nn.functional.pad(turn, (1, 0), value=1.0), 1.0)
+        ctx.save_for_backward(unit, length, scales, matrix)
+        turned = (matrix * unit[..., None, :]).sum(-1)
+        return means + offset, scales, turned, feature.contiguous()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, ...]:
+        unit, length, scales, matrix = ctx.saved_tensors
+        by_center, by_scale, by_rotation, by_feature = upstream
+        by_log = by_scale * scales
+        turned = (matrix * by_rotation[..., None]).sum(-2).sum(0)
+        by_quaternion = (turned - unit * (unit * turned).sum(-1, keepdim=True)) / length
+        by_turn = (_product_matrix(unit, -1.0) * by_rotation[..., None]).sum(-2)[..., 1:]
+        by_changes = torch.cat([by_center, by_log, by_turn, by_feature], -1)
+        return by_changes, by_center.sum(0), by_log.sum(0), by_quaternion
+
+
+def _product_matrix(quaternions: Float[Tensor, "*N 4"], side: float) -> Float[Tensor, "*N 4 4"]:
+    """What multiplies by ``quaternions`` (w, x, y, z) from the left (1) or from the right (-1)."""
+    w, x, y, z = quaternions.unbind(-1)
+    _, nx, ny, nz = quaternions.neg().unbind(-1)
+    (a, b, c), (na, nb, nc) = ((x, y, z), (nx, ny, nz)) if side > 0 else ((nx, ny, nz), (x, y, z))
+    rows = (w, nx, ny, nz, x, w, nc, b, y, c, w, na, z, nb, a, w)
+    return torch.stack(rows, -1).unflatten(-1, (4, 4))
 
 
 class _NativeShape(torch.autograd.Function):

@@ -1,10 +1,12 @@
 """Pose vector of a skeleton: small networks along the kinematic tree (LEAP)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from evsplat.body.tree import level_inverse, tree_levels
 from evsplat.models.networks.mlp import uniform
@@ -87,15 +89,68 @@ class PoseEncoder(nn.Module):
             -1,
         )
         weight_own, weight_parent = self.first_weight.split((13, self.joint_dim), 1)
-        hidden = torch.baddbmm(self.first_bias, own, weight_own).split(self.level_sizes)
-        from_parent = weight_parent.split(self.level_sizes)
-        second_weight = self.second_weight.split(self.level_sizes)
-        second_bias = self.second_bias.split(self.level_sizes)
-        features = []
-        for depth, base in enumerate(hidden):
-            slots = self.get_buffer(f"slots_{depth}")
-            above = feature.index_select(0, slots)
-            inner = torch.baddbmm(base, above, from_parent[depth]).relu()
-            feature = torch.baddbmm(second_bias[depth], inner, second_weight[depth])
+        features: Tensor = _DownTheTree.apply(
+            [(size, self.get_buffer(f"slots_{k}")) for k, size in enumerate(self.level_sizes)],
+            feature,
+            torch.baddbmm(self.first_bias, own, weight_own),
+            weight_parent,
+            self.second_weight,
+            self.second_bias,
+        )
+        return features.index_select(0, self.inverse).transpose(0, 1).flatten(1)
+
+
+class _DownTheTree(torch.autograd.Function):
+    """Features (J, T, F) of all joints, level by level from the root's; the gradient back up.
+
+    Only what one level needs of the next is done level by level; gradients of the weights are of
+    all joints at once.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        levels: list[tuple[int, Tensor]],
+        root: Float[Tensor, "1 T F"],
+        hidden: Float[Tensor, "J T I"],
+        parent_weight: Float[Tensor, "J F I"],
+        weight: Float[Tensor, "J I F"],
+        bias: Float[Tensor, "J 1 F"],
+    ) -> Float[Tensor, "J T F"]:
+        above: list[Tensor] = []
+        inner: list[Tensor] = []
+        features: list[Tensor] = []
+        feature, end = root, 0
+        for size, slots in levels:
+            rows = slice(end, end := end + size)
+            above.append(feature.index_select(0, slots))
+            inner.append(torch.baddbmm(hidden[rows], above[-1], parent_weight[rows]).relu_())
+            feature = torch.baddbmm(bias[rows], inner[-1], weight[rows])
             features.append(feature)
-        return torch.cat(features).index_select(0, self.inverse).transpose(0, 1).flatten(1)
+        ctx.levels = levels
+        ctx.save_for_backward(torch.cat(above), torch.cat(inner), parent_weight, weight)
+        return torch.cat(features)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        above, inner, parent_weight, weight = ctx.saved_tensors
+        lit, by_feature = inner > 0, upstream[0].clone()
+        by_hidden, by_above = torch.empty_like(inner), above[:1]
+        end = len(inner)
+        children: Tensor | None = None
+        for size, slots in reversed(ctx.levels):
+            rows = slice(end - size, end)
+            if children is not None:
+                by_feature[rows].index_add_(0, children, by_above)
+            torch.mul(by_feature[rows] @ weight[rows].mT, lit[rows], out=by_hidden[rows])
+            by_above = by_hidden[rows] @ parent_weight[rows].mT
+            end, children = end - size, slots
+        return (
+            None,
+            by_above,
+            by_hidden,
+            above.mT @ by_hidden,
+            inner.mT @ by_feature,
+            by_feature.sum(1, keepdim=True),
+        )
