@@ -220,7 +220,7 @@ class DiscModel(PosedModel):
             human_splats(world, turned, scales, still.opacities, rgb, still.semantics, linear),
             still.scene,
             transforms,
-            self._scene_shadow(light, casters),
+            self._cast(light, casters),
             self.low_pass,
         )
 
@@ -289,9 +289,7 @@ class DiscModel(PosedModel):
             return None
         return self.shadow.lit(casters.detach(), places, light.lamps)
 
-    def _scene_shadow(
-        self, light: SurfaceLight | None, casters: Tensor | None
-    ) -> SceneShadow | None:
+    def _cast(self, light: SurfaceLight | None, casters: Tensor | None) -> SceneShadow | None:
         """The shadow that the body throws on places of the scene."""
         shadow = self.shadow
         if shadow is None or self.lamps is None or casters is None:
