@@ -291,7 +291,7 @@ def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
     if isinstance(model, DiscModel):
         watch.calls(model.surface, "normals", "nearest surface")
         watch.calls(model.surface, "weights", "nearest surface")
-        watch.calls(discs_model, "skin", "blend skinning")
+        watch.calls(discs_model, "skin_with_linear", "blend skinning")
         watch.calls(model, "_light", "light")
         watch.calls(model.lamps, "places", "lamps")
         watch.calls(model.shadow, "place", "casters")
