@@ -21,10 +21,6 @@ class Level:
     parent_slots: Int[Tensor, "L"]
     """Position of the parent within the level above (0 for the root)."""
 
-    def to(self, device: torch.device | str) -> "Level":
-        """The same level with its indices on ``device``."""
-        return Level(self.joints.to(device), self.parents.to(device), self.parent_slots.to(device))
-
 
 def joint_depths(parents: Sequence[int], source: str = "kinematic tree") -> list[int]:
     """Depth of every joint, 0 for the root; any order of joints.

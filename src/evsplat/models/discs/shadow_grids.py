@@ -31,10 +31,9 @@ def shadow_on_scene(
     A lamp's ``shares`` of the light, in 0..1, gets lost times ``1 - exp(-depth)`` behind the points
     of the ``body``, Gaussians of standard deviation ``widths`` (metres).
     """
-    if _all_native(body, lamps, widths, shares) and runs_native(places):
-        factors: Tensor = _Cast.apply(body, places.flatten(0, 1), lamps, widths, shares)
-        return factors.unflatten(1, places.shape[:2])
-    factors = shadow_on_places(body, places.flatten(0, 1), lamps, widths, shares)
+    compiled = _all_native(body, lamps, widths, shares) and runs_native(places)
+    shade = _Cast.apply if compiled else shadow_on_places
+    factors: Tensor = shade(body, places.flatten(0, 1), lamps, widths, shares)
     return factors.unflatten(1, places.shape[:2])
 
 
