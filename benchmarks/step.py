@@ -301,7 +301,7 @@ def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
         watch.calls(drawing, "_enlarge", "shadow enlarged")
     else:
         watch.calls(model.skinning, "forward", "skinning network")
-        watch.calls(paper_model, "skin", "blend skinning")
+        watch.calls(paper_model, "skin_with_linear", "blend skinning")
         watch.calls(model.human_colour, "forward", "human colour")
         watch.calls(model.scene_colour, "forward", "scene colour")
     watch.calls(model, "_layers", "posing, rest")
