@@ -104,7 +104,8 @@ def write_image(path: Path, pixels: np.ndarray, *, source: str = "") -> None:
 def save_png(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
     """Write a PNG, whole or not at all."""
     with atomic_path(path) as temporary:
-        Image.fromarray(picture).save(temporary)
+        # Pillow's default of 6 takes twice as long for 3 % fewer bytes.
+        Image.fromarray(picture).save(temporary, compress_level=4)
 
 
 def _pixels(image: Image.Image) -> np.ndarray | None:
