@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import torch
 
+from evsplat.body import PoseErrors
 from evsplat.capture import Capture, TrainingCapture, load_body_track, load_capture
 from evsplat.errors import ConfigError
 from evsplat.methods import poses
 from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.poses import SMOOTHED, Poses, prepare_poses
 from evsplat.models.pose_correction import SHARES
+from evsplat.posing.refine import LEAST_GAIN, Verdict
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
@@ -41,7 +43,9 @@ def with_errors(path: Path, **fields) -> None:
 @pytest.fixture(autouse=True)
 def _few_steps(monkeypatch):
     """What is found before training is another test's (tests/posing/test_refine.py)."""
-    monkeypatch.setattr(poses, "refine", partial(poses.refine, steps=(4, 4), discs=100))
+    for how in ("refine", "judge"):
+        few = partial(getattr(poses, how), steps=(4, 4), discs=100)
+        monkeypatch.setattr(poses, how, few)
 
 
 @pytest.fixture
@@ -98,7 +102,8 @@ def test_poses_that_err_are_smoothed_and_corrected_by_what_is_said_of_them(captu
 
 
 def test_poses_that_were_corrected_when_found_are_not_drawn_again(captures, monkeypatch):
-    monkeypatch.setattr(poses, "refine", lambda *_: pytest.fail("drawn again"))
+    for how in ("refine", "judge"):
+        monkeypatch.setattr(poses, how, lambda *_, **__: pytest.fail("drawn again"))
     file = captures[1].path / "capture.json"
     document = json.loads(file.read_text())
     document.setdefault("provenance", {})["poses"] = {"refinement": {"taken": False}}
@@ -120,6 +125,30 @@ def test_what_a_capture_says_of_its_poses_counts_whatever_their_curve(seed, sour
     found = prepared(seen(path))
     assert np.array_equal(found.track.poses, load_body_track(load_capture(path)).poses)
     assert bool(found.correction.exact) == (source == "exact")
+
+
+@pytest.mark.parametrize("gain", [0.1, 0.5])
+def test_poses_that_say_nothing_are_corrected_once_they_are_disproved(
+    gain, tiny_capture, monkeypatch
+):
+    path = tiny_capture("silent", frames=20)
+    with_errors(path, source=False)
+    capture = seen(path)
+    keys, joints = load_body_track(capture).poses.shape[:2]
+    told = PoseErrors("estimated", np.full((keys, joints), 0.07), np.full((keys, 3), 0.03))
+    monkeypatch.setattr(poses, "judge", lambda *_, **__: Verdict(gain, 0.01, told, 1.0))
+    corrected, real = [], poses.refine
+
+    def noted(track, *args, **options):
+        corrected.append(track)
+        return real(track, *args, **options)
+
+    monkeypatch.setattr(poses, "refine", noted)
+    found = prepared(capture).correction
+    assert bool(found.exact) == (gain < LEAST_GAIN)
+    assert [track.errors for track in corrected] == ([] if gain < LEAST_GAIN else [told])
+    if corrected:
+        assert float(found.joint_rad.max()) == pytest.approx(0.07)
 
 
 def test_what_was_found_out_is_part_of_the_state(captures, tiny_capture):

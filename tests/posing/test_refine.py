@@ -9,13 +9,26 @@ import torch
 from evsplat.body import BodyTrack, default_body
 from evsplat.body.silhouette import silhouette
 from evsplat.camera import Camera
-from evsplat.capture import Frame
+from evsplat.capture import Frame, load_body_track
 from evsplat.pictures import decode, encode, luminance
+from evsplat.posing import refine as refining
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import Descent
-from evsplat.posing.refine import _gain, _given_errors, expected_errors
+from evsplat.posing.refine import (
+    JUDGED_FRAMES,
+    LEAST_GAIN,
+    _between,
+    _descended,
+    _gain,
+    _given_errors,
+    expected_errors,
+    judge,
+)
 from evsplat.posing.surface_discs import SurfaceDiscs
-from evsplat.posing.targets import Targets
+from evsplat.posing.targets import Targets, find_targets
+from evsplat.posing.time_limit import TimeLimit
+
+from ..seen import seen
 
 TIMES = list(range(0, 400_001, 20_000))
 
@@ -102,7 +115,8 @@ def test_a_motion_errs_by_how_far_it_was_corrected(body, size):
     with torch.no_grad():
         correction.turns.normal_(std=size)
         correction.shifts.normal_(std=size)
-    errors = _given_errors(correction)
+    errors = _given_errors(correction, 40)
+    assert errors.joint_rad.shape[0] == 40
     assert errors.source == "estimated" and not errors.typical
     assert errors.joint_rad == pytest.approx(np.full_like(errors.joint_rad, size * rad), rel=0.2)
     # Three axes of a handful of coordinates: a rough estimate, no axis far below the worst.
@@ -246,3 +260,59 @@ def test_pictures_of_the_same_motion_hardly_move_it(body):
     truth, descent = staged(body, 0.0)
     descent.run(1, 60, first=True)
     assert joint_px(descent, truth) < 0.1
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_larger_pictures_are_asked_where_the_smallest_leave_it_open(body, wrong):
+    """Those of the true motion say for certain that no other one is much better."""
+    _, descent = staged(body, 1.0 if wrong else 0.0)
+    limit, steps = TimeLimit(None, 1), (60, 10)
+    track = still_track(body)
+    found = _descended(track, descent.targets, limit, steps, 500, 0, least_gain=LEAST_GAIN)
+    gain, gain_error = found.gain
+    assert len(found.stages) == (2 if wrong else 1)
+    assert (gain - 2 * gain_error > LEAST_GAIN) == wrong
+
+
+def test_a_piece_of_a_motion_moves_as_the_whole(body):
+    """Splines through keys around it: farther ones count less than a thousandth."""
+    rng = np.random.default_rng(0)
+    times = np.arange(60) * 40_000
+    poses = 0.3 * rng.normal(size=(60, len(body.parents), 3))
+    whole = BodyTrack(body, times, poses, rng.normal(size=(60, 3)))
+    inside = np.linspace(times[20], times[39], 50).astype(np.int64).tolist()
+    piece = _between(whole, inside[0], inside[-1])
+    assert len(piece.times_us) < 40
+    for found, wanted in zip(piece.at(inside), whole.at(inside), strict=True):
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
+
+
+def test_a_verdict_takes_no_longer_for_a_longer_recording(tiny_capture, monkeypatch):
+    """Pictures of so many training frames, and of what is held out between them."""
+    asked = []
+
+    def noted(track, capture, frames, **options):
+        asked.append(frames)
+        return find_targets(track, capture, frames, **options)
+
+    monkeypatch.setattr(refining, "find_targets", noted)
+    capture = seen(tiny_capture(frames=60))
+    assert len(capture.train_frames) > JUDGED_FRAMES
+    track = load_body_track(capture)
+    verdict = judge(track, capture, steps=(2, 2), discs=100)
+    (frames,) = asked
+    assert sum(frame.split == "train" for frame in frames) == JUDGED_FRAMES
+    before, after = frames[0].mid_us, capture.frames[-1].mid_us - frames[-1].mid_us
+    assert abs(before - after) <= 3 * (frames[1].mid_us - frames[0].mid_us)
+    assert len(verdict.given_errors.joint_rad) == len(track.times_us)
+
+
+def test_larger_pictures_are_made_smaller_for_a_verdict(tiny_capture):
+    """Halved while both sides keep the least, as the camera is."""
+    capture = seen(tiny_capture(width=64, height=48))
+    track = load_body_track(capture)
+    whole, small = find_targets(track, capture), find_targets(track, capture, least_px=12)
+    assert (small.camera.width, small.camera.height) == (16, 12)
+    assert small.image.shape[1:3] == (12, 16) == small.behind.shape[1:3]
+    means = torch.nn.functional.avg_pool2d(whole.image.permute(0, 3, 1, 2), 4)
+    torch.testing.assert_close(small.image, means.permute(0, 2, 3, 1))

@@ -48,17 +48,24 @@ class SharpPicture:
 
 
 def sharp_pictures(
-    capture: TrainingCapture, *, fractions: Sequence[float] = FRACTIONS
+    capture: TrainingCapture,
+    *,
+    fractions: Sequence[float] = FRACTIONS,
+    frames: Sequence[Frame] | None = None,
 ) -> list[SharpPicture]:
     """Sharp pictures in order of time, at ``fractions`` (0..1) of every exposure.
+
+    ``frames``: those whose exposures count, None for all.
 
     Those of held-out frames are carried there by events from training exposures on both sides, and
     left out where the policy hides these events. Where there are no events with polarity, or no
     contrast thresholds and none can be estimated, they are the blurry training pictures at their
     mid-exposures; the log says so.
     """
+    frames = capture.frames if frames is None else frames
     thresholds = _thresholds(capture)
     if thresholds is None:
+        blurry = [frame for frame in frames if frame.split == "train"]
         return [
             SharpPicture(
                 frame.mid_us,
@@ -66,11 +73,11 @@ def sharp_pictures(
                 frame,
                 BLURRY_SIGMA,
             )
-            for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us)
+            for frame in sorted(blurry, key=lambda frame: frame.mid_us)
         ]
     pictures = [
         picture
-        for frame in capture.frames
+        for frame in frames
         for picture in (
             _in_exposure(capture, frame, fractions, thresholds)
             if frame.split == "train"

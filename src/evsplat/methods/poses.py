@@ -1,6 +1,7 @@
 """Errors of given body poses: whether there are any, what is smoothed, what training corrects."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -13,7 +14,7 @@ from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError, DataError
 from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, Weight
 from evsplat.models.pose_correction import SHARES, PoseCorrection
-from evsplat.posing.refine import Refined, refine
+from evsplat.posing.refine import Refined, Verdict, judge, refine
 
 logger = logging.getLogger(__name__)
 
@@ -84,14 +85,16 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
         track = _smoothed(track, joint_rad, root_m)
     # Poses that were corrected when they were found need not wait for the same again.
     tried = source is not None and capture.poses_refined
-    found = _refined(track, capture) if fit and exact is not True and not tried else None
+    found: Verdict | None = None
+    if fit and exact is not True and not tried:
+        found = _compared(refine if told else judge, track, capture)
     decided = exact if exact is not None else found is None or not found.disproves
     if exact is not False and decided and fit:
         _refuse_unread(config, capture)
     given = track
     if found is not None and found.better and not decided and not told:
         track = _as_far_off(track, found.given_errors, smooth=config.smooth == "auto")
-        found = _refined(track, capture) or found
+        found = _compared(refine, track, capture)
         joint_rad, root_m = _expected(config, track)
     if fit:
         smooth = smooth or track is not given and config.smooth == "auto"
@@ -103,7 +106,7 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
     correction = PoseCorrection(
         given, frames_us, joint_rad=joint_rad, root_m=root_m, between=between, exact=decided
     )
-    if found is not None and found.better and not decided:
+    if isinstance(found, Refined) and found.better and not decided:
         if track is not given:
             correction.smooth_to(given, track)
         correction.start_at(track, found.track)
@@ -132,10 +135,12 @@ def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTr
     return _smoothed(told, errors.joint_rad, errors.root_m) if smooth else told
 
 
-def _refined(track: BodyTrack, capture: TrainingCapture) -> Refined | None:
+def _compared(
+    how: Callable[..., Verdict], track: BodyTrack, capture: TrainingCapture
+) -> Verdict | None:
     """Other poses, found without any Gaussian; None where a moving camera rules them out."""
     try:
-        found = refine(track, capture, progress=True)
+        found = how(track, capture, progress=True)
     except DataError as error:
         logger.info("given poses are not compared with others: %s", error)
         return None

@@ -15,15 +15,16 @@ from jaxtyping import Float
 from evsplat.body import Body, BodyTrack, PoseErrors
 from evsplat.body.pose_noise import PoseNoise, joint_angles
 from evsplat.camera import Camera
-from evsplat.capture import TrainingCapture
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import COARSE_PX, LOOK_STEPS, PROBE_STEPS, PROBES, Descent, Stage
 from evsplat.posing.surface_discs import SurfaceDiscs
-from evsplat.posing.targets import Targets, find_targets
+from evsplat.posing.targets import Targets, find_targets, halved
 from evsplat.posing.time_limit import TimeLimit
 
-DISCS = 4_000
+DISCS, _JUDGED_DISCS = 4_000, 3_000
+"""On the body; as many as `Descent` draws in pictures of `JUDGED_PX`."""
 UNKNOWN_RAD, UNKNOWN_M = 0.05, 0.02
 """Errors expected of limb joints and of the root's place, per axis, where nobody says."""
 LEAST_GAIN = 0.12
@@ -38,12 +39,17 @@ _NEARER = 0.6
 """How near to the corrected body the background is taken for sure, in shares of before."""
 
 
-@dataclass(frozen=True, eq=False)
-class Refined:
-    """A corrected motion, and whether it is better than the given one."""
+JUDGED_PX, JUDGED_FRAMES = 128, 24
+"""Least side of the pictures, and training frames, that tell whether given poses are exact. More
+of either takes the longer and tells no more: `LEAST_GAIN` was chosen on recordings of this size."""
+_AROUND = 8
+"""Keys beside those frames: a spline forgets three quarters of a value from one to the next."""
 
-    track: BodyTrack
-    """The corrected motion with its errors; `better` says whether to use it."""
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Whether a corrected motion is better than the given one."""
+
     gain: float
     """Share by which it explains pictures better that neither motion was fitted to."""
     gain_error: float
@@ -51,7 +57,6 @@ class Refined:
     given_errors: PoseErrors
     """Errors of the given motion, by how far the corrected one lies from it: for motions that don't
     say how far they err."""
-    stages: tuple[Stage, ...]
     seconds: float
 
     @property
@@ -63,6 +68,46 @@ class Refined:
     def disproves(self) -> bool:
         """True where the given poses cannot be exact: the gain exceeds `LEAST_GAIN` as surely."""
         return self.gain - 2 * self.gain_error > LEAST_GAIN
+
+
+@dataclass(frozen=True, eq=False)
+class Refined(Verdict):
+    """A corrected motion, and whether it is better than the given one."""
+
+    track: BodyTrack
+    """The corrected motion with its errors; `better` says whether to use it."""
+    stages: tuple[Stage, ...]
+
+
+def judge(
+    track: BodyTrack,
+    capture: TrainingCapture,
+    *,
+    progress: bool = False,
+    steps: tuple[int, int] = _STEPS,
+    discs: int = _JUDGED_DISCS,
+    seed: int = 0,
+) -> Verdict:
+    """Compare a motion with one that is corrected, in a piece of the recording and small pictures.
+
+    Of motions that don't say how far they err: what `refine` finds out on its way as well, but in
+    a time that grows neither with the recording nor with its pictures. Where the smallest pictures
+    say for certain that the gain is below `LEAST_GAIN`, no larger ones are asked: what discs cannot
+    show moves a true motion the more, the smaller the pictures are.
+
+    Raises:
+        DataError: the camera moves, or the posed body is in no picture.
+    """
+    began = time.monotonic()
+    frames = _middle(capture)
+    times = [time_us for frame in frames for time_us in frame.exposure_us]
+    targets = find_targets(track, capture, frames, least_px=JUDGED_PX)
+    limit = TimeLimit(None, 5 * LOOK_STEPS + sum(steps), progress=progress)
+    piece = _between(track, min(times), max(times))
+    found = _descended(piece, targets, limit, steps, discs, seed, least_gain=LEAST_GAIN)
+    limit.close()
+    errors = _given_errors(found.descent.correction, len(track.times_us))
+    return Verdict(*found.gain, errors, time.monotonic() - began)
 
 
 def refine(
@@ -88,39 +133,83 @@ def refine(
     planned = 3 * LOOK_STEPS + sum(steps) + _LAST_STEPS + PROBES * PROBE_STEPS
     limit = TimeLimit(seconds, planned, progress=progress)
     targets = find_targets(track, capture)
-    joint_rad, root_m = expected_errors(track)
-    correction = Correction(track, joint_rad, root_m)
+    found = _descended(track, targets, limit, steps, discs, seed)
+    descent = found.descent
+    descent.targets = found.nearer
+    last = descent.run(1, _LAST_STEPS, first=False)
+    errors = descent.errors()
+    limit.close()
+    return Refined(
+        *found.gain,
+        _given_errors(descent.correction, len(track.times_us)),
+        time.monotonic() - began,
+        descent.correction.corrected(errors),
+        (*found.stages, last),
+    )
+
+
+def _middle(capture: TrainingCapture) -> list[Frame]:
+    """The frames from the first to the last of `JUDGED_FRAMES` training frames in the middle."""
+    trained = sorted(frame.mid_us for frame in capture.train_frames)
+    first = max(0, len(trained) - JUDGED_FRAMES) // 2
+    kept = trained[first : first + JUDGED_FRAMES]
+    return [frame for frame in capture.frames if kept[0] <= frame.mid_us <= kept[-1]]
+
+
+def _between(track: BodyTrack, start_us: int, end_us: int) -> BodyTrack:
+    """The motion between two times, without what it says of its errors."""
+    first, last = np.searchsorted(track.times_us, [start_us, end_us])
+    keys = slice(max(0, first - _AROUND), last + _AROUND)
+    values = track.times_us[keys], track.poses[keys], track.transl[keys]
+    return BodyTrack(track.body, *values, camera_up=track.camera_up)
+
+
+@dataclass(frozen=True, eq=False)
+class _Descended:
+    """A motion as pictures correct it, those in the middle of exposures kept aside."""
+
+    descent: Descent
+    nearer: Targets
+    """All pictures, and what is behind the person by the motion found in the smallest ones."""
+    stages: list[Stage]
+    gain: tuple[float, float]
+    """With its standard error."""
+
+
+def _descended(
+    track: BodyTrack,
+    targets: Targets,
+    limit: TimeLimit,
+    steps: tuple[int, int],
+    discs: int,
+    seed: int,
+    *,
+    least_gain: float | None = None,
+) -> _Descended:
+    """Ends after the smallest pictures where these say that the gain is below ``least_gain``."""
+    correction = Correction(track, *expected_errors(track))
     look = SurfaceDiscs(track.body, discs, torch.Generator().manual_seed(seed))
     aside = _middles(targets)
     fitted = sorted(set(range(len(targets.times_us))) - set(aside)) or aside
     descent = Descent(correction, look, targets.rows(fitted), limit)
-    sizes = _sizes(targets.camera, steps)
+    nearer = targets
     stages: list[Stage] = []
-    for shrink, count in sizes:
+    for shrink, count in _sizes(targets.camera, steps):
         stages.append(descent.run(shrink, count, first=not stages))
-        if len(stages) == 1:
-            nearer = targets.around(correction.corrected(), _NEARER)
-            descent.targets = nearer.rows(fitted)
-    gain, gain_error = _gain(descent, targets.rows(aside))
-    descent.targets = nearer
-    stages.append(descent.run(1, _LAST_STEPS, first=False))
-    errors = descent.errors()
-    limit.close()
-    return Refined(
-        correction.corrected(errors),
-        gain,
-        gain_error,
-        _given_errors(correction),
-        tuple(stages),
-        time.monotonic() - began,
-    )
+        if len(stages) > 1:
+            continue
+        if least_gain is not None:
+            gain, gain_error = _gain(descent, targets.rows(aside), shrink)
+            if gain + 2 * gain_error < least_gain:
+                return _Descended(descent, nearer, stages, (gain, gain_error))
+        nearer = targets.around(correction.corrected(), _NEARER)
+        descent.targets = nearer.rows(fitted)
+    return _Descended(descent, nearer, stages, _gain(descent, targets.rows(aside)))
 
 
 def _sizes(camera: Camera, steps: tuple[int, int]) -> list[tuple[int, int]]:
     """By how much pictures are made smaller, and steps at each size: fewer in larger ones."""
-    shrink = 1
-    while min(camera.width, camera.height) >= 2 * shrink * COARSE_PX:
-        shrink *= 2
+    shrink = halved(camera, COARSE_PX)
     finer = [1 << k for k in reversed(range(shrink.bit_length() - 1))] or [1]
     share = steps[1] / sum(finer)
     return [(shrink, steps[0]), *((size, max(1, round(share * size))) for size in finer)]
@@ -139,8 +228,8 @@ def expected_errors(track: BodyTrack) -> tuple[Float[np.ndarray, "J"], Float[np.
 
 
 @torch.no_grad()
-def _given_errors(correction: Correction) -> PoseErrors:
-    """Errors of the motion that was corrected, root mean squares of the correction.
+def _given_errors(correction: Correction, keys: int) -> PoseErrors:
+    """Errors of the motion that was corrected, root mean squares of the correction, at all keys.
 
     Of the joints one factor on what was expected of each: the correction of a single joint may be
     another's, turned the other way. Of the root at least `_LEAST_AXIS` of its worst axis.
@@ -148,11 +237,11 @@ def _given_errors(correction: Correction) -> PoseErrors:
     track = correction.track
     weights = correction.weights(track.times_us.tolist())
     turned = torch.einsum("tm,mjc->tjc", weights, correction.turns).square().mean().sqrt()
-    joint_rad = np.zeros(track.poses.shape[:2])
+    joint_rad = np.zeros((keys, track.poses.shape[1]))
     joint_rad[:, correction.joints.numpy()] = float(turned) * correction.joint_rad.numpy()
     moved = (correction.root_m * (weights @ correction.shifts)).square().mean(0).sqrt()
     root_m = moved.clamp_min(_LEAST_AXIS * float(moved.max())).double().numpy()
-    return PoseErrors("estimated", joint_rad, np.tile(root_m, (len(joint_rad), 1)))
+    return PoseErrors("estimated", joint_rad, np.tile(root_m, (keys, 1)))
 
 
 def _anatomical(body: Body) -> Float[np.ndarray, "J"]:
@@ -174,11 +263,15 @@ def _middles(targets: Targets) -> list[int]:
     return [number for _, number in best.values()]
 
 
-def _gain(descent: Descent, aside: Targets) -> tuple[float, float]:
+def _gain(descent: Descent, aside: Targets, shrink: int = 1) -> tuple[float, float]:
     """How much better the corrected motion explains pictures kept aside, and the standard error.
 
-    Both motions get their look learned for as many steps from where the corrected one's was.
+    Both motions get their look learned for as many steps from where the corrected one's was, in
+    pictures smaller by a factor.
     """
+    targets = descent.targets
+    if shrink > 1:
+        targets, aside = targets.smaller(shrink), aside.smaller(shrink)
     params = [descent.correction.turns, descent.correction.shifts]
     found = [param.detach().clone() for param in params]
     state = {name: value.clone() for name, value in descent.look.state_dict().items()}
@@ -188,7 +281,7 @@ def _gain(descent: Descent, aside: Targets) -> tuple[float, float]:
             for param, value in zip(params, found, strict=True):
                 param.copy_(factor * value)
         descent.look.load_state_dict(state)
-        descent.learn_look(descent.targets, 1, LOOK_STEPS)
+        descent.learn_look(targets, shrink, LOOK_STEPS)
         misfits.append(descent.misfits(aside))
     with torch.no_grad():
         for param, value in zip(params, found, strict=True):

@@ -104,8 +104,25 @@ class Targets:
         )
 
 
-def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
+def halved(camera: Camera, least_px: int) -> int:
+    """By how much pictures become smaller, halved while both sides keep ``least_px``."""
+    times = 1
+    while min(camera.width, camera.height) >= 2 * times * least_px:
+        times *= 2
+    return times
+
+
+def find_targets(
+    track: BodyTrack,
+    capture: TrainingCapture,
+    frames: Sequence[Frame] | None = None,
+    *,
+    least_px: int | None = None,
+) -> Targets:
     """Sharp pictures of all times that the policy shows, with what is behind the person.
+
+    ``frames``: those in whose exposures they lie, None for all. With ``least_px`` they are made
+    smaller, see `halved`.
 
     Raises:
         DataError: the camera moves, or the posed body is in no picture.
@@ -115,7 +132,7 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
             f"{capture.path}: has a moving camera or several, and a motion is corrected by what "
             "differs from a static background; leave the poses as they are."
         )
-    pictures = sharp_pictures(capture)
+    pictures = sharp_pictures(capture, frames=frames)
     image = torch.stack([picture.image for picture in pictures]).float()
     transfer = transfer_shown(capture.transfer(pictures[0].frame))
     coloured = torch.tensor([picture.frame.split == "train" for picture in pictures])
@@ -131,6 +148,8 @@ def find_targets(track: BodyTrack, capture: TrainingCapture) -> Targets:
         capture.camera(pictures[0].frame),
         transfer,
     )
+    shrink = 1 if least_px is None else halved(found.camera, least_px)
+    found = found if shrink == 1 else found.smaller(shrink)
     try:
         return found.around(track)
     except DataError as error:
