@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, axis_angle_to_matrix, default_body
 from evsplat.body.smoothing import spline_error
-from evsplat.models.pose_correction import SHARES, PoseCorrection
+from evsplat.models.pose_correction import SHARES, PoseCorrection, _apart
+from evsplat.models.ridge import Ridge
 
 STEP_US = 80_000
 KEYS = 16
@@ -124,6 +125,46 @@ def test_prices_are_squares_per_unknown():
     with torch.no_grad():
         still.errors["constant"].rotations[:, ::2] = 5.0  # joints that are not expected to err
     assert float(still.price().detach()) == 0.0
+
+
+def uneven(seed: int, keys: int = 40) -> BodyTrack:
+    """Keys some of which lie close together, and a gap."""
+    rng, body = np.random.default_rng(seed), default_body()
+    times = np.cumsum(rng.integers(20_000, 120_000, keys))
+    times[keys // 2 :] += 900_000
+    poses = 0.3 * rng.normal(size=(keys, len(body.parents), 3))
+    return BodyTrack(body, times, poses, rng.normal(size=(keys, 3)))
+
+
+@pytest.mark.parametrize("track", [dance(0), uneven(1), uneven(2)], ids=["even", "1", "2"])
+def test_banded_ridge_regression_is_the_dense_one(track):
+    learned = correction(track, frames=slice(None, None, 3))
+    times = track.times_us.tolist()
+    parts = [(learned.errors[name], SHARES[name] ** 0.5) for name in SHARES]
+    design = [factor * spline.weights(times).double().numpy() for spline, factor in parts]
+    dense = np.concatenate(design, 1)
+    goal = np.random.default_rng(0).normal(size=(len(times), 7))
+    square = dense.T @ dense + 0.05**2 * np.eye(dense.shape[1])
+    ridge = Ridge(parts, times, 0.05)
+    found = ridge.solve(goal)
+    # Control points' weights are of float32 in the dense matrix.
+    assert np.allclose(found, np.linalg.solve(square, dense.T @ goal), rtol=0, atol=2e-5)
+    assert np.allclose(ridge.values(found), dense @ found, atol=1e-6)
+
+
+def test_smoothing_is_the_smallest_that_fits():
+    """As the pseudo-inverse of the dense matrix has it."""
+    track = dance(1)
+    learned = correction(track, joint_rad=0.2)
+    rng = np.random.default_rng(1)
+    poses = track.poses + 0.05 * rng.normal(size=track.poses.shape)
+    other = BodyTrack(track.body, track.times_us, poses, track.transl + 0.01)
+    learned.smooth_to(track, other)
+    turns, shifts = _apart(track, other)
+    inverse = np.linalg.pinv(learned.smoothing.weights(track.times_us.tolist()).double().numpy())
+    wanted = inverse @ turns.flatten(1).double().numpy()
+    assert np.allclose(learned.smoothing.rotations.flatten(1), wanted, rtol=0, atol=1e-6)
+    assert np.allclose(learned.smoothing.translations, inverse @ shifts.numpy(), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -13,6 +13,7 @@ from evsplat.body import BodyTrack
 from evsplat.body.smoothing import SplineError
 from evsplat.devices import send
 from evsplat.models.pose_spline import PoseSpline
+from evsplat.models.ridge import Ridge
 
 SHARES = {"constant": 0.3, "slow": 0.5, "fast": 0.2}
 """Parts of an error's variance. Whoever fits poses to pictures errs by a habit per joint, by what
@@ -21,6 +22,11 @@ SLOW_US = 200_000
 """Least time between knots of the slow part: no less than two key poses, either."""
 _PRICED = 1_024
 """Keys whose price is asked at a time: an hour's would take as long as the rest of the step."""
+
+_AT_ONCE = 1_024
+"""Keys at which two motions are compared at a time."""
+_SMALLEST = 1e-3
+"""Weight of control points' squares, against those of keys that are missed."""
 
 
 class PoseCorrection(nn.Module):
@@ -170,15 +176,15 @@ class PoseCorrection(nn.Module):
 
     def smooth_to(self, given: BodyTrack, smoothed: BodyTrack) -> None:
         """Add what turns the given keys into smoothed ones: not learned, and no error's price."""
-        times = given.times_us.tolist()
         turns, shifts = _apart(given, smoothed)
-        design = self.smoothing.weights(times).double()
-        goal = torch.cat((turns.flatten(1), shifts), 1).double()
-        # Two more control points than keys: of all that fit, the smallest.
-        found = (torch.linalg.pinv(design, rtol=1e-3) @ goal).float()
-        with torch.no_grad():
-            self.smoothing.rotations.copy_(found[:, :-3].view_as(self.smoothing.rotations))
-            self.smoothing.translations.copy_(found[:, -3:])
+        goal = torch.cat((turns.flatten(1), shifts), 1).double().numpy()
+        # Two more control points than keys: of all that fit, the smallest. What is missed for being
+        # the smallest is then made up for.
+        ridge = Ridge([(self.smoothing, 1.0)], given.times_us.tolist(), _SMALLEST)
+        found = ridge.solve(goal)
+        goal -= ridge.values(found)
+        found += ridge.solve(goal)
+        _set(self.smoothing, found)
 
     def start_at(self, given: BodyTrack, better: BodyTrack, *, misfit: float = 0.05) -> None:
         """Set the errors to the likeliest that turn the given motion into a better one.
@@ -200,20 +206,13 @@ class PoseCorrection(nn.Module):
         times = torch.as_tensor(times_us, dtype=torch.float64)
         joint_rad, root_m = self._expected(times)
         goal_turns = torch.where(joint_rad[..., None] > 0, turns / joint_rad[..., None], 0.0)
-        parts = list(self._errors())
-        design = torch.cat(
-            [SHARES[name] ** 0.5 * spline.weights(times) for name, spline in parts], 1
-        ).double()
-        goal = torch.cat((goal_turns.flatten(1), shifts / root_m.clamp_min(1e-6)), 1).double()
-        normal = design.T @ design + misfit**2 * torch.eye(design.shape[1], dtype=torch.float64)
-        found = torch.linalg.solve(normal, design.T @ goal).float()
-        with torch.no_grad():
-            for (_, spline), values in zip(
-                parts, found.split([spline.count for _, spline in parts]), strict=True
-            ):
-                spline.rotations.copy_(values[:, :-3].view_as(spline.rotations))
-                spline.translations.copy_(values[:, -3:])
-            self.started.fill_(True)
+        goal = torch.cat((goal_turns.flatten(1), shifts / root_m.clamp_min(1e-6)), 1)
+        parts = [(spline, SHARES[name] ** 0.5) for name, spline in self._errors()]
+        found = Ridge(parts, times_us, misfit).solve(goal.double().numpy())
+        ends = np.cumsum([spline.count for spline, _ in parts])[:-1]
+        for (spline, _), values in zip(parts, np.split(found, ends), strict=True):
+            _set(spline, values)
+        self.started.fill_(True)
 
     def forget(self) -> None:
         """Set all residuals to zero."""
@@ -223,13 +222,23 @@ class PoseCorrection(nn.Module):
                 value.zero_()
 
 
+@torch.no_grad()
+def _set(spline: PoseSpline, values: Float[np.ndarray, "K C"]) -> None:
+    """Control points: turns of the joints and, in the last three columns, shifts."""
+    found = torch.from_numpy(values.astype(np.float32))
+    spline.rotations.copy_(found[:, :-3].view_as(spline.rotations))
+    spline.translations.copy_(found[:, -3:])
+
+
 def _apart(
     first: BodyTrack, second: BodyTrack
 ) -> tuple[Float[Tensor, "P J 3"], Float[Tensor, "P 3"]]:
     """Turns and shifts from one motion to another at the keys of the first."""
-    times = first.times_us.tolist()
-    (turns, places), (other_turns, other_places) = first.at(times), second.at(times)
-    apart = (turns.mT @ other_turns).double().cpu().numpy()
-    vectors = Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec()
-    turned = torch.from_numpy(vectors).to(other_places).view(*apart.shape[:2], 3)
-    return turned, other_places - places
+    turned, moved = [], []
+    for times in torch.from_numpy(first.times_us).split(_AT_ONCE):
+        (turns, places), (other_turns, other_places) = first.at(times), second.at(times)
+        apart = (turns.mT @ other_turns).double().cpu().numpy()
+        vectors = Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec()
+        turned.append(torch.from_numpy(vectors).to(other_places).view(*apart.shape[:2], 3))
+        moved.append(other_places - places)
+    return torch.cat(turned), torch.cat(moved)

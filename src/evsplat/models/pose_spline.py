@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy import sparse
 from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
@@ -88,6 +89,21 @@ class PoseSpline(nn.Module):
         for index, share in self._local(times):
             found.scatter_add_(1, index, share)
         return send(found.float() - self.mean, device)
+
+    def design(
+        self, times_us: Sequence[int] | Tensor
+    ) -> tuple[sparse.csr_array, Float[np.ndarray, "K"]]:
+        """`weights` in two parts: of the control points near each time, and the mean taken off.
+
+        Not of a spline that is held at keys.
+        """
+        if math.isinf(self.knot_us):
+            return sparse.csr_array((len(times_us), 1)), -np.ones(1)  # 1 at all times
+        ((index, share),) = self._local(_on_host(times_us))
+        rows = np.arange(0, index.numel() + 1, index.shape[1])
+        shape = len(times_us), self.count
+        near = sparse.csr_array((share.flatten().numpy(), index.flatten().numpy(), rows), shape)
+        return near, self.mean.double().numpy()
 
     def _local(self, times: Float[Tensor, "T"]) -> list[tuple[Tensor, Tensor]]:
         """Control points that count at each time, and their weights, of which there are two sorts.
