@@ -1,12 +1,14 @@
 """Memory and start of a run by the length of its recording: 20 steps after 1, 10 and 60 minutes.
 
     python benchmarks/length.py [--minutes 1 10 60] [--steps 20] [--visit 2500] [--keep 50]
+        [--erring]
 
 The recording is the demo capture again and again, with every ``--keep``-th of its events: 54
 million an hour at 50. It is written in pieces, and each training runs in a process of its own, so
 that its peak memory is its own: Python and PyTorch are about 300 MB of it, the model the same
 at every length. Beside the steps the pictures, silhouettes and events of up to ``--visit`` training
-frames are read, evenly spread, which fills every cache as a long training does. Printed for each
+frames are read, evenly spread, which fills every cache as a long training does. With ``--erring``
+the poses err by 0.03 rad and say so. Printed for each
 length: frames, events, seconds to the first step (reading, checks, estimates and the fits before
 training), CPU time of a step, and peak memory. The last line is JSON.
 """
@@ -45,6 +47,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--visit", type=int, default=2_500, metavar="N", help="frames")
     parser.add_argument("--keep", type=int, default=50, metavar="N", help="one event in N")
+    parser.add_argument("--erring", action="store_true", help="poses that err, and say so")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -56,7 +59,7 @@ def main() -> None:
     for minutes in options.minutes:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "capture"
-            frames, events = write_recording(path, minutes, options.keep)
+            frames, events = write_recording(path, minutes, options.keep, erring=options.erring)
             command = [sys.executable, __file__, "--run", str(path)]
             for name in ("steps", "visit", "threads"):
                 command += [f"--{name}", str(getattr(options, name))]
@@ -109,7 +112,9 @@ def fill_caches(trainer: Trainer, visited: int) -> None:
                 objective.events.between(*frame.exposure_us)
 
 
-def write_recording(folder: Path, minutes: float, keep: int) -> tuple[int, int]:
+def write_recording(
+    folder: Path, minutes: float, keep: int, *, erring: bool = False
+) -> tuple[int, int]:
     """The demo capture in a row for so long, one event in ``keep``; how many frames and events."""
     shutil.copytree(demo_capture(), folder)
     metadata = json.loads((folder / "capture.json").read_text())
@@ -130,10 +135,17 @@ def write_recording(folder: Path, minutes: float, keep: int) -> tuple[int, int]:
         metadata["frames"].append(entry | kept)
     for link in folder.glob("images/*.new"):
         link.replace(link.with_suffix(""))
+    if erring:
+        metadata["body"]["source"] = "estimated"
     (folder / "capture.json").write_text(json.dumps(metadata))
     body["times_us"] = np.concatenate([body["times_us"] + turn * period for turn in range(turns)])
     for name in ("poses", "transl"):
         body[name] = np.concatenate([body[name]] * turns)
+    if erring:
+        keys, joints = body["poses"].shape[:2]
+        body["poses"] += np.random.default_rng(0).normal(0, 0.03, body["poses"].shape)
+        body["pose_std_rad"] = np.full((keys, joints), 0.03, np.float32)
+        body["transl_std_m"] = np.full((keys, 3), 0.01, np.float32)
     np.savez(folder / "body.npz", **body)
     return len(metadata["frames"]), _write_events(folder / "events.h5", period, turns, keep)
 

@@ -63,16 +63,16 @@ def test_two_keys_are_slerp_and_straight_line():
 
 
 def test_angular_velocity_and_acceleration_are_continuous_at_the_keys():
-    track, _, _ = make_track(6, keys=8)
+    track, poses, _ = make_track(6, keys=8)
     step = 2e-5  # seconds; the polynomials themselves are evaluated, in float64, without rounding
-    starts, keys = track._polynomials, track._keys
+    starts = track._turns.double()
     for knot in range(1, 7):
         length = float(track._seconds[knot] - track._seconds[knot - 1])
 
         def path(interval, offsets):
             c3, c2, c1, c0 = starts[interval].unbind(1)
-            values = [(((c3 * h + c2) * h + c1) * h + c0)[:-1].numpy() for h in offsets]
-            base = Rotation.from_matrix(keys[interval].numpy())
+            values = [(((c3 * h + c2) * h + c1) * h + c0).numpy() for h in offsets]
+            base = Rotation.from_rotvec(poses[interval])
             return [base * Rotation.from_rotvec(value) for value in values]
 
         def derivatives(interval, at):

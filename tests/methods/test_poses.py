@@ -151,6 +151,19 @@ def test_poses_that_say_nothing_are_corrected_once_they_are_disproved(
         assert float(found.joint_rad.max()) == pytest.approx(0.07)
 
 
+def test_a_long_recording_is_not_drawn_before_training(captures, monkeypatch, caplog):
+    capture = seen(captures[1])
+    frames = len(capture.train_frames)
+    monkeypatch.setattr(poses, "MOST_PIXELS", 3 * 32 * 24 * frames - 1)
+    monkeypatch.setattr(poses, "refine", lambda *_, **__: pytest.fail("drawn"))
+    found = prepared(capture).correction
+    assert f"more than the {frames - 1} of this size" in caplog.text
+    assert not bool(found.exact) and not bool(found.started)
+    monkeypatch.setattr(poses, "MOST_PIXELS", 3 * 32 * 24 * frames)
+    with pytest.raises(pytest.fail.Exception, match="drawn"):
+        prepared(capture)
+
+
 def test_what_was_found_out_is_part_of_the_state(captures, tiny_capture):
     """Of poses that say nothing: built to be loaded, the state decides."""
     path = tiny_capture("silent", frames=20)

@@ -58,12 +58,11 @@ class BodyTrack:
         self.times_us = times
         self.poses, self.transl = poses, transl
         seconds = (times - times[0]) * 1e-6
-        keys, polynomials = _polynomials(seconds, poses, transl)
-        # float64 throughout: a few hundred numbers per call, and exact at the keys. They stay on
-        # the host, since a GPU would take a launch per operation for them.
+        # On the host, since a GPU would take a launch per operation for a few hundred numbers.
+        # Those of an hour are many: turns are float32, which errs by less than 1e-6 rad.
         self._seconds = torch.from_numpy(seconds)
-        self._keys = torch.from_numpy(keys)
-        self._polynomials = torch.from_numpy(polynomials)
+        turns, places = _polynomials(seconds, poses, transl)
+        self._turns, self._places = torch.from_numpy(turns), torch.from_numpy(places)
 
     def to(self, device: torch.device | str) -> "BodyTrack":
         """The same track, whose poses are for ``device``."""
@@ -92,12 +91,12 @@ class BodyTrack:
         seconds = (times - int(self.times_us[0])).double() * 1e-6
         seconds = seconds.clamp(self._seconds[0], self._seconds[-1])
         index = torch.searchsorted(self._seconds, seconds, right=True) - 1
-        index = index.clamp(0, len(self._polynomials) - 1)
-        step = (seconds - self._seconds[index])[:, None, None]
-        c3, c2, c1, c0 = self._polynomials[index].unbind(2)
-        value = ((c3 * step + c2) * step + c1) * step + c0
-        rotations = self._keys[index] @ axis_angle_to_matrix(value[:, :-1])
-        return rotations.float(), value[:, -1].float()
+        index = index.clamp(0, len(self._places) - 1)
+        step = seconds - self._seconds[index]
+        turned = _at_step(self._turns[index], step[:, None, None])
+        turns = torch.stack([torch.from_numpy(self.poses)[index], turned])
+        key, since = axis_angle_to_matrix(turns)
+        return (key @ since).float(), _at_step(self._places[index], step[:, None]).float()
 
     def bones(self, times_us: Int[Tensor, "T"] | Sequence[int]) -> Float[Tensor, "T J 4 4"]:
         """Bone transforms, canonical pose to world, at the given times."""
@@ -135,30 +134,32 @@ def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
     return up
 
 
+def _at_step(coefficients: Float[Tensor, "*T 4 3"], step: Float[Tensor, "*T 1"]) -> Tensor:
+    """Cubic polynomials, the highest power first."""
+    c3, c2, c1, c0 = coefficients.unbind(-2)
+    return ((c3 * step + c2) * step + c1) * step + c0
+
+
 def _polynomials(
     seconds: Float[np.ndarray, "P"],
     poses: Float[np.ndarray, "P J 3"],
     transl: Float[np.ndarray, "P 3"],
-) -> tuple[Float[np.ndarray, "I J 3 3"], Float[np.ndarray, "I J+1 4 3"]]:
-    """Rotation at the start of each interval, and cubic coefficients (highest first) from there.
+) -> tuple[Float[np.ndarray, "I J 4 3"], Float[np.ndarray, "I 4 3"]]:
+    """Cubic coefficients (highest first) of each interval: of turns since its start, and of places.
 
-    The last ones are of the place.
+    Turns are float32.
     """
     count, joints = poses.shape[:2]
+    turns = np.zeros((max(1, count - 1), joints, 4, 3), np.float32)
     if count == 1:
-        matrices = Rotation.from_rotvec(poses[0]).as_matrix()
-        still = np.zeros((1, joints + 1, 4, 3))
-        still[0, -1, -1] = transl[0]
-        return matrices[None], still
-    keys = np.empty((count - 1, joints, 3, 3))
-    polynomials = np.empty((count - 1, joints + 1, 4, 3))
-    polynomials[:, -1] = CubicSpline(seconds, transl).c.transpose(1, 0, 2)
+        places = np.zeros((1, 4, 3))
+        places[0, -1] = transl[0]
+        return turns, places
     for joint in range(joints):
         rotations = Rotation.from_rotvec(poses[:, joint])
-        keys[:, joint] = rotations[:-1].as_matrix()
         coefficients = RotationSpline(seconds, rotations).interpolator.c
-        polynomials[:, joint] = coefficients.transpose(1, 0, 2)
-    return keys, polynomials
+        turns[:, joint] = coefficients.transpose(1, 0, 2)
+    return turns, np.ascontiguousarray(CubicSpline(seconds, transl).c.transpose(1, 0, 2))
 
 
 def _check(

@@ -12,6 +12,7 @@ from evsplat.body.smoothing import motion_noise, moving_joints, smoothed, spline
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError, DataError
+from evsplat.landmarks.pictures import FRACTIONS
 from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, Weight
 from evsplat.models.pose_correction import SHARES, PoseCorrection
 from evsplat.posing.refine import Refined, Verdict, judge, refine
@@ -26,6 +27,10 @@ source is unknown, and of those that are said to be exact where they are to be c
 SMOOTHED = 0.5
 """Noise that is believed of a curve alone, over what is expected to be new in every key: fast
 motion looks like noise as well, and with all of it up to 15 % was added to errors of joints."""
+
+MOST_PIXELS = 40_000_000
+"""Of the pictures by which poses are corrected before training: they are there at once, with all
+that is computed of them 140 B a pixel."""
 
 _NOT_ALWAYS = ReadIf("pose.refine", "auto or never", lambda refine: refine != "always")
 _REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "never")
@@ -87,14 +92,14 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
     tried = source is not None and capture.poses_refined
     found: Verdict | None = None
     if fit and exact is not True and not tried:
-        found = _compared(refine if told else judge, track, capture)
+        found = _corrected(track, capture) if told else _compared(judge, track, capture)
     decided = exact if exact is not None else found is None or not found.disproves
     if exact is not False and decided and fit:
         _refuse_unread(config, capture)
     given = track
     if found is not None and found.better and not decided and not told:
         track = _as_far_off(track, found.given_errors, smooth=config.smooth == "auto")
-        found = _compared(refine, track, capture)
+        found = _corrected(track, capture)
         joint_rad, root_m = _expected(config, track)
     if fit:
         smooth = smooth or track is not given and config.smooth == "auto"
@@ -133,6 +138,22 @@ def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTr
         camera_up=track.camera_up,
     )
     return _smoothed(told, errors.joint_rad, errors.root_m) if smooth else told
+
+
+def _corrected(track: BodyTrack, capture: TrainingCapture) -> Verdict | None:
+    """Poses corrected by the whole recording; None where that is ruled out, which is logged."""
+    frames = capture.train_frames
+    camera = capture.camera(frames[0])
+    most = MOST_PIXELS // (len(FRACTIONS) * camera.width * camera.height)
+    if len(frames) > most:
+        logger.warning(
+            "%s: has %d training frames, more than the %d of this size whose poses are corrected "
+            "before training; what they err by is learned in training alone, which is less "
+            "exact. Cut the recording into shorter ones where that matters.",
+            capture.path, len(frames), most,
+        )  # fmt: skip
+        return None
+    return _compared(refine, track, capture)
 
 
 def _compared(

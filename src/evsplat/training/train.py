@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shlex
 import signal
 import sys
 import time
@@ -115,6 +116,7 @@ def train(
         if on_start is not None:
             on_start(folder.path)
         _loop(trainer, folder)
+    logger.info("%s", _ended(trainer.clock, capture.path, folder.path))
     return folder.path
 
 
@@ -265,6 +267,14 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
             save(ending=True)  # once more: what was learned is safe whatever this takes
     if clock.iteration == 0:
         raise DataError(f"{folder.path}: no step was made.")
+
+
+def _ended(clock: Clock, capture: Path, run: Path) -> str:
+    """After how many steps a training ended, why there, and how it goes on."""
+    why = "its schedule is finished" if clock.done else "the time that it was given is over"
+    more = ["--out", str(run), "--resume", "--iterations", str(2 * clock.iteration)]
+    command = shlex.join(["evsplat", "train", str(capture), *more])
+    return f"training ended after {clock.iteration:,} steps: {why}. To go on: {command}"
 
 
 def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
