@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, cast
@@ -224,6 +224,12 @@ def write_bytes(path: Path | str, content: bytes) -> None:
     """Write ``content``, whole or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+def write_pieces(path: Path | str, pieces: Iterable[bytes | memoryview]) -> None:
+    """Write what would be too large in one piece, whole or not at all."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.writelines(pieces)
 
 
 def write_text(path: Path | str, text: str) -> None:

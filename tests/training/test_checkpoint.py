@@ -1,14 +1,19 @@
 """Checkpoints on a full disk and after damage: what is there is kept, and said."""
 
 import errno
+import json
 import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from evsplat.errors import DataError, OutputError
+from evsplat.training import checkpoint
 from evsplat.training.checkpoint import checkpoints, load_latest, load_model, save_checkpoint
 
 from ..small_model import SMALL, built
@@ -35,14 +40,14 @@ def steps(folder: Path) -> list[int]:
 
 def full_unless(monkeypatch: pytest.MonkeyPatch, folder: Path, most: int) -> None:
     """Nothing can be written while the folder holds more than ``most`` checkpoints."""
-    write = Path.write_bytes
+    sound = checkpoint._pieces
 
-    def on_a_full_disk(path: Path, content: bytes) -> int:
+    def on_a_full_disk(*content: Any) -> Iterator[bytes | memoryview]:
         if len(steps(folder)) > most:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(path, content)
+        yield from sound(*content)
 
-    monkeypatch.setattr(Path, "write_bytes", on_a_full_disk)
+    monkeypatch.setattr(checkpoint, "_pieces", on_a_full_disk)
 
 
 def test_on_a_full_disk_the_oldest_gives_way(
@@ -105,11 +110,37 @@ def test_a_training_that_goes_on_from_before_drops_what_is_later(folder: Path) -
     assert steps(folder) == [10, 15]
 
 
+def test_a_checkpoint_is_a_file_of_safetensors(folder: Path) -> None:
+    """As its own writer makes it: shapes, types, numbers and texts, read by its own reader."""
+    generator = torch.Generator().manual_seed(0)
+    tensors = {
+        "numbers": torch.randn(3, 5, 2, generator=generator),
+        "turned": torch.randn(4, 3, generator=generator).T,
+        "exact": torch.randn(2, generator=generator, dtype=torch.float64),
+        "rows": torch.arange(7),
+        "state": torch.randint(256, (5,), generator=generator, dtype=torch.uint8),
+        "flag": torch.tensor(True),
+        "none": torch.zeros(0, 3),
+        "one": torch.tensor(2.5),
+    }
+    path = save_checkpoint(folder, 30, tensors, STATE)
+    kept = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    other = path.with_name("other.safetensors")
+    save_file(kept, other, metadata={"state": json.dumps(STATE)})
+    for found in (load_file(path), load_file(other)):
+        assert found.keys() == tensors.keys()
+        for name, tensor in tensors.items():
+            assert found[name].dtype == tensor.dtype and torch.equal(found[name], tensor)
+    assert path.stat().st_size == other.stat().st_size
+    assert load_latest(folder)[2] == STATE
+
+
 def test_the_disk_s_other_faults_keep_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object, **__: object) -> None:
+    def broken(*_: object) -> Iterator[bytes]:
+        yield b"some of it"
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(Path, "write_bytes", broken)
+    monkeypatch.setattr(checkpoint, "_pieces", broken)
     with pytest.raises(OSError, match=os.strerror(errno.EIO)):
         save(folder, 30)
     assert steps(folder) == [10, 20]

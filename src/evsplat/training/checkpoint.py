@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
 from evsplat.errors import DataError, OutputError
-from evsplat.files import remove_file, write_bytes
+from evsplat.files import remove_file, write_pieces
 from evsplat.models.model import Model
 from evsplat.untrusted.faults import MISFITS, broken_as
 from evsplat.untrusted.records import misfit
@@ -67,8 +66,36 @@ def kept_sentence(folder: Path) -> str:
 def write_state(path: Path, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:
     """Write tensors and state as `load_checkpoint` reads them, whole or not at all."""
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # Not save_file, which writes to a file of its own and leaves it behind where it is killed.
-    write_bytes(path, save(kept, metadata={"state": json.dumps(state)}))
+    # Not safetensors' save_file, which writes to a file of its own and leaves it behind where it is
+    # killed; nor its save, which makes the file twice in memory, 300 MB of an hour's recording.
+    write_pieces(path, _pieces(kept, {"state": json.dumps(state)}))
+
+
+_TYPES = {
+    **{torch.float64: "F64", torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16"},
+    **{torch.int64: "I64", torch.int32: "I32", torch.int16: "I16", torch.int8: "I8"},
+    **{torch.uint8: "U8", torch.bool: "BOOL"},
+}
+
+
+def _pieces(tensors: dict[str, Tensor], texts: dict[str, str]) -> Iterator[bytes | memoryview]:
+    """A file of safetensors: the length of its header, the header, and the numbers in a row.
+
+    The largest types come first, so that all lie at multiples of their size.
+    """
+    order = sorted(tensors, key=lambda name: (-tensors[name].element_size(), name))
+    header: dict[str, Any] = {"__metadata__": texts}
+    end = 0
+    for name in order:
+        begin, end = end, end + tensors[name].nbytes
+        kind, shape = _TYPES[tensors[name].dtype], list(tensors[name].shape)
+        header[name] = {"dtype": kind, "shape": shape, "data_offsets": [begin, end]}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    yield len(text).to_bytes(8, "little")
+    yield text
+    for name in order:
+        yield tensors[name].flatten().view(torch.uint8).numpy().data
 
 
 def checkpoints(folder: Path) -> list[Path]:
