@@ -1,19 +1,21 @@
 """Errors of found body poses against the truth, by stage: landmarks, fit, refinement.
 
-    python benchmarks/find_poses.py CAPTURE … [--held-out-events] [--refine] [--keypoints-px 2]
-                                              [--out FOLDER] [--threads 1]
+    python benchmarks/find_poses.py CAPTURE … [--held-out-events] [--without-events] [--refine]
+                                              [--keypoints-px 2] [--out FOLDER] [--threads 1]
 
 Per capture and stage the mean distance of 14 joints in pixels (through the frame's camera), in
 millimetres about the pelvis (MPJPE), and after a similarity per frame (PA-MPJPE), at the times of
 training and of held-out frames apart; the share of the given poses' overlap with the masks that
 the found ones reach; seconds. The stature is taken from the truth, the pose prior leaves the
-capture's motion out. With ``--keypoints-px`` a row follows that is fitted to the true joints, off
-by that many pixels of noise per axis, in place of landmarks. With ``--out`` the poses of each stage
-are written as captures NAME_STAGE. The last line is all of it as JSON.
+capture's motion out. ``--without-events`` takes the events away. With ``--keypoints-px`` the motion
+is fitted to the true joints in the middle of training exposures, off by that many pixels of noise
+per axis, in place of landmarks, as `evsplat poses --keypoints FILE` is. With ``--out`` the poses of
+each stage are written as captures NAME_STAGE. The last line is all of it as JSON.
 """
 
 import argparse
 import json
+import tempfile
 import time
 from pathlib import Path
 
@@ -50,6 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--held-out-events", action="store_true")
+    parser.add_argument("--without-events", action="store_true")
     parser.add_argument("--refine", action="store_true", help="correct fits by drawing the person")
     parser.add_argument("--keypoints-px", type=float)
     parser.add_argument("--out", type=Path, help="folder for captures with the poses found")
@@ -59,9 +62,19 @@ def main() -> None:
     policy = Policy(held_out_events=options.held_out_events)
     results = []
     for path in options.captures:
-        capture = load_capture(path)
-        results += measure(capture, policy, options.keypoints_px, options.refine, options.out)
+        with tempfile.TemporaryDirectory() as spare:
+            capture = load_capture(path)
+            if options.without_events:
+                capture = blurry_alone(capture, Path(spare) / path.name)
+            results += measure(capture, policy, options.keypoints_px, options.refine, options.out)
     print(json.dumps({"policy": policy.sentence, "rows": results}))
+
+
+def blurry_alone(capture: Capture, folder: Path) -> Capture:
+    """The same recording without its events."""
+    with derived_capture(capture, folder) as making:
+        making.document["events"] = None
+    return load_capture(folder)
 
 
 def measure(
@@ -77,34 +90,35 @@ def measure(
         prior = pose_prior(without=(motion,))
     except DataError:
         prior = pose_prior()
-    start = time.perf_counter()
-    landmarks = find_landmarks(
-        seen, sharp_pictures(seen), network=LandmarkNetwork(), progress=False
-    )
-    found_s = time.perf_counter() - start
-    rows = [
-        {"stage": "landmarks", "seconds": found_s, **landmark_errors(capture, truth, landmarks)}
-    ]
-    sets = {"fit": landmarks}
-    if keypoints_px is not None:
-        sets["fit to true joints"] = true_keypoints(capture, truth, landmarks, keypoints_px)
-    for stage, points in sets.items():
+    rows: list[dict] = []
+    if keypoints_px is None:
         start = time.perf_counter()
-        cameras = [capture.camera(nearest(capture, t)) for t in points.times_us.tolist()]
-        span = capture.frames[0].exposure_us[0], max(f.exposure_us[1] for f in capture.frames)
-        fitted = fit_landmarks(points, cameras, span, settings=settings, prior=prior)
-        track = fitted.track(key_times(seen))
-        seconds = time.perf_counter() - start
-        rows.append({"stage": stage, "seconds": seconds, **pose_errors(capture, truth, track)})
-        tracks = {stage: track}
-        if refined:
-            better = refine(track, seen)
-            errors = pose_errors(capture, truth, better.track)
-            rows.append({"stage": f"{stage}, refined", "seconds": better.seconds, **errors})
-            tracks[f"{stage}, refined"] = better.track
-        if out is not None:
-            for name, one in tracks.items():
-                write(capture, out / f"{capture.name}_{name.replace(', ', '_')}", one, fitted)
+        points = find_landmarks(
+            seen, sharp_pictures(seen), network=LandmarkNetwork(), progress=False
+        )
+        found_s = time.perf_counter() - start
+        errors = landmark_errors(capture, truth, points)
+        rows.append({"stage": "landmarks", "seconds": found_s, **errors})
+        stage = "fit"
+    else:
+        points = true_keypoints(capture, truth, keypoints_px)
+        stage = "fit to true joints"
+    start = time.perf_counter()
+    cameras = [capture.camera(nearest(capture, t)) for t in points.times_us.tolist()]
+    span = capture.frames[0].exposure_us[0], max(f.exposure_us[1] for f in capture.frames)
+    fitted = fit_landmarks(points, cameras, span, settings=settings, prior=prior)
+    track = fitted.track(key_times(seen))
+    seconds = time.perf_counter() - start
+    rows.append({"stage": stage, "seconds": seconds, **pose_errors(capture, truth, track)})
+    tracks = {stage: track}
+    if refined:
+        better = refine(track, seen)
+        errors = pose_errors(capture, truth, better.track)
+        rows.append({"stage": f"{stage}, refined", "seconds": better.seconds, **errors})
+        tracks[f"{stage}, refined"] = better.track
+    if out is not None:
+        for name, one in tracks.items():
+            write(capture, out / f"{capture.name}_{name.replace(', ', '_')}", one, fitted)
     for row in rows:
         row["capture"] = capture.name
         shown = {k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}
@@ -187,12 +201,11 @@ def landmark_errors(capture: Capture, truth: BodyTrack, landmarks: Landmarks) ->
     return values | ({"test_px": float(off[held].mean())} if held.any() else {})
 
 
-def true_keypoints(
-    capture: Capture, truth: BodyTrack, landmarks: Landmarks, noise_px: float
-) -> Landmarks:
-    """The joints' true places at the same times as COCO's key points, the face not seen."""
-    true = joints(truth, landmarks.times_us.tolist())[:, :12]
-    frames = [nearest(capture, int(time)) for time in landmarks.times_us]
+def true_keypoints(capture: Capture, truth: BodyTrack, noise_px: float) -> Landmarks:
+    """The joints' true places in training pictures as COCO's key points, the face not seen."""
+    frames = sorted(capture.train_frames, key=lambda frame: frame.mid_us)
+    times_us = np.array([frame.mid_us for frame in frames])
+    true = joints(truth, times_us.tolist())[:, :12]
     pixels = [capture.camera(f).project(place)[0] for f, place in zip(frames, true, strict=True)]
     places = np.zeros((len(frames), len(COCO_17), 2))
     seen = np.zeros(places.shape[:2])
@@ -201,7 +214,7 @@ def true_keypoints(
     places[:, index] = torch.stack(pixels).numpy() + noise
     seen[:, index] = 1
     sigma = np.full(seen.shape, noise_px)
-    return Landmarks(landmarks.times_us, places, sigma, seen, None, COCO_17)
+    return Landmarks(times_us, places, sigma, seen, None, COCO_17)
 
 
 def joints(track: BodyTrack, times_us: list[int]) -> torch.Tensor:

@@ -170,11 +170,13 @@ def judged(capture: Capture, track: BodyTrack | None, label: str) -> tuple[Belon
     start = time.perf_counter()
     found = judge_body(capture.for_training(Policy()), track)
     seconds = time.perf_counter() - start
-    order = "-" if found.order is None else f"{found.order:.2f}"
+    order, follows = (
+        "-" if told is None else f"{told:.2f}" for told in (found.order, found.follows)
+    )
     print(
         f"{label:78} {found.verdict:8} {found.score:5.2f} of {found.best_score:.2f}, "
-        f"order {order}, off {found.shift_px[0]:+5.1f} {found.shift_px[1]:+5.1f} px "
-        f"{found.delay_frames:+.1f} frames, {seconds:.2f} s",
+        f"order {order}, follows {follows}, off {found.shift_px[0]:+5.1f} "
+        f"{found.shift_px[1]:+5.1f} px {found.delay_frames:+.1f} frames, {seconds:.2f} s",
         flush=True,
     )
     return found, seconds

@@ -1,11 +1,11 @@
-"""`Correlations` and `own_time_order` against closed forms."""
+"""`Correlations` and `OwnTimes` against closed forms."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from evsplat.inspection.matching import Correlations, normalised, own_time_order
+from evsplat.inspection.matching import Correlations, OwnTimes, normalised
 from evsplat.inspection.search import DELAYS, NOW, BestPlace, _changing
 
 REACH = 5
@@ -65,14 +65,31 @@ def test_order_is_one_for_the_own_times_and_a_half_by_chance() -> None:
     posed = squares([tuple(rng.integers(0, 20, 2)) for _ in range(16)])
     far = ~np.eye(16, dtype=bool)
     noisy = posed + rng.normal(size=posed.shape)
-    assert own_time_order(noisy, posed, far) > 0.95
-    chance = [own_time_order(rng.normal(size=posed.shape), posed, far) for _ in range(20)]
-    assert np.mean(chance) == pytest.approx(0.5, abs=0.05)
+    assert OwnTimes.of(noisy, posed, far).order > 0.95
+    chance = [OwnTimes.of(rng.normal(size=posed.shape), posed, far) for _ in range(20)]
+    assert np.mean([one.order for one in chance]) == pytest.approx(0.5, abs=0.05)
+    assert np.mean([one.follows for one in chance]) == pytest.approx(0, abs=0.02)
+
+
+def test_what_follows_a_body_does_so_as_far_as_it_is_like_it_whether_it_moves_much_or_little() -> (
+    None
+):
+    rng = np.random.default_rng(2)
+    far = ~np.eye(40, dtype=bool)
+    for reach in (3, 20):
+        posed = squares([tuple(rng.integers(0, reach, 2)) for _ in range(40)])
+        noisy = posed + rng.normal(size=posed.shape)
+        alike = [np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in zip(noisy, posed, strict=True)]
+        found = OwnTimes.of(noisy, posed, far)
+        assert found.follows == pytest.approx(np.mean(alike), abs=0.03)
+        # A part that stands where the body stands is like it at all times, and follows nothing.
+        stands = OwnTimes.of(np.repeat(noisy[:1], 40, axis=0), posed, far)
+        assert stands.follows == pytest.approx(0, abs=1e-6)
 
 
 def test_order_of_a_body_that_stands_still_is_not_told() -> None:
     posed = squares([(4, 4)] * 8)
-    assert own_time_order(posed.astype(float), posed, ~np.eye(8, dtype=bool)) is None
+    assert OwnTimes.of(posed.astype(float), posed, ~np.eye(8, dtype=bool)) is None
 
 
 def test_what_changes_in_time_tells_delays_of_somebody_who_stays():

@@ -33,6 +33,9 @@ _LEAST_GAIN_OF_CHANGE = 0.13
 man's own bodies lost up to 0.06, those 2 frames off 0.27 and more, and this is midway."""
 _ANOTHER, _DOUBTFUL, _FOLLOWS = 0.75, 0.85, 0.9
 """Order below which a body is another one, below which it may be, and above which it is none."""
+_LEAST_FOLLOWED = 0.1
+"""What moves has more than this of a right body's changes in it (`OwnTimes.follows`): those of two
+draws had 0.13 and more, others' bodies in the same place 0.07."""
 _PARTED = 0.05
 """A doubtful one is another if halves of the recording disagree so much on the best place."""
 _FAINT = 0.08
@@ -68,6 +71,9 @@ class Belonging:
     """Share of pairs of times in which, at the best place, a frame's own pose fits better than the
     other time's: 1 where it always does, 0.5 by chance. None where frames are few or poses differ
     little."""
+    follows: float | None
+    """How much of the body's changes is in what moves, at the best place (`OwnTimes.follows`); None
+    as `order`."""
     parting: float
     """Share of its correlation that the first or second half of the recording, the worse, loses at
     the common best place against the best place of its own."""
@@ -84,14 +90,14 @@ class Belonging:
     def verdict(self) -> Verdict:
         """``off``: fits better elsewhere; ``another``: out of view, or follows nothing anywhere.
 
-        ``unknown``: too little moves, or, with the camera, all.
+        ``unknown``: too little moves, or, with the camera, all; or it hardly follows what moves.
         """
         if self.area == 0:
             return "another"
         if not self.shares or self.best_score < _FAINT:
             return "unknown"
         if not self._is_off:
-            return "belongs"
+            return "unknown" if self._hardly_follows else "belongs"
         order = self.order
         if not self.standing_camera:
             return "off" if order is not None and order >= _FOLLOWS else "unknown"
@@ -112,6 +118,13 @@ class Belonging:
             return delay >= _OFF_FRAMES and self.change_lost > _LEAST_GAIN_OF_CHANGE
         least = _LEAST_GAIN_OF_A_FRAME if delay < 2 * _OFF_FRAMES else _LEAST_GAIN_IN_TIME
         return delay >= _OFF_FRAMES and gain > least
+
+    @property
+    def _hardly_follows(self) -> bool:
+        """In the right place, as somebody else in another recording may be."""
+        if self.order is None or self.follows is None or not self.standing_camera:
+            return False
+        return self.order < _DOUBTFUL and self.follows < _LEAST_FOLLOWED
 
     @property
     def where(self) -> str:
@@ -154,6 +167,11 @@ class Belonging:
                 f"the posed body follows nothing that moves, at no shift and delay: its own pose "
                 f"fits a frame better than another time's in {self.order:.0%} of pairs (by chance "
                 f"50 %, a right body's in over 90 %); {self.where} ({fit})"
+            )
+        if self.best_score >= _FAINT and self._hardly_follows:
+            return (
+                f"the posed body is where something moves but hardly follows it, as another "
+                f"recording's may: {self.where} ({fit})"
             )
         why = "too little moves; check camera and exposure"
         if not self.standing_camera:
@@ -204,7 +222,8 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
         delay_us=round(DELAYS[delay] * period_us),
         score=best.given_score,
         best_score=best.score,
-        order=best.order,
+        order=None if best.own_times is None else best.own_times.order,
+        follows=None if best.own_times is None else best.own_times.follows,
         change_lost=change_lost,
         parting=best.parting,
         standing_camera=stands(frames),

@@ -83,25 +83,40 @@ class Correlations:
         return self.products / np.maximum(norm, 1e-9)[..., None, None]
 
 
-def own_time_order(
-    maps: Float[np.ndarray, "K h w"],
-    posed: Float[np.ndarray, "K h w"],
-    far: Bool[np.ndarray, "K K"],
-) -> float | None:
-    """Share of the pairs ``far`` (map, time) in which a map's own silhouette fits it better.
+@dataclass(frozen=True)
+class OwnTimes:
+    """How much better than those of other times each map's own silhouette fits it."""
 
-    Silhouettes that fit all maps better than others do gain nothing by that. None where there are
-    few pairs, or silhouettes hardly differ.
-    """
-    if far.sum() < _FEWEST_PAIRS:
-        return None
-    silhouettes = _unit(posed)
-    if 1 - (silhouettes @ silhouettes.T)[far].mean() < _LEAST_CHANGE:
-        return None
-    fits = _unit(maps) @ silhouettes.T
-    fits = fits - fits.mean(0)
-    own = np.diag(fits)[:, None]
-    return float(((own > fits) + 0.5 * (own == fits))[far].mean())
+    order: float
+    """Share of the pairs (map, time) in which it does: 0.5 by chance."""
+    follows: float
+    """By how much, over how far silhouettes of the two times are from equal: 0 by chance, and the
+    mean correlation where maps are silhouettes and noise."""
+
+    @classmethod
+    def of(
+        cls,
+        maps: Float[np.ndarray, "K h w"],
+        posed: Float[np.ndarray, "K h w"],
+        far: Bool[np.ndarray, "K K"],
+    ) -> "OwnTimes | None":
+        """Of the pairs ``far``, which holds each one's reverse as well.
+
+        Silhouettes that fit all maps better than others do gain nothing by that. None where there
+        are few pairs, or silhouettes hardly differ.
+        """
+        if far.sum() < _FEWEST_PAIRS:
+            return None
+        silhouettes = _unit(posed)
+        differ = float(1 - (silhouettes @ silhouettes.T)[far].mean())
+        if differ < _LEAST_CHANGE:
+            return None
+        fits = _unit(maps) @ silhouettes.T
+        fits = fits - fits.mean(0)
+        better = (np.diag(fits)[:, None] - fits)[far]
+        return cls(
+            float(np.mean((better > 0) + 0.5 * (better == 0))), float(better.mean()) / differ
+        )
 
 
 def _unit(maps: np.ndarray) -> Float32[np.ndarray, "K P"]:

@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped
 
-from evsplat.inspection.matching import Correlations, normalised, own_time_order
+from evsplat.inspection.matching import Correlations, OwnTimes, normalised
 
 REACH_PX = 24
 """Shifts of so many map pixels each way are tried: 30 % of the body's height."""
 DELAYS = tuple(step / 2 for step in range(-8, 9))
 """Delays that are tried, in frames."""
 NOW = DELAYS.index(0.0)
-_CHANGES = 0.08
+_CHANGES = 0.12
 """A lower correlation of what changes in time tells nothing."""
 
 
@@ -30,8 +30,8 @@ class BestPlace:
     given_score: float = 0.0
     """Correlation without shift and delay."""
     score: float = 0.0
-    order: float | None = None
-    """`own_time_order` there."""
+    own_times: OwnTimes | None = None
+    """There, the mean over kinds of movement."""
     parting: float = 0.0
     """`Belonging.parting`."""
     changing: Float[np.ndarray, "3 D"] | None = None
@@ -63,8 +63,8 @@ class BestPlace:
         place = np.unravel_index(overall.argmax(), overall.shape)
         delay, down, right = int(place[0]), int(place[1]) - REACH_PX, int(place[2]) - REACH_PX
         highest = np.maximum(grouped.max((1, 2, 3)), 1e-9)
-        orders = [
-            own_time_order(
+        told = [
+            OwnTimes.of(
                 m, in_picture(silhouettes(kind, row[:, delay]), m.shape[1:], down, right), far
             )
             for kind, m in maps.items()
@@ -74,14 +74,14 @@ class BestPlace:
             films = [in_picture(silhouettes(kind, at), m.shape[1:], 0, 0) for at in row.T]
             parts = (slice(None), *halves)
             changing.append([[_changing(m[p], film[p]) for film in films] for p in parts])
-        told = [order for order in orders if order is not None]
+        own = [(one.order, one.follows) for one in told if one is not None]
         return cls(
             delay,
             down,
             right,
             given_score=float(overall[NOW, REACH_PX, REACH_PX]),
             score=float(overall[place]),
-            order=float(np.mean(told)) if told else None,
+            own_times=OwnTimes(*np.mean(own, axis=0).tolist()) if own else None,
             parting=float((1 - grouped[:, *place] / highest).max()),
             changing=np.mean(changing, axis=0),
         )
