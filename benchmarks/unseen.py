@@ -1,6 +1,6 @@
 """The person's unseen side before and after the fill at the end of training.
 
-    python benchmarks/unseen.py RUN [RUN ...] [--strength 0.0025] [--pictures FOLDER]
+    python benchmarks/unseen.py RUN [RUN ...] [--strength 0.001] [--pictures FOLDER]
 
 For runs of method evsplat on staged captures. Their learned parameters are drawn as they are
 ("before") and filled anew ("after"); nothing is trained or written to the run. Printed, in dB:
@@ -70,7 +70,7 @@ def main() -> None:
     """Measure runs before and after."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--strength", type=float, default=0.0025)
+    parser.add_argument("--strength", type=float, default=0.001)
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     rows: dict[str, dict[str, dict[str, float]]] = {}

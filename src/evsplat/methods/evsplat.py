@@ -143,7 +143,7 @@ class EvsplatConfig:
         prefit_steps=300,
     )
     """Discs of the scene at the start."""
-    fill: NotNegative = 0.0025
+    fill: NotNegative = 0.001
     """How strongly neighbours along the surface, and the other side's, decide at the end of
     training about colours of the person that were little seen; 0 leaves them as they are."""
     densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=10_000)

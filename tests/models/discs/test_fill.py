@@ -9,7 +9,7 @@ import torch
 from evsplat.capture import Policy, load_capture
 from evsplat.errors import DataError
 from evsplat.film.looks import Look
-from evsplat.models.discs.fill import _shade, filled
+from evsplat.models.discs.fill import _Pictures, _shade, _views, filled
 from evsplat.models.drawing import draw
 from evsplat.models.seen import Seen, seen_by
 from evsplat.training.checkpoint import below, load_latest, load_model, write_state
@@ -76,6 +76,23 @@ def test_the_fill_evens_what_is_unseen_and_leaves_the_pictures(spoilt):
         with torch.no_grad():
             change = (draw(layers, camera).output.image - draw(old, camera).output.image)[..., :3]
         assert float(change.square().mean().sqrt()) < 0.01
+
+
+def test_what_was_well_seen_keeps_its_look_in_a_light_twice_as_bright(spoilt):
+    model, capture, seen = spoilt
+    rows, name = model.gaussians.human, model.gaussians.colour
+    with torch.no_grad():
+        model.shading.coefficients.zero_()
+        normals = model.surface.normals(model.gaussians.means[rows])
+        own = model.gaussians.get_parameter(name)[rows, :3].sigmoid()
+    views = _views(model, capture, normals)
+    with torch.no_grad():
+        model.shading.coefficients[0, 0] = 1.0  # of the constant term: the factor is 2
+    relit = _Pictures.of(model, views, own).relit(own)
+    well = ~seen.little()
+    assert torch.allclose(relit[well], own[well] / 2, rtol=1e-3)
+    never = torch.stack([view.weight for view in views]).sum(0) == 0
+    assert torch.equal(relit[never], own[never])
 
 
 def test_the_shade_is_the_darkest_fifth_in_the_mean_light_s_hue():

@@ -20,19 +20,21 @@ from evsplat.models.discs.model import DiscModel
 from evsplat.models.layers import Layers
 from evsplat.models.seen import Seen, draw_values, facing, shares_in
 
-STEPS = 5
+STEPS = 8
 """Of conjugate gradients, twice."""
 MOST_BEHIND = 0.25
 """Largest difference to what neighbours say where a surface was seen from behind alone."""
-CALM = 0.0005
+CALM = 0.000125
 """Weight of the squares of the light's numbers, the constant one apart, against the mean squared
 change of the factors that were seen."""
-SHADE, SHADE_WEIGHT = 0.2, 0.05
+SHADE, SHADE_WEIGHT = 0.2, 0.02
 """What turns its back to a camera is lit like the darkest of what is seen, at this quantile: the
 side that is filmed is mostly the one in the light. The weight is against all that is seen."""
 _BACK = -0.1
 """Cosine to the camera under which a surface turns its back."""
 _FAST = 1e6
+_LEAST_SHARE = 1e-6
+"""Pixels; where nothing was seen a colour is taken as it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,8 @@ class _View:
     """Sum of each Gaussian's shares of the pixels."""
     away: Bool[Tensor, " H"]
     """True where the surface turns its back."""
+    lit: Float[Tensor, "H 3"]
+    """Colours in the light."""
 
 
 def filled(
@@ -56,10 +60,11 @@ def filled(
 
     First the light: as it is where it was seen, and no brighter elsewhere than in the shade. Then
     what neighbours would say of each colour: the even transition between those that were well seen
-    and facing (`harmonic`). Last the colours closest to that with which the training frames look as
-    before (`closest`): what shines through the front, or has a small share of its pixels, gives
-    way, and what is well seen stays. ``strength`` is what a difference to the neighbours costs,
-    per training frame, against one of a whole pixel.
+    and facing (`harmonic`); the more was seen, the more its own colour counts instead. Last the
+    colours closest to that with which the training frames look as before (`closest`): what shines
+    through the front, or has a small share of its pixels, gives way, and what is well seen stays.
+    ``strength`` is what a difference to the neighbours costs, per training frame, against one of a
+    whole pixel.
     """
     gaussians, rows = model.gaussians, model.gaussians.human
     if gaussians.human_count < 2 or not float(seen.squares.sum()) > 0:
@@ -79,6 +84,7 @@ def filled(
     sure = (seen.squares * facing.clamp_min(0).square()).masked_fill(seen.little(), 0)
     told = harmonic(own, sure, EVEN * rough)
     pictures = _Pictures.of(new, views, own)
+    told = told.lerp(pictures.relit(own), seen.certainty()[:, None])
     share = len(views) / len(capture.train_frames)
     diagonal = share * seen.squares * pictures.brightness()
     held = torch.full_like(diagonal, strength * len(views))
@@ -114,7 +120,7 @@ def _views(
             picture = draw_values(layers, camera, person, scene)
         weight = shares_in(layers, camera, generator, draws=0)[:, 0]
         away = facing(layers, normals, camera) < _BACK
-        views.append(_View(frame, camera, picture, weight, away))
+        views.append(_View(frame, camera, picture, weight, away, person[0].detach()))
     return views
 
 
@@ -175,6 +181,15 @@ class _Pictures:
     def brightness(self) -> Float[Tensor, " H"]:
         """Mean square of the factors."""
         return torch.stack([light[0].square().mean(-1) for light in self.light]).mean(0)
+
+    @torch.no_grad()
+    def relit(self, own: Float[Tensor, "H 3"]) -> Float[Tensor, "H 3"]:
+        """Colours that in the new light are closest to what ``own`` were in the old, by shares."""
+        above, below = _LEAST_SHARE * own, torch.full_like(own, _LEAST_SHARE)
+        for view, light in zip(self.views, self.light, strict=True):
+            above += view.weight[:, None] * light[0] * view.lit
+            below += view.weight[:, None] * light[0].square()
+        return above / below
 
     def missing(self, values: Float[Tensor, "H 3"]) -> Float[Tensor, "H 3"]:
         """``J^T (b - J y - rest)``, b being the pictures before the fill."""
