@@ -118,9 +118,7 @@ def parts_of(
     ]
     if isinstance(model, discs_model.DiscModel):
         watched += [
-            (model.deformation.pose_encoder, "forward", "pose encoder"),
-            (model.deformation, "forward", "non-rigid shape"),
-            (model.deformation.network, "forward", "non-rigid network"),
+            (model.shade, "forward", "shade by the pose"),
             (discs_model, "skin", "blend skinning"),
             (model, "_light", "light on the person"),
             (model, "_lit", "shadow on the person"),

@@ -285,10 +285,8 @@ def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
     """Let it look at all parts of a step."""
     model = trainer.model
     watch.calls(model, "pose", "body pose")
-    watch.calls(model.deformation.pose_encoder, "forward", "pose encoder")
-    watch.calls(model.deformation.network.encoding, "forward", "position encoding")
-    watch.calls(model.deformation.network, "forward", "non-rigid network")
     if isinstance(model, DiscModel):
+        watch.calls(model.shade, "forward", "shade by the pose")
         watch.calls(model.surface, "normals", "nearest surface")
         watch.calls(model.surface, "weights", "nearest surface")
         watch.calls(discs_model, "skin_with_linear", "blend skinning")
@@ -300,6 +298,9 @@ def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
         watch.calls(model.places, "of", "places of the scene")
         watch.calls(drawing, "_enlarge", "shadow enlarged")
     else:
+        watch.calls(model.deformation.pose_encoder, "forward", "pose encoder")
+        watch.calls(model.deformation.network.encoding, "forward", "position encoding")
+        watch.calls(model.deformation.network, "forward", "non-rigid network")
         watch.calls(model.skinning, "forward", "skinning network")
         watch.calls(paper_model, "skin_with_linear", "blend skinning")
         watch.calls(model.human_colour, "forward", "human colour")

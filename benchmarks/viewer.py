@@ -43,7 +43,7 @@ from evsplat.view.server import Viewer
 WANTED_HZ = 15.0
 SIDE_PX = 512
 PORT = 18330
-NON_RIGID_START = {"evsplat": "non_rigid_start", "paper": "networks.non_rigid_start"}
+NETWORK_START = {"evsplat": "shade_start", "paper": "networks.non_rigid_start"}
 """Names of the setting, by method."""
 
 
@@ -51,7 +51,7 @@ def untrained_run(gaussians: int, method: str) -> Run:
     """A run of the demo capture with so many Gaussians, a fifth of them the person's."""
     capture = load_capture(demo_capture())
     human = gaussians // 5
-    values = override({}, (f"human.count={human}", f"{NON_RIGID_START[method]}=0"))
+    values = override({}, (f"human.count={human}", f"{NETWORK_START[method]}=0"))
     config = method_config(method, values, where="benchmark")
     seen = capture.for_training(config.policy)
     model = TRAINABLE[method].build(config, seen, 0, purpose="draw").model
@@ -311,7 +311,7 @@ def main() -> None:
     )
     parser.add_argument("--training", action="store_true", help="what watching costs a training")
     parser.add_argument("--gaussians", type=int, default=100_000)
-    parser.add_argument("--method", default="paper", choices=sorted(NON_RIGID_START))
+    parser.add_argument("--method", default="paper", choices=sorted(NETWORK_START))
     parser.add_argument("--seconds", type=float, default=12.0, help="of each measurement or turn")
     parser.add_argument("--turns", type=int, default=4, help="in which the training is watched")
     options = parser.parse_args()

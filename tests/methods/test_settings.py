@@ -108,7 +108,7 @@ OUT_OF_RANGE = {
     "most_renders=0 event_start=-1 event_start=15001 event_weight=-0.1 event_weight=.inf "
     "event_term=none event_eps=0 event_reach=-1 event_ramp_us=-1 clock=maybe contrast_weight=-1 "
     "rates.final=0 rates.final=2 rates.means=-1 pose.std_rad=0 pose.start=15001 "
-    "pose.prior=-1 pose_noise=-1 non_rigid_start=.nan shading=1 semantic_band_px_at_256=0 "
+    "pose.prior=-1 pose_noise=-1 shade_start=.nan shading=1 semantic_band_px_at_256=0 "
     "scene.prefit_steps=-1 scene.backdrop_stride_px=0 scene.cube_count=3 scene.cube_half_side_m=0",
     "hugs": "channels=0 resolution=1 sh_degree=4 fit_steps=-1 rate_scale=0 skinning_weight=-1",
     "paper": "networks.width=0 networks.colour_width=0 networks.pose_noise=-1 semantics=soft "

@@ -87,7 +87,7 @@ def model(tiny_capture):
 @torch.no_grad()
 def test_a_model_with_cached_networks_poses_and_colours_as_the_model_does(model):
     model, capture = model
-    assert set(NETWORKS) <= {name for name, _ in model.named_modules()}
+    assert set(NETWORKS) - {"shade.network"} <= {name for name, _ in model.named_modules()}
     twin = with_cached_networks(model)
     cameras = list(capture.cameras.values())
     times = [frame.mid_us for frame in capture.frames[:3]]

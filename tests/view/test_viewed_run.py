@@ -19,7 +19,7 @@ from ..small_model import built, small_config
 
 DEFORMED = {
     "paper": ("networks.non_rigid_start=0",),
-    "evsplat": ("non_rigid_start=0",),
+    "evsplat": ("shade_start=0",),
     "hugs": (),
 }
 

@@ -72,13 +72,18 @@ PAPER = {
 }
 """Of `paper`."""
 
+_NON_RIGID = "gone, it bent nothing (docs/method.md); shade_start is that of the brightness by pose"
+
 EVSPLAT = {
     **_RENAMED,
     **_EVENTS,
     "deform.shadow_lights": "renamed to lamps",
     "deform.pose_correction_start": "evsplat reads pose.refine and pose.start instead",
-    "deform": "what evsplat reads of it are width, shading, lamps, self_shadow, low_pass, "
-    "non_rigid_start and pose_noise",
+    "deform.non_rigid_start": _NON_RIGID,
+    "non_rigid_start": _NON_RIGID,
+    "rates.non_rigid": "renamed to rates.shade",
+    "deform": "what evsplat reads of it are width, shading, lamps, self_shadow, low_pass "
+    "and pose_noise",
     "loss.semantic": "renamed to semantic_weight",
     "loss.binarise": "renamed to binarise_weight",
     "loss": "its weights are l1_weight, dssim_weight, semantic_weight and binarise_weight",

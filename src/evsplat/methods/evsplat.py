@@ -107,8 +107,8 @@ class DiscRates:
     """Opacities before the sigmoid."""
     colour_logits: NotNegative = 1e-2
     """Colours before the sigmoid."""
-    non_rigid: NotNegative = 1e-3
-    """Non-rigid network and pose encoder."""
+    shade: NotNegative = 1e-3
+    """Network of what poses do to the person's brightness."""
     pose: NotNegative = 0.1
     """Pose residuals, units of the errors expected."""
     shading: Annotated[float, AtLeast(0), _SHADING] = 6e-3
@@ -150,12 +150,12 @@ class EvsplatConfig:
     """Growth and pruning."""
 
     width: Annotated[int, AtLeast(1)] = 64
-    """Hidden width of the non-rigid network."""
-    non_rigid_start: Nominal = 3_000
-    """Nominal iteration at which the non-rigid network is switched on (A9)."""
+    """Hidden width of the network of what poses do to the person's brightness."""
+    shade_start: Nominal = 3_000
+    """Nominal iteration at which that network is switched on; 15000: never."""
     pose_noise: NotNegative = 0.1
-    """Standard deviation of the noise on the rotation matrices fed to the pose encoder, in half of
-    the steps."""
+    """Standard deviation of the noise on the rotation matrices that it sees, in half of the
+    steps."""
     shading: bool = True
     """The person's brightness depends on the surface's normal and place in the world."""
     lamps: Annotated[int, Within(0, 16)] = 4
@@ -242,7 +242,7 @@ def build(
         times_us,
         _start(config, capture, poses.track, generator),
         width=config.width,
-        non_rigid_start=config.non_rigid_start,
+        shade_start=config.shade_start,
         pose_noise=config.pose_noise,
         low_pass=config.low_pass,
         shading=config.shading,
@@ -345,7 +345,7 @@ def _learning(rates: DiscRates, model: DiscModel) -> Learning:
     )
     residual = model.residual
     parts = (
-        (model.deformation, rates.non_rigid, True),
+        (model.shade, rates.shade, True),
         (model.scene_colour, SCENE_NETWORK_RATE, True),
         (residual and residual.between, rates.pose, False),
         (residual and residual.errors, ERRORS_RATE * rates.pose, False),

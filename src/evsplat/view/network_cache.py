@@ -30,14 +30,15 @@ class Interleave:
 
 NETWORKS = {
     "deformation.network": Interleave(4, (0, None)),
+    "shade.network": Interleave(4, (0, None)),
     "skinning": Interleave(16, (1,)),
     "human_colour": Interleave(4, (0, 1, 1, None)),
     "scene_colour": Interleave(8, (0, 0)),
 }
 """Modules of a model that map all Gaussians at once, whose last output is kept.
 
-Inputs of the first two do not change when the camera turns, those of the last when time moves. The
-less the output changes with pose and view, the longer a draft may take to renew it.
+Inputs of the first three do not change when the camera turns, those of the last when time moves.
+The less the output changes with pose and view, the longer a draft may take to renew it.
 """
 
 _WITHOUT_POSE = {

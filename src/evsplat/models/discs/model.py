@@ -1,8 +1,8 @@
 """A closed surface of flat discs in the light of a room: the model of method `evsplat`.
 
 Each Gaussian has a colour of its own (in a scene of random points a network gives it), and the
-person's hang on the nearest point of the body's surface; networks are asked only for what the pose
-bends beyond that. Light falls on the person from lamps, which it hides from the scene and itself.
+person's hang on the nearest point of the body's surface. Light falls on them from lamps, which the
+person hides from the scene and itself; for what else the pose does to them a network is asked.
 """
 
 import copy
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from evsplat.body import BodyTrack, skin_with_linear, up_axis
 from evsplat.capture import Camera, Frame
 from evsplat.gaussians import GaussianSet
+from evsplat.models.discs.pose_shade import PoseShade
 from evsplat.models.discs.relief import Relief
 from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.models.discs.shadow import BodyShadow, Lamps
@@ -26,7 +27,7 @@ from evsplat.models.kept import Kept
 from evsplat.models.layers import Layers, SceneShadow, human_splats
 from evsplat.models.model import PosedModel, RowCache
 from evsplat.models.networks.colour import SceneColour, scene_rgb
-from evsplat.models.networks.non_rigid import PoseDeformation, draw_pose_noise
+from evsplat.models.networks.non_rigid import draw_pose_noise
 from evsplat.models.pose_correction import PoseCorrection
 from evsplat.models.scene_places import ScenePlaces
 from evsplat.render import rows_in_view
@@ -65,7 +66,7 @@ class DiscModel(PosedModel):
         gaussians: GaussianSet,
         *,
         width: int,
-        non_rigid_start: float,
+        shade_start: float,
         pose_noise: float,
         low_pass: float,
         shading: bool,
@@ -85,15 +86,15 @@ class DiscModel(PosedModel):
 
         ``camera``: the recording one where it stands still, which sees no depth of its scene.
         ``frame_times_us``: mid-exposures of the training frames, for where the person goes.
-        ``width`` of the non-rigid network, used from nominal iteration ``non_rigid_start`` on.
+        ``width`` of the network of `PoseShade`, used from nominal iteration ``shade_start`` on.
         ``pose_noise``: standard deviation of what training adds to the matrices that it sees.
         """
         super().__init__(track)
         body = track.body
         self.gaussians, self._kept = gaussians, Kept()
-        self.non_rigid_start, self.pose_noise = non_rigid_start, pose_noise
+        self.shade_start, self.pose_noise = shade_start, pose_noise
         self.low_pass = low_pass
-        self.deformation = PoseDeformation(body, width=width, feature_dim=0)
+        self.shade = PoseShade(track, frame_times_us, width)
         self.scene_colour = SceneColour() if scene_network else None
         self.residual, self.residual_start = residual, residual_start
         self.sensor: nn.Module | None = None
@@ -164,8 +165,8 @@ class DiscModel(PosedModel):
     ) -> Drawing:
         """Pictures of a training step; see `Model`.
 
-        The times of a step lie within a frame of each other: the non-rigid network sees the pose
-        at the frame's middle alone, and own shadows are looked up at the time nearest to it.
+        The times of a step lie within a frame of each other: the network sees the pose at the
+        frame's middle alone, and own shadows are looked up at the time nearest to it.
         """
         # Posed together: the skeleton is walked once for all times.
         turned, bones = self.pose([*times_us, frame.mid_us])
@@ -201,21 +202,20 @@ class DiscModel(PosedModel):
         *,
         hard_semantics: bool = False,
     ) -> Layers:
-        """Both classes under ``bones``; the non-rigid network sees ``rotations``.
+        """Both classes under ``bones``; the network of shades sees ``rotations``.
 
         ``lit_at``: the times, one or all, at which shadows on the person are looked up.
         """
         still = self._still(view, hard_semantics=hard_semantics)
         means, scales_log, quaternions = still.means, still.scales_log, still.quaternions
-        if float(self.nominal) >= self.non_rigid_start:
-            centers, scales, turned, _ = self.deformation(means, scales_log, quaternions, rotations)
-        else:
-            centers, scales, turned = means[None], scales_log.exp()[None], quaternions[None]
         weights = self.surface.weights(means)[None]
-        world, transforms, linear = skin_with_linear(centers, weights, bones)
+        world, transforms, linear = skin_with_linear(means[None], weights, bones)
         casters = None if self.shadow is None else self.shadow.place(bones)
         light = self.surface_light()
         rgb = still.rgb[None] * self._light(light, world, transforms, casters, lit_at)
+        if float(self.nominal) >= self.shade_start:
+            rgb = rgb * self.shade(means, rotations)
+        turned, scales = quaternions[None], scales_log.exp()[None]
         return Layers(
             human_splats(world, turned, scales, still.opacities, rgb, still.semantics, linear),
             still.scene,

@@ -9,10 +9,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from evsplat.body import Body, bounding_box
+from evsplat.body import Body
 from evsplat.compiled import native, runs_native
 from evsplat.devices import send
 from evsplat.models.kept import Kept
+from evsplat.models.networks.body_box import BodyBox
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.networks.pose_encoder import PoseEncoder, normalise_joints
 
@@ -242,11 +243,8 @@ class NonRigidNetwork(nn.Module):
         return NonRigid(self.mlp(encoded, pose))
 
 
-class PoseDeformation(nn.Module):
+class PoseDeformation(BodyBox):
     """Pose encoder and non-rigid network over the body's box."""
-
-    box_low: Tensor
-    box_high: Tensor
 
     def __init__(
         self,
@@ -257,7 +255,7 @@ class PoseDeformation(nn.Module):
         last_std: float | None = 1e-3,
     ) -> None:
         """``feature_dim`` values for a colour network; ``last_std`` as in `NonRigidNetwork`."""
-        super().__init__()
+        super().__init__(body)
         joints = normalise_joints(body.rest_joints, body.rest_vertices)
         self.pose_encoder = PoseEncoder(body.parents.tolist(), joints)
         self.network = NonRigidNetwork(
@@ -266,14 +264,7 @@ class PoseDeformation(nn.Module):
             feature_dim=feature_dim,
             last_layer_std=last_std,
         )
-        low, high = bounding_box(body)
         self._encoded = Kept()
-        self.register_buffer("box_low", low.float())
-        self.register_buffer("box_high", high.float())
-
-    def normalise(self, positions: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
-        """Canonical metres to [-1, 1] over the enlarged bounding box of the body."""
-        return 2 * (positions - self.box_low) / (self.box_high - self.box_low) - 1
 
     def inside_box(self, positions: Float[Tensor, "N 3"]) -> Tensor:
         """Mask (N,) of positions, canonical metres, inside that box."""
