@@ -11,6 +11,8 @@ from functools import cache, partial
 from typing import Annotated, ClassVar, Literal
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.calibration import SensorEstimate
@@ -24,6 +26,7 @@ from evsplat.capture import (
 from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
+from evsplat.methods.background import background_without
 from evsplat.methods.base import (
     Composition,
     HeldOut,
@@ -142,7 +145,8 @@ class EvsplatConfig:
         backdrop_stride_px=2,
         prefit_steps=300,
     )
-    """Discs of the scene at the start."""
+    """Discs of the scene at the start; the median of a pixel is that of frames whose body is not
+    near it."""
     fill: NotNegative = 0.001
     """How strongly neighbours along the surface, and the other side's, decide at the end of
     training about colours of the person that were little seen; 0 leaves them as they are."""
@@ -235,12 +239,13 @@ def build(
     fit = purpose == "train"
     generator = start_of_randomness(seed)
     poses = prepare_poses(config.pose, capture, fit=fit)
+    background = _background(config, capture, poses.track) if fit else None
     frames = capture.train_frames
     times_us = [frame.mid_us for frame in frames]
     model = DiscModel(
         poses.track,
         times_us,
-        _start(config, capture, poses.track, generator),
+        _start(config, capture, poses.track, generator, background),
         width=config.width,
         shade_start=config.shade_start,
         pose_noise=config.pose_noise,
@@ -254,7 +259,7 @@ def build(
         residual_start=config.pose.start,
     ).to(device)
     if fit:
-        _fit_colours(config, capture, model, device)
+        _fit_colours(config, capture, model, background)
 
     def renders(frame: Frame) -> int:
         motion = motion_px(capture.camera(frame), poses.track, frame)
@@ -302,15 +307,26 @@ def build(
     )
 
 
+def _background(
+    config: EvsplatConfig, capture: TrainingCapture, track: BodyTrack
+) -> Float[Tensor, "H W 3"] | None:
+    """What a backdrop is to show; None where there is to be none."""
+    if config.scene.kind != "median_backdrop" or not capture.is_static_camera:
+        return None
+    return background_without(capture, track, config.semantic_band_px_at_256)
+
+
 def _fit_colours(
-    config: EvsplatConfig, capture: TrainingCapture, model: DiscModel, device: torch.device | str
+    config: EvsplatConfig,
+    capture: TrainingCapture,
+    model: DiscModel,
+    background: Float[Tensor, "H W 3"] | None,
 ) -> None:
-    """The scene as in the median of the training frames, the person in the colours they show."""
+    """The scene as in ``background``, the person in the colours that the frames show."""
     gaussians = model.gaussians
-    if config.scene.kind == "median_backdrop":
-        camera = capture.camera(capture.train_frames[0]).to(device)
-        picture = capture.median_background().to(device)
-        steps = config.scene.prefit_steps
+    if background is not None:
+        camera = capture.camera(capture.train_frames[0]).to(model.device)
+        picture, steps = background.to(model.device), config.scene.prefit_steps
         fit_scene(gaussians, camera, picture, steps, low_pass=config.low_pass)
     colours = first_colours(model, capture)
     with torch.no_grad():
@@ -318,14 +334,26 @@ def _fit_colours(
 
 
 def _start(
-    config: EvsplatConfig, capture: TrainingCapture, track: BodyTrack, generator: torch.Generator
+    config: EvsplatConfig,
+    capture: TrainingCapture,
+    track: BodyTrack,
+    generator: torch.Generator,
+    background: Float[Tensor, "H W 3"] | None,
 ) -> GaussianSet:
     """Discs on the body and behind it; random points get features for a network of their colour."""
     features = FEATURE_DIM if config.scene.kind == "random_cube" else None
     human = human_start(
         config.human, CLOSED_SURFACE, capture, track, generator, LABEL, feature_dim=features
     )
-    scene, _ = scene_start(config.scene, capture, track, generator, -LABEL, feature_dim=features)
+    scene, _ = scene_start(
+        config.scene,
+        capture,
+        track,
+        generator,
+        -LABEL,
+        feature_dim=features,
+        background=background,
+    )
     return GaussianSet(human, scene)
 
 

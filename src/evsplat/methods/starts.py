@@ -154,8 +154,12 @@ def scene_start(
     generator: torch.Generator,
     semantic_logit: float,
     feature_dim: int | None = FEATURE_DIM,
+    background: Float[Tensor, "H W 3"] | None = None,
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Start values of the scene's Gaussians, and the colours they shall show."""
+    """Start values of the scene's Gaussians, and the colours they shall show.
+
+    ``background``: what a backdrop shows instead of the median of the training frames.
+    """
     frames = capture.train_frames
     camera = capture.camera(frames[0])
     if start.kind == "random_cube":
@@ -173,7 +177,7 @@ def scene_start(
         )
         points, scales, colours = median_backdrop(
             camera,
-            capture.median_background(),
+            capture.median_background() if background is None else background,
             depth,
             stride=start.backdrop_stride_px,
             edge_points=int(BACKDROP_EDGE_SHARE * camera.width * camera.height),
