@@ -1,6 +1,7 @@
 """A training run as a user meets it: reproducible, resumable, honest when it fails."""
 
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -21,6 +22,7 @@ from evsplat.training.bad_steps import MAX_BAD_STEPS
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.clock import Clock
 from evsplat.training.run import RunFolder, read_config
+from evsplat.training.train import _ended
 from evsplat.training.trainer import Trainer
 from evsplat.untrusted.text import read_json
 
@@ -116,6 +118,16 @@ def test_a_finished_run_goes_on_where_more_steps_are_asked_for(tiny_capture, tmp
     assert load_run(out).iteration == 8
     _, state = load_checkpoint(latest_checkpoint(out / "checkpoints"))
     assert state["clock"]["iterations"] == 8 and state["clock"]["fraction"] == 1.0
+
+
+def test_a_training_says_why_it_ended_and_how_it_goes_on(tiny_capture, tmp_path, caplog):
+    capture = tiny_capture(frames=10)
+    with caplog.at_level(logging.INFO):
+        out = train(capture, out=tmp_path / "run", iterations=4, overrides=small("evsplat"))
+    again = f"To go on: evsplat train {capture} --out {out} --resume --iterations 8"
+    assert f"training ended after 4 steps: its schedule is finished. {again}" in caplog.text
+    late = _ended(Clock(9, max_seconds=1.0, iteration=3, fraction=1 / 3), capture, out)
+    assert "after 3 steps: the time that it was given is over. To go on: evsplat train" in late
 
 
 def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(tiny_capture, tmp_path):
