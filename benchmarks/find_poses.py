@@ -38,7 +38,7 @@ from evsplat.landmarks import (
 from evsplat.posing.find import key_times
 from evsplat.posing.fit import FitSettings, PoseFit, fit_landmarks
 from evsplat.posing.prior import pose_prior
-from evsplat.posing.refine import refine
+from evsplat.posing.refine import FOUND_STEPS, refine
 
 PARTS = [f"{s}_{p}" for p in ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
          for s in ("left", "right")]  # fmt: skip
@@ -112,7 +112,7 @@ def measure(
     rows.append({"stage": stage, "seconds": seconds, **pose_errors(capture, truth, track)})
     tracks = {stage: track}
     if refined:
-        better = refine(track, seen)
+        better = refine(track, seen, steps=FOUND_STEPS)
         errors = pose_errors(capture, truth, better.track)
         rows.append({"stage": f"{stage}, refined", "seconds": better.seconds, **errors})
         tracks[f"{stage}, refined"] = better.track

@@ -14,7 +14,7 @@ from evsplat.body import PoseErrors
 from evsplat.capture import Capture, TrainingCapture, load_body_track, load_capture
 from evsplat.errors import ConfigError
 from evsplat.methods import poses
-from evsplat.methods.evsplat import EvsplatConfig
+from evsplat.methods.evsplat import ERRORS_RATE, EvsplatConfig
 from evsplat.methods.poses import SMOOTHED, Poses, prepare_poses
 from evsplat.models.pose_correction import SHARES
 from evsplat.posing.refine import LEAST_GAIN, Verdict
@@ -149,6 +149,22 @@ def test_poses_that_say_nothing_are_corrected_once_they_are_disproved(
     assert [track.errors for track in corrected] == ([] if gain < LEAST_GAIN else [told])
     if corrected:
         assert float(found.joint_rad.max()) == pytest.approx(0.07)
+
+
+@pytest.mark.parametrize(("said", "largest"), [(0.02, 0.02), (0.05, 0.05), (0.2, 0.05)])
+def test_steps_of_large_errors_are_no_larger_than_those_of_poses_nobody_knows(
+    said, largest, captures
+):
+    """A first step of Adam is the learning rate, in units of the error that is expected."""
+    path = captures[1].path
+    with np.load(path / "body.npz") as archive:
+        std = np.full_like(archive["pose_std_rad"], said)
+    with_errors(path, pose_std_rad=std)
+    composition = composed(load_capture(path), "pose.smooth=never")
+    errors = list(composition.model.residual.errors.parameters())
+    (network,) = [one for one in composition.learning.networks if one.parameters[0] is errors[0]]
+    usual = ERRORS_RATE * EvsplatConfig().rates.pose
+    assert network.rate.start * said == pytest.approx(usual * largest)
 
 
 def test_a_long_recording_is_not_drawn_before_training(captures, monkeypatch, caplog):

@@ -298,7 +298,7 @@ def build(
             "event": config.event_weight,
             "contrast": config.contrast_weight,
         },
-        learning=_learning(config.rates, model),
+        learning=_learning(config.rates, model, poses.pace),
         densify=config.densify.limits(cube_max_count=config.scene.growth_limit),
         body_frames=body_frames(poses.track, times_us),
         generator=generator,
@@ -357,8 +357,8 @@ def _start(
     return GaussianSet(human, scene)
 
 
-def _learning(rates: DiscRates, model: DiscModel) -> Learning:
-    """Rates of discs, network, light, poses and sensor."""
+def _learning(rates: DiscRates, model: DiscModel, pace: float) -> Learning:
+    """Rates of discs, network, light, poses and sensor; ``pace`` is that of the poses' errors."""
     rows = row_rates(
         {
             "scales_log": rates.scales_log,
@@ -376,7 +376,7 @@ def _learning(rates: DiscRates, model: DiscModel) -> Learning:
         (model.shade, rates.shade, True),
         (model.scene_colour, SCENE_NETWORK_RATE, True),
         (residual and residual.between, rates.pose, False),
-        (residual and residual.errors, ERRORS_RATE * rates.pose, False),
+        (residual and residual.errors, ERRORS_RATE * pace * rates.pose, False),
         (model.shading, rates.shading, False),
         (model.shadow, rates.shadow, False),
         (model.lamps, rates.shadow, False),

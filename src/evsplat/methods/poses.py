@@ -71,6 +71,10 @@ class Poses:
     track: BodyTrack
     correction: PoseCorrection | None = None
     """None where nothing is to be learned of poses."""
+    pace: float = 1.0
+    """Factor on the learning rate of the errors. A step of Adam is a share of the error expected,
+    and an error of ten degrees has to be found as exactly as one of one: with such steps poses that
+    were found from the video ended farther off than they began."""
 
 
 def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) -> Poses:
@@ -85,6 +89,8 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
         exact = source == "exact"
     joint_rad, root_m = _expected(config, track)
     told = track.errors is not None and not track.errors.typical and source != "exact"
+    # Errors that are found from pictures are small, and a run that goes on doesn't know them yet.
+    pace = _pace(joint_rad) if told or config.std_rad is not None else 1.0
     smooth = config.smooth == "always" or (config.smooth == "auto" and told)
     if smooth:
         track = _smoothed(track, joint_rad, root_m)
@@ -115,7 +121,13 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
         if track is not given:
             correction.smooth_to(given, track)
         correction.start_at(track, found.track)
-    return Poses(given, correction)
+    return Poses(given, correction, pace)
+
+
+def _pace(joint_rad: np.ndarray) -> float:
+    """1 up to the errors of poses of which nobody says how far they err; of larger ones less."""
+    moving = joint_rad[joint_rad > 0]
+    return min(1.0, UNKNOWN[0] / float(np.sqrt(np.square(moving).mean()))) if moving.size else 1.0
 
 
 def _smoothed(track: BodyTrack, joint_rad: np.ndarray, root_m: np.ndarray) -> BodyTrack:

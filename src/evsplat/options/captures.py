@@ -193,7 +193,7 @@ class PoseOptions:
     ] = None
     """Stature of the person, metres: it alone tells how far away they are."""
     refine_s: Annotated[
-        float | None, Within(0, 1e6), option("SECONDS", default="2 per frame", name="refine")
+        float | None, Within(0, 1e6), option("SECONDS", default="3 per frame", name="refine")
     ] = None
     """Time for their correction by drawing the person; 0: none."""
     use: Use = "training"

@@ -33,14 +33,14 @@ from evsplat.options.declare import given
 from evsplat.posing.fit import FocalFit, PoseFit, fit_focal, fit_landmarks
 from evsplat.posing.page import poses_page
 from evsplat.posing.problem import FitSettings
-from evsplat.posing.refine import Refined, refine
+from evsplat.posing.refine import FOUND_STEPS, Refined, refine
 from evsplat.posing.rig import Rig, default_rig, make_rig
 
 logger = logging.getLogger(__name__)
 
 _USUAL_FOCAL = 1.0
 """Focal length from which `--focal auto` begins, in longer sides of the pictures."""
-_FRAME_S = 2.0
+_FRAME_S = 3.0
 """Time for the refinement, per frame."""
 _BETAS = 10
 _QUARTERS = (0.25, 0.5, 0.75)
@@ -133,7 +133,7 @@ def find_poses(
         refined: Refined | None = None
         if limit_s > 0:
             with stages(bar, "refinement"):
-                refined = refine(track, seen, seconds=limit_s, progress=True)
+                refined = refine(track, seen, seconds=limit_s, progress=True, steps=FOUND_STEPS)
             track = refined.track if refined.better else track
     made = {
         "from": "key points of a file" if keypoints else "landmarks of BlazePose",

@@ -33,6 +33,8 @@ count as wrong. What discs cannot show of a person moves true motions: exact pos
 were explained up to 0.08 better, fitted ones of a real recording 0.15."""
 _LEAST_AXIS = 0.5
 _STEPS = (160, 140)
+FOUND_STEPS = (160, 320)
+"""Of motions that landmarks found, which are off by more than what most others tell."""
 _LAST_STEPS = 40
 """Steps in which pictures kept aside are explained as well, once they have judged."""
 _NEARER = 0.6
