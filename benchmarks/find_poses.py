@@ -126,8 +126,13 @@ def measure(
     return rows
 
 
-def write(capture: Capture, folder: Path, track: BodyTrack, fitted: PoseFit) -> None:
-    """A capture with found poses, and what they are expected to err by, in place of its own."""
+def write(
+    capture: Capture, folder: Path, track: BodyTrack, fitted: PoseFit, *, drawn: bool
+) -> None:
+    """A capture with found poses, and what they are expected to err by, in place of its own.
+
+    Of those that were corrected by drawing the person it says so, as that of `evsplat poses` does.
+    """
     assert track.errors is not None
     with derived_capture(capture, folder, replace=True) as making:
         making.set_body(
@@ -140,6 +145,8 @@ def write(capture: Capture, folder: Path, track: BodyTrack, fitted: PoseFit) -> 
             pose_std_rad=track.errors.joint_rad,
             transl_std_m=track.errors.root_m,
         )
+        if drawn:
+            making.document["provenance"] = {**capture.provenance, "poses": {"refinement": {}}}
 
 
 def pose_errors(capture: Capture, truth: BodyTrack, track: BodyTrack) -> dict:
