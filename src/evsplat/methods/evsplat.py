@@ -113,7 +113,7 @@ class DiscRates:
     shade: NotNegative = 1e-3
     """Network of what poses do to the person's brightness."""
     pose: NotNegative = 0.1
-    """Pose residuals, units of the errors expected."""
+    """Pose residuals, units of the errors expected; lower where these exceed 0.05 radians."""
     shading: Annotated[float, AtLeast(0), _SHADING] = 6e-3
     """Light on the person."""
     shadow: Annotated[float, AtLeast(0), _LAMPS] = 2e-2
