@@ -67,7 +67,7 @@ def write_state(path: Path, tensors: dict[str, Tensor], state: dict[str, Any]) -
     """Write tensors and state as `load_checkpoint` reads them, whole or not at all."""
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     # Not safetensors' save_file, which writes to a file of its own and leaves it behind where it is
-    # killed; nor its save, which makes the whole file in memory first, 170 MB of an hour's recording.
+    # killed; nor its save, which makes the whole file in memory first, 170 MB of an hour's.
     write_pieces(path, _pieces(kept, {"state": json.dumps(state)}))
 
 
