@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion, gaussian_filter
 from torch import Tensor
+from turned import drawn
 
 import evsplat as ev
 from evsplat.body.motion import load_motion
@@ -107,7 +108,7 @@ def figures(run: Run) -> Figures:
     values: dict[str, list[float]] = {}
     squares = dict.fromkeys(("all", "outline", "slow"), 0.0)
     for frame, mask in _held_out(run):
-        picture, truth = _drawn(run, frame), run.capture.sharp(frame)
+        picture, truth = drawn(run, frame), run.capture.sharp(frame)
         inside = torch.from_numpy(binary_erosion(mask.numpy(), iterations=OUTLINE_PX))
         found = chroma_psnr(picture, truth, mask)
         found["mask"] = float(psnr(picture, truth, mask=mask))
@@ -141,10 +142,6 @@ def _slow(error: Float[Tensor, "H W 2"], mask: Bool[Tensor, "H W"]) -> Float[Ten
     return torch.from_numpy(np.stack([plane / around for plane in planes], -1))
 
 
-def _drawn(run: Run, frame: Frame) -> Float[Tensor, "H W 3"]:
-    return run.reconstruction.render(run.capture.camera(frame), [frame.mid_us]).rgb[0].cpu()
-
-
 def _hues(picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     """The colour differences alone, 2.5 times as large, at one luma."""
     cb, cr = (2.5 * chroma(picture)).unbind(-1)
@@ -156,7 +153,7 @@ def shown(path: Path, runs: Sequence[Run]) -> None:
     held = [[frame for frame, _ in _held_out(run)] for run in runs]
     rows = []
     for frames in list(zip(*held, strict=True))[:: -(-len(held[0]) // SHOWN)]:
-        pictures = [_drawn(run, frame) for run, frame in zip(runs, frames, strict=True)]
+        pictures = [drawn(run, frame) for run, frame in zip(runs, frames, strict=True)]
         pictures.append(runs[0].capture.sharp(frames[0]))
         rows.append(torch.cat(pictures + [_hues(picture) for picture in pictures]))
     save_png(path, to_bytes(torch.cat(rows, 1).clamp(0, 1)))

@@ -119,7 +119,7 @@ def parts_of(
     if isinstance(model, discs_model.DiscModel):
         watched += [
             (model.shade, "forward", "shade by the pose"),
-            (discs_model, "skin", "blend skinning"),
+            (discs_model, "skin_with_linear", "blend skinning"),
             (model, "_light", "light on the person"),
             (model, "_lit", "shadow on the person"),
             (model, "_layers", "posing rest"),

@@ -76,10 +76,10 @@ def _cases(points: int, times: int) -> dict[str, tuple[Callable[[], object], flo
     }
     network = NonRigidNetwork(encoder.dim, last_layer_std=None)
     encoding = network.encoding
-    cases["encoding"] = (lambda: _step(network.encode(positions)), 0.0)
+    cases["encoding"] = (lambda: _step(encoding(0.5 * (positions + 1))), 0.0)
 
     def non_rigid() -> None:
-        out = network(network.encode(positions), pose)
+        out = network(encoding(0.5 * (positions + 1)), pose)
         _step(out.changes)
 
     products = 6 * points * encoding.dim * 128 + 2 * hidden + 6 * rows * 128 * 25

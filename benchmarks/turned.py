@@ -102,7 +102,7 @@ def figures(run: Run, frames: list[Frame], lpips: PerceptualMetric | None) -> di
 
 def drawn(run: Run, frame: Frame) -> torch.Tensor:
     """The picture at mid-exposure."""
-    return run.reconstruction.render(run.capture.camera(frame), [frame.mid_us]).rgb[0]
+    return run.reconstruction.render(run.capture.camera(frame), [frame.mid_us]).rgb[0].cpu()
 
 
 def measured(

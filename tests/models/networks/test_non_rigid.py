@@ -7,7 +7,7 @@ from evsplat.models.networks.non_rigid import NonRigid, NonRigidNetwork, OneBlob
 
 
 def _changes(network, positions, pose):
-    return network(network.encode(positions), pose)
+    return network(network.encoding(0.5 * (positions + 1)), pose)
 
 
 def test_start_changes_almost_nothing_unless_asked_for():

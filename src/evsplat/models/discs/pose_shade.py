@@ -1,12 +1,11 @@
 """What a pose does to the brightness of the person's surface: folds, muscles, hollows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack
-from evsplat.models.kept import Kept
 from evsplat.models.networks.body_box import BodyBox
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.networks.non_rigid import OneBlobEncoding
@@ -31,7 +30,6 @@ class PoseShade(BodyBox):
         self.code = PoseCode(track, times_us)
         self.encoding = OneBlobEncoding()
         self.network = PointMLP(self.encoding.dim, self.code.dim, 0, width, _DEPTH, 1, last_std=0.0)
-        self._encoded = Kept()
 
     def forward(
         self, means: Float[Tensor, "N 3"], rotations: Float[Tensor, "T J 3 3"]
@@ -40,8 +38,6 @@ class PoseShade(BodyBox):
 
         Neither gets a gradient: a colour must not be bought by moving or turning the body.
         """
-        places = means.detach()
-        encode: Callable[[], Tensor] = lambda: self.encoding(0.5 * (self.normalise(places) + 1))  # noqa: E731
-        code = self.code(rotations.detach())
-        logs: Tensor = self.network(self._encoded.of([means], encode), code)
+        places = self.encoded(means, self.encoding).detach()
+        logs: Tensor = self.network(places, self.code(rotations.detach()))
         return (_UNIT * logs).exp()

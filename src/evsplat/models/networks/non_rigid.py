@@ -1,6 +1,5 @@
 """Non-rigid change of canonical Gaussians by the pose: clothes and muscles (paper eq. 1)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,6 @@ from torch.autograd.function import once_differentiable
 from evsplat.body import Body
 from evsplat.compiled import native, runs_native
 from evsplat.devices import send
-from evsplat.models.kept import Kept
 from evsplat.models.networks.body_box import BodyBox
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.networks.pose_encoder import PoseEncoder, normalise_joints
@@ -233,13 +231,8 @@ class NonRigidNetwork(nn.Module):
             last_std=last_layer_std,
         )
 
-    def encode(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N D"]:
-        """What the network is told of points at normalised positions in [-1, 1]."""
-        encoded: Tensor = self.encoding(0.5 * (positions + 1))
-        return encoded
-
     def forward(self, encoded: Float[Tensor, "N D"], pose: Float[Tensor, "T P"]) -> NonRigid:
-        """Deformation of encoded points under each pose."""
+        """Deformation of points, encoded by its `encoding`, under each pose."""
         return NonRigid(self.mlp(encoded, pose))
 
 
@@ -264,7 +257,6 @@ class PoseDeformation(BodyBox):
             feature_dim=feature_dim,
             last_layer_std=last_std,
         )
-        self._encoded = Kept()
 
     def inside_box(self, positions: Float[Tensor, "N 3"]) -> Tensor:
         """Mask (N,) of positions, canonical metres, inside that box."""
@@ -278,8 +270,8 @@ class PoseDeformation(BodyBox):
         rotations: Float[Tensor, "T J 3 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Centres, scales (metres), quaternions and colour feature under each pose, T leading."""
-        encode: Callable[[], Tensor] = lambda: self.network.encode(self.normalise(means))  # noqa: E731
-        changes = self.network(self._encoded.of([means], encode), self.pose_encoder(rotations))
+        places = self.encoded(means, self.network.encoding)
+        changes = self.network(places, self.pose_encoder(rotations))
         return changes.shape(means, scales_log, quaternions)
 
 
