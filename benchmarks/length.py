@@ -1,10 +1,11 @@
 """Memory and start of a run by the length of its recording: 20 steps after 1, 10 and 60 minutes.
 
-    python benchmarks/length.py [--minutes 1 10 60] [--steps 20] [--visit 2500] [--keep 50]
+    python benchmarks/length.py [--minutes 1 10 60] [--steps 20] [--visit 2500] [--events 54e6]
         [--erring]
 
-The recording is the demo capture again and again, with every ``--keep``-th of its events: 54
-million an hour at 50. It is written in pieces, and each training runs in a process of its own, so
+The recording is the demo capture again and again, with one of so many of its events that at most
+``--events`` are left: about as many at every length, so that what is kept of them decoded is full
+at each. It is written in pieces, and each training runs in a process of its own, so
 that its peak memory is its own: Python and PyTorch are about 300 MB of it, the model the same
 at every length. Beside the steps the pictures, silhouettes and events of up to ``--visit`` training
 frames are read, evenly spread, which fills every cache as a long training does. With ``--erring``
@@ -46,7 +47,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, nargs="+", default=[1.0, 10.0, 60.0])
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--visit", type=int, default=2_500, metavar="N", help="frames")
-    parser.add_argument("--keep", type=int, default=50, metavar="N", help="one event in N")
+    parser.add_argument("--events", type=float, default=54e6, metavar="N", help="at most")
     parser.add_argument("--erring", action="store_true", help="poses that err, and say so")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
@@ -59,7 +60,9 @@ def main() -> None:
     for minutes in options.minutes:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "capture"
-            frames, events = write_recording(path, minutes, options.keep, erring=options.erring)
+            frames, events = write_recording(
+                path, minutes, int(options.events), erring=options.erring
+            )
             command = [sys.executable, __file__, "--run", str(path)]
             for name in ("steps", "visit", "threads"):
                 command += [f"--{name}", str(getattr(options, name))]
@@ -113,9 +116,9 @@ def fill_caches(trainer: Trainer, visited: int) -> None:
 
 
 def write_recording(
-    folder: Path, minutes: float, keep: int, *, erring: bool = False
+    folder: Path, minutes: float, most: int, *, erring: bool = False
 ) -> tuple[int, int]:
-    """The demo capture in a row for so long, one event in ``keep``; how many frames and events."""
+    """The demo capture again and again for so long, thinned to ``most`` events; what there is."""
     shutil.copytree(demo_capture(), folder)
     metadata = json.loads((folder / "capture.json").read_text())
     frames, metadata["novel_views"] = metadata["frames"], []
@@ -147,15 +150,17 @@ def write_recording(
         body["pose_std_rad"] = np.full((keys, joints), 0.03, np.float32)
         body["transl_std_m"] = np.full((keys, 3), 0.01, np.float32)
     np.savez(folder / "body.npz", **body)
-    return len(metadata["frames"]), _write_events(folder / "events.h5", period, turns, keep)
+    return len(metadata["frames"]), _write_events(folder / "events.h5", period, turns, most)
 
 
-def _write_events(path: Path, period_us: int, turns: int, keep: int) -> int:
+def _write_events(path: Path, period_us: int, turns: int, most: int) -> int:
     """The file's events, thinned, ``turns`` times in a row, in its place; gives their number."""
     with h5py.File(path, "r") as file:
         events = {name: file["events"][name][:] for name in "txyp"}
         offset = int(file["t_offset"][()])
-    events = {name: values[events["t"] < period_us][::keep] for name, values in events.items()}
+    events = {name: values[events["t"] < period_us] for name, values in events.items()}
+    keep = max(1, -(-turns * len(events["t"]) // most))
+    events = {name: values[::keep] for name, values in events.items()}
     count, ms = len(events["t"]), np.arange(turns * period_us // 1000 + 2)
     path.unlink()
     with h5py.File(path, "w") as file:

@@ -70,8 +70,8 @@ def test_angular_velocity_and_acceleration_are_continuous_at_the_keys():
         length = float(track._seconds[knot] - track._seconds[knot - 1])
 
         def path(interval, offsets):
-            c3, c2, c1, c0 = starts[interval].unbind(1)
-            values = [(((c3 * h + c2) * h + c1) * h + c0).numpy() for h in offsets]
+            c3, c2, c1 = starts[interval].unbind(1)
+            values = [(((c3 * h + c2) * h + c1) * h).numpy() for h in offsets]
             base = Rotation.from_rotvec(poses[interval])
             return [base * Rotation.from_rotvec(value) for value in values]
 

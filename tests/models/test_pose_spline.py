@@ -116,4 +116,38 @@ def test_between_many_keys_it_is_the_spline_through_all_of_them(seed):
     assert np.abs(found - expected).max() < 1e-4
     assert np.abs(spline.weights(keys.tolist()).double().numpy() @ values).max() < 1e-4
     # Bytes in proportion to the keys, where all weights of all pieces would be a million.
-    assert spline.held.numel() < 1_000 * 4 * 250
+    assert spline.slopes.numel() < 1_000 * 250
+
+
+def test_in_parts_it_is_the_same_and_only_those_near_have_a_gradient(monkeypatch):
+    rng = np.random.default_rng(0)
+    keys = np.cumsum(rng.integers(30_000, 60_000, 300))
+    span = int(keys[0]), int(keys[-1])
+    whole = PoseSpline(span, 22_000.0, 4, held_us=keys.tolist())
+    monkeypatch.setattr("evsplat.models.pose_spline._DENSE", 50)
+    monkeypatch.setattr("evsplat.models.pose_spline._APART", 64)
+    parts = PoseSpline(span, 22_000.0, 4, held_us=keys.tolist())
+    times = (keys[150] + rng.integers(0, 40_000, 9)).tolist()
+    assert parts.still_zero(times) and not whole.still_zero(times)
+    with torch.no_grad():
+        for mine, theirs in zip(parts.whole(), whole.whole(), strict=True):
+            theirs.normal_()
+            assert mine.shape == theirs.shape
+        for mine, theirs in (
+            (parts.rotations, whole.rotations),
+            (parts.translations, whole.translations),
+        ):
+            for part, values in zip(mine, theirs.split(64), strict=True):
+                part.copy_(values)
+    assert not parts.still_zero(times)
+    turns, shifts = parts.values(times)
+    expected_turns, expected_shifts = whole.values(times)
+    torch.testing.assert_close(turns, expected_turns, rtol=0, atol=1e-6)
+    torch.testing.assert_close(shifts, expected_shifts, rtol=0, atol=1e-6)
+    upstream = torch.from_numpy(rng.normal(size=turns.shape)).float()
+    (turns * upstream).sum().backward()
+    (expected_turns * upstream).sum().backward()
+    met = [part.grad is not None for part in parts.rotations]
+    assert 0 < sum(met) <= 3 < len(met)
+    found = [torch.zeros_like(p) if p.grad is None else p.grad for p in parts.rotations]
+    torch.testing.assert_close(torch.cat(found), whole.rotations.grad, rtol=0, atol=1e-6)

@@ -44,7 +44,11 @@ class BodyTrack:
         camera_up: Float[Tensor, "3"] | None = None,
     ) -> None:
         times = np.asarray(times_us, dtype=np.int64)
-        poses = np.asarray(poses, dtype=np.float64)
+        # As they are given: an hour's are kept once, in the file's float32.
+        self._poses = np.asarray(poses)
+        if self._poses.dtype != np.float32:
+            self._poses = self._poses.astype(np.float64, copy=False)
+        poses = self.poses
         transl = np.asarray(transl, dtype=np.float64)
         _check(body, times, poses, transl, source)
         if errors is not None:
@@ -56,13 +60,21 @@ class BodyTrack:
         """Mean of the unit vectors in the world that lie upwards in the pictures of the cameras
         that recorded the body; None where none did."""
         self.times_us = times
-        self.poses, self.transl = poses, transl
+        self.transl = transl
         seconds = (times - times[0]) * 1e-6
         # On the host, since a GPU would take a launch per operation for a few hundred numbers.
         # Those of an hour are many: turns are float32, which errs by less than 1e-6 rad.
         self._seconds = torch.from_numpy(seconds)
-        turns, places = _polynomials(seconds, poses, transl)
+        moving = (poses != poses[:1]).any((0, 2))
+        turns, places = _polynomials(seconds, poses[:, moving], transl)
+        self._moving = torch.from_numpy(np.flatnonzero(moving))
+        """Joints that turn at all; the others' turns are not kept."""
         self._turns, self._places = torch.from_numpy(turns), torch.from_numpy(places)
+
+    @property
+    def poses(self) -> Float[np.ndarray, "P J 3"]:
+        """Key poses, axis-angle, float64."""
+        return self._poses.astype(np.float64, copy=False)
 
     def to(self, device: torch.device | str) -> "BodyTrack":
         """The same track, whose poses are for ``device``."""
@@ -93,10 +105,16 @@ class BodyTrack:
         index = torch.searchsorted(self._seconds, seconds, right=True) - 1
         index = index.clamp(0, len(self._places) - 1)
         step = seconds - self._seconds[index]
-        turned = _at_step(self._turns[index], step[:, None, None])
-        turns = torch.stack([torch.from_numpy(self.poses)[index], turned])
-        key, since = axis_angle_to_matrix(turns)
-        return (key @ since).float(), _at_step(self._places[index], step[:, None]).float()
+        c3, c2, c1 = self._turns[index].unbind(-2)
+        since_s = step[:, None, None]
+        poses = torch.from_numpy(self._poses)[index].double()
+        turned = torch.zeros_like(poses)
+        turned[:, self._moving] = ((c3 * since_s + c2) * since_s + c1) * since_s
+        key, since = axis_angle_to_matrix(torch.stack([poses, turned]))
+        c3, c2, c1, c0 = self._places[index].unbind(-2)
+        since_s = step[:, None]
+        places = ((c3 * since_s + c2) * since_s + c1) * since_s + c0
+        return (key @ since).float(), places.float()
 
     def bones(self, times_us: Int[Tensor, "T"] | Sequence[int]) -> Float[Tensor, "T J 4 4"]:
         """Bone transforms, canonical pose to world, at the given times."""
@@ -134,23 +152,17 @@ def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
     return up
 
 
-def _at_step(coefficients: Float[Tensor, "*T 4 3"], step: Float[Tensor, "*T 1"]) -> Tensor:
-    """Cubic polynomials, the highest power first."""
-    c3, c2, c1, c0 = coefficients.unbind(-2)
-    return ((c3 * step + c2) * step + c1) * step + c0
-
-
 def _polynomials(
     seconds: Float[np.ndarray, "P"],
     poses: Float[np.ndarray, "P J 3"],
     transl: Float[np.ndarray, "P 3"],
-) -> tuple[Float[np.ndarray, "I J 4 3"], Float[np.ndarray, "I 4 3"]]:
+) -> tuple[Float[np.ndarray, "I J 3 3"], Float[np.ndarray, "I 4 3"]]:
     """Cubic coefficients (highest first) of each interval: of turns since its start, and of places.
 
-    Turns are float32.
+    Turns are float32, without the constant, which is zero.
     """
     count, joints = poses.shape[:2]
-    turns = np.zeros((max(1, count - 1), joints, 4, 3), np.float32)
+    turns = np.zeros((max(1, count - 1), joints, 3, 3), np.float32)
     if count == 1:
         places = np.zeros((1, 4, 3))
         places[0, -1] = transl[0]
@@ -158,7 +170,7 @@ def _polynomials(
     for joint in range(joints):
         rotations = Rotation.from_rotvec(poses[:, joint])
         coefficients = RotationSpline(seconds, rotations).interpolator.c
-        turns[:, joint] = coefficients.transpose(1, 0, 2)
+        turns[:, joint] = coefficients[:3].transpose(1, 0, 2)
     return turns, np.ascontiguousarray(CubicSpline(seconds, transl).c.transpose(1, 0, 2))
 
 

@@ -42,7 +42,7 @@ def load_body_track(capture: Capture | TrainingCapture, *, dense: bool = False) 
     return BodyTrack(
         body,
         file.times_us,
-        poses[:, order],
+        poses if order == list(range(len(order))) else poses[:, order],
         file.transl,
         source=str(file.path),
         errors=errors,

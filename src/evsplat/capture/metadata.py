@@ -13,7 +13,7 @@ from evsplat.capture.distortion import Distortion
 from evsplat.pictures.light import Transfer
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)  # an hour has 45,000
 class Frame:
     """One blurry picture and what goes with it."""
 

@@ -233,6 +233,7 @@ class _Parser:
         frames = []
         for index, value in enumerate(entries):
             frame = self.frame(index, value, cameras)
+            entries[index] = None  # an hour's are 25 MB, whose room the frames can take
             if frame is not None:
                 frames.append(frame)
         self.check_frames(frames)

@@ -59,7 +59,6 @@ class TrainingCapture:
         self.name: str = source.name
         self.frames: tuple[Frame, ...] = tuple(self._redacted(f) for f in self._source.frames)
         """All frames in order; of those held out only name, camera and times mean anything."""
-        self._by_name = {frame.name: frame for frame in self.frames}
 
     def __repr__(self) -> str:
         return f"TrainingCapture({str(self.path)!r}, {self.policy})"
@@ -86,9 +85,7 @@ class TrainingCapture:
 
     def frame(self, name: str) -> Frame:
         """The frame of that name."""
-        if name not in self._by_name:
-            raise DataError(f"{self.path}: no frame is named {name!r}.")
-        return self._by_name[name]
+        return self.frames[self._source.frame(name).index]
 
     def neighbours(self, frame: Frame) -> tuple[Frame, ...]:
         """The frames in order of time about a training frame, up to the next held-out ones."""
@@ -163,7 +160,7 @@ class TrainingCapture:
         """Whether `evsplat poses` tried to correct what it had found by drawing the person."""
         return self._source.poses_refined
 
-    @functools.cached_property
+    @property
     def body_file(self) -> BodyFile:
         """The body with the key poses that are seen.
 
@@ -199,7 +196,10 @@ class TrainingCapture:
 
     def _redacted(self, frame: Frame) -> Frame:
         given = frame.split == "train" and self.policy.masks == "given"
-        return replace(frame, sharp=None, mask=frame.mask if given else None)
+        mask = frame.mask if given else None
+        if frame.sharp is None and frame.mask is mask:
+            return frame
+        return replace(frame, sharp=None, mask=mask)
 
     def _name(self, frame: Frame | str) -> str:
         return frame if isinstance(frame, str) else frame.name

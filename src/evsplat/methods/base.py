@@ -1,6 +1,6 @@
 """Contract of a method: a configuration, and what it is put together to for one capture."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Literal, Protocol
@@ -105,7 +105,7 @@ def body_frames(track: BodyTrack, times_us: Sequence[int]) -> BodyFrames:
 
 def semantic_bounds(
     capture: TrainingCapture, track: BodyTrack, band_px_at_256: float
-) -> dict[int, Callable[[], PackedBounds]]:
+) -> Mapping[int, Callable[[], PackedBounds]]:
     """Places of the person by the posed body, for each training frame's mid-exposure.
 
     ``band_px_at_256``: width of the undecided band around it, for a picture 256 pixels high. They
@@ -122,4 +122,24 @@ def semantic_bounds(
         band = max(1, round(band_px_at_256 * camera.height / 256))
         return PackedBounds.of(mask.numpy(), band)
 
-    return {frame.mid_us: partial(found, frame) for frame in frames}
+    return _ByTime({frame.mid_us: frame for frame in frames}, found)
+
+
+@dataclass(frozen=True)
+class _ByTime(Mapping[int, Callable[[], PackedBounds]]):
+    """What finds a frame's bounds, by its time; made when it is asked for, an hour having many."""
+
+    frames: dict[int, Frame]
+    found: Callable[[Frame], PackedBounds]
+
+    def __getitem__(self, time_us: int) -> Callable[[], PackedBounds]:
+        return partial(self.found, self.frames[time_us])
+
+    def __contains__(self, time_us: object) -> bool:
+        return time_us in self.frames
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.frames)
+
+    def __len__(self) -> int:
+        return len(self.frames)

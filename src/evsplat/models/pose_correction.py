@@ -134,7 +134,8 @@ class PoseCorrection(nn.Module):
                 price = price + share * self._price(spline, keys, moving)
         elif self.between is not None:
             middles = ((keys[1:] + keys[:-1]) / 2).floor()
-            price = self._price(self.between, middles, self.between_rad > 0)
+            if not self.between.still_zero(middles):
+                price = self._price(self.between, middles, self.between_rad > 0)
         return price
 
     def unlikeliness(self) -> Float[Tensor, ""]:
@@ -143,10 +144,8 @@ class PoseCorrection(nn.Module):
         Twice the negative logarithm of how likely they are before anything was seen.
         """
         moving = (self.joint_rad > 0).any(0)[:, None]
-        squares = [
-            (spline.rotations * moving).square().sum() + spline.translations.square().sum()
-            for _, spline in self._errors()
-        ]
+        points = [spline.whole() for _, spline in self._errors()]
+        squares = [(turns * moving).square().sum() + s.square().sum() for turns, s in points]
         return torch.stack(squares).sum()
 
     @staticmethod
@@ -217,8 +216,7 @@ class PoseCorrection(nn.Module):
     def forget(self) -> None:
         """Set all residuals to zero."""
         with torch.no_grad():
-            smoothing = self.smoothing.rotations, self.smoothing.translations
-            for value in (*self.parameters(), *smoothing):
+            for value in (*self.parameters(), *self.smoothing.whole()):
                 value.zero_()
 
 
@@ -226,8 +224,9 @@ class PoseCorrection(nn.Module):
 def _set(spline: PoseSpline, values: Float[np.ndarray, "K C"]) -> None:
     """Control points: turns of the joints and, in the last three columns, shifts."""
     found = torch.from_numpy(values.astype(np.float32))
-    spline.rotations.copy_(found[:, :-3].view_as(spline.rotations))
-    spline.translations.copy_(found[:, -3:])
+    rotations, translations = spline.whole()
+    rotations.copy_(found[:, :-3].view_as(rotations))
+    translations.copy_(found[:, -3:])
 
 
 def _apart(

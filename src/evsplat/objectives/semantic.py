@@ -1,6 +1,6 @@
 """Teaches the semantic attribute where the person is, without any mask (A8)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,7 +102,7 @@ class RenderedSemantics(Objective):
 
     def __init__(
         self,
-        bounds: dict[int, Callable[[], PackedBounds]],
+        bounds: Mapping[int, Callable[[], PackedBounds]],
     ) -> None:
         """``bounds`` of the posed body, by mid-exposure (microseconds) of the training frames."""
         self.bounds = bounds

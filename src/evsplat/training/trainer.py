@@ -118,7 +118,7 @@ class Trainer:
         # The host knows that the step is sound, or a GPU will know it.
         if_sound = None if self.bad.at_once else sound
         self.optimiser.step(nominal, if_sound)
-        self._count(step.drawing, if_sound)
+        self._count(step.drawing, nominal, if_sound)
         self._edit(nominal)
         self._learn_held_out(nominal)
         drawn = step.drawing.rgb[step.index(frame.mid_us)].detach()
@@ -166,7 +166,7 @@ class Trainer:
         terms = held_out.objective.loss(step)
         if terms:
             loss = self._weighted(terms, nominal)
-            gradients = torch.autograd.grad(loss, held_out.parameters)
+            gradients = torch.autograd.grad(loss, held_out.parameters, allow_unused=True)
             self.optimiser.step_only(held_out.parameters, gradients)
 
     def counts(self) -> dict[str, int]:
@@ -240,15 +240,19 @@ class Trainer:
             objective.prefetch(frames[self.queue[-1]], self.clock.nominal, self.data)
         return frame
 
-    def _count(self, drawing: Drawing, if_sound: Tensor | None) -> None:
-        """Add the step to the statistics, nothing where ``if_sound`` is false."""
+    def _count(self, drawing: Drawing, nominal: float, if_sound: Tensor | None) -> None:
+        """Add the step to the statistics of those that will be densified yet.
+
+        Nothing where ``if_sound`` is false.
+        """
+        limits = self.composition.densify
         height, width = drawing.output.alpha.shape[1:]
         gradients = drawing.center_gradients()
         radii = drawing.radii()
         for name, rows in self.model.sets.items():
             for part, gradient, radius in zip(PARTS, gradients, radii, strict=True):
                 place = rows.rows_of(part)
-                if place.start == place.stop:
+                if place.start == place.stop or part not in limits or nominal >= limits[part].end:
                     continue
                 if if_sound is not None:
                     radius = radius.masked_fill(~if_sound, 0)  # nothing is drawn

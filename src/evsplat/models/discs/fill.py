@@ -73,7 +73,8 @@ def filled(
         normals = model.surface.normals(gaussians.means[rows])
         bones = model.surface.weights(gaussians.means[rows])
     views = _views(model, capture, normals)
-    new = copy.deepcopy(model)
+    # An hour's motion is large, and no colour changes it.
+    new = copy.deepcopy(model, {id(part): part for part in (model.track, model.residual)})
     names = [f"gaussians.{gaussians.colour}"]
     if new.shading is not None:
         _dim(new, views)

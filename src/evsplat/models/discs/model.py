@@ -38,6 +38,8 @@ CASTERS = 400
 """Points of the body that hide lights."""
 _PLACES_REFRESH = 8
 """Steps after which the places that shadows fall on are drawn anew."""
+_TIMES_AT_ONCE = 1_024
+"""Of the recorded poses, whose places alone are kept."""
 _RELIEF_START = 500.0
 """Nominal iteration from which shadows tell where the scene lies; lamps need to be found first."""
 _DIRECTION_DROPOUT = 0.5
@@ -101,7 +103,8 @@ class DiscModel(PosedModel):
         """Learned properties of the event camera, set by a method that learns any."""
         generator = torch.Generator().manual_seed(0)
         self.surface = NearestSurface(body.sample_surface(NORMAL_SAMPLES, generator))
-        roots = track.at(torch.as_tensor(list(frame_times_us)))[1] + body.rest_joints[0]
+        times = torch.as_tensor(list(frame_times_us)).split(_TIMES_AT_ONCE)
+        roots = torch.cat([track.at(some)[1] for some in times]) + body.rest_joints[0]
         middle = roots.mean(0).float()
         self.places = ScenePlaces(_PLACES_REFRESH)
         self.lamps: Lamps | None = None

@@ -14,6 +14,9 @@ _LEAST_SPREAD = 0.1
 """Of the matrices' entries along a direction: as much as training adds to them in noise. What
 varies less is not made larger."""
 
+_MOST_POSES = 4_096
+"""That are looked at."""
+
 
 class PoseCode(nn.Module):
     """Local joint rotations along the principal components of a recording's, in their spreads.
@@ -33,7 +36,9 @@ class PoseCode(nn.Module):
         """``times_us``: of the poses that count, the training frames'."""
         super().__init__()
         self.dim = COMPONENTS
-        entries = _entries(track.at(torch.as_tensor(list(times_us)))[0]).double().cpu()
+        # Of more than `_MOST_POSES` some stand for all.
+        times = torch.as_tensor(list(times_us)[:: -(-len(times_us) // _MOST_POSES)])
+        entries = _entries(track.at(times)[0]).double().cpu()
         middle = entries.mean(0)
         _, sizes, rows = torch.linalg.svd(entries - middle, full_matrices=False)
         kept = min(COMPONENTS, len(sizes))
