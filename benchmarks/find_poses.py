@@ -118,7 +118,8 @@ def measure(
         tracks[f"{stage}, refined"] = better.track
     if out is not None:
         for name, one in tracks.items():
-            write(capture, out / f"{capture.name}_{name.replace(', ', '_')}", one, fitted)
+            folder = out / f"{capture.name}_{name.replace(', ', '_')}"
+            write(capture, folder, one, fitted, drawn="refined" in name)
     for row in rows:
         row["capture"] = capture.name
         shown = {k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}
