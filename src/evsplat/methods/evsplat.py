@@ -55,6 +55,7 @@ from evsplat.models.discs import DiscModel
 from evsplat.models.discs.fill import filled
 from evsplat.models.discs.first_colours import first_colours
 from evsplat.objectives import (
+    DeformationPrior,
     EventChange,
     EventNoise,
     EventSensor,
@@ -87,6 +88,10 @@ CHROMA_WEIGHT = 1.6
 """Weight of the mean absolute difference of Cb and Cr to the blurry frame, twice that of sRGB."""
 RELIEF_WEIGHT = 3e-3
 """Weight of the roughness of the scene's relief."""
+DEFORMATION_WEIGHT = 3e-3
+"""Weight of the mean square of what the person's shape changes by, in centimetres."""
+DEFORMATION_START = 1_500
+"""Nominal iteration from which it changes."""
 ERRORS_RATE = 0.3
 """Learning rate of the poses' errors as a share of that of the motion between exact key poses:
 three splines add up to them, and all move at once."""
@@ -112,6 +117,8 @@ class DiscRates:
     """Colours before the sigmoid."""
     shade: NotNegative = 1e-3
     """Network of what poses do to the person's brightness."""
+    deformation: NotNegative = 0.05
+    """What the person's shape changes by in time, centimetres; 0 = nothing."""
     pose: NotNegative = 0.1
     """Pose residuals, units of the errors expected; lower where these exceed 0.05 radians."""
     shading: Annotated[float, AtLeast(0), _SHADING] = 6e-3
@@ -257,6 +264,7 @@ def build(
         camera=None if config.scene.kind == "random_cube" else capture.camera(frames[0]),
         residual=poses.correction,
         residual_start=config.pose.start,
+        deformation_start=DEFORMATION_START if config.rates.deformation else float("inf"),
     ).to(device)
     if fit:
         _fit_colours(config, capture, model, background)
@@ -272,6 +280,8 @@ def build(
     ]
     if poses.correction is not None:
         objectives.append(PosePrior())
+    if config.rates.deformation:
+        objectives.append(DeformationPrior())
     if model.relief is not None:
         objectives.append(ReliefPrior())
     windows = None
@@ -295,6 +305,7 @@ def build(
             "binarise": config.binarise_weight,
             "pose_prior": config.pose.prior,
             "relief": RELIEF_WEIGHT,
+            "deformation": DEFORMATION_WEIGHT,
             "event": config.event_weight,
             "contrast": config.contrast_weight,
         },
@@ -374,6 +385,7 @@ def _learning(rates: DiscRates, model: DiscModel, pace: float) -> Learning:
     residual = model.residual
     parts = (
         (model.shade, rates.shade, True),
+        (model.deformation, rates.deformation, False),
         (model.scene_colour, SCENE_NETWORK_RATE, True),
         (residual and residual.between, rates.pose, False),
         (residual and residual.errors, ERRORS_RATE * pace * rates.pose, False),

@@ -7,11 +7,12 @@ from evsplat.objectives.event_windows import EventWindows, HeldOutWindows
 from evsplat.objectives.exposure import Exposure, motion_px, renders_for
 from evsplat.objectives.isometry import Isometry
 from evsplat.objectives.photometric import Alpha, Photometric
-from evsplat.objectives.priors import PosePrior, ReliefPrior, SkinningPrior
+from evsplat.objectives.priors import DeformationPrior, PosePrior, ReliefPrior, SkinningPrior
 from evsplat.objectives.semantic import PackedBounds, RenderedSemantics
 
 __all__ = [
     "Alpha",
+    "DeformationPrior",
     "EventChange",
     "EventNoise",
     "EventSensor",

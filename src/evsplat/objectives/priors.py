@@ -29,6 +29,14 @@ class ReliefPrior(Objective):
         return {"relief": step.model.relief.price()}
 
 
+class DeformationPrior(Objective):
+    """How far the person's shape changes in time."""
+
+    def loss(self, step: Step[DiscModel]) -> dict[str, Tensor]:
+        """``deformation``: see `Deformation.price`."""
+        return {"deformation": step.model.deformation.price()}
+
+
 class SkinningPrior(Objective):
     """Mean over surface points of the squared weight error, summed over joints (1.6)."""
 

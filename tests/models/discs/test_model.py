@@ -35,6 +35,7 @@ def activate(model) -> None:
         if model.residual is not None:
             for values in model.residual.parameters():
                 values.normal_(std=0.1)
+        model.deformation.handles.normal_()
 
 
 def fields(splats) -> dict[str, torch.Tensor]:
@@ -47,6 +48,12 @@ def nearest_weights(model) -> torch.Tensor:
     canonical = model.gaussians.means[model.gaussians.human].detach()
     samples = model.surface.surface
     return samples.weights[torch.cdist(canonical, samples.points).argmin(1)]
+
+
+def deformed(model, times) -> torch.Tensor:
+    """Canonical centres at given times."""
+    canonical = model.gaussians.means[model.gaussians.human].detach()
+    return canonical + model.deformation(model.surface.at(canonical), times).detach()
 
 
 def test_a_disc_is_fifteen_floats(tiny_capture):
@@ -66,7 +73,7 @@ def test_a_disc_on_the_body_has_its_own_colour_and_the_shade_of_the_pose(tiny_ca
     canonical = gaussians.means[gaussians.human].detach()
     weights = nearest_weights(model)
     rotations, bones = model.pose(times)
-    expected, _ = skin(canonical[None], weights, bones)
+    expected, _ = skin(deformed(model, times), weights, bones)
     assert torch.allclose(layers.human.means, expected, atol=1e-5)
     assert torch.equal(layers.human.scales[0], gaussians.scales_log[gaussians.human].exp())
     assert torch.equal(layers.human.quaternions[0], gaussians.quaternions[gaussians.human])
@@ -78,13 +85,22 @@ def test_a_disc_on_the_body_has_its_own_colour_and_the_shade_of_the_pose(tiny_ca
     assert torch.equal(layers.scene.channels[0, :, :3], colours)
     assert torch.equal(layers.scene.means[0], gaussians.means[gaussians.scene])
     names = {name.partition(".")[0] for name, _ in model.named_parameters()}
-    assert names == {"gaussians", "shade", "residual", "lamps", "shadow", "sensor", "relief"}
+    assert names == {
+        "gaussians",
+        "deformation",
+        "shade",
+        "residual",
+        "lamps",
+        "shadow",
+        "sensor",
+        "relief",
+    }
 
 
-def test_the_person_is_blend_skinned_and_has_no_shade_before_that_starts(tiny_capture):
+def test_the_person_is_blend_skinned_and_has_no_shade_before_more_starts(tiny_capture):
     model, _, times, center = model_of(tiny_capture(), "shading=false")
     activate(model)
-    model.nominal.fill_(2_999.0)
+    model.nominal.fill_(1_499.0)
     layers = model.at(times, center)
     canonical = model.gaussians.means[model.gaussians.human]
     expected, transforms = skin(canonical[None], nearest_weights(model), model.pose(times)[1])
@@ -93,6 +109,19 @@ def test_the_person_is_blend_skinned_and_has_no_shade_before_that_starts(tiny_ca
     assert torch.equal(layers.human.linear, layers.transforms[..., :3, :3])
     colours = model.gaussians.colour_logits[model.gaussians.human].sigmoid()
     assert torch.equal(layers.human.channels[..., :3], colours.expand(len(times), -1, -1))
+
+
+def test_shape_that_times_give_belongs_to_no_other_motion(tiny_capture):
+    model, _, times, center = model_of(tiny_capture(), "shading=false")
+    activate(model)
+    other = model.following(model.track)
+    expected, _ = skin(
+        model.gaussians.means[model.gaussians.human][None],
+        nearest_weights(model),
+        model.track.bones(times),
+    )
+    assert torch.allclose(other.at(times, center).human.means, expected, atol=1e-5)
+    assert not torch.allclose(model.at(times, center).human.means, expected, atol=1e-3)
 
 
 def test_times_do_not_see_each_other(tiny_capture):
@@ -202,7 +231,8 @@ def test_a_training_step_shades_by_the_pose_at_the_middle_of_its_frame(tiny_capt
         step = model.training_drawing(times, frame, capture.camera(frame), generator).layers
         each = model.at(times, center)
         shade = model.shade(canonical, model.pose([frame.mid_us])[0])
-        expected, _ = skin(canonical[None], nearest_weights(model), model.pose(times)[1])
+        placed = deformed(model, [frame.mid_us]).expand(len(times), -1, -1)
+        expected, _ = skin(placed, nearest_weights(model), model.pose(times)[1])
     shown = step.human.channels[..., :3].expand(3, -1, -1)
     assert torch.allclose(shown, (logits.sigmoid() * shade).expand(3, -1, -1), atol=1e-6)
     assert torch.allclose(step.human.means, expected, atol=1e-5)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from evsplat.body import BodyTrack, skin_with_linear, up_axis
 from evsplat.capture import Camera, Frame
 from evsplat.gaussians import GaussianSet
+from evsplat.models.discs.deformation import Deformation
 from evsplat.models.discs.pose_shade import PoseShade
 from evsplat.models.discs.relief import Relief
 from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
@@ -78,6 +79,7 @@ class DiscModel(PosedModel):
         camera: Camera | None = None,
         residual: PoseCorrection | None = None,
         residual_start: float = 0.0,
+        deformation_start: float = 0.0,
     ) -> None:
         """Start at ``gaussians``, whose colours are their own.
 
@@ -90,6 +92,7 @@ class DiscModel(PosedModel):
         ``frame_times_us``: mid-exposures of the training frames, for where the person goes.
         ``width`` of the network of `PoseShade`, used from nominal iteration ``shade_start`` on.
         ``pose_noise``: standard deviation of what training adds to the matrices that it sees.
+        ``deformation_start``: nominal iteration from which the person's shape changes in time.
         """
         super().__init__(track)
         body = track.body
@@ -102,7 +105,10 @@ class DiscModel(PosedModel):
         self.sensor: nn.Module | None = None
         """Learned properties of the event camera, set by a method that learns any."""
         generator = torch.Generator().manual_seed(0)
-        self.surface = NearestSurface(body.sample_surface(NORMAL_SAMPLES, generator))
+        surface = body.sample_surface(NORMAL_SAMPLES, generator)
+        self.surface = NearestSurface(surface)
+        self.deformation_start = deformation_start
+        self.deformation = Deformation(frame_times_us, surface)
         times = torch.as_tensor(list(frame_times_us)).split(_TIMES_AT_ONCE)
         roots = torch.cat([track.at(some)[1] for some in times]) + body.rest_joints[0]
         middle = roots.mean(0).float()
@@ -157,7 +163,10 @@ class DiscModel(PosedModel):
         """All Gaussians in world space; own colours are the same for every camera."""
         rotations, bones = self.pose(times_us)
         view = _View(camera_center)
-        return self._layers(bones, rotations, slice(None), view, hard_semantics=hard_semantics)
+        offsets = self._offsets(times_us)
+        return self._layers(
+            bones, rotations, offsets, slice(None), view, hard_semantics=hard_semantics
+        )
 
     def training_drawing(
         self,
@@ -168,8 +177,9 @@ class DiscModel(PosedModel):
     ) -> Drawing:
         """Pictures of a training step; see `Model`.
 
-        The times of a step lie within a frame of each other: the network sees the pose at the
-        frame's middle alone, and own shadows are looked up at the time nearest to it.
+        The times of a step lie within a frame of each other: the network sees the pose, and the
+        person has the shape, of the frame's middle alone, and own shadows are looked up at the time
+        nearest to it.
         """
         # Posed together: the skeleton is walked once for all times.
         turned, bones = self.pose([*times_us, frame.mid_us])
@@ -181,25 +191,35 @@ class DiscModel(PosedModel):
         if self.scene_colour is not None:
             hidden = float(torch.rand((), generator=generator)) < _DIRECTION_DROPOUT
             view = _View(camera.center(), hidden, camera)
-        layers = self._layers(bones, rotations, slice(nearest, nearest + 1), view)
+        offsets = self._offsets([frame.mid_us])
+        layers = self._layers(bones, rotations, offsets, slice(nearest, nearest + 1), view)
         return draw(layers, camera, center_gradients=True, places=self.places)
 
     def following(self, track: BodyTrack) -> "DiscModel":
-        """The same person doing what ``track`` says, without pose residuals; see `Model`."""
+        """The same person doing what ``track`` says, without what times did; see `Model`."""
         model = copy.deepcopy(self)
         model.track = track.to(self.device)
         if model.residual is not None:
             model.residual.forget()
+        model.deformation.forget()
         return model
 
     def stay_together(self) -> None:
         """Weights of the bones without jumps from disc to disc, for poses beyond the recorded."""
         self.surface.even_out(self.gaussians.means[self.gaussians.human])
 
+    def _offsets(self, times_us: Sequence[int]) -> Float[Tensor, "T H 3"] | None:
+        """What times do to the person's shape; None before it is learned."""
+        if float(self.nominal) < self.deformation_start:
+            return None
+        rows = self.surface.at(self.gaussians.means[self.gaussians.human])
+        return self.deformation(rows, times_us)
+
     def _layers(
         self,
         bones: Float[Tensor, "T J 4 4"],
         rotations: Float[Tensor, "#T J 3 3"],
+        offsets: Float[Tensor, "#T H 3"] | None,
         lit_at: slice,
         view: _View,
         *,
@@ -207,12 +227,15 @@ class DiscModel(PosedModel):
     ) -> Layers:
         """Both classes under ``bones``; the network of shades sees ``rotations``.
 
+        ``offsets``: of the person's canonical centres.
+
         ``lit_at``: the times, one or all, at which shadows on the person are looked up.
         """
         still = self._still(view, hard_semantics=hard_semantics)
         means, scales_log, quaternions = still.means, still.scales_log, still.quaternions
         weights = self.surface.weights(means)[None]
-        world, transforms, linear = skin_with_linear(means[None], weights, bones)
+        placed = means[None] if offsets is None else means + offsets
+        world, transforms, linear = skin_with_linear(placed, weights, bones)
         casters = None if self.shadow is None else self.shadow.place(bones)
         light = self.surface_light()
         rgb = still.rgb[None] * self._light(light, world, transforms, casters, lit_at)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -207,6 +207,11 @@ class NearestSurface:
     def weights(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Skinning weights at the canonical centres of all Gaussians."""
         return self._at_all(means)[1]
+
+    def at(self, means: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
+        """Numbers of the nearest points of the surface at the canonical centres."""
+        self._at_all(means)
+        return self.index
 
     def even_out(self, means: Float[Tensor, "N 3"]) -> None:
         """Let weights change evenly along the surface, until rows change.
