@@ -315,6 +315,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=12.0, help="of each measurement or turn")
     parser.add_argument("--turns", type=int, default=4, help="in which the training is watched")
     options = parser.parse_args()
+    if options.seconds < 2:
+        parser.error("--seconds: the first second of a measurement does not count; give 2 or more")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # no process is left behind
     if options.training:
         figures = measure_training(options.turns, options.seconds, options.method)

@@ -58,3 +58,24 @@ def test_a_run_that_is_longer_than_its_new_schedule_is_finished():
         clock.advance(0.1)
     clock.go_by(50)
     assert clock.done and clock.fraction == 1.0
+
+
+def test_the_rest_of_a_schedule_is_passed_in_as_few_steps_as_are_said():
+    clock = Clock(iterations=200, may_end_early=True)
+    for _ in range(100):
+        clock.advance(0.1)
+    assert clock.end_in(25) and clock.expected_iterations == 125
+    seen = []
+    while not clock.done:
+        seen.append(clock.fraction)
+        clock.advance(0.1)
+    # evenly, and to the very end of all schedules
+    assert seen == pytest.approx([0.5 + 0.02 * step for step in range(25)])
+    assert clock.iteration == 125 and clock.fraction == 1.0
+    clock.go_by(250)
+    assert clock.fraction == 0.5 and not clock.may_end_early and not clock.ends_at
+
+
+def test_a_schedule_with_fewer_steps_left_stays_as_it_is():
+    clock = Clock(iterations=200, may_end_early=True, iteration=180, fraction=0.9)
+    assert not clock.end_in(25) and not clock.ends_at

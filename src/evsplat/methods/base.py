@@ -72,6 +72,9 @@ class Composition:
     capture: TrainingCapture | None = None
     """The recording as the method sees it, where that is not all of it (masked pictures)."""
     held_out: HeldOut | None = None
+    watched: tuple[str, ...] = ()
+    """Terms that compare pictures: how their weighted sum falls tells when little more is to come,
+    and a run that was given no number of steps ends earlier then. None: it never does."""
     fill: Callable[[Seen], dict[str, Tensor]] | None = None
     """Parameters by their names in the model's state, as a prior decides them at the end where
     little was seen; None: as they were learned."""

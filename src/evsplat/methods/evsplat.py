@@ -140,7 +140,8 @@ class EvsplatConfig:
     policy: Policy = Policy()
     """Held-out data that training may see."""
     iterations: Annotated[int, AtLeast(1)] = 2_000
-    """Training steps; all schedules stretch with it. Twice as many bring less than 0.2 dB."""
+    """Training steps; all schedules stretch with it. Twice as many bring less than 0.2 dB. Without
+    ``--iterations`` a run ends earlier where little more is to come."""
 
     human: HumanStart = HumanStart(count=None, spacing_px=0.85)
     """Discs of the person at the start."""
@@ -314,6 +315,7 @@ def build(
         body_frames=body_frames(poses.track, times_us),
         generator=generator,
         held_out=None if windows is None else _held_out(config, capture, model, windows),
+        watched=("l1", "dssim"),
         fill=partial(filled, model, capture, config.fill) if config.fill else None,
     )
 

@@ -29,7 +29,7 @@ class TrainOptions:
     device: Device = "auto"
     """Device; auto takes what the installed rasterisers can use."""
     iterations: Annotated[int | None, AtLeast(1), option("N", default="the method's")] = None
-    """Training steps; every schedule is scaled to it."""
+    """Exactly so many training steps; every schedule is scaled to it."""
     max_minutes: Annotated[float | None, Above(0), option("M", default="no limit")] = None
     """Minutes of training after which to stop gracefully, save and evaluate."""
     resume: Flag = False

@@ -150,7 +150,9 @@ _STATE = {
     },
     "human_count": int,
 }
-RESUMED = {"queue": [int], "skipped": int, "previous_nominal": float}
+ENDING = {"may_end_early": bool, "ends_at": int}
+"""Of the clock, what a training that goes on needs."""
+RESUMED = {"clock": ENDING, "queue": [int], "skipped": int, "previous_nominal": float}
 """What the state of a checkpoint holds besides, for a training that goes on."""
 
 

@@ -22,6 +22,10 @@ class Clock:
     max_seconds: float | None = None
     shrink: bool = False
     """Whether the schedule may be shortened to fit the time limit."""
+    may_end_early: bool = False
+    """Whether `end_in` may be asked for; part of the state, as a run that goes on ends likewise."""
+    ends_at: int = 0
+    """Step at which the schedule ends where its end was brought forward, otherwise 0."""
     iteration: int = 0
     fraction: float = 0.0
     seconds: float = 0.0
@@ -59,20 +63,30 @@ class Clock:
         share = 1.0 if first else SMOOTHING
         self.step_seconds += share * (step_seconds - self.step_seconds)
         self.seconds += step_seconds
+        left = self._steps_left()
         self.iteration += 1
-        if not self.shrink:
-            self.go_by(self.iterations)
+        if self.shrink or self.ends_at:
+            self.fraction += (1 - self.fraction) / max(left, 1.0)
         else:
-            self.fraction += (1 - self.fraction) / max(self._steps_left(), 1.0)
+            # From the integer, so that a thousand additions leave no rounding behind.
+            self.fraction = min(1.0, self.iteration / self.iterations)
+
+    def end_in(self, steps: int) -> bool:
+        """Pass what is left of the schedule in so many steps; false where that is no fewer."""
+        if steps >= self._steps_left():
+            return False
+        self.ends_at = self.iteration + steps
+        return True
 
     def go_by(self, iterations: int) -> None:
         """Stand where a schedule of so many steps is after those made, finished as this may be."""
-        self.iterations = iterations
-        # From the integer, so that a thousand additions leave no rounding behind.
+        self.iterations, self.ends_at, self.may_end_early = iterations, 0, False
         self.fraction = min(1.0, self.iteration / iterations)
 
     def _steps_left(self) -> float:
         left = (1 - self.fraction) * self.iterations
+        if self.ends_at:
+            left = float(max(self.ends_at - self.iteration, 0))
         if self.shrink and self.max_seconds is not None and self.step_seconds > 0:
             left = min(left, max(self.max_seconds - self.seconds, 0.0) / self.step_seconds)
         return left

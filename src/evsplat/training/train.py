@@ -89,7 +89,8 @@ def train(
     """Train a method on a capture and return the run folder.
 
     ``changes`` are fields of `TrainOptions`: ``train("my_capture", max_minutes=10)``. Without
-    ``iterations`` the schedule is shortened to be finished within ``max_minutes``. The cheap fits
+    ``iterations`` the schedule is shortened to be finished within ``max_minutes``, and where the
+    loss of the pictures says that little more is to come (method `evsplat`). The cheap fits
     before the first step count as training. ``use="everything"`` is short for the setting
     ``policy.use=everything``. ``on_start`` is called with the run folder before the first step.
 
@@ -139,6 +140,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
         iterations or start.settings.iterations,
         None if max_minutes is None else 60 * max_minutes,
         shrink=max_minutes is not None and iterations is None,
+        may_end_early=iterations is None and bool(composition.watched),
         seconds=time.perf_counter() - started,
     )
     cache_gb = options.device_memory_gb
@@ -248,7 +250,7 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
             logged = (clock.iteration + 1) % LOG_EVERY == 0
             if report is not None and logged:
                 trainer.bad.settle()  # what a GPU has still to do belongs to this step's time
-            clock.advance(time.perf_counter() - started)
+            trainer.advance(report, time.perf_counter() - started)
             if report is not None and (logged or clock.done):
                 log.write(json.dumps(_log_line(trainer, report)).encode() + b"\n")
                 _show(bar, trainer, report)
@@ -272,6 +274,8 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
 def _ended(clock: Clock, capture: Path, run: Path) -> str:
     """After how many steps a training ended, why there, and how it goes on."""
     why = "its schedule is finished" if clock.done else "the time that it was given is over"
+    if clock.done and clock.ends_at:
+        why += ", whose end was brought forward since little more was to come"
     more = ["--out", str(run), "--resume", "--iterations", str(2 * clock.iteration)]
     command = shlex.join(["evsplat", "train", str(capture), *more])
     return f"training ended after {clock.iteration:,} steps: {why}. To go on: {command}"
@@ -282,6 +286,7 @@ def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:
     return {
         "iteration": clock.iteration,
         "nominal": round(clock.nominal, 3),
+        "ends_at": clock.expected_iterations,
         "seconds": round(clock.seconds, 3),
         "loss": report.loss,
         "terms": report.terms,

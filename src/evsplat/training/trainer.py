@@ -1,5 +1,6 @@
 """The training loop: draw a frame, render what the objectives need, compare, step, densify."""
 
+import logging
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass
@@ -19,9 +20,12 @@ from evsplat.models.drawing import Drawing
 from evsplat.models.seen import seen_by
 from evsplat.objectives import Objective, Step
 from evsplat.training.bad_steps import BadSteps
-from evsplat.training.checkpoint import below, counts, flatten, load_model
+from evsplat.training.checkpoint import ENDING, below, counts, flatten, load_model
 from evsplat.training.clock import Clock
 from evsplat.training.optimiser import Optimiser
+from evsplat.training.outlook import REST, SETTLED, Outlook
+
+logger = logging.getLogger(__name__)
 
 PARTS: tuple[Part, Part] = ("human", "scene")
 """In the order of a drawing's layers."""
@@ -90,6 +94,7 @@ class Trainer:
         )
         self._cameras: dict[Hashable, Camera] = {}
         self.queue: list[int] = []
+        self.outlook = Outlook({name: composition.weights[name] for name in composition.watched})
         self.bad = BadSteps(self.device, str(capture.path))
         self.previous_nominal = 0.0
         self.statistics = {name: _fresh(rows) for name, rows in self.model.sets.items()}
@@ -124,6 +129,25 @@ class Trainer:
         drawn = step.drawing.rgb[step.index(frame.mid_us)].detach()
         losses = tuple(number.detach() for number in (loss, *terms.values()))
         return StepReport(losses, tuple(terms), drawn, step.observed(frame))
+
+    def advance(self, report: StepReport | None, step_seconds: float) -> None:
+        """Count a step; bring the end of the schedule forward where little more is to come."""
+        clock, before = self.clock, self.clock.fraction
+        if report is not None and clock.may_end_early:
+            self.outlook.note(before, dict(zip(report.names, report.losses[1:], strict=True)))
+        clock.advance(step_seconds)
+        if not clock.may_end_early or clock.ends_at:
+            return
+        fall = self.outlook.fall(before, clock.fraction)
+        if fall is None or fall >= SETTLED:
+            return
+        planned = clock.expected_iterations
+        if clock.end_in(round(REST * clock.iterations)):
+            logger.info(
+                "the pictures' loss fell by %.0f %% in the last tenth of the schedule: what is "
+                "left of it ends with step %d, not %d (--iterations %d makes them all)",
+                100 * fall, clock.ends_at, planned, clock.iterations,
+            )  # fmt: skip
 
     def _drawn(self, frame: Frame, objectives: Sequence[Objective], nominal: float) -> Step:
         """Pictures of a frame at all times that objectives ask for."""
@@ -184,6 +208,7 @@ class Trainer:
         for name, cache in self.model.row_caches.items():
             tensors |= flatten(name, cache.state())
         tensors["generator"] = self.composition.generator.get_state()
+        tensors["outlook"] = self.outlook.state()
         state |= {
             "queue": self.queue,
             "skipped": self.bad.settle(),
@@ -223,7 +248,8 @@ class Trainer:
             cache.load_state(below(name, tensors))
         self.composition.generator.set_state(tensors["generator"])
         saved = state["clock"]
-        for name in ("iteration", "fraction", "seconds", "step_seconds"):
+        self.outlook.load_state(tensors["outlook"])
+        for name in ("iteration", "fraction", "seconds", "step_seconds", *ENDING):
             setattr(self.clock, name, saved[name])
         self.queue = list(state["queue"])
         self.bad.skipped = state["skipped"]

@@ -1,0 +1,105 @@
+"""When the rest of a schedule is worth its steps: told by means of the pictures' loss alone."""
+
+import logging
+import sys
+
+import pytest
+import torch
+
+from evsplat.training import load_run, train
+from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
+from evsplat.training.outlook import FIRST, PARTS, REST, SPAN, Outlook
+from evsplat.training.trainer import Trainer
+
+from ..small_model import small
+
+WEIGHTS = {"l1": 2.0, "dssim": ((0.0, 1.0), (7_500.0, 3.0))}
+
+
+class Killed(Exception):
+    """What ends a process here."""
+
+
+def told(losses: list[float], *, weights=WEIGHTS, resumed_at: int | None = None) -> dict:
+    """What an outlook says after each part of a schedule of ten steps a part."""
+    outlook, steps, said = Outlook(weights), 10 * PARTS, {}
+    for step in range(steps):
+        if step == resumed_at:
+            state, outlook = outlook.state(), Outlook(weights)
+            outlook.load_state(state)
+        loss = torch.tensor(losses[step * len(losses) // steps])
+        outlook.note(step / steps, {"l1": loss, "dssim": loss, "other": torch.tensor(7.0)})
+        fall = outlook.fall(step / steps, (step + 1) / steps)
+        if fall is not None:
+            said[step + 1] = fall
+    return said
+
+
+def test_the_fall_is_that_of_weighted_means_over_parts():
+    halves = [0.4 * 0.9**part for part in range(PARTS)]
+    said = told(halves, weights={"l1": 2.0})
+    assert list(said) == [10 * part for part in range(FIRST, PARTS)]
+    assert list(said.values()) == pytest.approx([1 - 0.9**SPAN] * len(said), rel=1e-6)
+
+
+def test_a_weight_that_changes_counts_from_where_it_does():
+    said = told([0.4] * PARTS)
+    # 3 a step before the middle of the schedule, 5 behind it
+    assert said[10 * FIRST] == pytest.approx(0.0)
+    assert said[10 * (FIRST + SPAN)] == pytest.approx(1 - 5 / 3)
+
+
+def test_a_resumed_outlook_says_the_same_to_the_last_bit():
+    losses = torch.rand(10 * PARTS, generator=torch.Generator().manual_seed(0)).tolist()
+    assert told(losses, resumed_at=137) == told(losses)
+
+
+def test_steps_without_a_finite_loss_do_not_count():
+    losses = [0.4] * (10 * PARTS)
+    losses[93] = float("nan")
+    assert all(fall == pytest.approx(0.0) for fall in told(losses, weights={"l1": 1.0}).values())
+
+
+def test_a_method_that_names_no_terms_is_never_told_anything():
+    assert told([0.4] * PARTS, weights={}) == {}
+
+
+def test_a_run_without_a_number_of_steps_ends_earlier_and_says_so(tiny_capture, tmp_path, caplog):
+    capture, settings = tiny_capture(frames=10), small("evsplat", "iterations=80")
+    with caplog.at_level(logging.INFO):
+        out = train(capture, out=tmp_path / "run", overrides=settings)
+    _, state = load_checkpoint(latest_checkpoint(out / "checkpoints"))
+    clock = state["clock"]
+    assert clock["fraction"] == 1.0 and clock["ends_at"] == clock["iteration"] < 80
+    assert "of the schedule: what is left of it ends with step" in caplog.text
+    assert "whose end was brought forward" in caplog.text
+    train(capture, out=out, resume=True)
+    assert load_run(out).iteration == clock["iteration"]
+    told_so = train(capture, out=tmp_path / "told", overrides=settings, iterations=80)
+    assert load_run(told_so).iteration == 80
+
+
+def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(tiny_capture, tmp_path, monkeypatch):
+    module = sys.modules["evsplat.training.train"]  # its name in the package is the function
+    monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
+    capture, settings = tiny_capture(frames=10), small("evsplat", "iterations=80")
+    whole = train(capture, out=tmp_path / "whole", overrides=settings)
+
+    step, turn = Trainer.step, load_run(whole).iteration - round(80 * REST)
+    for kill_at in (turn - 1, turn + 3):
+
+        def killed(self: Trainer, kill_at: int = kill_at):
+            if self.clock.iteration == kill_at:
+                raise Killed
+            return step(self)
+
+        out = tmp_path / f"killed{kill_at}"
+        monkeypatch.setattr(Trainer, "step", killed)
+        with pytest.raises(Killed):
+            train(capture, out=out, overrides=settings)
+        monkeypatch.setattr(Trainer, "step", step)
+        train(capture, out=out, resume=True)
+        ends = [load_checkpoint(latest_checkpoint(run / "checkpoints")) for run in (whole, out)]
+        (expected, state), (found, again) = ends
+        assert again["clock"]["ends_at"] == state["clock"]["ends_at"] == state["clock"]["iteration"]
+        assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
