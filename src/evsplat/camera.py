@@ -35,6 +35,15 @@ class Camera:
         K[0, 0] = K[1, 1] = focal_px
         return replace(self, K=K)
 
+    def widened(self, beyond_x: int, beyond_y: int) -> "Camera":
+        """The same camera with so many pixels more at the left and right, and above and below."""
+        K = self.K.clone()
+        K[0, 2] += beyond_x
+        K[1, 2] += beyond_y
+        return replace(
+            self, width=self.width + 2 * beyond_x, height=self.height + 2 * beyond_y, K=K
+        )
+
     def project(
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:

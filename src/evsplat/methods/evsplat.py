@@ -366,6 +366,7 @@ def _start(
         -LABEL,
         feature_dim=features,
         background=background,
+        goes_on=True,
     )
     return GaussianSet(human, scene)
 

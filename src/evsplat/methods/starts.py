@@ -22,6 +22,7 @@ from evsplat.gaussians.initialise import (
     nearest_spacing,
     random_cube,
 )
+from evsplat.gaussians.surround import margins, surround
 
 MOST_SAMPLES = 20_000
 """Upper bound of the automatic number of samples of the person."""
@@ -155,13 +156,16 @@ def scene_start(
     semantic_logit: float,
     feature_dim: int | None = FEATURE_DIM,
     background: Float[Tensor, "H W 3"] | None = None,
+    goes_on: bool = False,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Start values of the scene's Gaussians, and the colours they shall show.
 
     ``background``: what a backdrop shows instead of the median of the training frames.
+    ``goes_on``: a backdrop goes on beyond the borders of the recorded picture.
     """
     frames = capture.train_frames
     camera = capture.camera(frames[0])
+    around: dict[str, Tensor] = {}
     if start.kind == "random_cube":
         points, colours = random_cube(*cube(start, capture, track), start.cube_count, generator)
         scales = nearest_spacing(points)[:, None].repeat(1, 3)
@@ -172,17 +176,23 @@ def scene_start(
                 f"{capture.path}: scene.kind is median_backdrop, which needs one static camera; "
                 "this capture's camera moves. Pass --set scene.kind=random_cube."
             )
+        if background is None:
+            background = capture.median_background()
+        beyond = margins(camera)
+        wide = camera.widened(*beyond)
         depth = backdrop_depth(
-            camera, _posed(track, frames), up=up_axis(track), margin=BACKDROP_MARGIN
+            wide, _posed(track, frames), up=up_axis(track), margin=BACKDROP_MARGIN
         )
         points, scales, colours = median_backdrop(
             camera,
-            capture.median_background() if background is None else background,
-            depth,
+            background,
+            depth[beyond[1] : -beyond[1], beyond[0] : -beyond[0]],
             stride=start.backdrop_stride_px,
             edge_points=int(BACKDROP_EDGE_SHARE * camera.width * camera.height),
         )
         opacity = BACKDROP_OPACITY
+        if goes_on:
+            around = surround(wide, background, depth, semantic_logit, feature_dim)
     values = gaussians_at(
         points,
         scales,
@@ -191,7 +201,10 @@ def scene_start(
         rgb_srgb=colours,
         feature_dim=feature_dim,
     )
-    return values, colours
+    return {
+        name: torch.cat([value, around[name]]) if around else value
+        for name, value in values.items()
+    }, colours
 
 
 def as_person(scene: dict[str, Tensor], track: BodyTrack, time_us: int) -> dict[str, Tensor]:
