@@ -18,7 +18,14 @@ from evsplat.body.rotations import matrix_to_quaternion
 from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import DataError
 from evsplat.export import export_run
-from evsplat.export.avatar import avatar_document, avatar_of, clip_of, recorded_clip
+from evsplat.export.avatar import (
+    FourBones,
+    avatar_document,
+    avatar_of,
+    clip_of,
+    four_bones,
+    recorded_clip,
+)
 from evsplat.export.bake import measure_loss
 from evsplat.export.cloud import cloud_of
 from evsplat.models.at_rest import SkinnedGaussians, mean_at_rest
@@ -131,15 +138,44 @@ def test_four_bones_in_255ths_are_the_heaviest_and_sum_to_one(reconstruction, se
     weights /= weights.sum(1, keepdims=True)
     gaussians = _skinned(track, 300, seed)
     avatar = avatar_of(replace(gaussians, weights=torch.from_numpy(np.float32(weights))))
-    assert (avatar.weights.astype(int).sum(1) == 255).all()
+    bones, shares = avatar.skin.bones.astype(int), avatar.skin.weights
+    assert (shares.astype(int).sum(1) == 255).all()
     want = np.sort(weights, axis=1)[:, -4:]
-    got = np.sort(np.take_along_axis(weights, avatar.bones.astype(int), axis=1), axis=1)
+    got = np.sort(np.take_along_axis(weights, bones, axis=1), axis=1)
     np.testing.assert_allclose(got, want, rtol=1e-6)
-    exact = weights[np.arange(300)[:, None], avatar.bones] / want.sum(1, keepdims=True)
-    assert np.abs(avatar.weights / 255 - exact).max() < 1 / 255
+    exact = weights[np.arange(300)[:, None], bones] / want.sum(1, keepdims=True)
+    assert np.abs(shares / 255 - exact).max() < 1 / 255
     dense = np.zeros((300, 9))
-    np.put_along_axis(dense, avatar.bones.astype(int), avatar.weights / 255, axis=1)
+    np.put_along_axis(dense, bones, shares / 255, axis=1)
     np.testing.assert_allclose(avatar.gaussians.weights, dense, atol=1e-7)
+    assert avatar.elsewhere is None
+
+
+@pytest.mark.parametrize("joints", [2, 4])
+def test_a_body_of_few_joints_keeps_its_weights(reconstruction, joints):
+    gaussians = _skinned(load_body_track(reconstruction[0]), 50, 0)
+    weights = torch.rand(50, joints, generator=torch.Generator().manual_seed(0))
+    weights /= weights.sum(1, keepdim=True)
+    avatar = avatar_of(replace(gaussians, weights=weights), weights.flip(1))
+    assert (avatar.gaussians.weights - weights).abs().max() < 1 / 255
+    assert (avatar.elsewhere.dense(joints) - weights.flip(1)).abs().max() < 1 / 255
+
+
+def test_the_document_has_the_weights_of_poses_that_were_not_recorded(run):
+    """Those with which films draw other motions, where they are others."""
+    page = export_run(run.path, "avatar", out=run.path / "dancer")
+    document = json.loads((page.parent / "avatar.json").read_text(encoding="utf-8"))
+    source = run.reconstruction
+    means = source.model.gaussians.means[source.model.gaussians.human]
+    even = source.in_new_motion(source.track).model.skinning_weights(means)
+    assert (even - source.model.skinning_weights(means)).abs().max() > 0.01
+    elsewhere = document["skin"]["elsewhere"]
+    bones, weights = (
+        np.frombuffer(base64.b64decode(elsewhere[name]), "u1").reshape(-1, 4)
+        for name in ("bones", "weights")
+    )
+    kept = FourBones(bones.copy(), weights.copy()).dense(even.shape[1])
+    assert (kept - four_bones(even).dense(even.shape[1])).abs().max() == 0
 
 
 def test_a_body_of_too_many_joints_is_told(reconstruction):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from evsplat.body import BodyTrack, up_axis
@@ -30,7 +30,7 @@ from evsplat.training.run import GaussianReconstruction
 BONES_EACH = 4
 _MOST_JOINTS = 256
 KEYS_PER_SECOND = 60.0
-FORMAT, VERSION = "evsplat-avatar", 2
+FORMAT, VERSION = "evsplat-avatar", 3
 _PLAYER = files("evsplat") / "data" / "player"
 _SCRIPTS = ("splats.js", "skeleton.js", "orbit.js", "player.js")
 _README = """An avatar made by evsplat.
@@ -43,15 +43,37 @@ scene.ply      what stands around, in the axes of the capture (where it was aske
 
 
 @dataclass(frozen=True, eq=False)
-class Avatar:
-    """A person whose every Gaussian follows at most four bones, as graphics cards like it."""
+class FourBones:
+    """Which bones each Gaussian follows, at most four, as graphics cards like it."""
 
-    gaussians: SkinnedGaussians
-    """Gaussians at rest; their weights are those below, divided by 255."""
     bones: UInt8[np.ndarray, "H 4"]
     """Joint numbers, heaviest first."""
     weights: UInt8[np.ndarray, "H 4"]
     """Skinning weights; they sum to 255."""
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return len(self.bones)
+
+    def dense(self, joints: int) -> Float[Tensor, "H J"]:
+        """The same weights for every joint; rows sum to 1."""
+        weights = torch.zeros(len(self), joints)
+        # Unused places have no weight, and bone 0.
+        return weights.scatter_add_(
+            1, torch.from_numpy(self.bones).long(), torch.from_numpy(self.weights) / 255
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Avatar:
+    """A person whose every Gaussian follows at most four bones."""
+
+    gaussians: SkinnedGaussians
+    """Gaussians at rest; their weights are those of ``skin``."""
+    skin: FourBones
+    """In recorded poses."""
+    elsewhere: FourBones | None
+    """In all other poses, where neighbours stay together; None: the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,24 +88,30 @@ class Clip:
     """Root joint's shift from its rest place, metres."""
 
 
-def avatar_of(gaussians: SkinnedGaussians) -> Avatar:
+def avatar_of(gaussians: SkinnedGaussians, elsewhere: Float[Tensor, "H J"] | None = None) -> Avatar:
+    """Keep four bones of each Gaussian; ``elsewhere``: weights in poses that were not recorded."""
+    skin = four_bones(gaussians.weights)
+    weights = skin.dense(gaussians.weights.shape[1])
+    other = None if elsewhere is None else four_bones(elsewhere)
+    return Avatar(replace(gaussians, weights=weights), skin, other)
+
+
+def four_bones(weights: Float[Tensor, "H J"]) -> FourBones:
     """Keep the four heaviest bones of each Gaussian, in 255ths; the rest is shared among them."""
-    joints = gaussians.weights.shape[1]
+    joints = weights.shape[1]
     if joints > _MOST_JOINTS:
         raise DataError(f"The body has {joints} joints; an avatar holds up to {_MOST_JOINTS}.")
-    kept, bones = gaussians.weights.double().topk(min(BONES_EACH, joints), dim=1)
+    kept, bones = weights.double().topk(min(BONES_EACH, joints), dim=1)
     exact = kept / kept.sum(1, keepdim=True) * 255
     whole = exact.floor()
     # The largest remainders take what is missing to 255.
     missing = (255 - whole.sum(1, keepdim=True)).round()
     rank = (exact - whole).argsort(1, descending=True).argsort(1)
-    weights = whole + (rank < missing)
-    dense = torch.zeros_like(gaussians.weights).scatter_(1, bones, (weights / 255).float())
+    shares = whole + (rank < missing)
     padding = (0, BONES_EACH - bones.shape[1])
-    return Avatar(
-        gaussians=replace(gaussians, weights=dense),
+    return FourBones(
         bones=torch.nn.functional.pad(bones, padding).to(torch.uint8).numpy(),
-        weights=torch.nn.functional.pad(weights, padding).to(torch.uint8).numpy(),
+        weights=torch.nn.functional.pad(shares, padding).to(torch.uint8).numpy(),
     )
 
 
@@ -184,9 +212,9 @@ def avatar_document(
             "rest_from_canonical": [row.tolist() for row in inverse.float()],
         },
         "skin": {
-            "count": len(avatar.bones),
-            "bones": _base64(avatar.bones, "u1"),
-            "weights": _base64(avatar.weights, "u1"),
+            "count": len(avatar.skin),
+            **_skin(avatar.skin),
+            "elsewhere": None if avatar.elsewhere is None else _skin(avatar.elsewhere),
         },
         "light": None if light is None else _light(light),
         "correctives": None if correctives is None else _correctives(correctives),
@@ -234,6 +262,10 @@ def _cloud(cloud: SplatCloud) -> dict[str, Any]:
     """14 float32 per Gaussian: centre, rotation (w, x, y, z), scales, opacity, RGB."""
     columns = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities[:, None], cloud.rgb)
     return {"count": len(cloud), "values": _base64(np.concatenate(columns, axis=1), "<f4")}
+
+
+def _skin(skin: FourBones) -> dict[str, Any]:
+    return {"bones": _base64(skin.bones, "u1"), "weights": _base64(skin.weights, "u1")}
 
 
 def _light(light: SurfaceLight) -> dict[str, Any]:

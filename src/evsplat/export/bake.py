@@ -62,7 +62,9 @@ def export_avatar(
     if motion is not None:
         clips.append(clip_of(Path(motion).stem, load_motion_of(motion, track)))
     gaussians = with_correctives(run, at_rest(run, camera), camera)
-    avatar = avatar_of(gaussians)
+    together = source.in_new_motion(track).model.skinning_weights(gaussians.means).cpu()
+    even = None if torch.allclose(together, gaussians.weights, atol=1e-6) else together
+    avatar = avatar_of(gaussians, even)
     mids = [frame.mid_us for frame in capture.frames]
     clips.insert(0, recorded_clip(source, (min(mids), max(mids))))
     loss = measure_loss(source, avatar, capture)
@@ -76,7 +78,7 @@ def export_avatar(
     logger.info("%s", loss.sentence())
     logger.info(
         "%d Gaussians, %d joints, %s; metres, axes of the capture.",
-        len(avatar.bones),
+        len(avatar.skin),
         len(gaussians.body.parents),
         " and ".join(f"motion {clip.name}" for clip in clips),
     )

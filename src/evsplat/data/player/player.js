@@ -14,16 +14,19 @@ const joints = skeleton.names.length;
 const state = { clip: 0, time: 0, playing: true, speed: 1, rest: false, scene: true, exact: null, preset: null };
 
 const canvas = find("picture");
-const chosen = bytes(avatar.skin.bones), weights = bytes(avatar.skin.weights);
+// Of recorded poses, and of all others, where neighbours on the skin stay together.
+const skins = [avatar.skin, avatar.skin.elsewhere ?? avatar.skin].map((skin) => {
+  const bones = bytes(skin.bones), weights = bytes(skin.weights);
+  return { bones: (row, k) => bones[4 * row + k], weights: (row, k) => weights[4 * row + k] / 255 };
+});
 const clouds = [{
-  count: avatar.person.count, values: floats(avatar.person.values),
-  bones: (row, k) => chosen[4 * row + k], weights: (row, k) => weights[4 * row + k] / 255,
+  count: avatar.person.count, values: floats(avatar.person.values), skins,
   normals: avatar.light ? floats(avatar.light.normals) : null,
 }];
 if (avatar.scene) {
   clouds.push({
     count: avatar.scene.count, values: floats(avatar.scene.values),
-    bones: () => joints, weights: (_, k) => (k ? 0 : 1),
+    skins: skins.map(() => ({ bones: () => joints, weights: (_, k) => (k ? 0 : 1) })),
   });
 }
 
@@ -48,6 +51,10 @@ function pose() {
   if (!state.rest) return moving;
   return { rotations: moving.rotations.map((turn, joint) => (joint ? [1, 0, 0, 0] : turn)), transl: moving.transl };
 }
+
+// The first clip is the recording.
+const isRecorded = () => !state.preset && !state.rest && state.clip === 0
+  && !skeleton.offsets.some((angles) => angles.some((angle) => angle));
 
 // Stand where the recording camera stood and look at the person's depth.
 function goHome() {
@@ -76,7 +83,7 @@ function draw() {
   const posed = pose();
   const shares = correctives
     ? correctives.shares(posed.rotations.map((_, joint) => skeleton.turned(posed.rotations, joint))) : [];
-  renderer.draw(skeleton.bones(posed), columns, lens, background, count, shares);
+  renderer.draw(skeleton.bones(posed), columns, lens, background, count, shares, isRecorded() ? 0 : 1);
 }
 
 function seek(seconds) {
@@ -142,7 +149,7 @@ find("speed").onchange = (event) => { state.speed = Number(event.target.value); 
 find("home").onclick = goHome;
 find("joint").onchange = showJoint;
 find("reset-joint").onclick = () => setOffset(find("joint").value, [0, 0, 0]);
-find("reset-all").onclick = () => { skeleton.offsets.forEach((angles) => angles.fill(0)); showJoint(); };
+find("reset-all").onclick = () => { choosePreset(null); skeleton.offsets.forEach((angles) => angles.fill(0)); showJoint(); };
 find("rest").onchange = (event) => { state.rest = event.target.checked; };
 find("scene").onchange = (event) => { state.scene = event.target.checked; };
 find("fold").onclick = (event) => {

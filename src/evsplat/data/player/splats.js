@@ -126,8 +126,8 @@ out vec4 result;
 void main() { result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1); }`;
 
 class SplatRenderer {
-  // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with bones, weights and,
-  // where light falls on them, normals. lowPass: px². light: center, radius_m,
+  // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with skins (bones and
+  // weights, as many of each cloud) and, where light falls on them, normals. lowPass: px². light: center, radius_m,
   // coefficients (4 x 9 x 3), lamps and their intensities (L x 3), or null. correctives: count of
   // fields, steps and values (count x Gaussians x 4) for the first cloud, or null.
   constructor(canvas, clouds, boneCount, lowPass, light, correctives) {
@@ -143,7 +143,7 @@ class SplatRenderer {
     this.count = clouds.reduce((sum, cloud) => sum + cloud.count, 0);
     this.program = program(gl, VERTEX, FRAGMENT);
     this.copy = program(gl, COPY_VERTEX, COPY_FRAGMENT);
-    this.gaussians = this.pack(clouds);
+    this.skins = clouds[0].skins.map((_, number) => this.pack(clouds, number));
     this.correctives = this.packCorrectives(correctives, clouds[0].count);
     this.bones = texture(gl);
     this.order = new Uint32Array(this.count);
@@ -160,28 +160,30 @@ class SplatRenderer {
     this.target = null;
   }
 
-  pack(clouds) {
+  // Gaussians with one of their skins: for the device, and what sorting them takes.
+  pack(clouds, number) {
     const gl = this.gl, rows = Math.ceil((this.count * TEXELS) / WIDTH);
     const texels = new Float32Array(4 * WIDTH * rows);
     this.centers = new Float32Array(3 * this.count);
-    this.skin = { bones: new Uint16Array(4 * this.count), weights: new Float32Array(4 * this.count) };
+    const skin = { bones: new Uint16Array(4 * this.count), weights: new Float32Array(4 * this.count) };
     let k = 0;
-    for (const { count, values, bones, weights, normals } of clouds) {
+    for (const { count, values, skins, normals } of clouds) {
+      const { bones, weights } = skins[number];
       for (let row = 0; row < count; row++, k++) {
         const v = values.subarray(14 * row, 14 * row + 14), at = 4 * TEXELS * k;
         const c = covarianceOf(v.subarray(3, 7), v.subarray(7, 10));
         const n = normals ? normals.subarray(3 * row, 3 * row + 3) : [0, 0, 0];
         texels.set([v[0], v[1], v[2], v[10], ...c, n[0], n[1], v[11], v[12], v[13], n[2]], at);
         for (let j = 0; j < 4; j++) {
-          texels[at + 16 + j] = this.skin.weights[4 * k + j] = weights(row, j);
-          texels[at + 20 + j] = this.skin.bones[4 * k + j] = bones(row, j);
+          texels[at + 16 + j] = skin.weights[4 * k + j] = weights(row, j);
+          texels[at + 20 + j] = skin.bones[4 * k + j] = bones(row, j);
         }
         this.centers.set([v[0], v[1], v[2]], 3 * k);
       }
     }
     const made = texture(gl);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, WIDTH, rows, 0, gl.RGBA, gl.FLOAT, texels);
-    return made;
+    return { gaussians: made, ...skin };
   }
 
   packCorrectives(correctives, gaussians) {
@@ -204,7 +206,7 @@ class SplatRenderer {
   }
 
   // Far to near, by a counting sort of 16 bits of depth.
-  sort(bones, view, count) {
+  sort(bones, view, count, { bones: chosen, weights }) {
     const depthOf = new Float32Array(4 * this.boneCount);
     for (let bone = 0; bone < this.boneCount; bone++) {
       for (let column = 0; column < 4; column++) {
@@ -213,7 +215,7 @@ class SplatRenderer {
         depthOf[4 * bone + column] = sum;
       }
     }
-    const { centers, depths, order } = this, { bones: chosen, weights } = this.skin;
+    const { centers, depths, order } = this;
     let low = Infinity, high = -Infinity;
     for (let k = 0; k < count; k++) {
       let depth = 0;
@@ -235,10 +237,11 @@ class SplatRenderer {
   }
 
   // bones: rows of 3x4 matrices; view: 4x4 by columns; lens: fx, fy, cx, cy in pixels; count: how
-  // many Gaussians from the start; shares: of the correctives.
-  draw(bones, view, lens, background, count = this.count, shares = []) {
+  // many Gaussians from the start; shares: of the correctives; number: of the skin.
+  draw(bones, view, lens, background, count = this.count, shares = [], number = 0) {
     const gl = this.gl, { width, height } = this.canvas;
-    this.sort(bones, view, count);
+    const skin = this.skins[number];
+    this.sort(bones, view, count, skin);
     gl.bindTexture(gl.TEXTURE_2D, this.bones);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 3, this.boneCount, 0, gl.RGBA, gl.FLOAT, bones);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.fine ? this.framebuffer(width, height) : null);
@@ -248,7 +251,7 @@ class SplatRenderer {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(this.program);
-    bind(gl, this.program, "gaussians", 0, this.gaussians);
+    bind(gl, this.program, "gaussians", 0, skin.gaussians);
     bind(gl, this.program, "bones", 1, this.bones);
     bind(gl, this.program, "correctives", 2, this.correctives);
     gl.uniform1i(gl.getUniformLocation(this.program, "correctiveCount"), shares.length);
