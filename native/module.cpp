@@ -315,10 +315,10 @@ void picture_enlarge(In from, int factor, Out to, bool back, int threads) {
 
 // Planes (3, pixels).
 void picture_log_brightness(In coded, const std::array<float, 3>& weight, float gamma, float darkest, float eps,
-                            Out value, std::optional<Out> slope, int threads) {
+                            Out value, std::optional<Out> slope, bool keeps_hue, int threads) {
     const size_t count = value.size();
     require(coded.size() == 3 * count && (!slope || slope->size() == 3 * count), "the picture");
-    LogBrightness job = {{}, {}, gamma, darkest, eps, value.data(), {}};
+    LogBrightness job = {{}, {}, gamma, darkest, eps, value.data(), {}, keeps_hue};
     for (int c = 0; c < 3; ++c) {
         job.coded[c] = coded.data() + c * count, job.weight[c] = weight[c];
         job.slope[c] = slope ? slope->data() + c * count : nullptr;
@@ -416,8 +416,8 @@ NB_MODULE(_native, m) {
     m.def("enlarge", &picture_enlarge, nb::arg("given"), nb::arg("factor"), nb::arg("to"), nb::arg("back"),
           nb::arg("threads"), "Pictures enlarged bilinearly, or the gradient of the small ones.");
     m.def("log_brightness", &picture_log_brightness, nb::arg("coded"), nb::arg("weight"), nb::arg("gamma"),
-          nb::arg("darkest"), nb::arg("eps"), nb::arg("value"), nb::arg("slope").none(), nb::arg("threads"),
-          "Logarithm of the luminance of (3, H, W) coded values, and its slope by each.");
+          nb::arg("darkest"), nb::arg("eps"), nb::arg("value"), nb::arg("slope").none(), nb::arg("keeps_hue"),
+          nb::arg("threads"), "Logarithm of the luminance of (3, H, W) coded values, and its slope by each.");
     m.def("skin", &blend_skin, nb::arg("position"), nb::arg("weight"), nb::arg("bones"), nb::arg("moved"),
           nb::arg("blended"), nb::arg("linear").none(), nb::arg("threads"), "Linear blend skinning.");
     m.def("skin_backward", &blend_skin_backward, nb::arg("position"), nb::arg("weight"), nb::arg("bones"),

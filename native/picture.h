@@ -8,13 +8,15 @@ namespace evsplat {
 
 // Natural logarithm of the luminance of `count` pixels whose coded channels are planes:
 // log(sum_c weight_c max(coded_c, darkest)^gamma + eps). `slope` is null or takes its derivative by each
-// channel, which is zero below `darkest`.
+// channel, which is zero below `darkest`; or, where `keeps_hue`, that of the mean over channels of
+// log(max(coded_c, darkest)^gamma + eps), which pulls at all of them alike.
 struct LogBrightness {
     const float* coded[3];
     float weight[3];
     float gamma, darkest, eps;
     float* value;
     float* slope[3];
+    bool keeps_hue;
 };
 
 void log_brightness(const LogBrightness&, size_t count, int threads);

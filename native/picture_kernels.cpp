@@ -149,15 +149,19 @@ void power_mean_backward(const PowerMean& job, size_t begin, size_t end, const f
 
 void log_brightness(const LogBrightness& job, size_t begin, size_t end) {
     vectors(begin, end, PER_VECTOR {
-        F light = splat(job.eps), slope[3];
+        F light = splat(job.eps), slope[3], linear[3];
         for (int c = 0; c < 3; ++c) {
             const F given = load_some(job.coded[c] + at, count), coded = max(given, splat(job.darkest));
             const F power = exp2(log2(coded) * (job.gamma - 1.f));
-            light += power * coded * job.weight[c];
-            slope[c] = select(given >= job.darkest, power * (job.weight[c] * job.gamma), F{});
+            linear[c] = power * coded;
+            light += linear[c] * job.weight[c];
+            slope[c] = select(given >= job.darkest, power * job.gamma, F{});
         }
         store_some(job.value + at, log2(light) * 0.693147181f, count);
-        for (int c = 0; c < 3 && job.slope[0]; ++c) store_some(job.slope[c] + at, slope[c] / light, count);
+        for (int c = 0; c < 3 && job.slope[0]; ++c) {
+            const F by = job.keeps_hue ? (1.f / 3.f) / (linear[c] + job.eps) : job.weight[c] / light;
+            store_some(job.slope[c] + at, slope[c] * by, count);
+        }
     });
 }
 

@@ -38,8 +38,9 @@ UNREAD = {
             (
                 closed,
                 "event_weight=1",
-                "event_eps=0.5 event_reach=9 event_ramp_us=9 event_noise_aware=false "
-                "contrast_weight=9 clock=always rates.sensor=0.5 pose.events_of_held_out=true",
+                "event_eps=0.5 event_reach=9 event_ramp_us=9 event_hue_from=9 "
+                "event_noise_aware=false contrast_weight=9 clock=always rates.sensor=0.5 "
+                "pose.events_of_held_out=true",
             )
             for closed in ("event_weight=0", "event_term=paper")
         ),
@@ -106,7 +107,8 @@ OUT_OF_RANGE = {
     "avatar3dgs_semantic": "semantic_band_px_at_256=0 scene.kind=cube binarise_weight=[[0,-1]]",
     "evsplat": "low_pass=0.5 low_pass=0 lamps=17 lamps=-1 lamps=1.5 width=0 px_per_render=0 "
     "most_renders=0 event_start=-1 event_start=15001 event_weight=-0.1 event_weight=.inf "
-    "event_term=none event_eps=0 event_reach=-1 event_ramp_us=-1 clock=maybe contrast_weight=-1 "
+    "event_term=none event_eps=0 event_reach=-1 event_ramp_us=-1 event_hue_from=-1 clock=maybe "
+    "contrast_weight=-1 "
     "rates.final=0 rates.final=2 rates.means=-1 pose.std_rad=0 pose.start=15001 "
     "pose.prior=-1 pose_noise=-1 shade_start=.nan shading=1 semantic_band_px_at_256=0 "
     "scene.prefit_steps=-1 scene.backdrop_stride_px=0 scene.cube_count=3 scene.cube_half_side_m=0",

@@ -9,7 +9,7 @@ import torch
 from evsplat.devices import DeviceCache
 from evsplat.events import ALWAYS, EventStream, window_counts
 from evsplat.objectives import EventNoise, EventSensor, EventWindows
-from evsplat.pictures import luminance
+from evsplat.pictures import log_luminance, luminance
 
 HEIGHT, WIDTH, EPS = 9, 11, 0.004
 
@@ -72,7 +72,9 @@ class StepAt(SimpleNamespace):
 
     data = DeviceCache("cpu", 0)
 
-    def log_luminance(self, which: slice, eps: float) -> torch.Tensor:
+    def log_luminance(self, which: slice, eps: float, *, keeps_hue: bool) -> torch.Tensor:
+        if keeps_hue:
+            return log_luminance(self.linear[which].unbind(0), eps, "linear", keeps_hue=True)
         return torch.log(luminance(self.linear[which]) + eps)
 
 
@@ -102,6 +104,25 @@ def test_right_thresholds_explain_every_window_and_wrong_ones_by_how_much(seed):
     assert float(loss) == pytest.approx(expected, rel=1e-6)
     loss.backward()
     assert wrong.sensor.logs.grad[0] > 0  # a smaller threshold fits better
+
+
+@pytest.mark.parametrize(("hue_from", "alike"), [(5_000, True), (5_001, False)])
+def test_from_its_start_on_events_pull_at_all_channels_alike(hue_from, alike):
+    capture, step = scene(0)
+    colours = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
+    logs = (step.linear + EPS).mul(colours).log().requires_grad_()
+    step.linear = logs.exp() - EPS
+    objective = make(capture, 0.3, 0.2)
+    objective.hue_from = hue_from
+    loss = objective.loss(step)["event"]
+    loss.backward()
+    pulls = logs.grad[logs.grad.abs().sum(-1) > 0]
+    assert len(pulls) > 100
+    apart = pulls.amax(-1) - pulls.amin(-1)
+    assert (float(apart.max()) < 1e-12) == alike
+    # The value is what luminance has.
+    objective.hue_from = 15_000
+    assert torch.equal(loss, objective.loss(step)["event"])
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -122,6 +122,35 @@ def test_compiled_light_of_pictures_and_its_gradient_equal_the_definition_in_flo
         assert (compiled - plain).abs().max() < 2e-6 * plain.abs().max()
 
 
+@pytest.mark.parametrize("transfer", ["power", "srgb", "linear"])
+def test_gradient_that_keeps_the_hue_is_that_of_the_channels_mean_logarithm(transfer):
+    eps = 0.004
+    coded = torch.rand(3, 7, 9, 3, generator=torch.Generator().manual_seed(1)) - 0.05
+    coded[0, 0] = 0.0
+    upstream = torch.arange(3 * 7 * 9.0).view(3, 7, 9).cos()
+    exact = coded.double().requires_grad_()
+    logs = torch.log(decode(exact, transfer) + eps).mean(-1)
+    (expected,) = torch.autograd.grad((logs * upstream).sum(), exact)
+    # The compiled module takes the power curve in single precision alone.
+    for dtype in (torch.float32, torch.float64):
+        leaf = coded.to(dtype).requires_grad_()
+        value = log_luminance(leaf.unbind(0), eps, transfer, keeps_hue=True)
+        assert torch.equal(value, log_luminance(leaf.unbind(0), eps, transfer))
+        (gradient,) = torch.autograd.grad(value, leaf, upstream.to(dtype))
+        assert (gradient - expected).abs().max() < 2e-6 * expected.abs().max()
+
+
+def test_a_step_along_the_gradient_that_keeps_the_hue_keeps_the_ratios_of_light():
+    logs = torch.randn(4, 6, 3, dtype=torch.float64, requires_grad=True)
+    pictures = encode(logs.exp(), "linear").unbind(0)
+    for keeps_hue in (True, False):
+        value = log_luminance([p[None] for p in pictures], 0.0, "linear", keeps_hue=keeps_hue)
+        (step,) = torch.autograd.grad(value.sum(), logs, retain_graph=True)
+        # Either way a step that is the same for all channels is one of the whole luminance.
+        assert torch.allclose(step.sum(-1), torch.ones(4, 6, dtype=torch.float64))
+        assert (float((step - step.mean(-1, keepdim=True)).abs().max()) < 1e-12) == keeps_hue
+
+
 @pytest.mark.parametrize("transfer", ["srgb", "linear"])
 def test_light_of_pictures_by_other_curves(transfer):
     coded = torch.rand(3, 4, 5, 3)

@@ -58,9 +58,11 @@ class Step(Generic[ModelType]):
         """The curve of the frame's camera, by which the pictures are coded."""
         return self.capture.transfer(self.frame)
 
-    def log_luminance(self, which: slice, eps: float) -> Float[Tensor, "T H W"]:
-        """Natural logarithm of some pictures' luminance in linear light, and ``eps``."""
-        return log_luminance(self.rgb[which], eps, self.transfer)
+    def log_luminance(
+        self, which: slice, eps: float, *, keeps_hue: bool = False
+    ) -> Float[Tensor, "T H W"]:
+        """`evsplat.pictures.log_luminance` of some pictures."""
+        return log_luminance(self.rgb[which], eps, self.transfer, keeps_hue=keeps_hue)
 
     def index(self, time_us: int) -> int:
         """Place of a time among the pictures."""

@@ -1,5 +1,6 @@
 """Events at full time resolution: brightness change between any two rendered times."""
 
+import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,6 +41,10 @@ class EventWindows(Objective):
     Events that nothing caused are allowed for: differences weigh by the noise of their time
     (`EventNoise`), and hot pixels do not count.
 
+    Events see luminance. Where it is wrong its gradient pulls at green ten times as hard as at
+    blue, and the frames pull back at all channels alike: what comes of it is a tint. From nominal
+    iteration ``hue_from`` on all channels are pulled at alike (`evsplat.pictures.log_luminance`).
+
     Where events have no polarity the size of the change is compared with their number, between
     neighbouring times only: over a longer span what went up and down again is in the number alone.
     """
@@ -55,6 +60,7 @@ class EventWindows(Objective):
         noise: EventNoise,
         reach: float = 0.5,
         ramp_us: int = 0,
+        hue_from: float = math.inf,
     ) -> None:
         """``start`` in nominal iterations; ``eps`` is added to linear luminance.
 
@@ -65,7 +71,7 @@ class EventWindows(Objective):
         self.events = capture.events.keeping(_KEPT_BYTES)
         self.blocks = EventBlocks(self.events)
         self.sensor, self.generator = sensor, generator
-        self.start, self.eps = start, eps
+        self.start, self.eps, self.hue_from = start, eps, hue_from
         mids = [frame.mid_us for frame in capture.frames]
         self.interval_us = _median_gap(mids)
         self.reach_us = reach * _median_gap([frame.mid_us for frame in capture.train_frames])
@@ -140,7 +146,7 @@ class EventWindows(Objective):
         late = [time + self._late_us for time in step.times_us[kept]]
         low, high = self.events.readable_around(step.frame.mid_us)
         # A sensor compares logarithms of light, before any transfer curve of a camera.
-        brightness = step.log_luminance(kept, self.eps)
+        brightness = step.log_luminance(kept, self.eps, keeps_hue=step.nominal >= self.hue_from)
         reach = max(_RATE_US, self.ramp_us)
         within = max(late[0] - reach, low), min(late[-1] + reach, high)
         # Events per microsecond at each instant tell what a later clock would have counted.

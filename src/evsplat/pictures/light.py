@@ -98,13 +98,26 @@ def mean_light(
 
 
 def log_luminance(
-    coded: Sequence[Float[Tensor, "H W 3"]], eps: float, transfer: Transfer = "power"
+    coded: Sequence[Float[Tensor, "H W 3"]],
+    eps: float,
+    transfer: Transfer = "power",
+    *,
+    keeps_hue: bool = False,
 ) -> Float[Tensor, "T H W"]:
-    """Natural logarithm of coded pictures' luminance in linear light, and ``eps``."""
+    """Natural logarithm of coded pictures' luminance in linear light, and ``eps``.
+
+    ``keeps_hue`` leaves the value and changes the gradient: to that of the mean over channels of
+    log(light + eps). It pulls at the logarithms of all channels alike, that of luminance at green
+    ten times as hard as at blue.
+    """
     if transfer == "power" and all(map(runs_native, coded)):
-        result: Tensor = _NativeLogLuminance.apply(eps, *coded)
+        result: Tensor = _NativeLogLuminance.apply(eps, keeps_hue, *coded)
         return result
-    return torch.log(luminance(decode(_planes(coded), transfer).movedim(1, -1)) + eps)
+    linear = decode(_planes(coded), transfer)
+    if keeps_hue:
+        result = _LogLuminanceKeepingHue.apply(linear, eps)
+        return result
+    return torch.log(luminance(linear.movedim(1, -1)) + eps)
 
 
 def _planes(pictures: Sequence[Float[Tensor, "H W 3"]]) -> Float[Tensor, "T 3 H W"]:
@@ -180,18 +193,34 @@ class _NativeMeanLight(torch.autograd.Function):
         return grads.movedim(1, -1).unbind(0)
 
 
+class _LogLuminanceKeepingHue(torch.autograd.Function):
+    """`log_luminance` of planes of light, whose gradient pulls at all channels alike."""
+
+    @staticmethod
+    def forward(ctx: Any, linear: Float[Tensor, "T 3 H W"], eps: float) -> Float[Tensor, "T H W"]:
+        ctx.save_for_backward(linear)
+        ctx.eps = eps
+        return torch.log(luminance(linear.movedim(1, -1)) + eps)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (linear,) = ctx.saved_tensors
+        return upstream[0][:, None] / (linear + ctx.eps) / linear.shape[1], None
+
+
 class _NativeLogLuminance(torch.autograd.Function):
     """`log_luminance` for the power curve in the compiled module; slopes are found at once."""
 
     @staticmethod
-    def forward(ctx: Any, eps: float, *coded: Tensor) -> Float[Tensor, "T H W"]:
+    def forward(ctx: Any, eps: float, keeps_hue: bool, *coded: Tensor) -> Float[Tensor, "T H W"]:
         height, width, channels = coded[0].shape
         value = coded[0].new_empty(len(coded), height, width)
         slopes = value.new_empty(len(coded), channels, height, width)
         for picture, at, slope in zip(coded, value, slopes, strict=True):
             planes = _planar(picture).movedim(-1, 0)
             native.log_brightness(
-                planes, REC709, GAMMA, _BLACK, eps, at, slope, torch.get_num_threads()
+                planes, REC709, GAMMA, _BLACK, eps, at, slope, keeps_hue, torch.get_num_threads()
             )
         ctx.save_for_backward(slopes)
         return value
@@ -200,7 +229,7 @@ class _NativeLogLuminance(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         (slopes,) = ctx.saved_tensors
-        return None, *(slopes * upstream[0][:, None]).movedim(1, -1).unbind(0)
+        return None, None, *(slopes * upstream[0][:, None]).movedim(1, -1).unbind(0)
 
 
 class _PowerEncode(torch.autograd.Function):
@@ -228,8 +257,9 @@ class _PowerLogBrightness(torch.autograd.Function):
             planes = rgb.detach().movedim(-1, 0).contiguous()
             slopes = torch.empty_like(planes) if ctx.needs_input_grad[0] else None
             value = torch.empty_like(planes[0])
+            threads = torch.get_num_threads()
             native.log_brightness(
-                planes, REC709, GAMMA, DARKEST, eps, value, slopes, torch.get_num_threads()
+                planes, REC709, GAMMA, DARKEST, eps, value, slopes, False, threads
             )
             if slopes is not None:
                 ctx.save_for_backward(slopes.movedim(0, -1))
