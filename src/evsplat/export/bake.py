@@ -62,9 +62,7 @@ def export_avatar(
     if motion is not None:
         clips.append(clip_of(Path(motion).stem, load_motion_of(motion, track)))
     gaussians = with_correctives(run, at_rest(run, camera), camera)
-    together = source.in_new_motion(track).model.skinning_weights(gaussians.means).cpu()
-    even = None if torch.allclose(together, gaussians.weights, atol=1e-6) else together
-    avatar = avatar_of(gaussians, even)
+    avatar = avatar_of(gaussians, _weights_elsewhere(source, gaussians))
     mids = [frame.mid_us for frame in capture.frames]
     clips.insert(0, recorded_clip(source, (min(mids), max(mids))))
     loss = measure_loss(source, avatar, capture)
@@ -83,6 +81,16 @@ def export_avatar(
         " and ".join(f"motion {clip.name}" for clip in clips),
     )
     return page
+
+
+@torch.no_grad()
+def _weights_elsewhere(
+    source: GaussianReconstruction, gaussians: SkinnedGaussians
+) -> Float[Tensor, "H J"] | None:
+    """Weights of the bones in motions that were not recorded; None: the same."""
+    model = source.in_new_motion(source.track).model
+    weights = model.skinning_weights(gaussians.means.to(source.model.device)).cpu()
+    return None if torch.allclose(weights, gaussians.weights, atol=1e-6) else weights
 
 
 @dataclass(frozen=True)
