@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from evsplat.body import BodyTrack
+from evsplat.body.make import rig_arrays
 from evsplat.body.skeleton import find_skeleton
 from evsplat.capture import Capture, Policy, load_body_track, load_capture
 from evsplat.capture.derive import derived_capture
@@ -111,15 +112,19 @@ def measure(
     seconds = time.perf_counter() - start
     rows.append({"stage": stage, "seconds": seconds, **pose_errors(capture, truth, track)})
     tracks = {stage: track}
+    dressed = None
     if refined:
         better = refine(track, seen, steps=FOUND_STEPS)
-        errors = pose_errors(capture, truth, better.track)
+        dressed = better.track.with_body(better.dressed)
+        errors = pose_errors(capture, truth, better.track) | dressed_overlap(
+            capture, truth, dressed
+        )
         rows.append({"stage": f"{stage}, refined", "seconds": better.seconds, **errors})
-        tracks[f"{stage}, refined"] = better.track
+        tracks[f"{stage}, refined"] = dressed
     if out is not None:
         for name, one in tracks.items():
             folder = out / f"{capture.name}_{name.replace(', ', '_')}"
-            write(capture, folder, one, fitted, drawn="refined" in name)
+            write(capture, folder, one, fitted, drawn=one is dressed)
     for row in rows:
         row["capture"] = capture.name
         shown = {k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}
@@ -132,16 +137,18 @@ def write(
 ) -> None:
     """A capture with found poses, and what they are expected to err by, in place of its own.
 
-    Of those that were corrected by drawing the person it says so, as that of `evsplat poses` does.
+    Of those that were corrected by drawing the person it says so, and the body is dressed, as by
+    `evsplat poses`.
     """
     assert track.errors is not None
     with derived_capture(capture, folder, replace=True) as making:
         making.set_body(
-            fitted.rig.model,
+            "rig" if drawn else fitted.rig.model,
             track.times_us,
             track.poses,
             track.transl,
-            betas=fitted.betas,
+            betas=None if drawn else fitted.betas,
+            rig=rig_arrays(track.body) if drawn else None,
             source="estimated",
             pose_std_rad=track.errors.joint_rad,
             transl_std_m=track.errors.root_m,
@@ -178,6 +185,12 @@ def pose_errors(capture: Capture, truth: BodyTrack, track: BodyTrack) -> dict:
     if track.errors is not None:
         values["sure"] = calibration(truth, track)
     return values
+
+
+def dressed_overlap(capture: Capture, truth: BodyTrack, dressed: BodyTrack) -> dict:
+    """Overlap of the dressed body with the masks, as a share of what the given bare one reaches."""
+    errors = pose_errors(capture, truth, dressed)
+    return {f"dressed_{key}": value for key, value in errors.items() if key.endswith("iou_share")}
 
 
 def calibration(truth: BodyTrack, track: BodyTrack) -> float:

@@ -11,16 +11,16 @@ from evsplat.body.skeleton import find_skeleton
 from evsplat.capture import Policy, load_body_track, load_capture
 from evsplat.errors import DataError
 from evsplat.landmarks import LandmarkNetwork, find_landmarks, sharp_pictures
-from evsplat.landmarks.detect import MIRRORED, Region, find_in
+from evsplat.landmarks.detect import MIRRORED, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33
 from evsplat.landmarks.motion import Motion, global_shift, pieces
-from evsplat.landmarks.pictures import SharpPicture
+from evsplat.landmarks.pictures import CARRIED_SIGMA, SharpPicture
 from evsplat.landmarks.refusals import (
     refuse_empty,
     refuse_half_out_of_view,
     refuse_moving_camera,
 )
-from evsplat.landmarks.track import _Tracker
+from evsplat.landmarks.track import _seen, _sigma, _Tracker
 from evsplat.shipped import demo_capture
 
 JOINTS = {"shoulder": "upper_arm", "elbow": "forearm", "knee": "shin", "ankle": "foot"}
@@ -86,6 +86,20 @@ def test_the_person_of_the_demo_capture_is_found(demo, training, middles, networ
     ratio = error / found.sigma_px[:, here]
     assert 0.4 < np.median(ratio) < 2.5
     assert (found.seen > 0).all() and (np.diff(found.times_us) > 0).all()
+
+
+@pytest.mark.parametrize(("carried", "belief", "factor"), [(False, 0.5, 2), (True, 0.1, 4)])
+def test_points_of_somebody_hardly_recognised_count_alike(middles, carried, belief, factor):
+    spread = np.linspace(0, 6, 33)
+    picture = replace(middles[0], sigma=CARRIED_SIGMA) if carried else middles[0]
+    nowhere = np.zeros((33, 3))
+    region = Region(np.zeros(2), 100.0)
+    found = Found(nowhere[:, :2], spread, np.linspace(0, 1, 33), nowhere, 0.2, region)
+    assert not found.is_person
+    np.testing.assert_array_equal(_seen(picture, found), belief)
+    # 0.8 pixels in a region of 100, and what the copies disagree by.
+    expected = factor * picture.sigma * np.hypot(0.8, spread)
+    np.testing.assert_allclose(_sigma(picture, found), expected)
 
 
 def test_names_change_sides_in_a_mirror():

@@ -2,12 +2,14 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from tests.posing.moving import CAMERA, landmarks
 
-from evsplat.capture import load_body_track, load_capture
+from evsplat.capture import load_body_track, load_capture, validate_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.options import PoseSearch
 from evsplat.posing import find, find_poses
@@ -80,6 +82,30 @@ def test_a_given_focal_length_is_written_and_refined_with(unposed, tmp_path, mon
     assert new.provenance["poses"]["refinement"]["seconds"] > 0
     assert new.camera(new.frames[0]).K[0, 0] == 45
     assert load_capture(path).camera(new.frames[0]).K[0, 0] == 37.5
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_a_corrected_body_is_written_as_the_pictures_show_it(
+    unposed, tmp_path, monkeypatch, better
+):
+    path, points = unposed
+    refined = []
+
+    def judged(*given, **options):
+        found = refine(*given, **options)
+        gain = (1.0, 0.0) if better else (0.0, 1.0)
+        refined.append(replace(found, gain=gain[0], gain_error=gain[1]))
+        return refined[0]
+
+    monkeypatch.setattr(find, "refine", judged)
+    found = find_poses(path, tmp_path / "new", keypoints=points, refine_s=0.2)
+    new = load_capture(tmp_path / "new")
+    track = load_body_track(new)
+    assert new.body_file.model == ("rig" if better else "default")
+    body = refined[0].dressed if better else found.fitted.rig.body(found.fitted.betas)
+    torch.testing.assert_close(track.body.rest_vertices, body.rest_vertices)
+    assert track.body.joint_names == body.joint_names
+    assert [one for one in validate_capture(tmp_path / "new") if one.severity == "error"] == []
 
 
 def test_a_focal_length_that_was_searched_for_is_said_to_be_rough(unposed, tmp_path, caplog):

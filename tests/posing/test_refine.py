@@ -8,6 +8,7 @@ import torch
 
 from evsplat.body import BodyTrack, default_body
 from evsplat.body.silhouette import silhouette
+from evsplat.body.surface import vertex_normals
 from evsplat.camera import Camera
 from evsplat.capture import Frame, load_body_track
 from evsplat.pictures import decode, encode, luminance
@@ -155,6 +156,25 @@ def grey_and_coloured():
     camera = Camera(4, 4, torch.eye(3), torch.eye(4))
     coloured = torch.tensor([True, False])
     return Targets([0, 1], [frame] * 2, coloured, image, image, ones, ones, camera, "power")
+
+
+def test_a_dressed_body_ends_where_the_discs_lie(body):
+    look = SurfaceDiscs(body, 1500, torch.Generator().manual_seed(0))
+    bare = look.dressed()
+    torch.testing.assert_close(bare.rest_vertices, body.rest_vertices)
+    with torch.no_grad():
+        look.offsets += 2.0
+    normals = vertex_normals(body.canonical_vertices(), body.faces)
+    moved = look.dressed().canonical_vertices() - body.canonical_vertices()
+    torch.testing.assert_close(moved, 0.02 * normals, rtol=0, atol=1e-5)
+    with torch.no_grad():
+        look.offsets.zero_()
+        look.bone_offsets[3, 1] = 1.0
+    dressed = look.dressed()
+    moved = dressed.canonical_vertices() - body.canonical_vertices()
+    wanted = 0.01 * body.weights[:, 3:4] * torch.tensor([0.0, 1.0, 0.0])
+    torch.testing.assert_close(moved, wanted, rtol=0, atol=1e-5)
+    torch.testing.assert_close(dressed.rest_joints, body.rest_joints)
 
 
 def test_carried_pictures_tell_luminance_alone():

@@ -77,6 +77,18 @@ def make_body(
     return body, order
 
 
+def rig_arrays(body: Body) -> dict[str, np.ndarray]:
+    """What `make_body` makes the body of, by the names of its arguments."""
+    return {
+        "joint_names": np.array(body.joint_names),
+        "parents": body.parents.numpy().astype(np.int32),
+        "rest_joints": body.rest_joints.numpy(),
+        "rest_vertices": body.rest_vertices.numpy(),
+        "faces": body.faces.numpy().astype(np.int32),
+        "weights": body.weights.numpy(),
+    }
+
+
 def default_body(betas: Float[np.ndarray, "B"] | None = None, *, source: str = "betas") -> Body:
     """The shipped parametric body (CC0) with up to 10 shape coefficients, each about -3..3."""
     data = _default_arrays()

@@ -82,6 +82,12 @@ class BodyTrack:
         moved.body = self.body.to(device)
         return moved
 
+    def with_body(self, body: Body) -> "BodyTrack":
+        """The same motion of a body with the same joints and another surface."""
+        other = copy.copy(self)
+        other.body = body
+        return other
+
     @property
     def device(self) -> torch.device:
         """Of the body, and of the poses that `at` gives."""

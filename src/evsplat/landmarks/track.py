@@ -14,7 +14,7 @@ from evsplat.landmarks.detect import COPIES, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
 from evsplat.landmarks.motion import Motion
 from evsplat.landmarks.network import LandmarkNetwork
-from evsplat.landmarks.pictures import SharpPicture
+from evsplat.landmarks.pictures import CARRIED_SIGMA, SharpPicture
 from evsplat.landmarks.refusals import (
     refuse_empty,
     refuse_half_out_of_view,
@@ -27,6 +27,11 @@ logger = logging.getLogger(__name__)
 
 SURE = 0.9
 """The person is tracked on from pictures with at least this flag, and searched for below it."""
+HARDLY, _HARDLY_SIGMA = 0.5, 2.0
+"""Belief in all points of somebody who is hardly recognised, and factor of their expected error: in
+kicks and flips most of them are near where they belong."""
+_CARRIED, _CARRIED_SIGMA = 0.1, 4.0
+"""The same where events carried the picture there from others, which may show ghosts."""
 _TURNS = (0.0, np.pi / 2, -np.pi / 2, np.pi)
 """Uprights of a search: cartwheels and handstands are found by the last three."""
 _CLEAR = 0.008
@@ -87,7 +92,7 @@ def find_landmarks(
         np.array([picture.time_us for picture in pictures], dtype=np.int64),
         places,
         np.stack([_sigma(*both) for both in zip(pictures, found, strict=True)]),
-        np.stack([_seen(person) for person in found]),
+        np.stack([_seen(*both) for both in zip(pictures, found, strict=True)]),
         np.stack([person.world for person in found]),
         BLAZEPOSE_33,
     )
@@ -186,15 +191,21 @@ def _alike(one: Region, other: Region) -> bool:
 
 def _sigma(picture: SharpPicture, found: Found) -> Float[np.ndarray, "33"]:
     """Expected error per axis, pixels: what clear points have, and the copies' disagreement."""
-    doubt = 1 if found.is_person else 4
     base = _BASE_SIGMA * found.region.side
+    doubt = 1.0 if found.is_person else _of(picture, _HARDLY_SIGMA, _CARRIED_SIGMA)
     sigma: np.ndarray = picture.sigma * doubt * np.hypot(base, found.spread)
     return sigma
 
 
-def _seen(found: Found) -> Float[np.ndarray, "33"]:
+def _seen(picture: SharpPicture, found: Found) -> Float[np.ndarray, "33"]:
     """The network's belief, less where its copies disagree: it believes in hidden arms as well."""
+    if not found.is_person:
+        return np.full(len(found.spread), _of(picture, HARDLY, _CARRIED))
     disagreement = found.spread / (_BASE_SIGMA * found.region.side)
-    belief = found.flag if found.is_person else 0.1 * found.flag
-    seen: np.ndarray = belief * found.visible / (1 + (disagreement / 2) ** 2)
+    seen: np.ndarray = found.flag * found.visible / (1 + (disagreement / 2) ** 2)
     return seen
+
+
+def _of(picture: SharpPicture, own: float, carried: float) -> float:
+    """One of two values, by whether events carried the picture from elsewhere."""
+    return carried if picture.sigma == CARRIED_SIGMA else own

@@ -12,7 +12,8 @@ import numpy as np
 from tqdm import tqdm
 
 import evsplat
-from evsplat.body import BodyTrack
+from evsplat.body import Body, BodyTrack
+from evsplat.body.make import rig_arrays
 from evsplat.body.smpl import smpl_body
 from evsplat.camera import Camera
 from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
@@ -131,10 +132,15 @@ def find_poses(
                 logger.warning("%s", _rough(focal))
         track = fitted.track(key_times(seen))
         refined: Refined | None = None
+        dressed: Body | None = None
         if limit_s > 0:
             with stages(bar, "refinement"):
                 refined = refine(track, seen, seconds=limit_s, progress=True, steps=FOUND_STEPS)
-            track = refined.track if refined.better else track
+            if refined.better:
+                track = refined.track
+                if rig.model == "default":  # the vertices of a licensed model are not ours to write
+                    dressed = refined.dressed
+                    track = track.with_body(dressed)
     made = {
         "from": "key points of a file" if keypoints else "landmarks of BlazePose",
         **to_dict(search),
@@ -145,7 +151,7 @@ def find_poses(
         **_refinement_made(refined),
     }
     with derived_capture(capture, out, replace=overwrite) as making:
-        _write_body(making, track, fitted)
+        _write_body(making, track, fitted, dressed)
         if focal_px is not None:
             _set_focal(making, focal_px)
             made["focal_px"] = round(focal_px, 2)
@@ -247,15 +253,20 @@ def _cameras(capture: TrainingCapture, times_us: Sequence[int]) -> list[Camera]:
     return [capture.camera(capture.frames[index]) for index in nearest]
 
 
-def _write_body(making: Derivation, track: BodyTrack, fitted: PoseFit) -> None:
+def _write_body(
+    making: Derivation, track: BodyTrack, fitted: PoseFit, dressed: Body | None
+) -> None:
+    """With the surface of ``dressed`` as a rig of its own, else as shape coefficients."""
     assert track.errors is not None
+    model = fitted.rig.model if dressed is None else "rig"
     making.set_body(
-        fitted.rig.model,
+        model,
         track.times_us,
         track.poses,
         track.transl,
-        betas=fitted.betas,
-        gender="neutral" if fitted.rig.model == "smpl" else None,
+        betas=fitted.betas if dressed is None else None,
+        rig=None if dressed is None else rig_arrays(dressed),
+        gender="neutral" if model == "smpl" else None,
         source="estimated",
         pose_std_rad=track.errors.joint_rad,
         transl_std_m=track.errors.root_m,

@@ -6,13 +6,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image, ImageDraw
+from torch import Tensor
 
 from evsplat.body import BodyTrack, silhouette
+from evsplat.body.silhouette import body_box
 from evsplat.camera import Camera
 from evsplat.capture import TrainingCapture
 from evsplat.inspection.drawing import DETAIL_PX, draw_outline, fit, to_picture
 from evsplat.landmarks import Landmarks, SharpPicture
+from evsplat.landmarks.track import HARDLY
 from evsplat.pages import Embedder, document, figure, folded, section, spread
 from evsplat.posing.fit import PoseFit
 from evsplat.posing.rig import LIMBS, Rig
@@ -23,6 +27,8 @@ _DOUBTFUL_PX = 3.0
 """Pictures whose landmarks lie this many of their standard deviations off are told."""
 _OUTLINE, _LANDMARK, _UNSEEN = (60, 255, 120), (255, 220, 60), (255, 90, 60)
 _NOT_SEEN = 0.5
+_MARGIN = 0.12
+"""Room around the person in a tile, share of the box on each side."""
 _BONES = (
     *(("left_shoulder", "right_shoulder"), ("left_hip", "right_hip")),
     *((f"{s}_{a}", f"{s}_{b}") for s in ("left", "right") for a, b in (
@@ -45,6 +51,11 @@ def poses_page(
     by_time = {picture.time_us: picture for picture in pictures}
     off = dict(zip(landmarks.times_us.tolist(), misfit(fitted), strict=True))
     shown = [index for index, time in enumerate(landmarks.times_us) if int(time) in by_time]
+    chosen = spread(shown, _MOST)
+    first = spread(chosen, _OPEN)
+    rest = [index for index in chosen if index not in first]
+    worst = sorted((i for i in shown if off[int(landmarks.times_us[i])] > _DOUBTFUL_PX),
+                   key=lambda i: -off[int(landmarks.times_us[i])])[:_OPEN]  # fmt: skip
     embed = Embedder(lossless=False)
 
     def tile(index: int) -> str:
@@ -53,11 +64,6 @@ def poses_page(
         label = f"{picture.frame.name}, {picture.time_us / 1e6:.3f} s, {off[picture.time_us]:.1f} σ"
         return figure(embed.image(np.asarray(drawn), label), label)
 
-    chosen = spread(shown, _MOST)
-    first = spread(chosen, _OPEN)
-    rest = [index for index in chosen if index not in first]
-    worst = sorted((i for i in shown if off[int(landmarks.times_us[i])] > _DOUBTFUL_PX),
-                   key=lambda i: -off[int(landmarks.times_us[i])])[:_OPEN]  # fmt: skip
     grid = lambda indices: f'<div class="tiles">{"".join(map(tile, indices))}</div>'  # noqa: E731
     body = (
         f"<header><p class='kicker'>evsplat poses</p><h1>{escape(name)}</h1>"
@@ -71,7 +77,7 @@ def poses_page(
             grid(first) + folded(f"{len(rest)} more pictures", grid(rest) if rest else ""),
         )
         + section("How sure", _SURE, _limb_table(track, fitted.rig))
-        + section("In doubt", _DOUBT, _doubts(fitted) + (grid(worst) if worst else ""))
+        + section("In doubt", _DOUBT, _doubts(fitted, landmarks) + (grid(worst) if worst else ""))
         + section(
             "Made with", "", _table(_lines({name: made[name] for name in made if name != "policy"}))
         )
@@ -100,18 +106,38 @@ def misfit(fitted: PoseFit) -> list[float]:
     return total.sqrt().tolist()
 
 
+def _window(vertices: Float[Tensor, "V 3"], camera: Camera) -> tuple[int, int, int, int]:
+    """Left, top, width and height of a square about the person, for as far as the picture reaches.
+
+    All of the picture where the person is out of view.
+    """
+    box = body_box(vertices, camera, margin=_MARGIN)
+    if box is None:
+        return 0, 0, camera.width, camera.height
+    side = max(box[2] - box[0], box[3] - box[1])
+    size = min(side, camera.width), min(side, camera.height)
+    left = min(max((box[0] + box[2] - size[0]) // 2, 0), camera.width - size[0])
+    top = min(max((box[1] + box[3] - size[1]) // 2, 0), camera.height - size[1])
+    return left, top, *size
+
+
 def _drawn(
     picture: SharpPicture, camera: Camera, track: BodyTrack, landmarks: Landmarks, index: int
 ) -> Image.Image:
-    size = fit(camera.width, camera.height, DETAIL_PX)
-    scale = size[0] / camera.width
-    factors = torch.tensor([scale, size[1] / camera.height, 1.0])
-    large = Camera(*size, camera.K * factors[:, None], camera.world_to_camera)
-    image = to_picture(picture.image, size)
-    mask = silhouette(track.vertices(picture.time_us), track.body.faces, large)
+    vertices = track.vertices(picture.time_us)
+    left, top, width, height = _window(vertices, camera)
+    size = fit(width, height, DETAIL_PX)
+    scale = size[0] / width
+    K = camera.K.clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    factors = torch.tensor([scale, size[1] / height, 1.0])
+    large = Camera(*size, K * factors[:, None], camera.world_to_camera)
+    image = to_picture(picture.image[top : top + height, left : left + width], size)
+    mask = silhouette(vertices, track.body.faces, large)
     draw_outline(image, mask.numpy(), _OUTLINE)
     draw = ImageDraw.Draw(image)
-    places, seen = landmarks.places[index] * scale, landmarks.seen[index]
+    places, seen = (landmarks.places[index] - [left, top]) * scale, landmarks.seen[index]
     for start, end in _BONES:
         a, b = landmarks.index(start), landmarks.index(end)
         if a is not None and b is not None and min(seen[a], seen[b]) > 0:
@@ -159,12 +185,19 @@ def _table(rows: Sequence[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
     return f"<table>{lines}</table>"
 
 
-def _doubts(fitted: PoseFit) -> str:
+def _doubts(fitted: PoseFit, landmarks: Landmarks) -> str:
+    hardly, count = int((landmarks.seen.max(1) <= HARDLY).sum()), len(landmarks.seen)
+    said = ""
+    if hardly:
+        said = (
+            f"<p>The person is hardly recognised in {hardly} of {count} pictures; poses there "
+            "follow from those before and after, and from the person's outline.</p>"
+        )
     if not fitted.doubts:
-        return "<p>No limb's depth is in doubt.</p>"
+        return f"{said}<p>No limb's depth is in doubt.</p>"
     rows = "".join(
         f"<li>{doubt.part.replace('_', ' ')}, {doubt.start_us / 1e6:.3f} to "
         f"{doubt.end_us / 1e6:.3f} s: odds {np.exp(doubt.odds_log):.1f} to 1</li>"
         for doubt in fitted.doubts
     )
-    return f"<ul>{rows}</ul>"
+    return f"{said}<ul>{rows}</ul>"

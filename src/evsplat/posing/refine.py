@@ -78,6 +78,8 @@ class Refined(Verdict):
 
     track: BodyTrack
     """The corrected motion with its errors; `better` says whether to use it."""
+    dressed: Body
+    """The body with its surface where pictures show the person's: clothes, hair and shoes too."""
     stages: tuple[Stage, ...]
 
 
@@ -146,6 +148,7 @@ def refine(
         _given_errors(descent.correction, len(track.times_us)),
         time.monotonic() - began,
         descent.correction.corrected(errors),
+        descent.look.dressed(),
         (*found.stages, last),
     )
 

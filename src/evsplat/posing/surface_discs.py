@@ -1,12 +1,15 @@
 """A body as flat discs on its surface, drawn in one colour each under a smooth light."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from evsplat.body import Body
 from evsplat.body.body import skin
-from evsplat.body.surface import SurfaceSamples
+from evsplat.body.surface import SurfaceSamples, vertex_normals
 from evsplat.camera import Camera
 from evsplat.render import RenderOutput, Splats, render
 
@@ -24,6 +27,8 @@ _ANCHORS = 300
 _SIZE = 0.015
 """Share by which clothes, hair and shoes make a person look larger or smaller as a whole. Such a
 person is drawn nearer or farther off, so that its motion keeps the distance that it had."""
+_NEIGHBOURS, _SMOOTH_M = 40, 0.05
+"""Discs that a vertex moves with, and how near they are, metres."""
 _INSET = 0.3
 """What is left to learn of how far discs must be set back, in units of `_OFFSET_M`."""
 _BEYOND = 0.3, 0.55
@@ -137,6 +142,25 @@ class SurfaceDiscs(nn.Module):
     def nearer_m(self, transl: Float[Tensor, "T 3"], camera: Camera) -> Float[Tensor, "T 3"]:
         """Vectors along the view, as long as looks of a typical size hide of a distance, metres."""
         return _SIZE * (transl + self.body.rest_joints[0] - camera.center())
+
+    @torch.no_grad()
+    def dressed(self) -> Body:
+        """The body with its surface where the discs are: with clothes, hair and shoes.
+
+        Joints, weights and triangles stay. A vertex moves as the discs near it do.
+        """
+        body = self.body
+        vertices = body.canonical_vertices()
+        normals = vertex_normals(vertices, body.faces)
+        thick = self.inset + self.offsets + _LAYER_M / _OFFSET_M * (self.near @ self.layer)
+        found = cKDTree(self.samples.points.numpy()).query(vertices.numpy(), _NEIGHBOURS)
+        apart, rows = torch.from_numpy(found[0]).float(), torch.from_numpy(found[1])
+        near = torch.exp(-0.5 * (apart / _SMOOTH_M).square()) + 1e-6
+        thick = (near * thick[rows]).sum(1) / near.sum(1)
+        moved = _OFFSET_M * (thick[:, None] * normals + body.weights @ self.bone_offsets)
+        spread = (body.weights @ body.canonical_bone_transforms().flatten(1)).unflatten(1, (4, 4))
+        back = torch.linalg.solve(spread[:, :3, :3], moved[..., None])[..., 0]
+        return replace(body, rest_vertices=body.rest_vertices + back)
 
     def _drawn(
         self,

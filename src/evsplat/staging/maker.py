@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 import evsplat
 from evsplat.body import BodyTrack, PoseSource
+from evsplat.body.make import rig_arrays
 from evsplat.body.motion import load_motion
 from evsplat.body.pose_noise import noise_errors, poses_off_by
 from evsplat.body.retarget import SkeletonMotion
@@ -199,14 +200,7 @@ class _Film:
             self.mids_us,
             poses,
             transl,
-            rig={
-                "joint_names": np.array(body.joint_names),
-                "parents": body.parents.numpy().astype(np.int32),
-                "rest_joints": body.rest_joints.numpy(),
-                "rest_vertices": body.rest_vertices.numpy(),
-                "faces": body.faces.numpy().astype(np.int32),
-                "weights": body.weights.numpy(),
-            },
+            rig=rig_arrays(body),
             dense=(dense, *key_poses(self.track, dense)),
             source=source,
             pose_std_rad=errors.joint_rad,
