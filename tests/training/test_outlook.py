@@ -79,6 +79,12 @@ def test_a_run_without_a_number_of_steps_ends_earlier_and_says_so(tiny_capture, 
     assert load_run(told_so).iteration == 80
 
 
+def test_a_run_on_poses_that_err_makes_all_its_steps(tiny_capture, tmp_path):
+    settings = small("evsplat", "iterations=80", "pose.refine=always")
+    out = train(tiny_capture(frames=10), out=tmp_path / "run", overrides=settings)
+    assert load_run(out).iteration == 80
+
+
 def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(tiny_capture, tmp_path, monkeypatch):
     module = sys.modules["evsplat.training.train"]  # its name in the package is the function
     monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)

@@ -75,6 +75,8 @@ class Composition:
     watched: tuple[str, ...] = ()
     """Terms that compare pictures: how their weighted sum falls tells when little more is to come,
     and a run that was given no number of steps ends earlier then. None: it never does."""
+    ends_early: bool = True
+    """Whether that holds for what a new training was given; one that goes on keeps to it."""
     fill: Callable[[Seen], dict[str, Tensor]] | None = None
     """Parameters by their names in the model's state, as a prior decides them at the end where
     little was seen; None: as they were learned."""

@@ -141,7 +141,7 @@ class EvsplatConfig:
     """Held-out data that training may see."""
     iterations: Annotated[int, AtLeast(1)] = 2_000
     """Training steps; all schedules stretch with it. Twice as many bring less than 0.2 dB. Without
-    ``--iterations`` a run ends earlier where little more is to come."""
+    ``--iterations`` a run on exact poses ends earlier where little more is to come."""
 
     human: HumanStart = HumanStart(count=None, spacing_px=0.85)
     """Discs of the person at the start."""
@@ -319,6 +319,8 @@ def build(
         generator=generator,
         held_out=None if windows is None else _held_out(config, capture, model, windows),
         watched=("l1", "dssim"),
+        # Errors of poses, and shapes that change, are still learned where the loss hardly falls.
+        ends_early=poses.correction is None or bool(poses.correction.exact),
         fill=partial(filled, model, capture, config.fill) if config.fill else None,
     )
 
