@@ -89,10 +89,11 @@ def train(
     """Train a method on a capture and return the run folder.
 
     ``changes`` are fields of `TrainOptions`: ``train("my_capture", max_minutes=10)``. Without
-    ``iterations`` the schedule is shortened to be finished within ``max_minutes``, and where the
-    loss of the pictures says that little more is to come (method `evsplat`). The cheap fits
-    before the first step count as training. ``use="everything"`` is short for the setting
-    ``policy.use=everything``. ``on_start`` is called with the run folder before the first step.
+    ``iterations`` the schedule is shortened to be finished within ``max_minutes``, and without
+    either where the loss of the pictures says that little more is to come (method `evsplat`, poses
+    that are exact). The cheap fits before the first step count as training. ``use="everything"``
+    is short for the setting ``policy.use=everything``. ``on_start`` is called with the run folder
+    before the first step.
 
     Raises:
         Stopped: Ctrl-C; the step is finished and saved.
@@ -140,7 +141,8 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
         iterations or start.settings.iterations,
         None if max_minutes is None else 60 * max_minutes,
         shrink=max_minutes is not None and iterations is None,
-        may_end_early=iterations is None and bool(composition.watched) and composition.ends_early,
+        may_end_early=(iterations is None and max_minutes is None)
+        and (bool(composition.watched) and composition.ends_early),
         seconds=time.perf_counter() - started,
     )
     cache_gb = options.device_memory_gb
