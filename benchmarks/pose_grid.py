@@ -28,7 +28,7 @@ import numpy as np
 import evsplat as ev
 from evsplat.benching.drawn import Draw, drawn_settings
 from evsplat.capture import Policy, load_capture
-from evsplat.methods.evsplat import EvsplatConfig
+from evsplat.methods.evsplat_settings import EvsplatConfig
 from evsplat.methods.poses import prepare_poses
 from evsplat.options import StageSettings
 from evsplat.staging.assets import characters

@@ -194,7 +194,7 @@ def _pose(time_us: float, phase: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _posed_vertices(rig: dict[str, np.ndarray], time_us: float, phase: float) -> np.ndarray:
-    """Linear blend skinning as design.md section 3 writes it."""
+    """Linear blend skinning, written out."""
     poses, transl = _pose(time_us, phase)
     rotations, origins = [], []
     for joint, parent in enumerate(rig["parents"]):

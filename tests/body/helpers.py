@@ -22,7 +22,7 @@ def random_rig(seed, joints=17, vertices=60, shuffled=False):
 
 
 def reference_bones(parents, rest_joints, poses, transl):
-    """Rest-to-world bone transforms of one pose, joint by joint (design.md section 3)."""
+    """Rest-to-world bone transforms of one pose, joint by joint."""
     rest = np.asarray(rest_joints, np.float64)
     local = Rotation.from_rotvec(np.asarray(poses, np.float64)).as_matrix()
     bones, frames = np.zeros((len(parents), 4, 4)), {}

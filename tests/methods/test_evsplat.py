@@ -8,8 +8,7 @@ import pytest
 
 from evsplat.calibration import ClockEstimate, SensorEstimate, ThresholdEstimate
 from evsplat.capture import TrainingCapture, load_capture
-from evsplat.methods import Purpose
-from evsplat.methods import evsplat as method
+from evsplat.methods import Purpose, sensor
 from evsplat.objectives import EventChange, EventWindows
 from evsplat.training import train
 
@@ -39,12 +38,12 @@ def test_a_clock_that_is_late_is_learned_from_there(
     tiny_capture, monkeypatch, choice, late_us, start_us
 ):
     found = None if late_us is None else SensorEstimate(lag(late_us), None)
-    monkeypatch.setattr(method, "estimate_sensor", lambda capture: found)
-    sensor = built("evsplat", tiny_capture(), f"clock={choice}", purpose="train").model.sensor
+    monkeypatch.setattr(sensor, "estimate_sensor", lambda capture: found)
+    learned = built("evsplat", tiny_capture(), f"clock={choice}", purpose="train").model.sensor
     if start_us is None:
-        assert sensor.offset_us is None
+        assert learned.offset_us is None
     else:
-        assert float(sensor.offset_us) == pytest.approx(start_us)
+        assert float(learned.offset_us) == pytest.approx(start_us)
 
 
 def forget(path) -> None:
@@ -68,7 +67,7 @@ def test_without_one_training_frames_and_events_tell_it(tiny_capture, monkeypatc
         looked_at.append(capture)
         return SensorEstimate(lag(0.0), ThresholdEstimate(0.31, 0.17, 0.1, 500))
 
-    monkeypatch.setattr(method, "estimate_sensor", estimate)
+    monkeypatch.setattr(sensor, "estimate_sensor", estimate)
     assert thresholds(path) == pytest.approx((0.31, 0.17), rel=1e-6)
     assert isinstance(looked_at[0], TrainingCapture)  # what is held out stays unseen
     looked_at.clear()
@@ -80,7 +79,7 @@ def test_without_one_training_frames_and_events_tell_it(tiny_capture, monkeypatc
 def test_what_cannot_be_told_is_said(tiny_capture, monkeypatch, caplog):
     path = tiny_capture()
     forget(path)
-    monkeypatch.setattr(method, "estimate_sensor", lambda capture: None)
+    monkeypatch.setattr(sensor, "estimate_sensor", lambda capture: None)
     assert thresholds(path) == pytest.approx((0.2, 0.2), rel=1e-6)
     assert "contrast thresholds are neither given nor to be found" in caplog.text
 

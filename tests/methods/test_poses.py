@@ -14,7 +14,8 @@ from evsplat.body import PoseErrors
 from evsplat.capture import Capture, TrainingCapture, load_body_track, load_capture
 from evsplat.errors import ConfigError
 from evsplat.methods import poses
-from evsplat.methods.evsplat import ERRORS_RATE, EvsplatConfig
+from evsplat.methods.evsplat import ERRORS_RATE
+from evsplat.methods.evsplat_settings import EvsplatConfig
 from evsplat.methods.poses import SMOOTHED, Poses, prepare_poses
 from evsplat.models.pose_correction import SHARES
 from evsplat.posing.refine import LEAST_GAIN, Verdict

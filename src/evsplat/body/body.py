@@ -48,7 +48,7 @@ class Body:
     def joint_transforms(
         self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
     ) -> Float[Tensor, "*T J 4 4"]:
-        """Posed joint frames [R_j | t_j] from rotations local to the parent (design.md section 3).
+        """Posed joint frames [R_j | t_j] from rotations local to the parent.
 
         ``R_j = R_parent r_j``, ``t_j = t_parent + R_parent (rest_j - rest_parent)``; the root
         stands at ``rest_0 + transl``.
@@ -72,7 +72,7 @@ class Body:
     def canonical_to_world(
         self, rotations: Float[Tensor, "*T J 3 3"], transl: Float[Tensor, "*T 3"]
     ) -> Float[Tensor, "*T J 4 4"]:
-        """Transforms of each bone, canonical pose to world (method.md 1.3)."""
+        """Transforms of each bone, canonical pose to world (3DGS-Avatar)."""
         return self.joint_transforms(rotations, transl) @ self._to_canonical.to(rotations.dtype)
 
     def sample_surface(
@@ -116,7 +116,7 @@ def skin(
     """Linear blend skinning: points moved by the weighted mean of the bone transforms.
 
     Returns the moved points and the blended matrices, whose 3x3 part is not a rotation where
-    bones disagree (the shear is kept; method.md 1.6).
+    bones disagree (the shear is kept, as in 3DGS-Avatar).
     """
     moved, blended, _ = _skinned(points, weights, bones, linear=False)
     return moved, blended

@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 SMPL_SPREAD_DEG = 45.0
-"""Rotation of each leg of the SMPL family (3DGS-Avatar; method.md 1.2)."""
+"""Rotation of each leg of the SMPL family (3DGS-Avatar)."""
 THIGH_DEG = 30.0
 """Other rigs: angle between thigh and straight down, seen from the front. Their rest poses differ
 (A-poses already have the legs apart), so the angle reached is fixed and not the rotation. At 30

@@ -32,6 +32,15 @@ class Fields:
                     file, self.field(key), "an unknown key", "a known key", nearest(key, known)
                 )
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the capture, which the object's paths are relative to."""
+        return self.file.parent
+
+    def inner(self, where: str, value: Any, known: tuple[str, ...]) -> "Fields":
+        """An object further in, of the same file."""
+        return Fields(self.file, where, value, known, self.findings)
+
     def field(self, key: str) -> str:
         """Dotted name of a key of this object."""
         return f"{self.where}.{key}".strip(".")
@@ -70,15 +79,15 @@ class Fields:
         self.fail(key, brief(text), f"a name: {NAME_RULE}", RENAME)
         return ""
 
-    def path(self, key: str, root: Path, *, required: bool = True) -> Path | None:
-        """A path below the capture's folder ``root``, which no link leads out of."""
+    def path(self, key: str, *, required: bool = True) -> Path | None:
+        """A path below the capture's folder, which no link leads out of."""
         text = self.text(key) if required else self.text(key, None)
         if not text:
             return None
         found = brief(text)
         if is_path_of_names(text):
-            if not leads_out(root / text, root):
-                return root / text
+            if not leads_out(self.folder / text, self.folder):
+                return self.folder / text
             found += ", a link that leads out of it"
         self.fail(
             key,

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import PoseSource
 from evsplat.capture.body_file import key_poses, save_arrays, write_body
-from evsplat.capture.parse import FORMAT, VERSION, default_split
+from evsplat.capture.parse import FORMAT, VERSION
+from evsplat.capture.parse_frames import default_split
 from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError

@@ -14,7 +14,7 @@ from evsplat.gaussians.row_adam import RowAdam
 
 @dataclass(frozen=True)
 class DensifyLimits:
-    """Limits of one class, in nominal iterations (of 15,000) and metres; reference 1.11, A20."""
+    """Limits of one class, in nominal iterations (of 15,000) and metres; 3DGS-Avatar's, see A20."""
 
     start: float = 1_000
     """First nominal iteration."""

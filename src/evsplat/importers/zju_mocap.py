@@ -35,7 +35,7 @@ from evsplat.untrusted.arrays import read_npy, read_npz
 from evsplat.untrusted.text import read_json
 
 FRAME_RANGES = {"377": (0, 570), "386": (0, 540), "387": (0, 540), "394": (0, 475)}
-"""Frames that ARAH and 3DGS-Avatar use; of 392 and 393 they use all (method.md 1.14)."""
+"""Frames that ARAH and 3DGS-Avatar use; of 392 and 393 they use all."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from evsplat.config import from_dict
 from evsplat.errors import ConfigError
 from evsplat.methods import avatar3dgs, hugs, paper
 from evsplat.methods.base import Composition, MethodConfig, Purpose
-from evsplat.methods.evsplat import EvsplatConfig
 from evsplat.methods.evsplat import build as build_evsplat
+from evsplat.methods.evsplat_settings import EvsplatConfig
 from evsplat.methods.settings import NOMINAL_ITERATIONS
 from evsplat.untrusted.faults import brief
 

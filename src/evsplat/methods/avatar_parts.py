@@ -25,7 +25,7 @@ from evsplat.objectives.photometric import Box
 SURFACE_SAMPLES = 100_000
 """Body surface points drawn once for the skinning prior."""
 SKINNING_POINTS = 1_024
-"""Surface points per step of the skinning prior (1.6)."""
+"""Surface points per step of the skinning prior."""
 ISOMETRY_REFRESH = 100
 """Steps between neighbour searches."""
 CLIP = 0.1
@@ -40,7 +40,7 @@ _PERCEPTUAL = ReadIf("terms.perceptual", "not none", lambda name: name != "none"
 
 @dataclass(frozen=True)
 class Networks:
-    """Networks that move and colour the person (1.4 to 1.8)."""
+    """Networks that move and colour the person."""
 
     width: Annotated[int, AtLeast(1)] = 128
     """Hidden width of the non-rigid and the skinning network."""
@@ -58,7 +58,7 @@ class Networks:
 
 @dataclass(frozen=True)
 class AvatarTerms:
-    """Terms of the loss beside the picture's (1.9)."""
+    """Terms of the loss beside the picture's."""
 
     perceptual: PerceptualChoice = "none"
     """``lpips_vgg`` is the paper's and needs its weights (see `evsplat doctor`); ``st_lpips`` runs
@@ -67,7 +67,7 @@ class AvatarTerms:
     perceptual_weight: Annotated[Weight, _PERCEPTUAL] = 0.01
     """Weight of the perceptual distance."""
     skinning: Weight = ((0, 10.0), (1_000, 0.1))
-    """Weight of the squared error of the skinning network on the body's surface (1.6)."""
+    """Weight of the squared error of the skinning network on the body's surface."""
     skinning_prefit_steps: Annotated[int, AtLeast(0)] = 2_000
     """Steps of fitting the skinning network alone before training proper. 2,000 bring its squared
     error against the body's weights to 0.03; with 400 it stays near 0.08 for good."""
@@ -81,7 +81,7 @@ class AvatarTerms:
 
 @dataclass(frozen=True)
 class AvatarRates:
-    """Adam's learning rates at the start of training (1.10)."""
+    """Adam's learning rates at the start of training."""
 
     means: NotNegative = 5.5e-4
     """Centres, metres (1.6e-4 times 3DGS-Avatar's extent of 3.47)."""
@@ -110,7 +110,7 @@ class AvatarRates:
 
 
 RELEASED_RATES = AvatarRates(features=1e-3, constant=0.0, gaussians_final=1.0)
-"""Rates of the released 3DGS-Avatar (1.10)."""
+"""Rates of the released 3DGS-Avatar."""
 
 
 def avatar(

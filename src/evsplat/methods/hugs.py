@@ -86,7 +86,7 @@ class HugsConfig:
     """Steps of the fit of triplane and decoders to the body before training. Released: 7,000."""
 
     l1_weight: Weight = 0.8
-    """Weight of the mean absolute difference to the recorded picture, sRGB (2.4)."""
+    """Weight of the mean absolute difference to the recorded picture, sRGB."""
     dssim_weight: Weight = 0.2
     """Weight of 1 - SSIM."""
     human_l1_weight: Weight = 0.8
@@ -101,7 +101,7 @@ class HugsConfig:
     """Weight of the perceptual distance of the joint picture and of the person alone."""
 
     rate_scale: Positive = 1.0
-    """Factor on all learning rates, which are the released ones (2.5)."""
+    """Factor on all learning rates, which are the released ones."""
 
 
 def build(
@@ -119,7 +119,7 @@ def build(
     track = load_body_track(capture)
     human, spacing = _human(config, capture, track, generator)
     # The scene's size, that rates and limits are relative to: the released code takes how far the
-    # cameras are from each other, which is 0 for a static one; this reading works (2.9).
+    # cameras are from each other, which is 0 for a static one; this reading works.
     _, extent = cube(config.scene, capture, track)
     scene = _scene(config, capture, track, generator)
     times_us = [frame.mid_us for frame in capture.train_frames]
@@ -211,7 +211,7 @@ def _seen(points: Float[Tensor, "N 3"], capture: TrainingCapture) -> Tensor:
 
 
 def _limits(config: HugsConfig, extent: float) -> dict[Part, DensifyLimits]:
-    """Released limits (2.6); a median backdrop would only grow in front of the person."""
+    """Released limits; a median backdrop would only grow in front of the person."""
     human = DensifyLimits(
         start=config.densify.start,
         end=config.densify.end,
@@ -240,7 +240,7 @@ def _limits(config: HugsConfig, extent: float) -> dict[Part, DensifyLimits]:
 
 
 def _learning(model: HugsModel, config: HugsConfig, extent: float) -> Learning:
-    """Released rates (2.5); centres fall to a tenth, as after half of the released 30,000."""
+    """Released rates; centres fall to a tenth, as after half of the released 30,000."""
     scale, human = config.rate_scale, model.human
     start = 1.6e-4 * scale * extent
     if config.scene.kind == "median_backdrop":

@@ -52,7 +52,7 @@ class Densify:
     """No clone or split of the person beyond this number of Gaussians."""
 
     def limits(self, *, cube_max_count: int | None = None) -> dict[Part, DensifyLimits]:
-        """Limits of the person as 3DGS-Avatar's (1.11), and of a random cube as 3DGS's (A20).
+        """Limits of the person as 3DGS-Avatar's, and of a random cube as 3DGS's (A20).
 
         Without ``cube_max_count`` the scene is left as it is: a median backdrop has a Gaussian for
         every 2x2 pixels already and would only grow where the person passes.

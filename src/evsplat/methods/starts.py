@@ -41,7 +41,7 @@ _BACKDROP = ReadIf("scene.kind", "median_backdrop", lambda kind: kind == "median
 
 @dataclass(frozen=True)
 class HumanStart:
-    """Number of the person's Gaussians at the start, samples of the body's surface (1.2)."""
+    """Number of the person's Gaussians at the start, samples of the body's surface."""
 
     count: Annotated[int, AtLeast(1)] | None
     """Number of surface samples. 3DGS-Avatar takes 50,000; null = as many as ``spacing_px`` asks
@@ -66,7 +66,7 @@ class SceneStart:
     """Start of the scene's Gaussians (A21: unsaid in the paper)."""
 
     kind: Literal["median_backdrop", "random_cube"]
-    """``random_cube``: as HUGS in the paper (2.9), needs far more steps. ``median_backdrop``: the
+    """``random_cube``: as HUGS in the paper, needs far more steps. ``median_backdrop``: the
     temporal median of the training frames on a floor and a wall; static cameras only."""
     cube_count: Annotated[int, AtLeast(4), _CUBE]
     """Points of the random cube."""

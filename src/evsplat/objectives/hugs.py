@@ -1,4 +1,4 @@
-"""HUGS's losses: both sets against the picture, the person alone against its pixels (2.4)."""
+"""HUGS's losses: both sets against the picture, the person alone against its pixels."""
 
 from dataclasses import replace
 

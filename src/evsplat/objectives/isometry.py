@@ -86,7 +86,7 @@ def _rows(values: Tensor, rows: Tensor, axis: int) -> Tensor:
 
 
 class Isometry(LookedUp):
-    """L1 between pairwise distances in canonical space and posed (3DGS-Avatar, 1.9).
+    """L1 between pairwise distances in canonical space and posed (3DGS-Avatar).
 
     Four neighbours per Gaussian, looked up among the canonical centres. Each step looks at
     ``samples`` random Gaussians, an unbiased estimate of the full mean, or at all if there are

@@ -72,7 +72,7 @@ class Photometric(OfMiddle):
 
 
 class Alpha(OfMiddle):
-    """L1 between the person's alpha picture and the mask (3DGS-Avatar; reference 1.9).
+    """L1 between the person's alpha picture and the mask (3DGS-Avatar).
 
     The alpha picture is the channel of the semantic attribute, for a set that is nothing but the
     person: the released code draws it as a second picture with all colours white.

@@ -38,7 +38,7 @@ class DeformationPrior(Objective):
 
 
 class SkinningPrior(Objective):
-    """Mean over surface points of the squared weight error, summed over joints (1.6)."""
+    """Mean over surface points of the squared weight error, summed over joints."""
 
     def __init__(self, surface: SurfaceSamples, points_per_step: int) -> None:
         """``surface``: samples of the canonical body, drawn once; each step uses a few of them."""

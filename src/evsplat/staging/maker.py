@@ -18,7 +18,7 @@ from evsplat.body.motion import load_motion
 from evsplat.body.pose_noise import noise_errors, poses_off_by
 from evsplat.body.retarget import SkeletonMotion
 from evsplat.capture import Camera, CaptureWriter
-from evsplat.capture.parse import default_split
+from evsplat.capture.parse_frames import default_split
 from evsplat.errors import ConfigError
 from evsplat.events import EventStream
 from evsplat.events.simulator import PRESETS, SensorSimulator

@@ -17,7 +17,7 @@ def test_start_changes_almost_nothing_unless_asked_for():
     loud = _changes(NonRigidNetwork(144, last_layer_std=None), positions, pose)
     assert quiet.changes.shape == (2, 500, 3 + 3 + 3 + 16)
     assert quiet.changes[..., :3].abs().max() < 0.005  # metres
-    assert loud.changes[..., :3].abs().max() > 0.03  # the centimetres of method.md 1.5
+    assert loud.changes[..., :3].abs().max() > 0.03  # the centimetres of the released network
     assert quiet.changes[..., 6:9].abs().max() < 0.02
 
 

@@ -12,7 +12,7 @@ from evsplat.models.networks.skinning_network import HierarchicalSoftmax, Skinni
 
 
 def smpl_rule(x):
-    """3DGS-Avatar's rule for 24 joints from 25 logits, step by step (method.md 1.6)."""
+    """3DGS-Avatar's rule for 24 joints from 25 logits, step by step (3DGS-Avatar)."""
     s, w = torch.sigmoid(x), [torch.empty(0)] * 24
     gate = s[:, 0]
     w[0] = 1 - gate

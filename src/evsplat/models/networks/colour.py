@@ -17,7 +17,7 @@ _DIRECTION_DIM = 15
 
 
 class HumanColour(nn.Module):
-    """Colour of human Gaussians (method.md 1.7): 79 inputs, two hidden layers of 64, sigmoid."""
+    """Colour of human Gaussians (3DGS-Avatar): 79 inputs, two hidden layers of 64, sigmoid."""
 
     def __init__(
         self,
@@ -159,7 +159,7 @@ def view_directions(
 def view_jitter(
     generator: torch.Generator | None = None, *, symmetric: bool = False
 ) -> Float[Tensor, "3 3"]:
-    """One random rotation for all canonical view directions of a training step (method.md 1.7).
+    """One random rotation for all canonical view directions of a training step (3DGS-Avatar).
 
     Three Euler angles about x, y, z: two normal with 45 degrees, clipped at 90; the third uniform
     in 0..45 as in the released code, or like the others if ``symmetric`` (what was surely meant).

@@ -24,7 +24,7 @@ class OneBlobEncoding(nn.Module):
     The bump is the quartic kernel ``15/16 (1 - u^2)^2`` with a radius of one bin, and what falls
     off one end comes in at the other, so that each axis sums to one (tiny-cuda-nn's one-blob). The
     released 3DGS-Avatar asks for a hash grid and most likely gets this: 16 bins, 48 values
-    (reference 1.5); the smooth one generalises better to held-out poses.
+    (3DGS-Avatar); the smooth one generalises better to held-out poses.
     """
 
     between: Tensor
@@ -198,7 +198,7 @@ def _even_rows(gradient: Tensor) -> Tensor:
 
 
 class NonRigidNetwork(nn.Module):
-    """Encoded position and pose vector to deformation (method.md 1.5, A9).
+    """Encoded position and pose vector to deformation (A9).
 
     Defaults: 3 hidden layers of 128, 16 features. The first quaternion component is always 1, so
     the network gives three (the released code computes and overwrites a fourth).
@@ -216,7 +216,7 @@ class NonRigidNetwork(nn.Module):
         """``last_layer_std`` None starts the last layer as any other, as the released code does.
 
         Then a random deformation of centimetres appears when this network is switched on
-        (method.md 1.5); a small value starts from almost none.
+        (3DGS-Avatar); a small value starts from almost none.
         """
         super().__init__()
         self.encoding = OneBlobEncoding(bins)

@@ -15,7 +15,7 @@ from evsplat.models.networks.mlp import uniform
 def normalise_joints(
     rest_joints: Float[Tensor, "J 3"], rest_vertices: Float[Tensor, "V 3"]
 ) -> Float[Tensor, "J 3"]:
-    """Rest joints in about [-1, 1]: centred on the mean vertex, one scale (method.md 1.3)."""
+    """Rest joints in about [-1, 1]: centred on the mean vertex, one scale (3DGS-Avatar)."""
     centre = rest_vertices.mean(0)
     low, high = (rest_vertices - centre).aminmax()
     extent = high - low
@@ -23,7 +23,7 @@ def normalise_joints(
 
 
 class PoseEncoder(nn.Module):
-    """Hierarchical encoding of local joint rotations (method.md 1.4).
+    """Hierarchical encoding of local joint rotations (3DGS-Avatar).
 
     A joint's feature is a two-layer network of its rotation matrix (9), rest place (3), bone length
     (1) and its parent's feature; the root's "parent" is a linear map of the whole pose. The root's

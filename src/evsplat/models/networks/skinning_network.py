@@ -16,7 +16,7 @@ Network = Callable[[Float[Tensor, "M C"]], Float[Tensor, "M J"]]
 
 
 class HierarchicalSoftmax(nn.Module):
-    """Weights over the joints of any tree by passing mass from the root down (method.md 1.6).
+    """Weights over the joints of any tree by passing mass from the root down (3DGS-Avatar).
 
     The root starts with mass one. A joint with one child passes it ``sigmoid(l_child)`` of its mass
     and keeps the rest. The root, and any joint with several children, passes on ``sigmoid(gate)``
@@ -127,7 +127,7 @@ class _NativeSoftmax(torch.autograd.Function):
 
 
 class SkinningNetwork(nn.Module):
-    """Normalised canonical position to skinning weights (method.md 1.6).
+    """Normalised canonical position to skinning weights (3DGS-Avatar).
 
     Defaults: 4 hidden layers of 128, no position encoding, no temperature.
     """

@@ -12,7 +12,7 @@ def sh_basis(
 
     K = (degree + 1)^2, less the constant. Order l, then m = -l..l; signs as in 3DGS (with the
     Condon-Shortley phase). Degree 3 without the constant gives the 15 values of the colour networks
-    (method.md 1.7).
+    (3DGS-Avatar).
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"degree is {degree}, expected 0..3")

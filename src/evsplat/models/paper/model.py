@@ -30,9 +30,9 @@ from evsplat.models.paper.placement import Placement, StraightThrough
 from evsplat.render import LOW_PASS, rows_in_view
 
 LATENT_DIM = 16
-"""Size of the per-frame latent of the person's colour (1.7)."""
+"""Size of the per-frame latent of the person's colour."""
 COLOUR_FEATURE_DIM = 16
-"""Values that the non-rigid network gives to the person's colour (1.5)."""
+"""Values that the non-rigid network gives to the person's colour."""
 
 Semantics = Literal["fixed", "ste", "rendered"]
 """Teacher of the attribute: none, straight-through placement, the rendered attribute."""
@@ -75,7 +75,7 @@ class PaperModel(PosedModel):
         pose residuals; these are learned from nominal iteration ``pose_start`` on, None: never.
         ``released``: as the released 3DGS-Avatar, where it differs from the better reading of its
         paper. Its last layer starts at random, so that every point jumps when the non-rigid network
-        is switched on (1.5); its view noise is not symmetric (1.7); of instants that are not the
+        is switched on; its view noise is not symmetric; of instants that are not the
         middle of a training frame it knows nothing (A22); it looks all skinning weights up at every
         step, not one row in four in turns.
         """

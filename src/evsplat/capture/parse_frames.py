@@ -1,0 +1,178 @@
+"""Frames and novel views of capture.json."""
+
+from typing import Any, Literal
+
+from evsplat.camera import Camera
+from evsplat.capture.fields import Fields, is_whole
+from evsplat.capture.metadata import Frame, NovelView
+from evsplat.capture.parse_cameras import rigid
+
+_LONGEST_EXPOSURE_US = 60_000_000
+
+
+def parse_frames(top: Fields, cameras: dict[str, Camera]) -> tuple[Frame, ...]:
+    """The frames without errors; faults of the others, and of all together, are noted."""
+    entries = top.entries("frames")
+    if not entries:
+        if "frames" in top.value:
+            top.fail("frames", "no frame", "at least one frame", "Add the recorded frames.")
+        return ()
+    with_split = sum(isinstance(value, dict) and "split" in value for value in entries)
+    if with_split not in (0, len(entries)):
+        top.fail(
+            "frames",
+            f"'split' in {with_split} of {len(entries)} frames",
+            "a split in every frame or in none",
+            "Name 'train' or 'test' for each, or leave all out (index mod 10 in 7, 8, 9 is "
+            "test then).",
+        )
+    frames = []
+    for index, value in enumerate(entries):
+        frame = _frame(top, index, value, cameras)
+        entries[index] = None  # an hour's are 25 MB, whose room the frames can take
+        if frame is not None:
+            frames.append(frame)
+    _check_frames(top, frames)
+    return tuple(frames)
+
+
+def parse_novel_views(
+    top: Fields, cameras: dict[str, Camera], frames: tuple[Frame, ...]
+) -> tuple[NovelView, ...]:
+    """The pictures of other cameras that have no errors."""
+    names = {frame.name for frame in frames}
+    views: list[NovelView] = []
+    seen: set[tuple[str, str]] = set()
+    for index, value in enumerate(top.entries("novel_views", [])):
+        keys = ("camera", "frame", "time_us", "image")
+        entry = top.inner(f"novel_views[{index}]", value, keys)
+        camera, frame = entry.text("camera"), entry.text("frame")
+        _check_camera(entry, camera, cameras)
+        time_us, image = entry.integer("time_us"), entry.path("image")
+        if entry.valid and frame not in names:
+            entry.fail("frame", repr(frame), "the name of a valid frame", "Correct it.")
+        if entry.valid and (camera, frame) in seen:
+            entry.fail(
+                "frame",
+                f"a second view of camera {camera!r} at frame {frame!r}",
+                "one view per camera and frame",
+                "Remove one.",
+            )
+        seen.add((camera, frame))
+        if entry.valid and image is not None:
+            views.append(NovelView(index, camera, frame, time_us, image))
+    return tuple(views)
+
+
+def _frame(top: Fields, index: int, value: Any, cameras: dict[str, Camera]) -> Frame | None:
+    keys = ("name", "camera", "image", "exposure_us", "split", "sharp", "mask")
+    entry = top.inner(f"frames[{index}]", value, (*keys, "world_to_camera"))
+    name, camera = entry.name("name"), entry.text("camera")
+    _check_camera(entry, camera, cameras)
+    image = entry.path("image")
+    exposure = _exposure(entry)
+    split = entry.text("split", default_split(index))
+    if entry.valid and split not in ("train", "test"):
+        entry.fail("split", repr(split), "'train' or 'test'", "Correct it.")
+    sharp = entry.path("sharp", required=False)
+    mask = entry.path("mask", required=False)
+    pose = rigid(entry, "world_to_camera", None)
+    if not entry.valid or image is None or exposure is None:
+        return None
+    kind: Literal["train", "test"] = "train" if split == "train" else "test"
+    return Frame(name, index, camera, image, exposure, kind, sharp, mask, pose)
+
+
+def _check_camera(entry: Fields, camera: str, cameras: dict[str, Camera]) -> None:
+    declared = entry.valid and camera in cameras
+    if entry.valid and not declared:
+        entry.fail(
+            "camera",
+            repr(camera),
+            f"one of the valid cameras {sorted(cameras)}",
+            "Correct the name or the camera's entry.",
+        )
+
+
+def _exposure(entry: Fields) -> tuple[int, int] | None:
+    pair = entry.numbers("exposure_us", (2,))
+    if pair is None:
+        return None
+    if not all(is_whole(value) for value in pair.tolist()):
+        entry.fail("exposure_us", str(pair.tolist()), "whole microseconds", "Round them.")
+        return None
+    start, end = int(pair[0]), int(pair[1])
+    if end <= start:
+        kind = "an empty exposure" if end == start else "a negative exposure"
+        entry.fail(
+            "exposure_us",
+            f"{kind} [{start}, {end}]",
+            "[start, end] with start < end in microseconds",
+            "Give the times when the shutter opened and closed.",
+        )
+        return None
+    if end - start > _LONGEST_EXPOSURE_US:
+        entry.fail(
+            "exposure_us",
+            f"{end - start} us",
+            f"at most {_LONGEST_EXPOSURE_US}, a minute",
+            "Give times in microseconds.",
+        )
+        return None
+    return start, end
+
+
+def _check_frames(top: Fields, frames: list[Frame]) -> None:
+    """Findings that need all frames together: names, order, overlap, splits."""
+    first_of: dict[str, int] = {}
+    last_of: dict[str, Frame] = {}
+    overlaps = []
+    for frame in frames:
+        where = f"frames[{frame.index}]"
+        if frame.name in first_of:
+            top.findings.error(
+                top.file,
+                f"{where}.name",
+                f"{frame.name!r}, already the name of frames[{first_of[frame.name]}]",
+                "a name of its own for each frame",
+                "Rename one of the two.",
+            )
+        first_of.setdefault(frame.name, frame.index)
+        before = last_of.get(frame.camera)
+        last_of[frame.camera] = frame
+        if before is None:
+            continue
+        if frame.exposure_us[0] <= before.exposure_us[0]:
+            top.findings.error(
+                top.file,
+                f"{where}.exposure_us",
+                f"a start of {frame.exposure_us[0]}, not after {before.exposure_us[0]} of "
+                f"frame {before.name!r}",
+                "frames of a camera in order of time",
+                "Sort the frames, or correct the exposure.",
+            )
+        elif frame.exposure_us[0] < before.exposure_us[1]:
+            overlaps.append(frame)
+    if overlaps:
+        top.findings.warning(
+            top.file,
+            f"frames[{overlaps[0].index}].exposure_us",
+            f"{len(overlaps)} exposures that begin before the one before ends "
+            f"(first: frame {overlaps[0].name!r})",
+            "exposures that do not overlap",
+            "Check the exposure time; a sharp moment is then seen by two frames.",
+        )
+    for split, note in (("train", top.findings.error), ("test", top.findings.warning)):
+        if frames and not any(frame.split == split for frame in frames):
+            note(
+                top.file,
+                "frames",
+                f"no {split} frame among {len(frames)}",
+                f"at least one frame with split {split!r}",
+                "Change the split of some frames.",
+            )
+
+
+def default_split(index: int) -> str:
+    """The split where a capture gives none: three frames of ten are test."""
+    return "test" if index % 10 in (7, 8, 9) else "train"

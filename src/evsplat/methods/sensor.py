@@ -1,0 +1,87 @@
+"""The event camera as training of method `evsplat` begins with it: thresholds, clock and noise."""
+
+import logging
+
+import torch
+
+from evsplat.calibration import SensorEstimate
+from evsplat.capture import TrainingCapture, estimate_sensor, warn_of_linear_frames
+from evsplat.methods.base import Purpose
+from evsplat.methods.evsplat_settings import EvsplatConfig
+from evsplat.models.discs import DiscModel
+from evsplat.objectives import EventNoise, EventSensor, EventWindows, minute_around
+
+logger = logging.getLogger(__name__)
+
+UNKNOWN_THRESHOLD = 0.2
+"""Contrast threshold to start from where neither the capture nor its frames tell one."""
+
+
+def event_windows(
+    config: EvsplatConfig,
+    capture: TrainingCapture,
+    model: DiscModel,
+    generator: torch.Generator,
+    *,
+    device: torch.device | str,
+    purpose: Purpose,
+) -> EventWindows:
+    """The event term; the sensor with its thresholds and clock becomes a part of ``model``."""
+    assert capture.events is not None
+    # A loaded model brings its own.
+    known, late_us = (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD), None
+    if purpose == "train":
+        estimate = None
+        if capture.contrast_threshold is None or config.clock != "never":
+            estimate = estimate_sensor(capture)
+            warn_of_linear_frames(capture, estimate)
+        known = _thresholds(capture, estimate)
+        late_us = _late_us(config, estimate)
+        if not capture.events.has_polarity:
+            logger.warning(
+                "%s: its events have no polarity; the size of changes is compared with their "
+                "number.", capture.path,
+            )  # fmt: skip
+    sensor = EventSensor(*known, late_us=late_us).to(device)
+    model.sensor = sensor
+    around_us = minute_around([frame.exposure_us for frame in capture.train_frames])
+    noise = EventNoise(capture.events, during_us=around_us, aware=config.event_noise_aware)
+    if purpose != "draw":
+        noise.measure()
+    return EventWindows(
+        capture,
+        sensor,
+        generator,
+        start=config.event_start,
+        eps=config.event_eps,
+        noise=noise,
+        reach=config.event_reach,
+        ramp_us=config.event_ramp_us,
+        hue_from=config.event_hue_from,
+    )
+
+
+def _late_us(config: EvsplatConfig, estimate: SensorEstimate | None) -> float | None:
+    """Start of the learned offset of the events' clock; None: not learned."""
+    if config.clock == "never":
+        return None
+    if estimate is None or not estimate.clock.differs:
+        return 0.0 if config.clock == "always" else None
+    late_ms = estimate.clock.lag_us / 1000
+    logger.info("events lag the frames by %.1f ms; the offset of their clock is learned", late_ms)
+    return estimate.clock.lag_us
+
+
+def _thresholds(capture: TrainingCapture, estimate: SensorEstimate | None) -> tuple[float, float]:
+    """C+ and C-: the capture's, or those at which training frames and events agree best."""
+    if capture.contrast_threshold is not None:
+        return capture.contrast_threshold
+    if estimate is None or estimate.thresholds is None:
+        logger.warning(
+            "%s: contrast thresholds are neither given nor to be found from frames and events; "
+            "starting from %g.", capture.path, UNKNOWN_THRESHOLD,
+        )  # fmt: skip
+        return UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD
+    found = estimate.thresholds
+    logger.info("contrast thresholds found: C+ %.3f, C- %.3f", found.plus, found.minus)
+    return found.plus, found.minus
