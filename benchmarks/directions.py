@@ -4,17 +4,19 @@
         [--learned] [--out FOLDER] [--avatar --node-modules FOLDER/node_modules]
 
 The person alone, as films show them, every 45 degrees around the body of each motion. Printed for
-each motion, over the directions: *speckle*, the mean step of Cb and Cr from pixel to pixel inside
-the body's outline in one direction against that from the front, the larger of the three directions
-behind (135 to 225 degrees) and of all; *holes*, the share of the outline's inside through which one
-sees (opacity below a half); *shreds*, the share of what is drawn that lies farther from the outline
-than 4 % of the picture's height, where clothes and hair are not. Of the Gaussians themselves, not
-of the pictures: *size*, the largest standard deviation of one against that at rest; *torn*, the
-share of those that leave a neighbour on the surface (the eight nearest, normals within 60 degrees)
-by 1.5 cm and to 2.5 times its distance at rest. ``--learned`` shows what was learned, before the
-sides that nothing showed were filled. ``--avatar`` looks at the exported avatar page in headless
-Chromium instead (`npm install --prefix FOLDER playwright-core`). FOLDER/MOTION.png is a sheet, a
-row per time, a column per direction. The last line is one JSON object.
+each motion, over the directions: *speckle*, the mean step of Cb and Cr from pixel to pixel of one
+surface (depths within 5 cm) inside the body's outline in one direction against that of the recorded
+motion from the recording camera's direction, which is what training saw, the larger of the three
+directions behind (135 to 225 degrees) and of all; *holes*, the share of the outline's inside
+through which one sees (opacity below a half); *shreds*, the share of what is drawn that lies
+farther from the outline than 4 % of the picture's height, where clothes and hair are not. Of the
+Gaussians themselves, not of the pictures: *size*, the largest standard deviation of one against
+that at rest; *torn*, the share of those that leave a neighbour on the surface (the eight nearest,
+normals within 60 degrees) by 1.5 cm and to 2.5 times its distance at rest. ``--learned`` shows what
+was learned, before the sides that nothing showed were filled. ``--avatar`` looks at the exported
+avatar page in headless Chromium instead (`npm install --prefix FOLDER playwright-core`).
+FOLDER/MOTION.png is a sheet, a row per time, a column per direction. The last line is one JSON
+object.
 """
 
 import argparse
@@ -53,6 +55,8 @@ View = tuple[int, Camera]
 """Time, microseconds, and camera."""
 Picture = tuple[torch.Tensor, np.ndarray]
 """sRGB (H, W, 3) over black and opacity (H, W)."""
+Draw = Callable[[BodyTrack, list[View]], list[Picture]]
+ONE_SURFACE_M = 0.05
 TORN_M, TORN_RATIO = 0.015, 2.5
 _NEIGHBOURS = 8
 _ALIKE = 0.5
@@ -78,12 +82,16 @@ def turned_by(angle: float, share: float) -> float:
     return angle
 
 
-def steps(rgb: torch.Tensor, inside: np.ndarray) -> float:
-    """Mean absolute step of Cb and Cr between neighbouring pixels, both ``inside``."""
+def steps(rgb: torch.Tensor, depth: np.ndarray, inside: np.ndarray) -> float:
+    """Mean absolute step of Cb and Cr between neighbouring pixels of one surface, both ``inside``.
+
+    An arm before the shirt is no speckle: their depths, metres, differ.
+    """
     values = chroma(rgb).numpy()
     found = []
     for axis in (0, 1):
-        both = inside & np.roll(inside, -1, axis)
+        apart = np.abs(np.roll(depth, -1, axis) - depth)
+        both = inside & np.roll(inside, -1, axis) & (apart < ONE_SURFACE_M)
         found.append(np.abs(np.roll(values, -1, axis) - values)[both])
     return float(np.concatenate(found).mean())
 
@@ -96,7 +104,7 @@ def by_model(run: Run, track: BodyTrack, views: list[View]) -> list[Picture]:
 
 
 def by_page(
-    motion: str, options: argparse.Namespace, track: BodyTrack, views: list[View]
+    motion: str | None, options: argparse.Namespace, track: BodyTrack, views: list[View]
 ) -> list[Picture]:
     """The person in the exported page: over black, and over white for its opacity."""
     with tempfile.TemporaryDirectory() as folder:
@@ -148,37 +156,70 @@ def pulled(run: Run, track: BodyTrack, times: list[int]) -> dict[str, float]:
     return {"size_most_ratio": round(max(sizes), 3), "torn_most_pct": round(max(torn), 3)}
 
 
-def measured(
-    run: Run, track: BodyTrack, draw: Callable[[list[View]], list[Picture]], out: Path,
-    options: argparse.Namespace,
-) -> dict[str, float]:  # fmt: skip
-    """Figures of a motion; its sheet is written to ``out``."""
-    times = film_times(track, options.times)
+def views_of(
+    run: Run, track: BodyTrack, options: argparse.Namespace, directions: int
+) -> list[View]:
+    """At even times of a motion, from so many of the directions."""
     start = sized(run.capture.camera(run.capture.train_frames[0]), options.size)
     up = up_axis(run.reconstruction.track)
-    angles = [2 * math.pi * column / DIRECTIONS for column in range(DIRECTIONS)]
-    views = [
+    angles = [2 * math.pi * column / DIRECTIONS for column in range(directions)]
+    return [
         (time, follow(start, track, [time], up, partial(turned_by, angle))[0])
-        for time in times
+        for time in film_times(track, options.times)
         for angle in angles
     ]
+
+
+def inside_of(track: BodyTrack, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """The body's outline, and what of it is not its rim."""
+    outline = silhouette(track.vertices(view[0]), track.body.faces, view[1]).numpy()
+    return outline, binary_erosion(outline, iterations=_INSET_PX)
+
+
+def depth_of(run: Run, track: BodyTrack, view: View) -> np.ndarray:
+    """Of the person as the model has it, metres."""
+    moving = run.reconstruction.in_new_motion(track)
+    return moving.depth(view[1], [view[0]], parts="human")[0].numpy()
+
+
+def seen_steps(run: Run, draw: Draw, options: argparse.Namespace) -> float:
+    """`steps` of what training saw: the recorded motion from the front.
+
+    Another motion may turn the plain back of a shirt there, against which the print is speckle.
+    """
+    track = run.reconstruction.track
+    views = views_of(run, track, options, 1)
+    pictures = draw(track, views)
+    return float(
+        np.mean(
+            [
+                steps(rgb, depth_of(run, track, view), inside_of(track, view)[1])
+                for view, (rgb, _) in zip(views, pictures, strict=True)
+            ]
+        )
+    )
+
+
+def measured(
+    run: Run, track: BodyTrack, draw: Draw, seen: float, out: Path, options: argparse.Namespace
+) -> dict[str, float]:
+    """Figures of a motion, ``seen`` being `seen_steps`; its sheet is written to ``out``."""
+    views = views_of(run, track, options, DIRECTIONS)
     speckle: list[float] = []
     holes, shreds, pictures = [], [], []
-    for (time, camera), (rgb, alpha) in zip(views, draw(views), strict=True):
-        outline = silhouette(track.vertices(time), track.body.faces, camera).numpy()
-        inside = binary_erosion(outline, iterations=_INSET_PX)
-        speckle.append(steps(rgb, inside))
+    for view, (rgb, alpha) in zip(views, draw(track, views), strict=True):
+        outline, inside = inside_of(track, view)
+        speckle.append(steps(rgb, depth_of(run, track, view), inside))
         holes.append(float((alpha[inside] < 0.5).mean()))
         away = distance_transform_edt(~binary_dilation(outline)) > OUTSIDE * options.size
         shreds.append(float(alpha[away].sum() / alpha.sum()))
         pictures.append(rgb + _GREY * (1 - torch.from_numpy(alpha)[..., None]))
     rows = [
         torch.cat(pictures[row * DIRECTIONS : (row + 1) * DIRECTIONS], 1)
-        for row in range(len(times))
+        for row in range(options.times)
     ]
     save_png(out, to_bytes(torch.cat(rows).clamp(0, 1)))
-    table = np.array(speckle).reshape(len(times), DIRECTIONS)
-    against = table.mean(0) / table[:, 0].mean()
+    against = np.array(speckle).reshape(options.times, DIRECTIONS).mean(0) / seen
     return {
         "speckle_behind_ratio": round(float(against[list(BEHIND)].max()), 3),
         "speckle_most_ratio": round(float(against.max()), 3),
@@ -211,13 +252,14 @@ def main() -> None:
         assert latest is not None
         tensors, state = load_checkpoint(latest[0])
         load_model(run.reconstruction.model, tensors, state["human_count"])
-    found = {}
+    recorded, found = run.reconstruction.track, {}
+    front = partial(by_page, None, options) if options.avatar else partial(by_model, run)
+    seen = seen_steps(run, front, options)
     for motion in options.motions:
-        recorded = run.reconstruction.track
         track = load_motion_of(motion, recorded, fps=None, in_place=not options.avatar)
         draw = partial(by_page, motion, options) if options.avatar else partial(by_model, run)
         out = options.out / f"{motion}.png"
-        found[motion] = measured(run, track, partial(draw, track), out, options)
+        found[motion] = measured(run, track, draw, seen, out, options)
         if not options.avatar:
             found[motion] |= pulled(run, track, film_times(track, options.times))
         print(f"{motion:10}", *(f"{name} {value:.2f} " for name, value in found[motion].items()))

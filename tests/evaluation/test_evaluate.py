@@ -263,8 +263,12 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
         gaussians={"human": 10, "scene": 20},
         policy=Policy(held_out_events=True),
     )
+    trained.beside = lambda: TruthWithNoise(capture, 0.0)
     monkeypatch.setattr(evaluation_run, "load_run", lambda path, **_: trained)
     metrics = evaluation_run.evaluate_run(out)
+    # Novel views alone are what cameras beside the recording one see.
+    novel = metrics["novel_views"]["side"]["full"]["psnr"]
+    assert novel == PSNR_CEILING_DB > metrics["protocols"]["standard"]["full"]["psnr"]
     assert json.loads((out / "metrics.json").read_text()) == metrics
     facts = ["capture", "method", "iteration", "train_seconds", "device", "gaussians"]
     assert list(metrics)[:6] == facts and metrics["iteration"] == 1200

@@ -67,6 +67,7 @@ def evaluate(
     test_frames_only: bool = False,
     human_only: bool = False,
     split: Split = "test",
+    beside: Reconstruction | None = None,
 ) -> dict[str, Any]:
     """Measure ``reconstruction`` on the test frames and novel views of ``capture``.
 
@@ -76,7 +77,8 @@ def evaluate(
     once more before the median background ("composited", by protocol), since against a full frame
     the black alone decides.
     ``split="train"`` measures the training frames instead, which needs their sharp truth, and no
-    events; the nearest training frame is then the frame itself and has no row.
+    events; the nearest training frame is then the frame itself and has no row. ``beside`` is drawn
+    in novel views where it is another.
     Every figure is a mean over frames of per-frame values. What cannot be measured is None,
     with the reason under "reasons" (a path of keys). Pictures are handled one by one, so that
     memory does not grow with the length of the recording.
@@ -112,7 +114,7 @@ def evaluate(
     reasons: dict[str, str] = result["reasons"]
     if not test_frames_only:
         result["novel_views"] = _novel_views(
-            capture, reconstruction, networks, human_regions, out_dir, reasons, split
+            capture, beside or reconstruction, networks, human_regions, out_dir, reasons, split
         )
         events: dict[str, Any] | Absent = Absent("they are measured with the test frames")
         if split == "test":

@@ -69,6 +69,7 @@ def _measured(
         device=device,
         human_only=run.human_only,
         split=split,
+        beside=run.beside() if run.capture.novel_views else None,
     )
     metrics = {
         "capture": measured.pop("capture"),

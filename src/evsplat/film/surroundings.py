@@ -19,6 +19,15 @@ from torch.nn.functional import interpolate
 from evsplat.body import BodyTrack, up_axis
 from evsplat.camera import Camera
 from evsplat.errors import ConfigError
+from evsplat.models.beyond import (
+    FLOOR_M,
+    along_floor,
+    eased,
+    instants,
+    lowest_m,
+    on_floor,
+    ray_directions,
+)
 from evsplat.models.layers import Layers
 from evsplat.pages import read_rgb
 
@@ -31,8 +40,6 @@ _CLEAR_M = (0.45, 0.15)
 """What is nearer to the camera than the person's nearest point by these begins and ends to fade."""
 _COARSE_PX = 64
 """Side of the pictures in a hurry, at least: with less the horizon and the spot are steps."""
-_FLOOR_STAYS_M = 0.12
-"""Height above the floor of what never fades: it hides nobody."""
 _BEHIND, _WALL = 1.05, 0.97
 """Depth of a wall as a share of the person's largest; share of its depth from which it is one."""
 _EDGE = 0.08
@@ -57,27 +64,18 @@ class Room:
     def of(cls, recorded: BodyTrack, filmed: BodyTrack, recording: Camera | None = None) -> "Room":
         """The floor is where the recorded person's lowest point is."""
         up = up_axis(recorded).float().cpu()
-        lowest = min(
-            float((recorded.vertices(time).cpu() @ up).min()) for time in _spread(recorded)
-        )
-        return cls(filmed, up, lowest, recording)
+        return cls(filmed, up, lowest_m(recorded, up), recording)
 
     def behind(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
         """The picture of the empty room, sRGB."""
-        center, directions = camera.center().cpu(), _directions(camera)
-        climbing = directions @ self.up
-        colour = _mixed(_HORIZON, _TOP, (climbing / 0.6).clamp(0, 1))
-        height = float(center @ self.up) - self.floor_m
-        if height <= 0:
+        directions = ray_directions(camera)
+        colour = _mixed(_HORIZON, _TOP, (directions @ self.up / 0.6).clamp(0, 1))
+        places, below = on_floor(camera, directions, self.up, self.floor_m)
+        if not below.any():
             return colour
-        below = climbing < -1e-4
-        way = height / (-climbing).clamp_min(1e-4)
-        places = center + way[..., None] * directions
         root = self.track.at([time_us])[1][0] + self.track.body.rest_joints[0]
         pelvis = root.float().cpu()
-        apart = places - pelvis
-        apart = apart - (apart @ self.up)[..., None] * self.up
-        square = apart.square().sum(-1)
+        square = along_floor(places - pelvis, self.up).square().sum(-1)
         floor = _mixed(_FLOOR, _HORIZON, 1 - torch.exp(-square / _FLOOR_ENDS_M**2))
         spot = 1 - _SHADOW * torch.exp(-square / (2 * _SHADOW_M**2))
         return torch.where(below[..., None], floor * spot[..., None], colour)
@@ -100,9 +98,9 @@ class Room:
         scene, human = layers.scene, layers.human
         depth, nearest = (camera.project(part.means)[1] for part in (scene, human))
         begin, end = (nearest.min() - metres for metres in _CLEAR_M)
-        share = _eased((depth[0] - begin) / (end - begin))
+        share = eased((depth[0] - begin) / (end - begin))
         height = scene.means[0] @ self.up.to(scene.means) - self.floor_m
-        share = torch.where(height < _FLOOR_STAYS_M, 1.0, share)
+        share = torch.where(height < FLOOR_M, 1.0, share)
         return replace(layers, scene=replace(scene, opacities=scene.opacities * share))
 
     def stand_back(self, layers: Layers, camera: Camera) -> Layers:
@@ -115,7 +113,7 @@ class Room:
         scene, recording = layers.scene, self.recording.to(layers.scene.means.device)
         depth = recording.project(scene.means[0])[1]
         height = scene.means[0] @ self.up.to(scene.means) - self.floor_m
-        high = height > _FLOOR_STAYS_M
+        high = height > FLOOR_M
         wall = depth[high].median() if high.any() else depth.max()
         factor = (_BEHIND * self._deepest_m / depth.clamp_min(0.1)).clamp_min(1.0)
         factor = torch.where(high | (depth > _WALL * wall), factor, 1.0)[:, None]
@@ -130,7 +128,7 @@ class Room:
         recording = self.recording.to("cpu")
         return max(
             float(recording.project(self.track.vertices(time).cpu())[1].max())
-            for time in _spread(self.track)
+            for time in instants(self.track)
         )
 
     def soften(self, layers: Layers, camera: Camera) -> Layers:
@@ -141,11 +139,11 @@ class Room:
         axes = camera.world_to_camera[2, :3] @ recording.world_to_camera[2, :3].to(camera.K)
         turned = float(axes.clamp(-1, 1).arccos())
         moved = float((camera.center() - recording.center().to(camera.K)).norm())
-        gone = _eased(torch.tensor(moved / _ELSEWHERE[0] + turned / _ELSEWHERE[1]))
+        gone = eased(torch.tensor(moved / _ELSEWHERE[0] + turned / _ELSEWHERE[1]))
         pixels, depth = recording.project(scene.means[0])
         size = pixels.new_tensor([recording.width, recording.height])
         inside = torch.minimum(pixels, size - pixels).amin(-1) / size.min()
-        rim = _eased(inside / _EDGE).masked_fill(depth <= 0, 0.0)
+        rim = eased(inside / _EDGE).masked_fill(depth <= 0, 0.0)
         share = 1 - gone.to(rim) * (1 - rim)
         return replace(layers, scene=replace(scene, opacities=scene.opacities * share))
 
@@ -181,28 +179,6 @@ class Painted:
         left, top = (size[0] - camera.width) // 2, (size[1] - camera.height) // 2
         image = image.crop((left, top, left + camera.width, top + camera.height))
         return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
-
-
-def _spread(track: BodyTrack) -> list[int]:
-    """Times over all of a motion."""
-    first, last = int(track.times_us[0]), int(track.times_us[-1])
-    return np.linspace(first, last, 16).round().astype(int).tolist()
-
-
-def _eased(share: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
-    """0 below 0, 1 above 1, and smooth in between."""
-    share = share.clamp(0, 1)
-    return share * share * (3 - 2 * share)
-
-
-def _directions(camera: Camera) -> Float[Tensor, "H W 3"]:
-    """Unit directions of the pixels' middles in the world."""
-    K = camera.K.cpu()
-    y, x = torch.meshgrid(
-        torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
-    )
-    rays = torch.stack(((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)), -1)
-    return torch.nn.functional.normalize(rays, dim=-1) @ camera.world_to_camera[:3, :3].cpu()
 
 
 def _mixed(

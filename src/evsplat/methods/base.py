@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack, silhouette
+from evsplat.camera import Camera
 from evsplat.capture import Frame, Policy, TrainingCapture
 from evsplat.errors import ConfigError, DataError
 from evsplat.gaussians import BodyFrames, DensifyLimits, Part
@@ -77,6 +78,8 @@ class Composition:
     and a run that was given no number of steps ends earlier then. None: it never does."""
     ends_early: bool = True
     """Whether that holds for what a new training was given; one that goes on keeps to it."""
+    recording: Camera | None = None
+    """The camera at rest beside which the scene goes on; None: what was not recorded is black."""
     fill: Callable[[Seen], dict[str, Tensor]] | None = None
     """Parameters by their names in the model's state, as a prior decides them at the end where
     little was seen; None: as they were learned."""

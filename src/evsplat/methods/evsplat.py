@@ -92,6 +92,7 @@ def build(
     background = _background(config, capture, poses.track) if fit else None
     frames = capture.train_frames
     times_us = [frame.mid_us for frame in frames]
+    recording = None if config.scene.kind == "random_cube" else capture.camera(frames[0])
     model = DiscModel(
         poses.track,
         times_us,
@@ -104,7 +105,7 @@ def build(
         lamps=config.lamps,
         self_shadow=config.self_shadow,
         scene_network=config.scene.kind == "random_cube",
-        camera=None if config.scene.kind == "random_cube" else capture.camera(frames[0]),
+        camera=recording,
         residual=poses.correction,
         residual_start=config.pose.start,
         deformation_start=DEFORMATION_START if config.rates.deformation else float("inf"),
@@ -160,6 +161,7 @@ def build(
         watched=("l1", "dssim"),
         # Errors of poses, and shapes that change, are still learned where the loss hardly falls.
         ends_early=poses.correction is None or bool(poses.correction.exact),
+        recording=recording,
         fill=partial(filled, model, capture, config.fill) if config.fill else None,
     )
 

@@ -23,6 +23,7 @@ from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest, with_correctives
+from evsplat.models.beyond import Beyond
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
@@ -120,6 +121,8 @@ class GaussianReconstruction:
     """Shadows are looked up so far apart."""
     changes: tuple[Callable[[Layers, Camera], Layers], ...] = ()
     """What a film makes of the posed Gaussians before they are drawn."""
+    beyond: Beyond | None = None
+    """What pictures of person and scene show where nothing is; black without."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`."""
@@ -131,6 +134,8 @@ class GaussianReconstruction:
                 )
                 rgb, human = _stacked(drawing.rgb), _stacked(drawing.semantic)
                 alpha = drawing.output.alpha
+                if self.beyond is not None:
+                    rgb = self.beyond.fill(rgb, alpha, camera)
             else:
                 layer = layers.human if parts == "human" else layers.scene
                 output = render(layer, camera, low_pass=layers.low_pass)
@@ -278,6 +283,22 @@ class Run:
     """Number of Gaussians, ``human`` and ``scene``."""
     human_only: bool
     """Whether the method learned nothing but the person and draws it on black."""
+    recording: Camera | None = None
+    """The camera at rest beside which the scene goes on, of methods whose scene does."""
+
+    def beside(self) -> GaussianReconstruction:
+        """The reconstruction as cameras beside the recording one are to see it; see `Beyond`.
+
+        That is `reconstruction` itself where the scene ends with what was recorded.
+        """
+        drawn = self.reconstruction
+        if self.recording is None:
+            return drawn
+        time = [int(drawn.track.times_us[0])]
+        picture = drawn.render(self.recording, time, parts="scene").rgb[0]
+        depth = drawn.depth(self.recording, time, parts="scene")[0]
+        beyond = Beyond.of(self.recording, drawn.track, picture, depth)
+        return replace(drawn.changed_by(beyond.uncovered), beyond=beyond)
 
     def what_was_seen(self) -> dict[str, float | None] | None:
         """Share of the person's Gaussians that were little seen, and how rough; see `roughness`.
@@ -346,6 +367,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         reconstruction=GaussianReconstruction(method, composition.model, seen, Backdrop()),
         device=facts["device"],
         human_only=isinstance(composition.capture, MaskedCapture),
+        recording=composition.recording,
         **_progress(composition.model, progress),
     )
 
