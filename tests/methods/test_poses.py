@@ -5,6 +5,7 @@ import logging
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from evsplat.methods.evsplat import ERRORS_RATE
 from evsplat.methods.evsplat_settings import EvsplatConfig
 from evsplat.methods.poses import SMOOTHED, Poses, prepare_poses
 from evsplat.models.pose_correction import SHARES
+from evsplat.objectives import DeformationPrior
 from evsplat.posing.refine import LEAST_GAIN, Verdict
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
@@ -193,6 +195,22 @@ def test_what_was_found_out_is_part_of_the_state(captures, tiny_capture):
     assert other.residual([0])[0].abs().max() > 0
     other.load_state_dict(state | {"exact": torch.tensor(True)})
     assert other.residual([0])[0].abs().max() < 1e-6
+
+
+def test_a_shape_that_changes_is_there_only_where_poses_may_err(captures, tiny_capture):
+    path = tiny_capture("silent", frames=20)
+    with_errors(path, source=False)
+    exact, noisy = (composed(capture) for capture in captures)
+    silent = built("evsplat", load_capture(path), *SETTINGS, purpose="draw")
+    assert exact.model.deformation is None and exact.watched
+    assert noisy.model.shape_changes is noisy.model.deformation is not None
+    assert not noisy.watched  # nor does such a training end by itself
+    prior = DeformationPrior()
+    for given, names in ((False, {"deformation"}), (True, set())):
+        silent.model.residual.exact.fill_(given)
+        assert set(prior.loss(SimpleNamespace(model=silent.model))) == names
+    kinds = [any(isinstance(o, DeformationPrior) for o in c.objectives) for c in (exact, silent)]
+    assert kinds == [False, True]
 
 
 INTERPOLATION = ("policy.held_out_events=true", "pose.events_of_held_out=true")

@@ -75,9 +75,7 @@ class Composition:
     held_out: HeldOut | None = None
     watched: tuple[str, ...] = ()
     """Terms that compare pictures: how their weighted sum falls tells when little more is to come,
-    and a run that was given no number of steps ends earlier then. None: it never does."""
-    ends_early: bool = True
-    """Whether that holds for what a new training was given; one that goes on keeps to it."""
+    and a new run that was given no number of steps ends earlier then. None: it never does."""
     recording: Camera | None = None
     """The camera at rest beside which the scene goes on; None: what was not recorded is black."""
     fill: Callable[[Seen], dict[str, Tensor]] | None = None

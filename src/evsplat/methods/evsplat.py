@@ -93,6 +93,7 @@ def build(
     frames = capture.train_frames
     times_us = [frame.mid_us for frame in frames]
     recording = None if config.scene.kind == "random_cube" else capture.camera(frames[0])
+    changes = poses.may_err and config.rates.deformation > 0
     model = DiscModel(
         poses.track,
         times_us,
@@ -108,7 +109,7 @@ def build(
         camera=recording,
         residual=poses.correction,
         residual_start=config.pose.start,
-        deformation_start=DEFORMATION_START if config.rates.deformation else float("inf"),
+        deformation_start=DEFORMATION_START if changes else None,
     ).to(device)
     if fit:
         _fit_colours(config, capture, model, background)
@@ -124,7 +125,7 @@ def build(
     ]
     if poses.correction is not None:
         objectives.append(PosePrior())
-    if config.rates.deformation:
+    if model.deformation is not None:
         objectives.append(DeformationPrior())
     if model.relief is not None:
         objectives.append(ReliefPrior())
@@ -158,9 +159,8 @@ def build(
         body_frames=body_frames(poses.track, times_us),
         generator=generator,
         held_out=None if windows is None else _held_out(config, capture, model, windows),
-        watched=("l1", "dssim"),
         # Errors of poses, and shapes that change, are still learned where the loss hardly falls.
-        ends_early=poses.correction is None or bool(poses.correction.exact),
+        watched=("l1", "dssim") if poses.correction is None or poses.correction.exact else (),
         recording=recording,
         fill=partial(filled, model, capture, config.fill) if config.fill else None,
     )

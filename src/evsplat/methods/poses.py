@@ -71,6 +71,8 @@ class Poses:
     track: BodyTrack
     correction: PoseCorrection | None = None
     """None where nothing is to be learned of poses."""
+    may_err: bool = False
+    """Whether they are not said to be exact; `PoseCorrection.exact` is what is held of them."""
     pace: float = 1.0
     """Factor on the learning rate of the errors. A step of Adam is a share of the error expected,
     and an error of ten degrees has to be found as exactly as one of one: with such steps poses that
@@ -121,7 +123,7 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
         if track is not given:
             correction.smooth_to(given, track)
         correction.start_at(track, found.track)
-    return Poses(given, correction, pace)
+    return Poses(given, correction, exact is not True, pace)
 
 
 def _pace(joint_rad: np.ndarray) -> float:

@@ -33,8 +33,9 @@ class DeformationPrior(Objective):
     """How far the person's shape changes in time."""
 
     def loss(self, step: Step[DiscModel]) -> dict[str, Tensor]:
-        """``deformation``: see `Deformation.price`."""
-        return {"deformation": step.model.deformation.price()}
+        """``deformation``, where poses err; see `Deformation.price`."""
+        changes = step.model.shape_changes
+        return {} if changes is None else {"deformation": changes.price()}
 
 
 class SkinningPrior(Objective):

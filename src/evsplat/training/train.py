@@ -141,8 +141,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
         iterations or start.settings.iterations,
         None if max_minutes is None else 60 * max_minutes,
         shrink=max_minutes is not None and iterations is None,
-        may_end_early=(iterations is None and max_minutes is None)
-        and (bool(composition.watched) and composition.ends_early),
+        may_end_early=iterations is None and max_minutes is None and bool(composition.watched),
         seconds=time.perf_counter() - started,
     )
     cache_gb = options.device_memory_gb

@@ -79,7 +79,7 @@ class DiscModel(PosedModel):
         camera: Camera | None = None,
         residual: PoseCorrection | None = None,
         residual_start: float = 0.0,
-        deformation_start: float = 0.0,
+        deformation_start: float | None = None,
     ) -> None:
         """Start at ``gaussians``, whose colours are their own.
 
@@ -92,7 +92,8 @@ class DiscModel(PosedModel):
         ``frame_times_us``: mid-exposures of the training frames, for where the person goes.
         ``width`` of the network of `PoseShade`, used from nominal iteration ``shade_start`` on.
         ``pose_noise``: standard deviation of what training adds to the matrices that it sees.
-        ``deformation_start``: nominal iteration from which the person's shape changes in time.
+        ``deformation_start``: nominal iteration from which the person's shape changes in time where
+        poses err; None: it never does.
         """
         super().__init__(track)
         body = track.body
@@ -107,8 +108,9 @@ class DiscModel(PosedModel):
         generator = torch.Generator().manual_seed(0)
         surface = body.sample_surface(NORMAL_SAMPLES, generator)
         self.surface = NearestSurface(surface)
-        self.deformation_start = deformation_start
-        self.deformation = Deformation(frame_times_us, surface)
+        self.deformation_start, self.deformation = deformation_start, None
+        if deformation_start is not None:
+            self.deformation = Deformation(frame_times_us, surface)
         times = torch.as_tensor(list(frame_times_us)).split(_TIMES_AT_ONCE)
         roots = torch.cat([track.at(some)[1] for some in times]) + body.rest_joints[0]
         middle = roots.mean(0).float()
@@ -140,6 +142,15 @@ class DiscModel(PosedModel):
         """Whether the pose residual counts: from its start, or where it began at what was found."""
         found = self.residual is not None and bool(self.residual.started)
         return found or super().residual_active
+
+    @property
+    def shape_changes(self) -> Deformation | None:
+        """What times do to the person's shape; None of exact poses.
+
+        The man of `man_dance_hard_256`, whose body is skinned as ours, lost 0.4 dB by it.
+        """
+        exact = self.residual is None or bool(self.residual.exact)
+        return None if exact else self.deformation
 
     def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Weights of the bones that `at` draws the person's Gaussians with, for any centres."""
@@ -201,7 +212,8 @@ class DiscModel(PosedModel):
         model.track = track.to(self.device)
         if model.residual is not None:
             model.residual.forget()
-        model.deformation.forget()
+        if model.deformation is not None:
+            model.deformation.forget()
         return model
 
     def stay_together(self) -> None:
@@ -209,15 +221,13 @@ class DiscModel(PosedModel):
         self.surface.even_out(self.gaussians.means[self.gaussians.human])
 
     def _offsets(self, times_us: Sequence[int]) -> Float[Tensor, "T H 3"] | None:
-        """What times do to the person's shape; None before it is learned, and of exact poses.
-
-        The man of `man_dance_hard_256`, whose body is skinned as ours, lost 0.4 dB by it.
-        """
-        exact = self.residual is None or bool(self.residual.exact)
-        if exact or float(self.nominal) < self.deformation_start:
+        """What times do to the person's shape; None where it does not change, or not yet."""
+        changes, start = self.shape_changes, self.deformation_start
+        if changes is None or start is None or float(self.nominal) < start:
             return None
         rows = self.surface.at(self.gaussians.means[self.gaussians.human])
-        return self.deformation(rows, times_us)
+        offsets: Tensor = changes(rows, times_us)
+        return offsets
 
     def _layers(
         self,
