@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from evsplat.body import Body, default_body
-from evsplat.gaussians import FEATURE_DIM, BodyFrames, GaussianSet, RowAdam, flip_labels
+from evsplat.gaussians import FEATURE_DIM, BodyFrames, GaussianSet, RowAdam, flip_labels, step_together
 from evsplat.gaussians.flip import REACH_M
 from evsplat.gaussians.initialise import gaussians_at
 
@@ -54,7 +54,7 @@ def make(
     names = gaussians.attributes
     adam = RowAdam({name: getattr(gaussians, name) for name in names}, dict.fromkeys(names, 1e-3))
     sum((getattr(gaussians, name) ** 2).sum() for name in names).backward()
-    adam.step()
+    step_together([adam.adam])
     return gaussians, adam
 
 

@@ -1,5 +1,6 @@
 """The Gaussian set: parameters, semantic attribute, start, densification."""
 
+from evsplat.gaussians.adam import step_together
 from evsplat.gaussians.densify import DensifyLimits, Edit, ScreenStatistics, densify
 from evsplat.gaussians.flip import BodyFrames, flip_labels
 from evsplat.gaussians.gaussian_set import (
@@ -26,4 +27,5 @@ __all__ = [
     "Shape",
     "densify",
     "flip_labels",
+    "step_together",
 ]

@@ -31,10 +31,6 @@ class RowAdam:
         """Drop gradients."""
         self.adam.zero_grad(set_to_none=True)
 
-    def step(self) -> None:
-        """One Adam step of every attribute that has a gradient."""
-        self.adam.step()
-
     def move_rows(
         self,
         parameters: dict[str, nn.Parameter],

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from evsplat.compiled import native, runs_native
+from evsplat.devices import send
 
 Transfer = Literal["power", "srgb", "linear"]
 """``power``: exponent 2.2 (paper eq. 8); ``srgb``: the exact piecewise curve of IEC 61966-2-1;
@@ -19,6 +20,12 @@ GAMMA = 2.2
 REC709 = (0.2126, 0.7152, 0.0722)
 BT601 = (0.299, 0.587, 0.114)
 """Weights of coded channels in luma, from which colour differences are taken."""
+_LARGEST = 2 * (1 - BT601[2]), 2 * (1 - BT601[0])
+_CHROMA = (
+    (torch.eye(3, dtype=torch.float64)[[2, 0]] - torch.tensor(BT601, dtype=torch.float64))
+    / torch.tensor(_LARGEST, dtype=torch.float64)[:, None]
+).T
+"""Cb and Cr of red, green and blue."""
 DARKEST = 1.0 / 255.0
 """Coded values are clamped here first: below one 8-bit level the logarithm only sees rounding."""
 _BLACK = 1e-6
@@ -30,10 +37,11 @@ _MOST_PICTURES = 256
 def decode(coded: Float[Tensor, "*shape"], transfer: Transfer = "power") -> Float[Tensor, "*shape"]:
     """Linear light in [0, 1] of coded values in [0, 1]; values below 0 count as 0."""
     if transfer == "power":
-        if coded.requires_grad and runs_native(coded):
-            linear: Tensor = _NativePower.apply(coded)
-            return linear
-        return coded.clamp_min(0.0) ** GAMMA
+        if not coded.requires_grad:
+            return coded.clamp_min(0.0) ** GAMMA
+        power = _NativePower if runs_native(coded) else _Power
+        linear: Tensor = power.apply(coded)
+        return linear
     coded = coded.clamp_min(0.0)
     if transfer == "linear":
         return coded
@@ -81,10 +89,7 @@ def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
 
 def chroma(coded: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 2"]:
     """Cb and Cr (ITU-R BT.601) of coded RGB, each of range 1."""
-    red, green, blue = coded.unbind(-1)
-    luma = BT601[0] * red + BT601[1] * green + BT601[2] * blue
-    largest_blue, largest_red = 2 * (1 - BT601[2]), 2 * (1 - BT601[0])
-    return torch.stack(((blue - luma) / largest_blue, (red - luma) / largest_red), -1)
+    return coded @ send(_CHROMA.to(coded.dtype), coded.device)
 
 
 def mean_light(
@@ -149,6 +154,23 @@ def log_brightness_change(
     """``log Y(after) - log Y(before)``, the left side of the event model (paper eq. 8)."""
     after = log_brightness(after_srgb, eps=eps, transfer=transfer)
     return after - log_brightness(before_srgb, eps=eps, transfer=transfer)
+
+
+class _Power(torch.autograd.Function):
+    """The power curve of a GPU, in as few operations as there can be."""
+
+    @staticmethod
+    def forward(ctx: Any, coded: Tensor) -> Tensor:
+        light = coded.clamp_min(0.0)
+        slope = light ** (GAMMA - 1)
+        ctx.save_for_backward(slope)
+        return slope * light
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        (slope,) = ctx.saved_tensors
+        return torch.mul(slope, upstream[0]).mul_(GAMMA)
 
 
 class _NativePower(torch.autograd.Function):

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from evsplat.gaussians import RowAdam
+from evsplat.gaussians import RowAdam, step_together
 from evsplat.methods.learning import Learning
 from evsplat.models.model import Model
 
@@ -62,11 +62,6 @@ class Optimiser:
 
         Where ``sound`` is false (one value, on the device) nothing moves; nobody waits for it.
         """
-        if sound is not None:
-            # What gradient scaling sets to have a fused Adam leave out a step.
-            unsound = (~sound).float()
-            for _, adam in self._adams():
-                adam.found_inf = unsound  # type: ignore[attr-defined]
         for name, rows in self.model.sets.items():
             for attribute in rows.attributes:
                 parameter = rows.get_parameter(attribute)
@@ -75,10 +70,11 @@ class Optimiser:
                     parameter.grad = None
                 elif nominal < self.learning.human_start and parameter.grad is not None:
                     parameter.grad[rows.human] = 0
-            self.rows[name].step()
         if self.learning.clip is not None:
             _clip([p.grad for p in self.clipped if p.grad is not None], self.learning.clip)
-        self.networks.step()
+        step_together(
+            [adam for _, adam in self._adams()], None if sound is None else (~sound).float()
+        )
 
     def step_only(self, parameters: list[nn.Parameter], gradients: Sequence[Tensor]) -> None:
         """Step these parameters of networks, by these gradients, and nothing else.
@@ -89,12 +85,9 @@ class Optimiser:
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         unsound = (~self.finite()).float()
-        if unsound.device.type == "cpu":
-            if bool(unsound):
-                return
-        else:
-            self.networks.found_inf = unsound  # type: ignore[attr-defined]
-        self.networks.step()
+        on_host = unsound.device.type == "cpu"
+        if not (on_host and bool(unsound)):
+            step_together([self.networks], None if on_host else unsound)
 
     def finite(self) -> Bool[Tensor, ""]:
         """Whether every gradient is finite, told on the device."""

@@ -159,3 +159,17 @@ def test_the_power_is_torchs_with_its_gradients_and_darkness_has_none():
     for own, torchs in zip(*found, strict=True):
         torch.testing.assert_close(own, torchs)
     assert found[0][1][0, 0, :2].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_price_of_any_cells_and_its_gradient_are_those_of_the_differences(seed):
+    relief = shaken(seed).double()
+    cells = relief._learned()
+    steps = [cells.diff(dim=axis).square().mean() for axis in (2, 3)]
+    plain = steps[0] + steps[1] + 0.1 * cells.square().mean()
+    parameters = list(relief.parameters())
+    wanted = torch.autograd.grad(plain, parameters)
+    found = torch.autograd.grad(relief.price(), parameters)
+    assert relief.price().item() == pytest.approx(plain.item(), rel=1e-6)  # the stencil is float32
+    for one, other in zip(found, wanted, strict=True):
+        assert torch.allclose(one, other, rtol=1e-5, atol=1e-6 * float(other.abs().max()))

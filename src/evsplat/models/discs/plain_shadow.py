@@ -9,8 +9,9 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
 
 REACH_M = 1.5
 """Half side of the square around the body, across the light, outside of which nothing is shaded."""
@@ -57,23 +58,24 @@ class _OnScene(torch.autograd.Function):
         ctx: Any, body: Tensor, places: Tensor, lamps: Tensor, widths: Tensor, shares: Tensor
     ) -> Float[Tensor, "T N"]:
         views = _Views.of(lamps, body)
-        cast, seen = views.project(body), views.project(places[None])
-        bells = _Bells.at(cast.at, widths)
+        seen = views.project(body, places.expand(len(body), -1, -1))
+        bells = _Bells.at(seen.cast, widths)
         scale = _scale(body, widths)
         density = scale * (bells.across @ bells.down.mT)
-        sampled, grid = _sample(density.flatten(0, 1)[:, None], seen.at.flatten(0, 1)[:, None])
-        sampled = sampled.view(seen.behind.shape)
-        gate = torch.sigmoid((seen.behind - _BEHIND_M) / _BEHIND_EDGE_M)
+        at, behind = seen.at[:, :, views.count :], seen.behind[:, :, views.count :]
+        sampled, grid = _sample(density.flatten(0, 1)[:, None], at.flatten(0, 1)[:, None])
+        sampled = sampled.view(behind.shape)
+        gate = torch.sigmoid((behind - _BEHIND_M) / _BEHIND_EDGE_M)
         lost = 1 - torch.exp(-sampled * gate)
         factors = 1 - shares[:, None, None] * lost
-        ctx.parts = views, cast, seen, bells
+        ctx.parts = views, seen, bells
         ctx.save_for_backward(widths, shares, scale, density, grid, sampled, gate, lost, factors)
         return factors.prod(0)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, ...]:
-        views, cast, seen, bells = ctx.parts
+        views, seen, bells = ctx.parts
         widths, shares, scale, density, grid, sampled, gate, lost, factors = ctx.saved_tensors
         tiny = torch.finfo(factors.dtype).tiny
         by_lost = -upstream[0] * factors.prod(0) / factors.clamp_min(tiny)
@@ -81,15 +83,14 @@ class _OnScene(torch.autograd.Function):
         by_depth = by_lost * shares[:, None, None] * (1 - lost)
         by_gate = by_depth * sampled * gate * ((1 - gate) / _BEHIND_EDGE_M)
         by_density, by_at = _sample_backward(by_depth * gate, density.flatten(0, 1)[:, None], grid)
-        by_density, by_at = by_density.view_as(density), by_at.view_as(seen.at)
-        by_cast, by_width = bells.backward(
-            (scale * by_density) @ bells.down, (scale * by_density).mT @ bells.across
+        by_density, by_at = by_density.view_as(density), by_at.view(*by_gate.shape, 2)
+        scaled = scale * by_density
+        by_cast, by_width = bells.backward(scaled @ bells.down, scaled.mT @ bells.across)
+        by_width = _of_scale(by_width, by_density, density, widths)
+        by_lamps, by_body, by_places = views.backward(
+            seen, torch.cat([by_cast, by_at], 2), F.pad(by_gate, (views.count, 0))
         )
-        by_width = by_width - 2 / widths * (by_density * density).sum((1, 2, 3))
-        to_places = views.backward(seen, by_at, by_gate)
-        to_body = views.backward(cast, by_cast, None)
-        by_lamps, by_body = views.gather(to_places, to_body)
-        return by_body, to_places[0].sum((0, 1)), by_lamps, by_width, by_share
+        return by_body, by_places.sum(0), by_lamps, by_width, by_share
 
 
 class _OnBody(torch.autograd.Function):
@@ -98,62 +99,67 @@ class _OnBody(torch.autograd.Function):
         ctx: Any, body: Tensor, places: Tensor, lamps: Tensor, widths: Tensor
     ) -> Float[Tensor, "L T N"]:
         views = _Views.of(lamps, body)
-        cast, seen = views.project(body), views.project(places)
-        bells = _Bells.at(cast.at, widths)
+        seen = views.project(body, places)
+        bells = _Bells.at(seen.cast, widths)
         scale = _scale(body, widths)
+        in_front = seen.behind[:, :, : views.count]
         layers = torch.linspace(-REACH_M, REACH_M, _LAYERS, dtype=lamps.dtype, device=lamps.device)
-        nearer = torch.sigmoid((layers[:, None] - cast.behind[:, :, None]) / _LAYER_EDGE_M)
+        nearer = torch.sigmoid((layers[:, None] - in_front[:, :, None]) / _LAYER_EDGE_M)
         rows = (nearer[:, :, :, None] * bells.across[:, :, None]).flatten(2, 3)
         density = scale * (rows @ bells.down.mT)
-        where = torch.cat([seen.at, (seen.behind - _OWN_SURFACE_M)[..., None]], -1)
+        at, behind = seen.at[:, :, views.count :], seen.behind[:, :, views.count :]
+        where = torch.cat([at, (behind - _OWN_SURFACE_M)[..., None]], -1)
         depth, grid = _sample(
             density.flatten(0, 1).unflatten(1, (1, _LAYERS, _CELLS)),
             where.flatten(0, 1)[:, None, None],
         )
-        light = torch.exp(-depth.view(seen.behind.shape))
-        ctx.parts = views, cast, seen, bells
+        light = torch.exp(-depth.view(behind.shape))
+        ctx.parts = views, seen, bells
         ctx.save_for_backward(widths, scale, density, grid, nearer, rows, light)
         return light
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, ...]:
-        views, cast, seen, bells = ctx.parts
+        views, seen, bells = ctx.parts
         widths, scale, density, grid, nearer, rows, light = ctx.saved_tensors
         layered = density.flatten(0, 1).unflatten(1, (1, _LAYERS, _CELLS))
         by_density, by_where = _sample_backward(-upstream[0] * light, layered, grid)
         by_density = by_density.view_as(density)
-        by_where = by_where.view(*seen.at.shape[:-1], 3)
+        by_where = by_where.view(*light.shape, 3)
         scaled = scale * by_density
         by_rows = (scaled @ bells.down).unflatten(2, (_LAYERS, _CELLS))
         by_across = (by_rows * nearer[:, :, :, None]).sum(2)
         by_nearer = (by_rows * bells.across[:, :, None]).sum(3)
         by_behind = (by_nearer * nearer * (nearer - 1)).sum(2) / _LAYER_EDGE_M
         by_cast, by_width = bells.backward(by_across, scaled.mT @ rows)
-        by_width = by_width - 2 / widths * (by_density * density).sum((1, 2, 3))
-        to_places = views.backward(seen, by_where[..., :2], by_where[..., 2])
-        to_body = views.backward(cast, by_cast, by_behind)
-        by_lamps, by_body = views.gather(to_places, to_body)
-        return by_body, to_places[0].sum(0), by_lamps, by_width
+        by_width = _of_scale(by_width, by_density, density, widths)
+        by_lamps, by_body, by_places = views.backward(
+            seen,
+            torch.cat([by_cast, by_where[..., :2]], 2),
+            torch.cat([by_behind, by_where[..., 2]], 2),
+        )
+        return by_body, by_places, by_lamps, by_width
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Points on the plane through the body's middle that faces a lamp."""
+    """Points on the plane through the body's middle that faces a lamp: the body's P, then places.
 
-    rays: Float[Tensor, "L T N 3"]
+    Together, since each operation on both is one launch of a GPU.
+    """
+
+    rays: Float[Tensor, "L T P+N 3"]
     """From the lamp, world axes."""
-    local: Float[Tensor, "L T N 3"]
-    """Across the light twice, and along it."""
-    spread: Float[Tensor, "L T N"]
+    along: Float[Tensor, "L T P+N"]
+    """The light, from the lamp."""
+    spread: Float[Tensor, "L T P+N"]
     """Of the plane by what lies in front of it."""
-    at: Float[Tensor, "L T N 2"]
-    behind: Float[Tensor, "L T N"]
+    at: Float[Tensor, "L T P+N 2"]
+    behind: Float[Tensor, "L T P+N"]
     """How far behind the plane, metres."""
-
-
-_Slopes = tuple[Float[Tensor, "L T N 3"], Float[Tensor, "L T 3 3"], Float[Tensor, "L T 1"]]
-"""Gradients of the rays, the frames and the distance."""
+    cast: Float[Tensor, "L T P 2"]
+    """Where the body's own are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,33 +183,37 @@ class _Views:
         frames = torch.cat([across, axis[..., None, :]], -2)
         return cls(lamps, frames, twist, distance, body.shape[1])
 
-    def project(self, points: Float[Tensor, "#T N 3"]) -> _Seen:
-        rays = points - self.lamps[:, None, None]
+    def project(self, body: Float[Tensor, "T P 3"], places: Float[Tensor, "T N 3"]) -> _Seen:
+        rays = torch.cat([body, places], 1) - self.lamps[:, None, None]
         local = rays @ self.frames.mT
         along = local[..., 2]
         spread = self.distance / along.clamp_min(_NEAREST_M)
         at = local[..., :2] * spread[..., None]
-        return _Seen(rays, local, spread, at, along - self.distance)
+        return _Seen(rays, along, spread, at, along - self.distance, at[:, :, : self.count])
 
     def backward(
         self,
         seen: _Seen,
-        by_at: Float[Tensor, "L T N 2"],
-        by_behind: Float[Tensor, "L T N"] | None,
-    ) -> _Slopes:
-        """Gradients of what `project` gave."""
-        reach = (by_at * seen.local[..., :2]).sum(-1) * seen.spread / self.distance
-        by_along = -reach * seen.spread * (seen.local[..., 2] > _NEAREST_M)
-        by_distance = reach
-        if by_behind is not None:
-            by_along, by_distance = by_along + by_behind, reach - by_behind
+        by_at: Float[Tensor, "L T P+N 2"],
+        by_behind: Float[Tensor, "L T P+N"],
+    ) -> tuple[Float[Tensor, "L 3"], Float[Tensor, "T P 3"], Float[Tensor, "T N 3"]]:
+        """Gradients of lamps, body and places from those of what `project` gave."""
+        reach = (by_at * seen.at).sum(-1) / self.distance
+        nears = seen.spread * (seen.along > _NEAREST_M)
+        by_along = torch.addcmul(by_behind, reach, nears, value=-1)
+        by_distance = (reach - by_behind).sum(-1, keepdim=True)
         by_local = torch.cat([by_at * seen.spread[..., None], by_along[..., None]], -1)
-        by_frame = by_local.mT @ seen.rays
-        return by_local @ self.frames, by_frame, by_distance.sum(-1, keepdim=True)
+        by_rays = by_local @ self.frames
+        by_ray = self._by_ray(by_local.mT @ seen.rays, by_distance)
+        by_points = by_rays.sum(0)
+        by_lamps = -by_ray.sum(1) - by_rays.sum((1, 2))
+        by_body = by_points[:, : self.count] + by_ray.sum(0)[:, None] / self.count
+        return by_lamps, by_body, by_points[:, self.count :]
 
-    def gather(self, to_places: _Slopes, to_body: _Slopes) -> tuple[Tensor, Tensor]:
-        """Gradients of the lamps and of the body's points."""
-        by_frame, by_distance = to_places[1] + to_body[1], to_places[2] + to_body[2]
+    def _by_ray(
+        self, by_frame: Float[Tensor, "L T 3 3"], by_distance: Float[Tensor, "L T 1"]
+    ) -> Float[Tensor, "L T 3"]:
+        """Gradient of the way from the lamp to the body's middle."""
         axis = self.frames[..., 2, :]
         turned = by_frame @ self.frames.mT
         about = turned[..., 0, 1] - turned[..., 1, 0]
@@ -211,10 +221,7 @@ class _Views:
         by_axis = torch.addcmul(by_axis, about[..., None], self.twist)
         # Only what turns the axis, and what makes the ray longer.
         along = (by_axis * axis).sum(-1, keepdim=True)
-        by_ray = (by_axis - along * axis) / self.distance + by_distance * axis
-        by_lamps = -by_ray.sum(1) - torch.cat([to_places[0], to_body[0]], 2).sum((1, 2))
-        by_body = to_body[0].sum(0) + by_ray.sum(0)[:, None] / self.count
-        return by_lamps, by_body
+        return torch.addcmul((by_axis - along * axis) / self.distance, by_distance, axis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +258,13 @@ class _Bells:
 
 def _scale(body: Float[Tensor, "T P 3"], widths: Float[Tensor, "L"]) -> Float[Tensor, "L 1 1 1"]:
     scale = DENSITY * AREA_M2 / (body.shape[1] * 2 * torch.pi)
-    return (scale / widths.square())[:, None, None, None]
+    return (scale * widths.pow(-2))[:, None, None, None]
+
+
+def _of_scale(by_width: Tensor, by_density: Tensor, density: Tensor, widths: Tensor) -> Tensor:
+    """The widths' gradient with that of `_scale` added."""
+    total = (by_density * density).sum((1, 2, 3))
+    return torch.addcdiv(by_width, total, widths, value=-2)
 
 
 def _sample(
@@ -260,7 +273,7 @@ def _sample(
     """Values of the grids at places, metres along their axes; and the places as torch has them."""
     # grid_sample wants the coordinate along the last axis first.
     at = _as_sampled(places)
-    return nn.functional.grid_sample(grids, at, align_corners=True), at
+    return F.grid_sample(grids, at, align_corners=True), at
 
 
 def _sample_backward(above: Tensor, grids: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
@@ -288,9 +301,10 @@ def _across(axis: Float[Tensor, "*T 3"]) -> tuple[Float[Tensor, "*T 2 3"], Float
     for a small move of the axis is the product with it.
     """
     sign = torch.copysign(torch.ones_like(axis[..., 2:]), axis[..., 2:])
-    between = axis + nn.functional.pad(sign, (2, 0))
+    between = axis + F.pad(sign, (2, 0))
     ratio = between[..., :2] / between[..., 2:]
     identity = torch.eye(3, dtype=axis.dtype, device=axis.device)[:2]
-    rows = identity - (ratio * sign)[..., None] * between[..., None, :]
-    twist = nn.functional.pad(torch.stack([ratio[..., 1], -ratio[..., 0]], -1), (0, 1))
-    return rows * nn.functional.pad(sign, (1, 0), value=1.0)[..., None], twist
+    # The identity less (ratio * sign) between.
+    rows = torch.addcmul(identity, (ratio * sign)[..., None], between[..., None, :], value=-1)
+    twist = F.pad(torch.stack([ratio[..., 1], -ratio[..., 0]], -1), (0, 1))
+    return rows * F.pad(sign, (1, 0), value=1.0)[..., None], twist

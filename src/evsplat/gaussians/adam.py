@@ -1,0 +1,62 @@
+"""One step of several Adams at once."""
+
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+@torch.no_grad()
+def step_together(adams: Iterable[torch.optim.Adam], unsound: Tensor | None = None) -> None:
+    """Step every parameter that has a gradient, as each of the fused ``adams`` would by itself.
+
+    They would count steps group by group, two launches of a GPU for each of the twenty groups of a
+    model. Here all are counted together, and groups of one rate are stepped together. Where
+    ``unsound`` is 1 (one value, on the device) nothing moves; nobody waits for it.
+    """
+    rules: defaultdict[tuple[Any, ...], list[tuple[Tensor, dict[str, Tensor]]]] = defaultdict(list)
+    for adam in adams:
+        for group in adam.param_groups:
+            rule = (group["lr"], *group["betas"], group["weight_decay"], group["eps"])
+            rules[rule] += [
+                (parameter, _state(adam, parameter))
+                for parameter in group["params"]
+                if parameter.grad is not None
+            ]
+    steps = [state["step"] for members in rules.values() for _, state in members]
+    if not steps:
+        return
+    torch._foreach_add_(steps, 1)
+    for (lr, beta1, beta2, weight_decay, eps), members in rules.items():
+        if not members:
+            continue
+        states = [state for _, state in members]
+        torch._fused_adam_(
+            [parameter for parameter, _ in members],
+            [parameter.grad for parameter, _ in members],
+            *([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq")),
+            [],
+            [state["step"] for state in states],
+            lr=lr,
+            beta1=beta1,
+            beta2=beta2,
+            weight_decay=weight_decay,
+            eps=eps,
+            amsgrad=False,
+            maximize=False,
+            found_inf=unsound,
+        )
+    if unsound is not None:
+        torch._foreach_sub_(steps, [unsound] * len(steps))
+
+
+def _state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:
+    """Moments and step count of a parameter, zero at the start."""
+    state: dict[str, Tensor] = adam.state[parameter]
+    if not state:
+        state["step"] = torch.zeros((), device=parameter.device)
+        for name in ("exp_avg", "exp_avg_sq"):
+            state[name] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+    return state
