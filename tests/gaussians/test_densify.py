@@ -3,7 +3,14 @@
 import pytest
 import torch
 
-from evsplat.gaussians import DensifyLimits, GaussianSet, RowAdam, ScreenStatistics, densify, step_together
+from evsplat.gaussians import (
+    DensifyLimits,
+    GaussianSet,
+    RowAdam,
+    ScreenStatistics,
+    densify,
+    step_together,
+)
 from evsplat.gaussians.densify import rebuild
 from evsplat.gaussians.initialise import gaussians_at
 

@@ -4,7 +4,14 @@ import pytest
 import torch
 
 from evsplat.body import Body, default_body
-from evsplat.gaussians import FEATURE_DIM, BodyFrames, GaussianSet, RowAdam, flip_labels, step_together
+from evsplat.gaussians import (
+    FEATURE_DIM,
+    BodyFrames,
+    GaussianSet,
+    RowAdam,
+    flip_labels,
+    step_together,
+)
 from evsplat.gaussians.flip import REACH_M
 from evsplat.gaussians.initialise import gaussians_at
 

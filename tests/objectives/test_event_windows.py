@@ -125,6 +125,31 @@ def test_from_its_start_on_events_pull_at_all_channels_alike(hue_from, alike):
     assert torch.equal(loss, objective.loss(step)["event"])
 
 
+@pytest.mark.parametrize("late_us", [None, 120.0])
+def test_the_loss_and_its_slopes_are_those_of_the_differences(late_us):
+    """What is written out at once against autograd through what held-out frames ask for."""
+    capture, step = scene(1)
+    objective = make(capture, 0.25, 0.35, late_us=late_us)
+    light = step.linear.clone().requires_grad_()
+    step.linear = light
+    parameters = [light, *objective.sensor.parameters()]
+    wrong = objective.differences(step, slice(None))
+    times = step.times_us
+    lasting = [end - start for start, end in zip(times, times[1:], strict=False)]
+    whole = objective.mean(wrong.sum(0, keepdim=True), [times[-1] - times[0]])
+    plain = 0.5 * (objective.mean(wrong, lasting) + whole)
+    found = objective.loss(step)["event"]
+    assert float(found) == pytest.approx(float(plain), rel=1e-6)
+    ours, theirs = (
+        torch.autograd.grad(loss, parameters, allow_unused=True) for loss in (found, plain)
+    )
+    for one, other in zip(ours, theirs, strict=True):
+        if other is None:  # no clock is learned
+            assert late_us is None and one is None
+        else:
+            assert torch.allclose(one, other, rtol=1e-5, atol=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_learned_thresholds_come_back(seed):
     capture, step = scene(seed)

@@ -151,8 +151,8 @@ class PoseCorrection(nn.Module):
     @staticmethod
     def _price(spline: PoseSpline, times_us: Tensor, moving: Tensor) -> Tensor:
         turns, shifts = spline.values(times_us)
-        joints = (turns * moving[:, None]).square().mean((0, 2)).sum()
-        return (joints + shifts.square().mean()) / (moving.sum() + 1)
+        every = torch.cat([(turns * moving[:, None]).flatten(1), shifts], 1).flatten()
+        return torch.dot(every, every) / (shifts.numel() * (moving.sum() + 1))
 
     def _expected(self, times_us: Tensor) -> tuple[Tensor, Tensor]:
         """Errors expected at times, linear between the keys."""

@@ -112,14 +112,10 @@ class EventWindows(Objective):
         seen = self._seen(step, kept)
         lasting = [end - start for start, end in zip(times, times[1:], strict=False)]
         whole = times[-1] - times[0]
-        if self.events.has_polarity and runs_native(seen.brightness):
+        if self.events.has_polarity:
             event = self._compared(seen, lasting, whole)
         else:
-            wrong = self._differences(seen)
-            event = self.mean(wrong, lasting)
-            if self.events.has_polarity:
-                # The whole span as well: small errors of one sign in each window add up in it.
-                event = 0.5 * (event + self.mean(wrong.sum(0, keepdim=True), [whole]))
+            event = self.mean(self._differences(seen), lasting)
         return {"event": event, "contrast": self.sensor.apart()}
 
     def readable(self, step: Step) -> slice:
@@ -192,7 +188,10 @@ class EventWindows(Objective):
         return changes - reported
 
     def _compared(self, seen: "_Seen", durations_us: Sequence[int], whole_us: int) -> Tensor:
-        """Mean size of the differences and of their sum, in the compiled module."""
+        """Mean size of the differences and of their sum.
+
+        The whole span as well: small errors of one sign in each window add up in it.
+        """
         pixels = seen.brightness[0].numel()
         each = [self.noise.weight(duration) / len(durations_us) for duration in durations_us]
         offset = self.sensor.offset_us
@@ -236,17 +235,21 @@ class _Compared(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        brightness: Tensor,
-        thresholds: Tensor,
-        offset: Tensor,
-        counts: Tensor,
-        drift: Tensor | None,
+        brightness: Float[Tensor, "T H W"],
+        thresholds: Float[Tensor, "2"],
+        offset: Float[Tensor, ""],
+        counts: Float[Tensor, "T-1 2 H W"],
+        drift: Float[Tensor, "T-1 H W"] | None,
         sound: Tensor,
-        weights: Tensor,
+        weights: Float[Tensor, "T-1"],
         whole: float,
-    ) -> Tensor:
+    ) -> Float[Tensor, ""]:
+        if not runs_native(brightness):
+            value, *slopes = _compared(brightness, thresholds, counts, drift, sound, weights, whole)
+            ctx.save_for_backward(*slopes)
+            return value
         slope = torch.empty_like(brightness)
-        value, *by = native.window_difference(
+        total, *by = native.window_difference(
             brightness.detach().contiguous(),
             counts,
             None if drift is None else drift.contiguous(),
@@ -258,7 +261,7 @@ class _Compared(torch.autograd.Function):
             torch.get_num_threads(),
         )
         ctx.save_for_backward(slope, thresholds.new_tensor(by))
-        return brightness.new_tensor(value)
+        return brightness.new_tensor(total)
 
     @staticmethod
     @once_differentiable
@@ -266,6 +269,30 @@ class _Compared(torch.autograd.Function):
         slope, by = ctx.saved_tensors
         by = by * upstream[0]
         return slope * upstream[0], by[:2], by[2], None, None, None, None, None
+
+
+def _compared(
+    brightness: Float[Tensor, "T H W"],
+    thresholds: Float[Tensor, "2"],
+    counts: Float[Tensor, "T-1 2 H W"],
+    drift: Float[Tensor, "T-1 H W"] | None,
+    sound: Tensor,
+    weights: Float[Tensor, "T-1"],
+    whole: float,
+) -> tuple[Float[Tensor, ""], Float[Tensor, "T H W"], Float[Tensor, "3"]]:
+    """Value, and its slopes by the brightness and by thresholds and offset, in plain torch."""
+    both = send(torch.tensor([1.0, -1.0]), counts.device)[:, None, None] * counts
+    wrong = brightness.diff(dim=0) - (thresholds[:, None, None] * both).sum(1)
+    each = torch.cat([wrong, wrong.sum(0, keepdim=True)])
+    weighed = torch.cat([weights, weights.new_tensor([whole])]).to(each.dtype)
+    weighed = send(weighed, each.device)
+    slopes = each.sign() * (send(sound, each.device) * weighed[:, None, None])
+    value = torch.dot(slopes.flatten(), each.flatten())
+    by_wrong = slopes[:-1] + slopes[-1:]
+    by_threshold = (by_wrong[:, None] * both).sum((0, 2, 3))
+    by_offset = by_wrong.new_zeros(1) if drift is None else (by_wrong * drift).sum()[None]
+    ends = torch.nn.functional.pad(by_wrong, (0, 0, 0, 0, 1, 1))
+    return value, ends[:-1] - ends[1:], -torch.cat([by_threshold, by_offset])
 
 
 class HeldOutWindows(Objective):

@@ -69,10 +69,30 @@ def membership_loss(
     if isinstance(masks, PackedBounds):
         packed: Tensor = _NativeMembership.apply(share, masks.bits)
         return packed
-    inside, outside = masks.to(share.dtype)
-    # The probability of what the pixel surely is: p inside, 1 - p outside, 1 between.
-    held = share.clamp(LEAST_SHARE, 1 - LEAST_SHARE)
-    return -torch.addcmul(1 - inside, inside - outside, held).log().mean()
+    loss: Tensor = _Membership.apply(share, masks)
+    return loss
+
+
+class _Membership(torch.autograd.Function):
+    """`membership_loss` in plain torch; the gradient is found on the way forward."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, share: Float[Tensor, "H W"], masks: Bool[Tensor, "2 H W"]
+    ) -> Float[Tensor, ""]:
+        inside, outside = masks.to(share.dtype)
+        held = share.clamp(LEAST_SHARE, 1 - LEAST_SHARE)
+        # The probability of what the pixel surely is: p inside, 1 - p outside, 1 between.
+        slope = inside - outside
+        right = torch.addcmul(1 - inside, slope, held)
+        ctx.save_for_backward(slope.div_(right).mul_(share == held))
+        return right.log_().mean().neg_()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (slope,) = ctx.saved_tensors
+        return slope * (-upstream[0] / slope.numel()), None
 
 
 class _NativeMembership(torch.autograd.Function):
@@ -124,5 +144,5 @@ class RenderedSemantics(Objective):
         soft = step.model.gaussians.semantics()
         terms = {"binarise": (soft * (1 - soft)).mean()}
         if values:
-            terms["semantic"] = torch.stack(values).mean()
+            terms["semantic"] = values[0] if len(values) == 1 else torch.stack(values).mean()
         return terms
