@@ -4,7 +4,8 @@ python benchmarks/curve_picture.py PICTURE.png LABEL=FILE [LABEL=FILE ...]
 
 Each file ends with a line of JSON as `curve.py` prints it. Drawn are full frame, person's crop and
 person's mask in a panel each; the first curve's end is a line across, so that one sees when the
-others reach it. The last line is JSON: for each label the seconds at which all three do.
+others reach it. The last line is JSON: for each label the seconds at which all three come within
+0.1 dB of it.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from curve import is_near
 from PIL import Image, ImageDraw
 
 from evsplat.inspection.drawing import font, round_ticks
@@ -44,11 +46,8 @@ def main() -> None:
 
 
 def reached(curve: Curve, goal: dict[str, Any]) -> float | None:
-    """Seconds of the first point that is nowhere below ``goal``; None where none is."""
-    for point in curve:
-        if all(point[f"{region}_psnr_db"] >= goal[f"{region}_psnr_db"] for region in REGIONS):
-            return float(point["train_s"])
-    return None
+    """Seconds of the first point that is as good as ``goal``; None where none is."""
+    return next((float(point["train_s"]) for point in curve if is_near(point, goal)), None)
 
 
 def panel(region: str, title: str, curves: dict[str, Curve]) -> Image.Image:

@@ -49,6 +49,17 @@ def test_keys_are_hit_exactly_and_held_beyond_the_ends(keys):
     assert torch.equal(outside[0], ends[0]) and torch.equal(outside[1], ends[1])
 
 
+def test_a_long_recording_is_posed_as_a_short_one(monkeypatch):
+    """Whose polynomials are not kept."""
+    short, _, _ = make_track(3, keys=40)
+    monkeypatch.setattr("evsplat.body.track._KEPT_KEYS", 39)
+    long, _, _ = make_track(3, keys=40)
+    assert long._known is None and short._known is not None
+    times = np.linspace(short.times_us[0] - 9, short.times_us[-1] + 9, 333).astype(np.int64)
+    for one, other in zip(long.at(times), short.at(times), strict=True):
+        assert torch.equal(one, other)
+
+
 def test_two_keys_are_slerp_and_straight_line():
     track, poses, _ = make_track(5, keys=2)
     middle = track.times_us[0] + np.arange(0, np.diff(track.times_us)[0], 1000)
@@ -65,13 +76,12 @@ def test_two_keys_are_slerp_and_straight_line():
 def test_angular_velocity_and_acceleration_are_continuous_at_the_keys():
     track, poses, _ = make_track(6, keys=8)
     step = 2e-5  # seconds; the polynomials themselves are evaluated, in float64, without rounding
-    starts = track._turns.double()
     for knot in range(1, 7):
         length = float(track._seconds[knot] - track._seconds[knot - 1])
 
         def path(interval, offsets):
-            c3, c2, c1 = starts[interval].unbind(1)
-            values = [(((c3 * h + c2) * h + c1) * h).numpy() for h in offsets]
+            at = torch.full((3,), interval)
+            values = track._turned(at, torch.tensor(offsets, dtype=torch.float64)).numpy()
             base = Rotation.from_rotvec(poses[interval])
             return [base * Rotation.from_rotvec(value) for value in values]
 

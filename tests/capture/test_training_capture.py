@@ -1,7 +1,6 @@
 """What a training may see of a capture: asked for anything else, it raises and says why."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ def frames(splits: str, longer_us: int = 0) -> list[Frame]:
     """A frame every 40 ms, 30 ms long; ``x`` is held out."""
     return [
         Frame(
-            str(index), index, "main", Path(f"{index}.png"),
+            str(index), index, "main", f"{index}.png",
             (index * PERIOD_US - longer_us, index * PERIOD_US + EXPOSURE_US + longer_us),
             "test" if split == "x" else "train",
         )

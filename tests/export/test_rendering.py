@@ -46,7 +46,7 @@ class _Recording:
                 f"f{k}",
                 k,
                 "main",
-                Path(f"{k}.png"),
+                f"{k}.png",
                 (mid - 36_000, mid + 36_000),
                 "test" if k == 2 else "train",
                 world_to_camera=_pose(0.2 * k, float(k)) if moving else None,

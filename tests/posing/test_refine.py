@@ -1,7 +1,5 @@
 """A motion is corrected by pictures of it, by a known amount, and left where it is right."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -152,7 +150,7 @@ def grey_and_coloured():
     """Two pictures of one colour, the second carried by events."""
     image = torch.tensor([0.2, 0.5, 0.9]).expand(2, 4, 4, 3).clone()
     ones = torch.ones(2, 4, 4)
-    frame = Frame("0", 0, "main", Path("none"), (0, 1), "train")
+    frame = Frame("0", 0, "main", "none", (0, 1), "train")
     camera = Camera(4, 4, torch.eye(3), torch.eye(4))
     coloured = torch.tensor([True, False])
     return Targets([0, 1], [frame] * 2, coloured, image, image, ones, ones, camera, "power")
@@ -209,7 +207,7 @@ def staged(body, size):
         correction.turns.zero_()
         correction.shifts.zero_()
     frames = [
-        Frame(str(k), k, "main", Path("none"), (t - 1, t + 1), "train") for k, t in enumerate(TIMES)
+        Frame(str(k), k, "main", "none", (t - 1, t + 1), "train") for k, t in enumerate(TIMES)
     ]
     weight = torch.ones(image.shape[:3])
     coloured = torch.ones(len(TIMES), dtype=torch.bool)

@@ -20,6 +20,8 @@ from evsplat.errors import DataError
 _MOST_KEYS = 24
 """Key poses that tell which way is up, at most."""
 _CAMERA_UP_WEIGHT = 0.5
+_KEPT_KEYS = 2_048
+"""Keys up to which the polynomials between them are kept."""
 _TIMES_AT_ONCE = 1_024
 """On the way to a pose there are ten times as many numbers as in it."""
 
@@ -63,13 +65,17 @@ class BodyTrack:
         self.transl = transl
         seconds = (times - times[0]) * 1e-6
         # On the host, since a GPU would take a launch per operation for a few hundred numbers.
-        # Those of an hour are many: turns are float32, which errs by less than 1e-6 rad.
+        # Those of an hour are many: of its turns only the rates at the keys are kept, in float32,
+        # which errs by less than 1e-6 rad; the polynomials would be three times as much.
         self._seconds = torch.from_numpy(seconds)
         moving = (poses != poses[:1]).any((0, 2))
-        turns, places = _polynomials(seconds, poses[:, moving], transl)
         self._moving = torch.from_numpy(np.flatnonzero(moving))
-        """Joints that turn at all; the others' turns are not kept."""
-        self._turns, self._places = torch.from_numpy(turns), torch.from_numpy(places)
+        """Joints that turn at all; the others' rates are not kept."""
+        self._rates = torch.from_numpy(_rates(seconds, poses[:, moving]))
+        self._places = torch.from_numpy(_places(seconds, transl))
+        self._known: Tensor | None = None
+        if 1 < len(seconds) <= _KEPT_KEYS:
+            self._known = self._cubics(torch.arange(len(seconds) - 1))
 
     @property
     def poses(self) -> Float[np.ndarray, "P J 3"]:
@@ -111,16 +117,36 @@ class BodyTrack:
         index = torch.searchsorted(self._seconds, seconds, right=True) - 1
         index = index.clamp(0, len(self._places) - 1)
         step = seconds - self._seconds[index]
-        c3, c2, c1 = self._turns[index].unbind(-2)
-        since_s = step[:, None, None]
         poses = torch.from_numpy(self._poses)[index].double()
         turned = torch.zeros_like(poses)
-        turned[:, self._moving] = ((c3 * since_s + c2) * since_s + c1) * since_s
+        if len(self._seconds) > 1:
+            turned[:, self._moving] = self._turned(index, step)
         key, since = axis_angle_to_matrix(torch.stack([poses, turned]))
         c3, c2, c1, c0 = self._places[index].unbind(-2)
         since_s = step[:, None]
         places = ((c3 * since_s + c2) * since_s + c1) * since_s + c0
         return (key @ since).float(), places.float()
+
+    def _turned(self, index: Int[Tensor, "T"], step: Float[Tensor, "T"]) -> Float[Tensor, "T M 3"]:
+        """Turns of the moving joints in ``step`` seconds since a key, axis-angle."""
+        cubics = self._cubics(index) if self._known is None else self._known[index]
+        c3, c2, c1 = cubics.unbind(-2)
+        since_s = step[:, None, None]
+        return ((c3 * since_s + c2) * since_s + c1) * since_s
+
+    def _cubics(self, index: Int[Tensor, "I"]) -> Float[Tensor, "I M 3 3"]:
+        """Coefficients (highest first) of the turns since a key, by seconds; the constant is zero.
+
+        The cubics that have the turn to the next key, and the rates at both, as their ends.
+        """
+        keys = torch.from_numpy(self._poses)
+        first, second = (keys[at][:, self._moving].double() for at in (index, index + 1))
+        whole = _turn_between(first, second)
+        gap_s = (self._seconds[index + 1] - self._seconds[index])[:, None, None]
+        before, after = (self._rates[at].double() for at in (index, index + 1))
+        mean, after = whole / gap_s, _vector_rate(whole, after)
+        cubics = (before + after - 2 * mean) / gap_s**2, (3 * mean - 2 * before - after) / gap_s
+        return torch.stack([*cubics, before], -2)
 
     def bones(self, times_us: Int[Tensor, "T"] | Sequence[int]) -> Float[Tensor, "T J 4 4"]:
         """Bone transforms, canonical pose to world, at the given times."""
@@ -158,26 +184,57 @@ def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
     return up
 
 
-def _polynomials(
-    seconds: Float[np.ndarray, "P"],
-    poses: Float[np.ndarray, "P J 3"],
-    transl: Float[np.ndarray, "P 3"],
-) -> tuple[Float[np.ndarray, "I J 3 3"], Float[np.ndarray, "I 4 3"]]:
-    """Cubic coefficients (highest first) of each interval: of turns since its start, and of places.
+def _rates(
+    seconds: Float[np.ndarray, "P"], poses: Float[np.ndarray, "P M 3"]
+) -> Float[np.ndarray, "P M 3"]:
+    """Angular rates at the keys, radians per second about each joint's own axes, float32."""
+    rates = np.zeros(poses.shape, np.float32)
+    if len(poses) == 1:
+        return rates
+    for joint in range(poses.shape[1]):
+        spline = RotationSpline(seconds, Rotation.from_rotvec(poses[:, joint]))
+        c3, c2, c1, _ = spline.interpolator.c
+        rates[:-1, joint] = c1
+        gap_s = seconds[-1] - seconds[-2]
+        whole = ((c3[-1] * gap_s + c2[-1]) * gap_s + c1[-1]) * gap_s
+        end = (3 * c3[-1] * gap_s + 2 * c2[-1]) * gap_s + c1[-1]
+        columns = _vector_rate(torch.from_numpy(whole).expand(3, 3), torch.eye(3).double())
+        rates[-1, joint] = np.linalg.solve(columns.T.numpy(), end)
+    return rates
 
-    Turns are float32, without the constant, which is zero.
-    """
-    count, joints = poses.shape[:2]
-    turns = np.zeros((max(1, count - 1), joints, 3, 3), np.float32)
-    if count == 1:
+
+def _turn_between(
+    first: Float[Tensor, "*batch 3"], second: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Turns from one rotation to another about the first one's axes, axis-angle vectors each."""
+    from_first, to_second = (
+        Rotation.from_rotvec(each.reshape(-1, 3).numpy()) for each in (first, second)
+    )
+    return torch.from_numpy((from_first.inv() * to_second).as_rotvec()).view_as(first)
+
+
+def _vector_rate(
+    turn: Float[Tensor, "*batch 3"], rates: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Rates of axis-angle vectors at angular rates (as scipy's RotationSpline has them)."""
+    angle = turn.norm(dim=-1, keepdim=True)
+    half = 0.5 * angle.clamp_min(1e-4)
+    share = torch.where(
+        angle > 1e-4, (1 - half / half.tan()) / (2 * half).square(), 1 / 12 + angle.square() / 720
+    )
+    about = torch.linalg.cross(turn, rates)
+    return rates + 0.5 * about + share * torch.linalg.cross(turn, about)
+
+
+def _places(
+    seconds: Float[np.ndarray, "P"], transl: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "I 4 3"]:
+    """Cubic coefficients (highest first) of places in each interval."""
+    if len(transl) == 1:
         places = np.zeros((1, 4, 3))
         places[0, -1] = transl[0]
-        return turns, places
-    for joint in range(joints):
-        rotations = Rotation.from_rotvec(poses[:, joint])
-        coefficients = RotationSpline(seconds, rotations).interpolator.c
-        turns[:, joint] = coefficients[:3].transpose(1, 0, 2)
-    return turns, np.ascontiguousarray(CubicSpline(seconds, transl).c.transpose(1, 0, 2))
+        return places
+    return np.ascontiguousarray(CubicSpline(seconds, transl).c.transpose(1, 0, 2))
 
 
 def _check(

@@ -21,7 +21,8 @@ class Frame:
     index: int
     """Position in ``capture.frames``."""
     camera: str
-    image: Path
+    image_file: str
+    """Path of the picture; an object of one would be four times as large."""
     exposure_us: tuple[int, int]
     """Start and end of the exposure on the camera's clock."""
     split: Literal["train", "test"]
@@ -30,6 +31,11 @@ class Frame:
     mask: Path | None = None
     world_to_camera: Float[Tensor, "4 4"] | None = None
     """Pose of a moving camera at mid-exposure; None where the camera stands."""
+
+    @property
+    def image(self) -> Path:
+        """The picture."""
+        return Path(self.image_file)
 
     @property
     def mid_us(self) -> int:

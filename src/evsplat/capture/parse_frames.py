@@ -80,7 +80,7 @@ def _frame(top: Fields, index: int, value: Any, cameras: dict[str, Camera]) -> F
     if not entry.valid or image is None or exposure is None:
         return None
     kind: Literal["train", "test"] = "train" if split == "train" else "test"
-    return Frame(name, index, camera, image, exposure, kind, sharp, mask, pose)
+    return Frame(name, index, camera, str(image), exposure, kind, sharp, mask, pose)
 
 
 def _check_camera(entry: Fields, camera: str, cameras: dict[str, Camera]) -> None:

@@ -35,8 +35,9 @@ def step_together(adams: Iterable[torch.optim.Adam], unsound: Tensor | None = No
         states = [state for _, state in members]
         torch._fused_adam_(
             [parameter for parameter, _ in members],
-            [parameter.grad for parameter, _ in members],
-            *([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq")),
+            [parameter.grad for parameter, _ in members if parameter.grad is not None],
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
             [],
             [state["step"] for state in states],
             lr=lr,
