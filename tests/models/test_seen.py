@@ -9,7 +9,7 @@ from evsplat.camera import Camera
 from evsplat.capture import Policy, load_capture
 from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.models.layers import Layers, human_splats, scene_splats
-from evsplat.models.seen import Seen, roughness, seen_by, shares_in
+from evsplat.models.seen import Seen, draw_values, roughness, seen_by, shares_in
 
 from ..small_model import built
 
@@ -41,6 +41,25 @@ def test_shares_of_two_stacked_discs():
     # The mean of n squares of a normal variable has the relative error sqrt(2 / n).
     squares = shares[:, 1:].square().mean(1)
     assert torch.allclose(squares, pixels * wanted.square(), rtol=5 * (2 / draws) ** 0.5)
+
+
+@pytest.mark.parametrize("behind", [True, False])
+def test_of_a_scene_only_what_may_hide_the_person_is_drawn(behind):
+    layers, camera = stacked(0.8)
+    generator = torch.Generator().manual_seed(int(behind))
+    depths = torch.tensor([3.1, 4.0, 9.0] if behind else [1.0, 2.5, 4.0])
+    means = torch.cat([0.3 * torch.randn(3, 2, generator=generator), depths[:, None]], 1)
+    wide = torch.full((3, 3), 0.4)
+    turned = torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4)
+    alike = torch.full((3,), 0.6), torch.zeros(3, 3), torch.zeros(3)
+    layers = dataclasses.replace(layers, scene=scene_splats(means, turned, wide, *alike))
+    values = torch.rand(1, 2, 3, generator=generator)
+    all_of_it, needed = (
+        draw_values(layers, camera, values, scene) for scene in (torch.zeros(1, 3, 3), None)
+    )
+    assert torch.allclose(needed, all_of_it, atol=1e-6)
+    alone = draw_values(dataclasses.replace(layers, scene=stacked(0.8)[0].scene), camera, values)
+    assert torch.allclose(needed, alone, atol=1e-6) == behind
 
 
 def test_what_shines_through_is_less_certain_than_what_is_seen():

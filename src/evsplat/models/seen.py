@@ -129,10 +129,33 @@ def draw_values(
     scene: Float[Tensor, "1 S C"] | None = None,
 ) -> Float[Tensor, "T H W C"]:
     """Values of Gaussians drawn instead of their colours, without shadow; the scene's may be 0."""
+    static: Splats | None = layers.scene
     if scene is None:
-        scene = human.new_zeros(1, layers.scene.means.shape[1], human.shape[-1])
-    person, behind = fixed(layers.human, human), fixed(layers.scene, scene)
-    return render(person, camera, static=behind, low_pass=layers.low_pass).image
+        static = _hiding(layers, camera)
+        if static is not None:
+            scene = human.new_zeros(1, static.means.shape[1], human.shape[-1])
+    if static is not None and scene is not None:
+        static = fixed(static, scene)
+    person = fixed(layers.human, human)
+    return render(person, camera, static=static, low_pass=layers.low_pass).image
+
+
+@torch.no_grad()
+def _hiding(layers: Layers, camera: Camera) -> Splats | None:
+    """The scene's Gaussians that may hide some of the person, or None where none may.
+
+    Those behind all of the person change nothing of what is seen of them, and are most of a scene.
+    """
+    pose = camera.world_to_camera
+    person, scene = (
+        layer.means @ pose[2, :3] + pose[2, 3] for layer in (layers.human, layers.scene)
+    )
+    nearer = (scene <= person.max()).any(0)
+    if not bool(nearer.any()):
+        return None
+    static = layers.scene.with_times()
+    rows = {name: value[:, nearer] for name, value in vars(static).items() if value is not None}
+    return replace(static, **rows)
 
 
 def fixed(layer: Splats, channels: Tensor) -> Splats:
