@@ -1,11 +1,12 @@
-"""Curves of `curve.py` side by side as a picture: PSNR of held-out frames over seconds of training.
+"""Curves of `curve.py` side by side as a picture: PSNR of held-out frames over seconds.
 
 python benchmarks/curve_picture.py PICTURE.png LABEL=FILE [LABEL=FILE ...]
 
-Each file ends with a line of JSON as `curve.py` prints it. Drawn are full frame, person's crop and
-person's mask in a panel each; the first curve's end is a line across, so that one sees when the
-others reach it. The last line is JSON: for each label the seconds at which all three come within
-0.1 dB of it.
+Each file ends with a line of JSON as `curve.py` prints it; seconds are those of the CPU from the
+start of the command where it has them, otherwise those of the training. Drawn are full frame,
+person's crop and person's mask in a panel each; the first curve's end is a line across, so that one
+sees when the others reach it. The last line is JSON: for each label the seconds at which all three
+come within 0.1 dB of it.
 """
 
 import argparse
@@ -47,7 +48,12 @@ def main() -> None:
 
 def reached(curve: Curve, goal: dict[str, Any]) -> float | None:
     """Seconds of the first point that is as good as ``goal``; None where none is."""
-    return next((float(point["train_s"]) for point in curve if is_near(point, goal)), None)
+    return next((seconds(point) for point in curve if is_near(point, goal)), None)
+
+
+def seconds(point: dict[str, Any]) -> float:
+    """Place of a point."""
+    return float(point.get("cpu_s", point["train_s"]))
 
 
 def panel(region: str, title: str, curves: dict[str, Curve]) -> Image.Image:
@@ -56,7 +62,7 @@ def panel(region: str, title: str, curves: dict[str, Curve]) -> Image.Image:
     picture = Image.new("RGB", (LEFT + width + GAP, TOP + height + BOTTOM), "white")
     draw, small = ImageDraw.Draw(picture), font(20)
     values = {
-        label: [(point["train_s"], point[f"{region}_psnr_db"]) for point in curve]
+        label: [(seconds(point), point[f"{region}_psnr_db"]) for point in curve]
         for label, curve in curves.items()
     }
     every = [pair for points in values.values() for pair in points]
