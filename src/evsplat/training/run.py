@@ -295,9 +295,9 @@ class Run:
         if self.recording is None:
             return drawn
         time = [int(drawn.track.times_us[0])]
-        picture = drawn.render(self.recording, time, parts="scene").rgb[0]
+        scene = drawn.render(self.recording, time, parts="scene")
         depth = drawn.depth(self.recording, time, parts="scene")[0]
-        beyond = Beyond.of(self.recording, drawn.track, picture, depth)
+        beyond = Beyond.of(self.recording, drawn.track, scene.rgb[0], scene.alpha[0], depth)
         return replace(drawn.changed_by(beyond.uncovered), beyond=beyond)
 
     def what_was_seen(self) -> dict[str, float | None] | None:
