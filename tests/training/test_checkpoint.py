@@ -110,6 +110,11 @@ def test_a_training_that_goes_on_from_before_drops_what_is_later(folder: Path) -
     assert steps(folder) == [10, 15]
 
 
+def test_files_that_are_not_named_by_a_step_are_no_checkpoints(folder: Path) -> None:
+    (folder / "000020.safetensors").rename(folder / "20 old.safetensors")
+    assert steps(folder) == [10]
+
+
 def test_a_checkpoint_is_a_file_of_safetensors(folder: Path) -> None:
     """As its own writer makes it: shapes, types, numbers and texts, read by its own reader."""
     generator = torch.Generator().manual_seed(0)

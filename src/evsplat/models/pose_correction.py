@@ -138,16 +138,6 @@ class PoseCorrection(nn.Module):
                 price = self._price(self.between, middles, self.between_rad > 0)
         return price
 
-    def unlikeliness(self) -> Float[Tensor, ""]:
-        """Sum of squares of the errors' unknowns, each in units of its standard deviation.
-
-        Twice the negative logarithm of how likely they are before anything was seen.
-        """
-        moving = (self.joint_rad > 0).any(0)[:, None]
-        points = [spline.whole() for _, spline in self._errors()]
-        squares = [(turns * moving).square().sum() + s.square().sum() for turns, s in points]
-        return torch.stack(squares).sum()
-
     @staticmethod
     def _price(spline: PoseSpline, times_us: Tensor, moving: Tensor) -> Tensor:
         turns, shifts = spline.values(times_us)

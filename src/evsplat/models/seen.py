@@ -64,6 +64,8 @@ class Seen:
         found = [tuple(value.shape) for value in vars(seen).values()]
         if found != [(count,), (count,), (count, 3)]:
             raise ValueError(f"what was seen is of shapes {found}, of {count} Gaussians")
+        if not all(value.isfinite().all() for value in vars(seen).values()):
+            raise ValueError("what was seen holds numbers that are not finite")
         return seen
 
 

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,7 @@ def _pieces(tensors: dict[str, Tensor], texts: dict[str, str]) -> Iterator[bytes
 
 def checkpoints(folder: Path) -> list[Path]:
     """The checkpoints of a run, the newest last."""
-    return sorted(folder.glob("[0-9]*.safetensors"))
+    return sorted(path for path in folder.glob("*.safetensors") if path.stem.isdecimal())
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
@@ -187,11 +187,18 @@ def load_model(
     """Give a model the parameters of a checkpoint, whatever its number of Gaussians was.
 
     ``filled``: those that a finished training decided for what it hardly saw, where it did.
+
+    Raises:
+        ValueError: Numbers are not finite, or attributes are not of as many Gaussians.
     """
     entries = below("model", tensors) | (below("filled", tensors) if filled else {})
+    require_finite(entries)
     for name, rows in model.sets.items():
         device = rows.means.device
         values = {key: entries[f"{name}.{key}"].to(device) for key in rows.attributes}
+        for key, value in values.items():
+            shape = (*values["means"].shape[:1], *rows.get_parameter(key).shape[1:])
+            require_shape(f"{name}.{key}", value, shape)
         if rows.holds("human") and not 0 <= human_count <= len(values["means"]):
             raise ValueError(f"{human_count} Gaussians of the person, of {len(values['means'])}")
         rows.set_rows(values, human_count)
@@ -199,6 +206,36 @@ def load_model(
     for cache in model.row_caches.values():
         # found for the rows that were there before, which may be as many
         cache.rows_changed()
+
+
+def require_finite(tensors: Mapping[str, Tensor]) -> None:
+    """Raise a `ValueError` that names a tensor whose numbers are not all finite."""
+    for name, value in tensors.items():
+        if value.is_floating_point() and not value.isfinite().all():
+            raise ValueError(f"{name} holds numbers that are not finite")
+
+
+def require_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    """Raise a `ValueError` where a tensor has another shape."""
+    if tuple(value.shape) != shape:
+        raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {shape}")
+
+
+def check_progress(state: dict[str, Any], frames: int) -> None:
+    """Raise a `ValueError` where a state is none that a training with so many frames has."""
+    clock = state["clock"]
+    within = {
+        "iteration": (clock["iteration"], 0, 2**53),
+        "iterations": (clock["iterations"], 1, 2**53),
+        "ends_at": (clock["ends_at"], 0, 2**53),
+        "fraction": (clock["fraction"], 0, 1),
+        "seconds": (clock["seconds"], 0, 1e12),
+        "step_seconds": (clock["step_seconds"], 0, 1e12),
+        **{f"queue[{k}]": (number, 0, frames - 1) for k, number in enumerate(state["queue"])},
+    }
+    for name, (value, least, most) in within.items():
+        if not least <= value <= most:
+            raise ValueError(f"{name} is {value}, expected {least} to {most}")
 
 
 def counts(model: Model) -> dict[str, int]:

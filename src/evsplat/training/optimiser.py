@@ -111,13 +111,26 @@ class Optimiser:
         return flat
 
     def load_state(self, flat: dict[str, Tensor]) -> None:
-        """Take back what `state` gave; parameters must have the shapes of that moment."""
+        """Take back what `state` gave; parameters must have the shapes of that moment.
+
+        Raises:
+            ValueError: They have not, or some moments are missing: Adam would read beyond them.
+        """
         for label, adam in self._adams():
             states: dict[int, dict[str, Any]] = {}
             for name, value in flat.items():
                 which, number, key = name.rsplit(".", 2)
                 if which == label:
                     states.setdefault(int(number), {})[key] = value
+            parameters = [one for group in adam.param_groups for one in group["params"]]
+            for place, moments in states.items():
+                shapes = [tuple(moments[key].shape) for key in ("exp_avg", "exp_avg_sq")]
+                expected = tuple(parameters[place].shape)
+                if any(shape != expected for shape in shapes):
+                    raise ValueError(
+                        f"optimiser.{label}.{place} has moments of shapes {shapes}, expected "
+                        f"{expected}"
+                    )
             adam.load_state_dict(
                 {"state": states, "param_groups": adam.state_dict()["param_groups"]}
             )

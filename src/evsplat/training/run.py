@@ -45,7 +45,7 @@ from evsplat.untrusted.text import parse_json, read_text
 PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
 
 _FACTS = {"capture": str, "capture_name": str, "device": str, "seed": int}
-"""Runs that an error about the folder above them names, at most."""
+"""What versions.json must hold."""
 
 
 class RunFolder:

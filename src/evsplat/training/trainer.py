@@ -20,7 +20,16 @@ from evsplat.models.drawing import Drawing
 from evsplat.models.seen import seen_by
 from evsplat.objectives import Objective, Step
 from evsplat.training.bad_steps import BadSteps
-from evsplat.training.checkpoint import ENDING, below, counts, flatten, load_model
+from evsplat.training.checkpoint import (
+    ENDING,
+    below,
+    check_progress,
+    counts,
+    flatten,
+    load_model,
+    require_finite,
+    require_shape,
+)
 from evsplat.training.clock import Clock
 from evsplat.training.optimiser import Optimiser
 from evsplat.training.outlook import REST, SETTLED, Outlook
@@ -234,14 +243,21 @@ class Trainer:
         return tensors
 
     def load_state(self, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:
-        """Go back to the moment of `state`; the clock's limits stay those of this run."""
+        """Go back to the moment of `state`; the clock's limits stay those of this run.
+
+        Raises:
+            ValueError: The state is not that of this model and its frames.
+        """
+        check_progress(state, len(self.capture.train_frames))
+        require_finite(tensors)
         load_model(self.model, tensors, state["human_count"])
         self.optimiser = Optimiser(self.model, self.composition.learning)
         self.optimiser.load_state(below("optimiser", tensors))
-        self.statistics = {
-            name: ScreenStatistics(**below(f"statistics.{name}", tensors)).to(self.device)
-            for name in self.model.sets
-        }
+        for name, rows in self.model.sets.items():
+            statistics = below(f"statistics.{name}", tensors)
+            for key, value in statistics.items():
+                require_shape(f"statistics.{name}.{key}", value, (len(rows.means),))
+            self.statistics[name] = ScreenStatistics(**statistics).to(self.device)
         for number, objective in enumerate(self.composition.objectives):
             objective.load_state(below(f"objective{number}", tensors))
         for name, cache in self.model.row_caches.items():

@@ -245,5 +245,12 @@ class NearestSurface:
         return {"index": self.index}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state` gave."""
-        self.index = state["index"]
+        """Take back what `state` gave; a `ValueError` where it names no points of the surface."""
+        index, count = state["index"], len(self.surface.points)
+        if (
+            index.dtype != torch.long
+            or index.dim() != 1
+            or not bool(((index >= 0) & (index < count)).all())
+        ):
+            raise ValueError(f"surface.index holds others than the numbers of {count} points")
+        self.index = index
