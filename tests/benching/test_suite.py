@@ -28,6 +28,12 @@ def write(tmp_path, text):
         ("name: s\nrows: [{name: a, method: m}, {name: a, method: n}]", "two rows are named a"),
         (f"name: s\ncaptures: [{{name: c}}]\n{ROW}", "either path or stage"),
         (f"name: s\nseeds: one\n{ROW}", "seeds"),
+        (f"name: ../../s\n{ROW}", "suite '../../s'"),
+        (
+            "name: s\nrows: [{name: a, method: nearest_frame, settings: [width=3]}]",
+            "row a: settings are those of a method that is trained",
+        ),
+        ("name: s\nrows: [{name: a, method: pictures, pictures: ''}]", "belong together"),
         (f"name: s\ncaptures: [{{name: c, stage: {{fps: 0}}}}]\n{ROW}", "fps is 0"),
     ],
 )
@@ -113,3 +119,14 @@ def test_a_row_has_its_own_number_of_steps_unless_the_bench_is_given_one(tmp_pat
     assert steps(max_minutes=2) == {"a": (None, 2), "b": (None, 2), "m": (None, None)}
     both = steps(max_minutes=2, iterations=7)
     assert both == {"a": (7, 2), "b": (7, 2), "m": (None, None)}
+
+
+def test_a_seed_that_is_named_twice_is_one(tmp_path):
+    assert read_suite(write(tmp_path, f"name: s\nseeds: [0, 1, 0]\n{ROW}")).seeds == (0, 1)
+
+
+@pytest.mark.parametrize("added", ["theirs", "theirs=", "=theirs", "theirs=absent"])
+def test_pictures_without_a_folder_are_not_those_of_the_working_directory(tmp_path, added):
+    suite = read_suite(write(tmp_path, f"name: s\ncaptures: [{{name: c, path: c}}]\n{ROW}"))
+    with pytest.raises(ConfigError, match=f"--add {added}: expected NAME=FOLDER"):
+        make_plan(suite, BenchFolder(tmp_path), add=(added,))

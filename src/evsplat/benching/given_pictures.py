@@ -5,7 +5,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,14 +14,14 @@ from evsplat.capture import Capture
 from evsplat.errors import DataError
 from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.methods.trivial import same_view
+from evsplat.pictures.files import read_image, to_rgb, to_unit_range
 from evsplat.untrusted.faults import open_bytes
-from evsplat.untrusted.pictures import image_size, read_picture
+from evsplat.untrusted.pictures import image_size
 
 PICTURES = "pictures"
 """Method of a row whose pictures are given."""
 OWN_PICTURE = "own_picture"
 """Method of a row with the blurry pictures that the camera took at test times."""
-_REMEDY = "write it again as an 8-bit RGB PNG"
 
 
 class _OfTestFrames(ABC):
@@ -78,10 +77,7 @@ class GivenPictures(_OfTestFrames):
     def _picture(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
         for view, time, path in self._places:
             if time == time_us and same_view(view, camera):
-                pixels = read_picture(
-                    path, lambda image: np.asarray(image.convert("RGB")), remedy=_REMEDY
-                )
-                return torch.from_numpy(pixels.astype(np.float32) / 255)
+                return to_rgb(to_unit_range(read_image(path)))
         raise DataError(f"no picture was given of this view at {time_us} us.")
 
 

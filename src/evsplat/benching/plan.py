@@ -149,7 +149,8 @@ def _added(rows: Sequence[SuiteRow], added: Sequence[str]) -> list[SuiteRow]:
     found = []
     for text in added:
         name, _, folder = text.partition("=")
-        if not name or not Path(folder).is_dir():
+        # An empty path would be the working directory.
+        if not name or not folder or not Path(folder).is_dir():
             raise ConfigError(
                 f"--add {text}: expected NAME=FOLDER, where FOLDER holds a folder of pictures per "
                 "capture."

@@ -1,11 +1,12 @@
 """A suite: captures x rows x seeds, read from a YAML file or from those that ship."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
+from evsplat.benching.cell import UNTRAINED
 from evsplat.benching.drawn import Draw
 from evsplat.benching.given_pictures import PICTURES
 from evsplat.config import Above, AtLeast, from_dict, load_yaml
@@ -121,6 +122,7 @@ def read_suite(suite: Path | str) -> Suite:
         )
     read = from_dict(Suite, load_yaml(path), where=str(path))
     for kind, names in (
+        ("suite", [read.name]),
         ("row", [row.name for row in read.rows]),
         ("capture", [capture.name for capture in read.captures]),
     ):
@@ -131,14 +133,19 @@ def read_suite(suite: Path | str) -> Suite:
     if read.captures and read.draw is not None:
         raise ConfigError(f"{path}: captures and draw both say what to run on; keep one of them.")
     for row in read.rows:
-        if (row.method == PICTURES) != (row.pictures is not None):
+        if (row.method == PICTURES) != bool(row.pictures):
             raise ConfigError(
                 f"{path}: row {row.name}: method {PICTURES} and the folder 'pictures' belong "
                 "together."
             )
+        if row.method in UNTRAINED and row.settings:
+            raise ConfigError(
+                f"{path}: row {row.name}: settings are those of a method that is trained, and "
+                f"{row.method} is not; leave them out."
+            )
     if not read.rows:
         raise ConfigError(f"{path}: rows is empty, expected at least one.")
-    return read
+    return replace(read, seeds=tuple(dict.fromkeys(read.seeds)))
 
 
 def check_names(kind: str, names: list[str], where: str) -> None:
