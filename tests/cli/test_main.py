@@ -224,3 +224,12 @@ def test_view_of_a_folder_that_is_no_run_is_one_sentence(capsys, tmp_path):
     assert main(["view", str(tmp_path)]) == 2
     message = capsys.readouterr().err
     assert str(tmp_path) in message and "config.yaml" in message
+
+
+def test_import_without_a_kind_says_where_it_stands(tmp_path, capsys):
+    (tmp_path / "clip.mp4").touch()
+    assert main(["import", str(tmp_path / "clip.mp4"), "--out", str(tmp_path / "new")]) == 2
+    said = capsys.readouterr().err
+    assert f"evsplat import KIND {tmp_path / 'clip.mp4'}" in said and "video" in said
+    assert main(["import", "vidoe", "clip.mp4"]) == 2
+    assert "vidoe: no such kind of source; did you mean video?" in capsys.readouterr().err

@@ -246,3 +246,27 @@ def test_what_is_missing_is_one_sentence(tmp_path: Path, fault: str) -> None:
         import_capture(kind, source, tmp_path / "out", **options)
     assert isinstance(caught.value, error) and "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("sensor", [(1280, 720), (24, 16)])
+def test_events_in_the_pixels_of_another_sensor_are_refused(
+    tmp_path: Path, sensor: tuple[int, int]
+) -> None:
+    write_video(
+        tmp_path / "clip.mp4", [np.repeat(p[..., None], 3, -1) for p in moving_bar()], fps=25
+    )
+    events, (width, height) = some_events(0), sensor
+    inside = EventStream(events.t, events.x % width, events.y % height, events.p)
+    write_events(tmp_path / "events.h5", inside, width=width, height=height)
+    with pytest.raises(
+        ConfigError, match=f"its sensor has {width}x{height} pixels, the pictures"
+    ) as e:
+        import_capture(
+            "video",
+            tmp_path / "clip.mp4",
+            tmp_path / "out",
+            exposure_us=EXPOSURE_US,
+            events=tmp_path / "events.h5",
+        )
+    assert f"convert events.h5 NEW.h5 --width {WIDTH} --height {HEIGHT}" in str(e.value)
+    assert not (tmp_path / "out").exists()

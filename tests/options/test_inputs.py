@@ -8,7 +8,11 @@ import pytest
 
 from evsplat.cli.main import main
 from evsplat.errors import DataError
-from evsplat.options.inputs import check_capture_or_recording, check_run_folder
+from evsplat.options.inputs import (
+    check_capture_folder,
+    check_capture_or_recording,
+    check_run_folder,
+)
 
 VERBS = [
     *(f"{verb} no" for verb in ("train", "evaluate", "report", "render", "view", "inspect")),
@@ -65,3 +69,9 @@ def test_what_inspect_takes_is_a_capture_a_recording_or_a_bag(tmp_path: Path) ->
         check_capture_or_recording(tmp_path)
         check_capture_or_recording(tmp_path / name)
         (tmp_path / name).unlink()
+
+
+def test_a_video_is_no_capture_and_what_makes_it_one_is_named(tmp_path: Path) -> None:
+    (tmp_path / "clip.mp4").touch()
+    with pytest.raises(DataError, match="found a file, expected a capture folder.*evsplat import"):
+        check_capture_folder(tmp_path / "clip.mp4")

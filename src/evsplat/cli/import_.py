@@ -1,7 +1,8 @@
 """``evsplat import``: turn a data set, or your own recording, into a capture."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, make_dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -129,6 +130,25 @@ class _Poses:
             overwrite=self.overwrite,
         )
         print(f"written: {path}\nlook at it with: evsplat inspect {path}")
+
+
+def check_kind(arguments: Sequence[str]) -> None:
+    """Raise a `ConfigError` where the word after ``import`` is no kind of source."""
+    from evsplat.importers import KINDS
+
+    kinds = [*KINDS, "poses"]
+    if not arguments or arguments[0].startswith("-") or arguments[0] in kinds:
+        return
+    asked = arguments[0]
+    if Path(asked).exists():
+        raise ConfigError(
+            f"{asked}: the kind of source stands before it: evsplat import KIND {asked} ..., with "
+            f"one of {', '.join(kinds)}."
+        )
+    near = get_close_matches(asked, kinds, 1, cutoff=0.0)[0]
+    raise ConfigError(
+        f"{asked}: no such kind of source; did you mean {near}? There are {', '.join(kinds)}."
+    )
 
 
 def import_with_kinds() -> Callable[..., Any]:

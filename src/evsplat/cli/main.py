@@ -1,6 +1,7 @@
 """Reading the command line: which verb, with which options."""
 
 import io
+import os
 import sys
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
@@ -12,7 +13,7 @@ import evsplat
 from evsplat.cli import captures, runs
 from evsplat.cli.doctor import doctor
 from evsplat.cli.exits import end_quietly, exit_code
-from evsplat.cli.import_ import import_, import_with_kinds
+from evsplat.cli.import_ import check_kind, import_, import_with_kinds
 from evsplat.errors import ConfigError
 from evsplat.options.inputs import check_inputs
 
@@ -51,6 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # A terminal of the C locale cannot show every name that a capture may have.
             stream.reconfigure(errors="backslashreplace")
     is_process = arguments is None
+    if is_process and not sys.stderr.isatty():
+        # In a file each move of a progress bar is a line; tqdm, not imported yet, reads this.
+        os.environ.setdefault("TQDM_MININTERVAL", "30")
     arguments = _gathered(sys.argv[1:] if arguments is None else arguments)
     if arguments == ["--version"]:
         print(f"evsplat {evsplat.__version__}")
@@ -67,6 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise ConfigError(
                 f"{arguments[0]}: no such verb; did you mean {near}? 'evsplat --help' lists all."
             )
+        if arguments[:1] == ["import"]:
+            check_kind(arguments[1:])
         asked = tyro.extras.subcommand_cli_from_dict(
             verbs,
             prog="evsplat",

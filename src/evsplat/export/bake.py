@@ -133,7 +133,7 @@ class Loss:
         before, after = self.model_to_truth.person, self.avatar_to_truth.person
         return (
             f"{sentence}; against the sharp truth {before:.2f} dB becomes {after:.2f} dB "
-            f"({after - before:+.2f})."
+            f"({round(after - before, 2) + 0.0:+.2f})."
         )
 
 

@@ -53,9 +53,16 @@ def add_recorded_events(
     """Write the events of a recording of any format; gives notes for the user."""
     if path is None:
         return ["events: none; simulate them, or give --events"]
-    recording = open_recording(
-        need(path, "the events"), width=size[0], height=size[1], repair=repair
-    )
+    sensor = open_recording(need(path, "the events"), repair=repair)
+    if sensor.width is not None and (sensor.width, sensor.height) != size:
+        width, height = size
+        raise ConfigError(
+            f"{path}: its sensor has {sensor.width}x{sensor.height} pixels, the pictures have "
+            f"{width}x{height}, and events have to lie in the pixels of the pictures; warp them "
+            "there first (docs/own-capture.md, two sensors). If they do already, say so: evsplat "
+            f"convert {path.name} NEW.h5 --width {width} --height {height}"
+        )
+    recording = open_recording(path, width=size[0], height=size[1], repair=repair)
     if not recording.has_polarity:
         return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
     writer.set_events(

@@ -39,6 +39,9 @@ def no_capture(path: Path) -> tuple[Path, str, str, str] | None:
 
     The file, what was found, what was expected, and what to do.
     """
+    if os.path.isfile(path):
+        remedy = "Videos and recordings become one by 'evsplat import' (docs/import.md)."
+        return path, "a file", "a capture folder", remedy
     if not os.path.isdir(path):
         return path, "no such folder", "a capture folder", "Check the path."
     file = path / "capture.json"

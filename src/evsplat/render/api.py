@@ -1,6 +1,7 @@
 """`render`: checks its input, picks the backend and hands over."""
 
 import logging
+from functools import cache
 from typing import Literal, get_args
 
 import torch
@@ -182,7 +183,7 @@ def choose_device(asked: str) -> str:
     """``cpu`` or ``cuda`` for what was asked for; what cannot run is an error with the reason.
 
     ``auto`` is ``cuda`` where an NVIDIA GPU, its driver, PyTorch with CUDA, gsplat and the means to
-    build its kernels are all there, otherwise ``cpu``; which one it is, is logged.
+    build its kernels are all there, otherwise ``cpu``; which one it is, is logged once.
     """
     if asked not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"--device {asked}: expected auto, cpu or cuda.")
@@ -196,5 +197,10 @@ def choose_device(asked: str) -> str:
     device = "cuda" if missing is None else "cpu"
     # Where there is no NVIDIA GPU at all, nobody misses the rest.
     worth_telling = missing is not None and next(needs()).there
-    logger.info("device: %s", f"{device}. For CUDA: {missing}" if worth_telling else device)
+    _tell_once(f"{device}. For CUDA: {missing}" if worth_telling else device)
     return device
+
+
+@cache
+def _tell_once(device: str) -> None:
+    logger.info("device: %s", device)
