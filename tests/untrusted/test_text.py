@@ -70,6 +70,7 @@ def test_pipes_and_devices_are_no_files(tmp_path: Path) -> None:
         ("2001-99-99", "month must be in 1..12"),
         ("9" * 5_000, "5000 digits"),
         ("!!bool 3", "a tag that its value does not fit"),
+        ("a: 1\nb: {c: 1, d: 2, c: 3}", "line 2: the key 'c' for the second time"),
         # a billion of laughs
         (
             "a0: &a0 [ha]\n"
@@ -84,8 +85,8 @@ def test_what_yaml_cannot_mean_is_a_value_error(text: str, said: str) -> None:
 
 
 def test_aliases_and_merged_sections_are_read() -> None:
-    text = "base: &base {a: 1, b: &b [2, 3]}\nother: {<<: *base, c: *b}"
-    assert parse_yaml(text)["other"] == {"a": 1, "b": [2, 3], "c": [2, 3]}
+    text = "base: &base {a: 1, b: &b [2, 3]}\nother: {<<: *base, c: *b, a: 4}"
+    assert parse_yaml(text)["other"] == {"a": 4, "b": [2, 3], "c": [2, 3]}
 
 
 def test_a_sentence_that_quotes_half_a_character_can_be_written_anywhere(tmp_path):

@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from evsplat.errors import DataError, EvsplatError
-from evsplat.untrusted.faults import ordinary_file, reason, why_not_read
+from evsplat.untrusted.faults import brief, ordinary_file, reason, why_not_read
 
 _MOST_BYTES = 1 << 28
 """Of a text; a capture of 100,000 frames describes itself in 40 MB."""
@@ -56,7 +56,7 @@ def parse_yaml(text: str) -> Any:
     """The value that a YAML text stands for; all that can be wrong with it is a `ValueError`."""
     try:
         _check_yaml(text)
-        return yaml.safe_load(text)
+        return yaml.load(text, Loader=_EachKeyOnce)
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from None
     except RecursionError:
@@ -65,6 +65,22 @@ def parse_yaml(text: str) -> Any:
         raise ValueError(reason(error)) from None
     except _MISFITS:
         raise ValueError("a tag that its value does not fit") from None
+
+
+class _EachKeyOnce(yaml.SafeLoader):
+    """Values and nothing run; of a key that is there twice neither is taken silently."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        found = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.value == "<<":
+                continue
+            if key.value in found:
+                line = key.start_mark.line + 1
+                raise yaml.YAMLError(f"line {line}: the key {brief(key.value)} for the second time")
+            found.add(key.value)
+        return node
 
 
 def _check_yaml(text: str) -> None:
