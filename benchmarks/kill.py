@@ -44,7 +44,10 @@ EXPECTED = {
     "fault": {2},
 }
 """Exit codes of what was interrupted; 0 where it came too late."""
-IMPORTED = "benching.run events.convert export importers masks.capture staging training".split()
+IMPORTED = (
+    "benching.run events.convert export importers masks.capture posing restore.capture staging "
+    "training"
+).split()
 LEFT = re.compile(r"\.evsplat-|(^|/)\.?tmp|\.watch$|snapshot\.safetensors$|\.part$|\.partial$")
 NOT_FOUND_OUT = re.compile(r"Traceback \(most recent|Exception ignored|Segmentation|core dumped")
 
@@ -98,6 +101,12 @@ def jobs(given: Path) -> dict[str, Job]:
         "render-video": Job((*render, "made.mp4"), "made.mp4", keeps=r"made\.mp4\.partial$"),
         "render-pictures": Job((*render, "made"), "made", keeps=r"made\.partial$"),
         "masks": Job(("masks", capture, "--out", "made", "--with", "silhouette"), "made"),
+        "restore": Job(("restore", capture, "--out", "made", "--with", "edi"), "made"),
+        "poses": Job(
+            ("poses", str(given / "unposed" / "capture"), "--out", "made", "--refine", "0")
+            + ("--keypoints", str(given / "unposed" / "points.npz"), "--threads", "1"),
+            "made",
+        ),
         "bench": Job(bench, "made", (*bench, "--retry"), keeps=r"made/runs/", parts=True),
     }
 
@@ -163,8 +172,9 @@ def summary(
 
 
 def make_inputs(given: Path, place: Path) -> None:
-    """A capture, a trained run, recordings of events, a data set, a suite."""
+    """Captures with poses and without, a trained run, recordings, a data set, a suite."""
     import numpy as np
+    from tests.fuzzing.readers import write_unposed
     from tests.importers import trees
 
     from evsplat.events import EventStream, write_events
@@ -172,6 +182,8 @@ def make_inputs(given: Path, place: Path) -> None:
     given.mkdir()
     write_tiny_capture(given / "capture", frames=10)
     trees.write_neuman(given / "neuman")
+    (given / "unposed").mkdir()
+    write_unposed(given / "unposed")
     generator = np.random.default_rng(0)
     count = 200_000
     t = np.sort(generator.integers(0, 10**7, count))

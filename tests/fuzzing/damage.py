@@ -8,6 +8,7 @@ import pickletools
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
 
 from ..events.formats.mutations import damaged
 
@@ -164,6 +165,28 @@ def damaged_npz(data: bytes, rng: Rng) -> bytes:
         arrays[key] = damaged_array(arrays[key], rng)
     np.savez(file, **arrays)
     return file.getvalue()
+
+
+def damaged_safetensors(data: bytes, rng: Rng) -> bytes:
+    """Tensors exchanged or left out, values in the texts beside them exchanged; or bytes."""
+    if rng.random() < 0.2:
+        return damaged_bytes(data, rng)
+    tensors = dict(safetensors.numpy.load(data))
+    length = int.from_bytes(data[:8], "little")
+    texts = json.loads(data[8 : 8 + length]).get("__metadata__", {})
+    if texts and rng.random() < 0.3:
+        name = list(texts)[rng.integers(len(texts))]
+        texts[name] = json.dumps(damaged_tree(json.loads(texts[name]), rng))
+    else:
+        name = list(tensors)[rng.integers(len(tensors))]
+        if rng.random() < 0.1:
+            del tensors[name]
+        else:
+            # No type that the format lacks.
+            spoilt = damaged_array(tensors[name], rng)
+            fits = spoilt.dtype.kind in "fiub"
+            tensors[name] = np.ascontiguousarray(spoilt if fits else tensors[name][..., None])
+    return safetensors.numpy.save(tensors, texts)
 
 
 def damaged_pickle(data: bytes, rng: Rng) -> bytes:

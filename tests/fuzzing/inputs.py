@@ -18,6 +18,7 @@ _DAMAGE = {
     ".json": damage.damaged_json,
     ".npz": damage.damaged_npz,
     ".pkl": damage.damaged_pickle,
+    ".safetensors": damage.damaged_safetensors,
     **dict.fromkeys(
         (".yaml", ".ply", ".bvh", ".amc", ".asf", ".txt", ".csv", ".jsonl", ".set"),
         damage.damaged_text,

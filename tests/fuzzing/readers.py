@@ -19,6 +19,7 @@ import yaml
 from PIL import Image
 
 from evsplat.benching.folder import BenchFolder
+from evsplat.benching.given_pictures import GivenPictures
 from evsplat.benching.plan import make_plan, pending_cells
 from evsplat.benching.run import bench, write_output
 from evsplat.benching.suite import read_suite
@@ -26,6 +27,7 @@ from evsplat.body.motion import load_motion
 from evsplat.body.pose_files import read_poses
 from evsplat.body.smpl import read_model_file
 from evsplat.capture import load_body_track, load_capture, validate_capture
+from evsplat.capture.finding import Finding
 from evsplat.capture.points import read_points, write_points
 from evsplat.config import override
 from evsplat.errors import EvsplatError
@@ -37,6 +39,7 @@ from evsplat.importers import import_capture
 from evsplat.landmarks.keypoint_files import read_points as read_keypoints
 from evsplat.methods import method_config
 from evsplat.pictures.files import read_image
+from evsplat.posing import find_poses
 from evsplat.training import load_run, train
 from evsplat.training.checkpoint import load_checkpoint
 from evsplat.training.run import RunFolder, read_config
@@ -59,6 +62,7 @@ from ..events.formats import encoders, mutations
 from ..events.formats.helpers import random_stream
 from ..importers.test_bad_trees import write as write_tree
 from ..landmarks.test_keypoints import WRITERS, points
+from ..posing.moving import CAMERA, landmarks
 from ..small_model import small
 
 
@@ -329,9 +333,12 @@ def read_recording(root: Path, damaged: Path) -> str:
 
 
 def write_run(root: Path) -> None:
-    """A run of two steps; its capture lies beside the folder."""
+    """A run of two steps on poses that err; its capture lies beside the folder."""
     capture = root.with_name(f"{root.name} capture")
     write_capture(capture)
+    document = json.loads((capture / "capture.json").read_text())
+    document["body"]["source"] = "estimated"
+    (capture / "capture.json").write_text(json.dumps(document))
     train(
         capture,
         out=root / "run",
@@ -341,6 +348,30 @@ def write_run(root: Path) -> None:
         any_body=True,
         threads=1,
     )
+
+
+def write_started(root: Path) -> None:
+    """A run of poses that err, whose checkpoint holds all that a resume needs."""
+    write_run(root)
+    (root / "run" / "log.jsonl").unlink()  # damaged lines of it are dropped
+    (root / "capture.where").write_text(json.dumps(str(root.with_name(f"{root.name} capture"))))
+
+
+def read_resumed(root: Path, damaged: Path) -> None:
+    """The training gone on with, in a copy: what it saves is sound, or nothing is saved."""
+    if damaged.suffix == ".where":
+        return
+    out = root.with_name(f"{root.name}-out")
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(root / "run", out, symlinks=True)
+    before = {path.name for path in (out / "checkpoints").iterdir()}
+    capture = Path(json.loads((root / "capture.where").read_text()))
+    train(capture, out=out, resume=True, iterations=4, any_body=True, threads=1)
+    for path in (out / "checkpoints").iterdir():
+        if path.name not in before:
+            tensors, _ = load_checkpoint(path)
+            if not all(value.isfinite().all() for value in tensors.values()):
+                raise Accepted(f"{path.name} holds numbers that are not finite")
 
 
 def write_evaluated(root: Path) -> None:
@@ -367,9 +398,7 @@ def write_bench(root: Path) -> None:
     suite = {
         "name": "tiny",
         "captures": [{"name": "tiny", "path": str(capture)}],
-        "rows": [
-            {"name": name, "method": name} for name in ("median_background", "previous_frame")
-        ],
+        "rows": [{"name": name, "method": name} for name in ("median_background", "nearest_frame")],
     }
     (root / "suite.yaml").write_text(yaml.safe_dump(suite))
     bench(root / "suite.yaml", out=root / "bench", jobs=1)
@@ -381,6 +410,69 @@ def read_bench(root: Path, damaged: Path) -> None:
     plan = make_plan(read_suite(root / "suite.yaml"), folder)
     pending_cells(plan, folder, retry=False)
     write_output(plan, folder)
+
+
+def write_kept(root: Path) -> None:
+    """Records that are kept, and pictures made elsewhere, with the suite that they are for."""
+    beside = root.with_name(f"{root.name} bench")
+    beside.mkdir()
+    write_bench(beside)
+    (beside / "suite.yaml").rename(root / "suite.yaml")
+    shutil.rmtree(beside / "bench")
+    bench(root / "suite.yaml", out=beside / "bench", records=root / "records", jobs=1)
+    shutil.copytree(root.with_name(f"{beside.name} capture") / "sharp", root / "theirs" / "tiny")
+
+
+def read_kept(root: Path, damaged: Path) -> None:
+    """The tables made of the records alone, and the pictures as a method would draw them."""
+    suite = read_suite(root / "suite.yaml")
+    out = root.with_name(f"{root.name}-out")
+    shutil.rmtree(out, ignore_errors=True)
+    folder = BenchFolder(out, root / "records")
+    plan = make_plan(suite, folder)
+    pending_cells(plan, folder, retry=False)
+    write_output(plan, folder)
+    for source in plan.sources.values():
+        capture = load_capture(source.path)
+        given = GivenPictures(root / "theirs" / "tiny", capture)
+        for frame in capture.test_frames:
+            given.render(capture.camera(frame), [frame.mid_us])
+
+
+def write_unposed(root: Path) -> None:
+    """A capture without poses and the points of somebody in it."""
+    write_capture(root / "capture")
+    document = json.loads((root / "capture" / "capture.json").read_text())
+    document["body"], document["novel_views"] = None, []
+    for frame in document["frames"]:
+        frame["split"] = "train"  # a motion is not fitted to three pictures
+    document["cameras"]["main"]["K"] = [[37.5, 0, 16], [0, 37.5, 16], [0, 0, 1]]
+    document["cameras"]["main"]["world_to_camera"] = CAMERA.world_to_camera.tolist()
+    (root / "capture" / "capture.json").write_text(json.dumps(document))
+    for name in ("body.npz", "body_dense.npz", "points.ply"):
+        (root / "capture" / name).unlink()
+    marks = landmarks(4)
+    points = np.concatenate((marks.places / 8, marks.seen[..., None]), -1)
+    np.savez(root / "points.npz", keypoints=points)
+
+
+def read_found(root: Path, damaged: Path) -> None:
+    """Poses found by the points: a capture that is sound, or none."""
+    out = root.with_name(f"{root.name}-out")
+    shutil.rmtree(out, ignore_errors=True)
+    try:
+        find_poses(root / "capture", out, keypoints=root / "points.npz", refine_s=0)
+    except EvsplatError:
+        if out.exists():
+            raise Accepted("a capture left behind, though it is refused") from None
+        raise
+    if not wrong_in(root / "capture") and wrong_in(out):
+        raise Accepted(f"what the check calls wrong: {wrong_in(out)[0]}")
+
+
+def wrong_in(capture: Path) -> list[Finding]:
+    """Errors of a capture; what nobody opened on the way is copied with its faults."""
+    return [found for found in validate_capture(capture) if found.severity == "error"]
 
 
 def tree(kind: str) -> Reader:
@@ -471,7 +563,10 @@ READERS = {
     "captures": Reader(write_capture, read_capture, 25),
     "runs": Reader(write_run, read_run, 3),
     "reports": Reader(write_evaluated, read_report, 1),
+    "resumed runs": Reader(write_started, read_resumed, 2),
     "benches": Reader(write_bench, read_bench, 10),
+    "kept records": Reader(write_kept, read_kept, 10),
+    "found poses": Reader(write_unposed, read_found, 2),
     "training": Reader(write_capture, read_training, 1),
     **{
         f"import {kind}": tree(kind)
