@@ -329,3 +329,22 @@ def test_a_run_of_the_version_before_says_what_became_of_its_settings(tiny_captu
         ):
             assert part in told
         assert "versions.json beside it names it" in advice and "train again" in advice
+
+
+@pytest.mark.parametrize("changed", ["capture", "policy"])
+def test_what_was_trained_on_is_no_test_frame_later(tiny_capture, tmp_path, changed):
+    path = tiny_capture(frames=10)
+    use = "everything" if changed == "policy" else None
+    out = train(path, out=tmp_path / "run", iterations=2, overrides=small("evsplat"), use=use)
+    assert load_run(out).capture.name
+    if changed == "policy":
+        settings = (out / "config.yaml").read_text()
+        (out / "config.yaml").write_text(settings.replace("use: everything", "use: training"))
+    else:
+        document = json.loads((path / "capture.json").read_text())
+        for frame in document["frames"]:
+            frame["split"] = "test" if frame["split"] == "train" else "train"
+        (path / "capture.json").write_text(json.dumps(document))
+    for read in (lambda: load_run(out), lambda: train(path, out=out, resume=True, iterations=4)):
+        with pytest.raises(DataError, match="what is held out may have been trained on"):
+            read()

@@ -177,7 +177,8 @@ def check_fits(model: Model, tensors: dict[str, Tensor], path: Path) -> None:
             others = f" and {more} more" if more else ""
             raise DataError(
                 f"{path}: {what} {first}{others}, being written by another version of evsplat "
-                "(versions.json beside its folder names it); open it with that one, or train again."
+                "(versions.json beside its folder names it), or before config.yaml or the capture "
+                "was changed; open it with that one, restore both as they were, or train again."
             )
 
 

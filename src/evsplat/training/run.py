@@ -1,5 +1,6 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
+import hashlib
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -39,6 +40,7 @@ from evsplat.training.checkpoint import (
     load_model,
     misfits_of,
 )
+from evsplat.untrusted.faults import brief
 from evsplat.untrusted.records import read_record
 from evsplat.untrusted.text import parse_json, read_text
 
@@ -82,8 +84,10 @@ def new_run_folder(capture: Capture, method: str) -> RunFolder:
     return RunFolder(Path("runs") / capture.name / method / stamp)
 
 
-def write_facts(folder: RunFolder, capture: Capture, method: str, device: str, seed: int) -> None:
-    """Record what the run was made with."""
+def write_facts(
+    folder: RunFolder, seen: TrainingCapture, method: str, device: str, seed: int
+) -> None:
+    """Record what the run was made with; ``seen`` is what its training is given."""
     versions = {}
     for package in ("evsplat", *PACKAGES):
         try:
@@ -93,8 +97,9 @@ def write_facts(folder: RunFolder, capture: Capture, method: str, device: str, s
     write_json(
         folder.facts,
         {
-            "capture": str(capture.path.resolve()),
-            "capture_name": capture.name,
+            "capture": str(seen.path.resolve()),
+            "capture_name": seen.name,
+            "training_frames": _frames_of(seen),
             "method": method,
             "device": device,
             "threads": torch.get_num_threads(),
@@ -329,6 +334,28 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     return method, config, facts
 
 
+def check_frames(facts: dict[str, Any], seen: TrainingCapture, folder: RunFolder) -> None:
+    """Refuse a capture whose frames of split `train` are others than those that were trained on.
+
+    What is held out now may have been seen then: figures of it would say nothing. Runs of before do
+    not tell.
+    """
+    then, now = facts.get("training_frames"), _frames_of(seen)
+    if then is not None and then != now:
+        raise DataError(
+            f"{folder.facts}: training_frames is {brief(then)}, and those of {seen.path} are "
+            f"{now!r} now: what is held out may have been trained on; give the frames of "
+            "capture.json the splits that they had, or train again."
+        )
+
+
+def _frames_of(seen: TrainingCapture) -> str:
+    """Number of the training frames, and a digest of their names."""
+    names = [frame.name for frame in seen.train_frames]
+    digest = hashlib.sha256("\0".join(names).encode("utf-8", "surrogatepass")).hexdigest()
+    return f"{len(names)}, digest {digest[:16]}"
+
+
 def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:
     """The part of a capture that a method with this configuration is given."""
     return capture.for_training(config.policy, MASKERS["background"])
@@ -350,6 +377,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
     shown = seen_by_training(capture, config)
+    check_frames(facts, shown, folder)
     composition = TRAINABLE[method].build(
         config, shown, facts["seed"], device=device, purpose="draw"
     )

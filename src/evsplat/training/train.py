@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -39,6 +39,7 @@ from evsplat.training.checkpoint import (
 from evsplat.training.clock import Clock
 from evsplat.training.run import (
     RunFolder,
+    check_frames,
     new_run_folder,
     read_config,
     seen_by_training,
@@ -77,6 +78,8 @@ class _Start:
     method: str
     settings: MethodConfig
     seed: int
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Of a run that goes on, what versions.json says."""
 
 
 def train(
@@ -127,6 +130,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     iterations, max_minutes = options.iterations, options.max_minutes
     started = time.perf_counter()
     seen = seen_by_training(capture, start.settings)
+    check_frames(start.facts, seen, start.folder)
     loaded = load_latest(start.folder.checkpoints) if options.resume else None
     purpose: Purpose = "train" if loaded is None else "resume"
     fitting = None
@@ -165,7 +169,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     try_target(folder.path, _KEPT_AND_NEW * _WITH_OPTIMISER * state_bytes)
     if loaded is None:
         if not options.resume:
-            write_facts(folder, capture, start.method, device, start.seed)
+            write_facts(folder, seen, start.method, device, start.seed)
             # The last of what resuming needs.
             save_yaml(folder.config, start.settings, method=start.method)
         if fitting is not None and fitting.verdict != "belongs":
@@ -197,7 +201,7 @@ def _resumed(capture: Capture, options: TrainOptions) -> _Start:
             f"{folder.path}: was trained on the capture {facts['capture_name']!r}, and is to go on "
             f"with {capture.name!r}; give the one of {facts['capture']}, or another --out."
         )
-    return _Start(folder, method, settings, facts["seed"])
+    return _Start(folder, method, settings, facts["seed"], facts)
 
 
 def _new(capture: Capture, options: TrainOptions) -> _Start:
