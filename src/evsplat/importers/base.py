@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
+from evsplat.options.declare import Flag
 from evsplat.pictures.files import read_image
 from evsplat.pictures.light import Transfer
 from evsplat.untrusted.pictures import image_size
@@ -27,7 +28,7 @@ _MOST_DIGITS = 18
 class Importer:
     """Options of one kind of source; `write` turns the source into a capture."""
 
-    no_poses: bool = False
+    no_poses: Flag = False
     """Leave out poses that are there: the capture has no body."""
 
     blur_recipe: ClassVar[str | None] = None

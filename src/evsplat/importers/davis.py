@@ -11,7 +11,9 @@ from evsplat.capture.write import CaptureWriter
 from evsplat.errors import DataError
 from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
 from evsplat.importers.base import Importer, chosen_frames, need
+from evsplat.importers.option_types import Contrast, FileOption, Focal, FrameRange
 from evsplat.importers.recorded import recorded_camera
+from evsplat.options.declare import Flag
 from evsplat.pictures.light import Transfer
 
 
@@ -19,17 +21,17 @@ from evsplat.pictures.light import Transfer
 class Davis(Importer):
     """A DAVIS recording (AEDAT4) without poses: frames with exposure times, and events."""
 
-    frames: tuple[int, int] | None = None
+    frames: FrameRange = None
     """First frame and the one after the last; by default all."""
-    camera: Path | None = None
+    camera: FileOption = None
     """One camera as in capture.json."""
-    focal: float | None = None
+    focal: Focal = None
     """Focal length in pixels, instead of --camera; without both 60 degrees of view are guessed."""
     transfer: Transfer = "linear"
     """From the values of the pictures to light; a DAVIS stores what it measures."""
-    contrast: tuple[float, float] | None = None
+    contrast: Contrast = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
-    repair: bool = False
+    repair: Flag = False
     """Read on where the recording is damaged."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Int64
@@ -21,10 +21,20 @@ from evsplat.importers.base import (
     human_mask,
     need,
 )
+from evsplat.importers.option_types import (
+    Contrast,
+    Curve,
+    Exposure,
+    FileOption,
+    Focal,
+    Name,
+    OwnRate,
+    TimeUs,
+)
 from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_motion
 from evsplat.importers.recorded import add_recorded_events, recorded_camera
 from evsplat.importers.smpl import chosen_poses
-from evsplat.pictures.light import Transfer
+from evsplat.options.declare import Flag, option
 from evsplat.untrusted.arrays import read_table
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -34,36 +44,36 @@ _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 class Folder(Importer):
     """Your own recording: pictures or a video, an event file, a pose file and a camera."""
 
-    images: Path | None = None
+    images: FileOption = None
     """Folder of pictures, or a video; by default SOURCE/images or the video in SOURCE."""
-    events: Path | None = None
+    events: FileOption = None
     """Event recording of any known format; by default SOURCE/events.* if there is one."""
-    poses: Path | None = None
+    poses: FileOption = None
     """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE, and
     no body where there are none."""
-    pose_source: PoseSource | None = None
+    pose_source: Annotated[PoseSource | None, option(default="")] = None
     """Where the poses come from; by default what the tool is known for."""
-    camera: Path | None = None
+    camera: FileOption = None
     """One camera as in capture.json; by default SOURCE/camera.json, else what the poses assume."""
-    focal: float | None = None
+    focal: Focal = None
     """Focal length in pixels, instead of a camera; without poses 60 degrees of view are guessed."""
-    transfer: Transfer | None = None
+    transfer: Curve = None
     """From the values of the pictures to light: power (2.2), srgb, or linear as a DAVIS stores."""
-    masks: Path | None = None
+    masks: FileOption = None
     """Masks of the person, named as the pictures; by default SOURCE/masks if there is one."""
-    fps: float | None = None
+    fps: OwnRate = None
     """Pictures per second; a video has its own."""
-    exposure_us: float | None = None
+    exposure_us: Exposure = None
     """Exposure time, microseconds; not needed with SOURCE/exposures.txt."""
-    start_us: int = 0
+    start_us: TimeUs = 0
     """Middle of the first exposure."""
-    clock_offset_us: int = 0
+    clock_offset_us: TimeUs = 0
     """Added to the events' times to get the clock of the pictures."""
-    contrast: tuple[float, float] | None = None
+    contrast: Contrast = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
-    person: str | None = None
+    person: Name = None
     """Choice among several people in the pose file."""
-    repair: bool = False
+    repair: Flag = False
     """Read on where the event recording is damaged."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:

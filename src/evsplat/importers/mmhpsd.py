@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -26,7 +26,9 @@ from evsplat.importers.base import (
     numbered,
     opencv_intrinsics,
 )
+from evsplat.importers.option_types import FrameRange, Name, Rate, Shrink
 from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
+from evsplat.options.declare import option
 from evsplat.untrusted.arrays import read_npz
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.pictures import image_size
@@ -41,15 +43,15 @@ class Mmhpsd(Importer):
 
     blur_recipe: ClassVar[str | None] = "mmhpsd-blur"
 
-    action: str | None = None
+    action: Name = None
     """Name of the action, such as subject01_group2_time3 (s1g2t3); needed for the releases."""
-    frames: tuple[int, int] | None = None
+    frames: FrameRange = None
     """First frame and one past the last; by default all that have a picture and a pose."""
-    shrink: int = 1
+    shrink: Shrink = 1
     """Pictures and events are made smaller by this factor."""
-    fps: float = 15.0
+    fps: Rate = 15.0
     """Frames per second; the data set has no time stamps."""
-    event_duty: float = 0.8
+    event_duty: Annotated[float, option("SHARE")] = 0.8
     """Share of a frame's interval over which its events are spread: the sensor sends none while it
     takes a full picture."""
     gender: Literal["male", "neutral", "female"] = "male"

@@ -24,6 +24,7 @@ from evsplat.importers.base import (
     numbered,
 )
 from evsplat.importers.colmap import read_colmap
+from evsplat.importers.option_types import FrameRange, Rate, Shrink
 from evsplat.importers.smpl import add_body, chosen_poses
 from evsplat.untrusted.arrays import read_npz
 
@@ -32,11 +33,11 @@ from evsplat.untrusted.arrays import read_npz
 class Neuman(Importer):
     """NeuMan, one sequence's folder (bike, citron, jogging, lab, parkinglot, seattle)."""
 
-    frames: tuple[int, int] | None = None
+    frames: FrameRange = None
     """First frame and one past the last; by default all."""
-    shrink: int = 1
+    shrink: Shrink = 1
     """Pictures are made smaller by this factor."""
-    fps: float = 30.0
+    fps: Rate = 30.0
     """Frames per second; the data set does not say."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:

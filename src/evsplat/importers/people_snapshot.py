@@ -27,6 +27,7 @@ from evsplat.importers.base import (
     rigid,
     shrunk,
 )
+from evsplat.importers.option_types import FrameRange, Name, Shrink
 from evsplat.importers.smpl import add_body, chosen_poses
 from evsplat.untrusted.faults import broken_as
 from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5, wrong_data_set
@@ -38,11 +39,11 @@ from evsplat.untrusted.videos import opened_video
 class PeopleSnapshot(Importer):
     """PeopleSnapshot, one subject's folder, such as male-3-casual."""
 
-    frames: tuple[int, int] | None = None
+    frames: FrameRange = None
     """First frame and one past the last; by default all."""
-    shrink: int = 2
+    shrink: Shrink = 2
     """Pictures are made smaller by this factor (1080 to 540 pixels)."""
-    gender: str | None = None
+    gender: Name = None
     """male or female; by default what the folder's name begins with."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:

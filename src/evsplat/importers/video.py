@@ -9,33 +9,42 @@ from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
 from evsplat.footage import open_footage
 from evsplat.importers.base import Importer, check_positive, exposure_around
+from evsplat.importers.option_types import (
+    Contrast,
+    Curve,
+    Exposure,
+    FileOption,
+    Focal,
+    OwnRate,
+    TimeUs,
+)
 from evsplat.importers.recorded import add_recorded_events, recorded_camera
-from evsplat.pictures.light import Transfer
+from evsplat.options.declare import Flag
 
 
 @dataclass(frozen=True, kw_only=True)
 class Video(Importer):
     """A video of your own, without poses: pictures, an event file if there is one, a camera."""
 
-    events: Path | None = None
+    events: FileOption = None
     """Event recording of any known format, in the pixels of the video."""
-    exposure_us: float | None = None
+    exposure_us: Exposure = None
     """Exposure time, microseconds; it has to be known."""
-    fps: float | None = None
+    fps: OwnRate = None
     """Rate at which it was shot, where the file does not say (slow motion)."""
-    camera: Path | None = None
+    camera: FileOption = None
     """One camera as in capture.json."""
-    focal: float | None = None
+    focal: Focal = None
     """Focal length in pixels, instead of --camera; without both 60 degrees of view are guessed."""
-    transfer: Transfer | None = None
+    transfer: Curve = None
     """From the values of the pictures to light: power (2.2), srgb or linear."""
-    start_us: int = 0
+    start_us: TimeUs = 0
     """Middle of the first exposure."""
-    clock_offset_us: int = 0
+    clock_offset_us: TimeUs = 0
     """Added to the events' times to get the clock of the pictures."""
-    contrast: tuple[float, float] | None = None
+    contrast: Contrast = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
-    repair: bool = False
+    repair: Flag = False
     """Read on where the event recording is damaged."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:

@@ -30,6 +30,7 @@ from evsplat.importers.base import (
     table,
     whole_number,
 )
+from evsplat.importers.option_types import FrameRange, Rate, Shrink
 from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
 from evsplat.untrusted.arrays import read_npy, read_npz
 from evsplat.untrusted.text import read_json
@@ -48,11 +49,11 @@ class ZjuMocap(Importer):
     """Number of the camera whose pictures become the frames."""
     novel_cameras: tuple[str, ...] = ()
     """Numbers of other cameras whose pictures are added for evaluation, one per frame each."""
-    frames: tuple[int, int] | None = None
+    frames: FrameRange = None
     """First frame and one past the last; by default those of 3DGS-Avatar."""
-    shrink: int = 2
+    shrink: Shrink = 2
     """Pictures are made smaller by this factor (1024 to 512 pixels)."""
-    fps: float = 50.0
+    fps: Rate = 50.0
     """Frames per second; the release does not say, and only the ratio to the exposure matters."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:

@@ -30,6 +30,7 @@ from evsplat.importers.base import (
     table,
     whole_number,
 )
+from evsplat.importers.option_types import Shrink
 from evsplat.importers.smpl import add_body
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.pictures import image_size
@@ -41,7 +42,7 @@ _EVENTS_PER_PIECE = 1 << 20
 class ZjuMocapBlur(Importer):
     """ExFMan's ZJU-MoCap-Blur, one sequence's folder (event_info.pkl beside HumanNeRF's files)."""
 
-    shrink: int = 1
+    shrink: Shrink = 1
     """Pictures and events are made smaller by this factor."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:

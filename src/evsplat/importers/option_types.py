@@ -1,0 +1,20 @@
+"""Types of the options of several importers: what stands for their values, and their defaults."""
+
+from pathlib import Path
+from typing import Annotated
+
+from evsplat.options.declare import option
+from evsplat.pictures.light import Transfer
+
+FileOption = Annotated[Path | None, option("PATH", default="")]
+"""A part of a recording, whose help says where it is looked for."""
+FrameRange = Annotated[tuple[int, int] | None, option("FIRST STOP", default="")]
+Shrink = Annotated[int, option("N")]
+Rate = Annotated[float, option("HZ")]
+OwnRate = Annotated[float | None, option("HZ", default="")]
+Focal = Annotated[float | None, option("PX", default="")]
+Exposure = Annotated[float | None, option("US", default="")]
+TimeUs = Annotated[int, option("US")]
+Contrast = Annotated[tuple[float, float] | None, option("C+ C-", default="unknown")]
+Curve = Annotated[Transfer | None, option(default="power")]
+Name = Annotated[str | None, option("NAME", default="")]
