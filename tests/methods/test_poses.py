@@ -168,6 +168,10 @@ def test_steps_of_large_errors_are_no_larger_than_those_of_poses_nobody_knows(
     (network,) = [one for one in composition.learning.networks if one.parameters[0] is errors[0]]
     usual = ERRORS_RATE * EvsplatConfig().rates.pose
     assert network.rate.start * said == pytest.approx(usual * largest)
+    # Where limbs may be that much farther off, the shape changes by that much more.
+    deformation = composition.model.deformation
+    assert deformation.unit_m * largest == pytest.approx(0.01 * said)
+    assert deformation.handles.shape[1] * largest == pytest.approx(100 * said)
 
 
 def test_a_long_recording_is_not_drawn_before_training(captures, monkeypatch, caplog):

@@ -65,9 +65,13 @@ CHROMA_WEIGHT = 1.6
 RELIEF_WEIGHT = 3e-3
 """Weight of the roughness of the scene's relief."""
 DEFORMATION_WEIGHT = 3e-3
-"""Weight of the mean square of what the person's shape changes by, in centimetres."""
+"""Weight of the mean square of what the person's shape changes by, in centimetres; where poses are
+expected to err by much, in units that are larger in proportion (`FREEST`)."""
 DEFORMATION_START = 1_500
 """Nominal iteration from which it changes."""
+FREEST = 4.0
+"""Bound of how much more freely it does so where poses are expected to err by over 0.05 radians:
+the shape moves limbs to where steps of the poses' errors, which are small then, don't."""
 ERRORS_RATE = 0.3
 """Learning rate of the poses' errors as a share of that of the motion between exact key poses:
 three splines add up to them, and all move at once."""
@@ -110,6 +114,7 @@ def build(
         residual=poses.correction,
         residual_start=config.pose.start,
         deformation_start=DEFORMATION_START if changes else None,
+        deformation_freedom=min(1 / poses.pace, FREEST),
     ).to(device)
     if fit:
         _fit_colours(config, capture, model, background)

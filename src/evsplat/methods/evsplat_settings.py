@@ -39,7 +39,8 @@ class DiscRates:
     shade: NotNegative = 1e-3
     """Network of what poses do to the person's brightness."""
     deformation: NotNegative = 0.05
-    """What the person's shape changes by in time where poses err, centimetres; 0 = nothing."""
+    """What the person's shape changes by in time where poses err, centimetres, up to four times as
+    much where that is by more than 0.05 radians; 0 = nothing."""
     pose: NotNegative = 0.1
     """Pose residuals, units of the errors expected; lower where these exceed 0.05 radians."""
     shading: Annotated[float, AtLeast(0), _SHADING] = 6e-3

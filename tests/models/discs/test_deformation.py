@@ -33,6 +33,23 @@ def test_it_starts_at_nothing_and_is_forgotten(surface, deformation):
     assert not deformation.price().detach()
 
 
+def test_with_more_freedom_handles_are_more_and_nearer_and_units_larger(surface):
+    usual, free = (Deformation(FRAMES_US, surface, freedom=freedom) for freedom in (1.0, 4.0))
+    assert free.handles.shape[1] == 4 * usual.handles.shape[1]
+    apart = torch.cdist(surface.points, surface.points)
+    near = [
+        float((apart[one.weights.argmax(1)] * one.weights).sum() / one.weights.sum())
+        for one in (usual, free)
+    ]
+    assert near[1] == pytest.approx(near[0] / 2, rel=0.15)
+    with torch.no_grad():
+        for one in (usual, free):
+            one.handles[:] = torch.linspace(-1, 1, one.spline.count)[:, None, None]
+    offsets = [one(torch.arange(9), FRAMES_US) for one in (usual, free)]
+    assert torch.allclose(offsets[1], 4 * offsets[0], atol=1e-6)
+    assert torch.allclose(free.price(), usual.price())
+
+
 def test_its_mean_over_the_training_frames_is_zero(surface, deformation):
     """What lasts is the canonical shape's; held-out times count for nothing."""
     offsets = deformation(torch.arange(len(surface.points)), FRAMES_US)

@@ -15,7 +15,7 @@ _HANDLES = 100
 _REACH_M = 0.07
 """Standard deviation of a handle's weight over its distance: neighbours are about as far apart."""
 _UNIT_M = 0.01
-"""What is learned is in units of it."""
+"""What is learned is in units of it, as a rule."""
 _KNOT_US = 200_000
 """Least time between knots. No less than between training frames where many are held out, either:
 nothing would tell of a handle in between."""
@@ -35,17 +35,24 @@ class Deformation(nn.Module):
 
     weights: Tensor
 
-    def __init__(self, frame_times_us: Sequence[int], surface: SurfaceSamples) -> None:
-        """``surface``: points that discs are attached to, by their number."""
+    def __init__(
+        self, frame_times_us: Sequence[int], surface: SurfaceSamples, *, freedom: float = 1.0
+    ) -> None:
+        """``surface``: points that discs are attached to, by their number.
+
+        ``freedom``, 1 or more: so many times as many handles, nearer to each other, and offsets in
+        units that are so many times as large.
+        """
         super().__init__()
+        self.unit_m = freedom * _UNIT_M
+        handles, reach_m = round(freedom * _HANDLES), _REACH_M / freedom**0.5
         times = sorted(frame_times_us)
         gaps = np.diff(times) if len(times) > 1 else np.zeros(1)
         knot_us = max(_KNOT_US, 2 * float(np.median(gaps)), float(np.quantile(gaps, _GAPS)))
         self.spline = PoseSpline((times[0], times[-1]), knot_us, 0, centred_us=times, learned=False)
-        self.handles = nn.Parameter(torch.zeros(self.spline.count, _HANDLES, 3))
-        weights = torch.exp(
-            -torch.cdist(surface.points, _spread(surface.points)).square() / (2 * _REACH_M**2)
-        )
+        self.handles = nn.Parameter(torch.zeros(self.spline.count, handles, 3))
+        apart = torch.cdist(surface.points, _spread(surface.points, handles))
+        weights = torch.exp(-apart.square() / (2 * reach_m**2))
         weights = weights / weights.sum(1, keepdim=True)
         # A row for each handle: products of few rows with long ones are the faster.
         self.register_buffer("weights", weights.T.contiguous(), persistent=False)
@@ -55,7 +62,7 @@ class Deformation(nn.Module):
         """Offsets, canonical metres, of discs at the surface points ``index``."""
         handles = torch.einsum("tk,khc->tch", self.spline.weights(times_us), self.handles)
         weights: Tensor = self._of_discs.of([index], lambda: self.weights[:, index])
-        moved = (_UNIT_M * handles).flatten(0, 1) @ weights
+        moved = (self.unit_m * handles).flatten(0, 1) @ weights
         return moved.unflatten(0, (-1, 3)).mT
 
     def forget(self) -> None:
@@ -64,14 +71,14 @@ class Deformation(nn.Module):
             self.handles.zero_()
 
     def price(self) -> Float[Tensor, ""]:
-        """Mean square, in units of a centimetre."""
+        """Mean square, in the units that are learned."""
         return self.handles.square().mean()
 
 
-def _spread(points: Float[Tensor, "N 3"]) -> Float[Tensor, "H 3"]:
-    """Handles among the points, each the farthest one from those before it."""
+def _spread(points: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "H 3"]:
+    """As many of the points, each the farthest one from those before it."""
     chosen, distance = [0], torch.full_like(points[:, 0], torch.inf)
-    for _ in range(_HANDLES - 1):
+    for _ in range(count - 1):
         distance = torch.minimum(distance, (points - points[chosen[-1]]).square().sum(1))
         chosen.append(int(distance.argmax()))
     return points[chosen]

@@ -80,6 +80,7 @@ class DiscModel(PosedModel):
         residual: PoseCorrection | None = None,
         residual_start: float = 0.0,
         deformation_start: float | None = None,
+        deformation_freedom: float = 1.0,
     ) -> None:
         """Start at ``gaussians``, whose colours are their own.
 
@@ -94,6 +95,7 @@ class DiscModel(PosedModel):
         ``pose_noise``: standard deviation of what training adds to the matrices that it sees.
         ``deformation_start``: nominal iteration from which the person's shape changes in time where
         poses err; None: it never does.
+        ``deformation_freedom``: see `Deformation`.
         """
         super().__init__(track)
         body = track.body
@@ -110,7 +112,7 @@ class DiscModel(PosedModel):
         self.surface = NearestSurface(surface)
         self.deformation_start, self.deformation = deformation_start, None
         if deformation_start is not None:
-            self.deformation = Deformation(frame_times_us, surface)
+            self.deformation = Deformation(frame_times_us, surface, freedom=deformation_freedom)
         times = torch.as_tensor(list(frame_times_us)).split(_TIMES_AT_ONCE)
         roots = torch.cat([track.at(some)[1] for some in times]) + body.rest_joints[0]
         middle = roots.mean(0).float()
