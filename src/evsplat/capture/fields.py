@@ -1,5 +1,6 @@
 """Typed access to JSON objects, with findings that say where a value is wrong."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,14 @@ class Fields:
             return text
         self.fail(key, brief(text), f"a name: {NAME_RULE}", RENAME)
         return ""
+
+    def choice(self, key: str, choices: Collection[str]) -> Any:
+        """One of the choices; None where it is missing, and after a finding."""
+        value = self.get(key, None)
+        if value is None or value in choices:
+            return value
+        self.fail(key, brief(value), f"one of {list(choices)}", "Correct it.")
+        return None
 
     def path(self, key: str, *, required: bool = True) -> Path | None:
         """A path below the capture's folder, which no link leads out of."""

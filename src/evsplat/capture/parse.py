@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
+from evsplat.body.pose_errors import POSE_SOURCES
 from evsplat.capture.fields import Fields
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Metadata
@@ -73,7 +73,7 @@ def _parse(file: Path, document: dict[str, Any], findings: Findings) -> Metadata
         novel_views=parse_novel_views(top, cameras, frames),
         body_file=body_file or top.folder / "body.npz",
         body_model=_body_model(body) if body else "",
-        body_source=_body_source(body) if body else None,
+        body_source=body.choice("source", POSE_SOURCES) if body else None,
         events=_events(top),
         provenance=provenance if isinstance(provenance, dict) else {"text": str(provenance)},
     )
@@ -98,14 +98,6 @@ def _body_model(body: Fields) -> str:
     if body.valid and model not in BODY_MODELS:
         body.fail("model", repr(model), f"one of {list(BODY_MODELS)}", "Correct it.")
     return model
-
-
-def _body_source(body: Fields) -> PoseSource | None:
-    source = body.get("source", None)
-    if source is None or source in POSE_SOURCES:
-        return source
-    body.fail("source", brief(source), f"one of {list(POSE_SOURCES)}", "Correct it.")
-    return None
 
 
 def _events(top: Fields) -> EventsEntry | None:

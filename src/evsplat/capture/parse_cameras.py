@@ -42,7 +42,7 @@ def parse_cameras(
         entry = top.inner(f"cameras.{name}", value, keys)
         width, height = _pixels(entry, "width"), _pixels(entry, "height")
         K, pose = _intrinsics(entry, width, height), rigid(entry, "world_to_camera")
-        coefficients, transfer = _distortion(entry), _transfer(entry)
+        coefficients, transfer = _distortion(entry), entry.choice("transfer", TRANSFERS)
         if not entry.valid or K is None or pose is None:
             continue
         K32 = torch.from_numpy(K.astype(np.float32))
@@ -134,11 +134,3 @@ def _distortion(entry: Fields) -> tuple[float, ...] | None:
         )
     entry.valid &= inner.valid
     return tuple(float(c) for c in coefficients) if inner.valid else None
-
-
-def _transfer(entry: Fields) -> Transfer | None:
-    value = entry.get("transfer", None)
-    if value is None or value in TRANSFERS:
-        return value
-    entry.fail("transfer", brief(value), f"one of {list(TRANSFERS)}", "Correct it.")
-    return None

@@ -27,6 +27,7 @@ from evsplat.models.beyond import (
     lowest_m,
     on_floor,
     ray_directions,
+    wall_m,
 )
 from evsplat.models.layers import Layers
 from evsplat.pages import read_rgb
@@ -114,9 +115,8 @@ class Room:
         depth = recording.project(scene.means[0])[1]
         height = scene.means[0] @ self.up.to(scene.means) - self.floor_m
         high = height > FLOOR_M
-        wall = depth[high].median() if high.any() else depth.max()
         factor = (_BEHIND * self._deepest_m / depth.clamp_min(0.1)).clamp_min(1.0)
-        factor = torch.where(high | (depth > _WALL * wall), factor, 1.0)[:, None]
+        factor = torch.where(high | (depth > _WALL * wall_m(depth, high)), factor, 1.0)[:, None]
         center = recording.center()
         means = center + (scene.means - center) * factor
         return replace(layers, scene=replace(scene, means=means, scales=scene.scales * factor))

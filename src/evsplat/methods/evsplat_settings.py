@@ -16,7 +16,7 @@ from evsplat.methods.settings import (
     Positive,
     Weight,
 )
-from evsplat.methods.starts import FittedScene, HumanStart
+from evsplat.methods.starts import FROM_MEDIAN, FittedScene, HumanStart
 from evsplat.render import LOW_PASS
 
 _LAMPS = ReadIf("lamps", "above 0", lambda lamps: lamps > 0)
@@ -67,14 +67,7 @@ class EvsplatConfig:
 
     human: HumanStart = HumanStart(count=None, spacing_px=0.85)
     """Discs of the person at the start."""
-    scene: FittedScene = FittedScene(
-        kind="median_backdrop",
-        cube_count=100_000,
-        cube_half_side_m=None,
-        cube_max_count=150_000,
-        backdrop_stride_px=2,
-        prefit_steps=300,
-    )
+    scene: FittedScene = FROM_MEDIAN
     """Discs of the scene at the start; the median of a pixel is that of frames whose body is not
     near it."""
     fill: NotNegative = 0.001

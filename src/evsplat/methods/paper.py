@@ -40,7 +40,14 @@ from evsplat.methods.settings import (
     Share,
     Weight,
 )
-from evsplat.methods.starts import FittedScene, HumanStart, Surface, human_start, scene_start
+from evsplat.methods.starts import (
+    FROM_MEDIAN,
+    FittedScene,
+    HumanStart,
+    Surface,
+    human_start,
+    scene_start,
+)
 from evsplat.models.paper import Semantics
 from evsplat.objectives import EventChange, Objective, RenderedSemantics
 
@@ -60,14 +67,7 @@ class PaperConfig:
 
     human: HumanStart = HumanStart(count=None, spacing_px=1.5)
     """Gaussians of the person at the start."""
-    scene: FittedScene = FittedScene(
-        kind="median_backdrop",
-        cube_count=100_000,
-        cube_half_side_m=None,
-        cube_max_count=150_000,
-        backdrop_stride_px=2,
-        prefit_steps=300,
-    )
+    scene: FittedScene = FROM_MEDIAN
     """Gaussians of the scene at the start."""
     densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=10_000)
     """Growth and pruning."""

@@ -92,6 +92,17 @@ class FittedScene(SceneStart):
     """Steps of fitting the sheet to the median before training proper."""
 
 
+FROM_MEDIAN = FittedScene(
+    kind="median_backdrop",
+    cube_count=100_000,
+    cube_half_side_m=None,
+    cube_max_count=150_000,
+    backdrop_stride_px=2,
+    prefit_steps=300,
+)
+"""The scene's start of `paper` and `evsplat`."""
+
+
 def human_start(
     config: HumanStart,
     surface: Surface,

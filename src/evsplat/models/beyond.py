@@ -72,13 +72,12 @@ class Beyond:
         width = max(1, round(_RIM * min(high.shape)))
         rim = torch.ones_like(high)
         rim[width:-width, width:-width] = False
-        wall = depth[high].median() if high.any() else depth.max()
         return cls(
             recording,
             up,
             floor_m,
             middle,
-            max(_LEAST_ROOM_M, float(wall - recording.project(middle)[1])),
+            max(_LEAST_ROOM_M, float(wall_m(depth, high) - recording.project(middle)[1])),
             _mean(picture, rim & ~high),
             _mean(picture, rim & high),
             float((1 - alpha).clamp(0, 1).flatten().quantile(_LET_THROUGH)),
@@ -147,6 +146,11 @@ def instants(track: BodyTrack) -> list[int]:
 def lowest_m(track: BodyTrack, up: Float[Tensor, "3"]) -> float:
     """Height along ``up`` of the person's lowest point: that of the floor."""
     return min(float((track.vertices(time).cpu() @ up).min()) for time in instants(track))
+
+
+def wall_m(depth: Float[Tensor, "*N"], high: Bool[Tensor, "*N"]) -> Float[Tensor, ""]:
+    """Depth of the wall, metres: the median of what is above the floor, or the farthest."""
+    return depth[high].median() if high.any() else depth.max()
 
 
 def _mean(picture: Float[Tensor, "H W 3"], where: Bool[Tensor, "H W"]) -> Float[Tensor, "3"]:
