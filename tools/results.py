@@ -26,7 +26,7 @@ from evsplat.benching.folder import BenchFolder  # noqa: E402
 from evsplat.benching.kept import plan_of_kept  # noqa: E402
 from evsplat.benching.plan import pending_cells  # noqa: E402
 from evsplat.benching.suite import SuiteRow, read_suite  # noqa: E402
-from evsplat.benching.tables import make_tables, origins, title_of  # noqa: E402
+from evsplat.benching.tables import machines, make_tables, origins, title_of  # noqa: E402
 from evsplat.capture.policy import STRICT_TERMS  # noqa: E402
 from evsplat.evaluation.tables import LEGEND, REGION_TITLES, markdown  # noqa: E402
 
@@ -99,9 +99,9 @@ def methods(records: Records) -> str:
         "PSNR in dB of full frame / person crop / person mask, protocol `standard`, "
         f"{_test_frames(records)} test frames; one seed where no ± follows, which is the largest "
         f"standard deviation of the three over seeds. {STRICT_TERMS}",
-        *origins(records),
+        *machines(records),
         "CPU minutes are the processor's of the training alone, which ran beside other work; the "
-        "mean over what the row has.",
+        "mean over what the row has. The commit of every cell is in docs/results.md.",
     ]
     if missing:
         notes.append(f"Not run yet: {'; '.join(missing)}.")

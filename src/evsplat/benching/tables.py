@@ -1,6 +1,6 @@
 """Tables of a bench in the layout of the paper's: what every column holds."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from statistics import fmean
@@ -213,22 +213,34 @@ def title_of(records: Records, row: SuiteRow, captures: Sequence[str]) -> str:
 def origins(records: Records) -> list[str]:
     """Which commit and machine the records of trained rows are from, oldest commit first."""
     rows: dict[tuple[str, str], list[str]] = {}
-    machines: set[str] = set()
-    for row in records.plan.suite.rows:
-        of_row = [r for c in records.captures for r in records.of(c, row.name) if r["iteration"]]
-        for record in of_row:
-            release = f"release {record.get('evsplat', 'unknown')}"
-            code = record.get("code") or {"date": "", "commit": release}
-            titles = rows.setdefault((code["date"], code["commit"]), [])
-            titles += [row.label] if row.label not in titles else []
-            if record.get("machine"):
-                machines.add(f"{record['machine']}, {_threads(record)}")
+    for row, record in _trained(records):
+        release = f"release {record.get('evsplat', 'unknown')}"
+        code = record.get("code") or {"date": "", "commit": release}
+        titles = rows.setdefault((code["date"], code["commit"]), [])
+        titles += [row.label] if row.label not in titles else []
     by_code = []
     for (date, commit), titles in sorted(rows.items()):
         whose = f" ({'; '.join(titles)})" if len(rows) > 1 else ""
         by_code.append(commit + (f" of {date}" if date else "") + whose)
     notes = [f"Code: {', '.join(by_code)}."] if by_code else []
-    return notes + [f"Trained on {text} a cell." for text in sorted(machines)]
+    return notes + machines(records)
+
+
+def machines(records: Records) -> list[str]:
+    """Which machines the records of trained rows are from."""
+    found = {
+        f"{record['machine']}, {_threads(record)}"
+        for _, record in _trained(records)
+        if record.get("machine")
+    }
+    return [f"Trained on {text} a cell." for text in sorted(found)]
+
+
+def _trained(records: Records) -> Iterator[tuple[SuiteRow, Record]]:
+    """Records of trained cells, each with its row."""
+    for row in records.plan.suite.rows:
+        for capture in records.captures:
+            yield from ((row, r) for r in records.of(capture, row.name) if r["iteration"])
 
 
 def _threads(record: Record) -> str:
