@@ -161,9 +161,10 @@ def grid_summary(records: Records) -> str:
     gaps = {capture: a - b for capture, (a, b) in pairs.items()}
     least = min(gaps, key=lambda capture: gaps[capture])
     wins = sum(gap > 0 for gap in gaps.values())
+    ran = f"the {len(pairs)} of {total}" if len(pairs) < total else f"all {total}"
     return (
-        f"On the {len(pairs)} of {total} captures drawn at random that both have run on, person's "
-        f"pixels: `evsplat` {fmean(of_ours):.2f} dB in the mean and {min(of_ours):.2f} at worst, "
+        f"On {ran} captures drawn at random that both have run on, person's pixels: "
+        f"`evsplat` {fmean(of_ours):.2f} dB in the mean and {min(of_ours):.2f} at worst, "
         f"`paper` {fmean(of_theirs):.2f} and {min(of_theirs):.2f}; `evsplat` is ahead on {wins} of "
         f"{len(pairs)}, by {gaps[least]:+.2f} dB where by least ({least})."
     )
