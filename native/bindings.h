@@ -36,6 +36,7 @@ inline const float* data_of(const std::optional<In>& array) { return array ? arr
 inline float* data_of(const std::optional<Out>& array) { return array ? array->data() : nullptr; }
 
 void bind_events(nb::module_&);
+void bind_geometry(nb::module_&);
 void bind_sensor(nb::module_&);
 void bind_shadow(nb::module_&);
 void bind_step(nb::module_&);

@@ -424,6 +424,7 @@ NB_MODULE(_native, m) {
           nb::arg("blended"), nb::arg("moved_grad").none(), nb::arg("blended_grad").none(),
           nb::arg("linear_grad").none(), nb::arg("position_grad").none(), nb::arg("weight_grad").none(), nb::arg("bones_grad").none(),
           nb::arg("threads"), "Writes the gradients of skin.");
+    bind_geometry(m);
     bind_sensor(m);
     bind_shadow(m);
     bind_step(m);

@@ -1,5 +1,7 @@
 """Triangle fill against a point-in-triangle test of every pixel, and the body's pixel box."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -46,6 +48,19 @@ def test_fill_equals_a_test_of_every_pixel_for_tiny_huge_and_clipped_triangles(s
     mask = silhouette(vertices, faces, camera()).numpy()
     expected = reference(vertices, faces, camera())
     assert mask.any() and (mask == expected).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_the_compiled_module_the_same_pixels_are_filled(seed, monkeypatch):
+    generator = torch.Generator().manual_seed(seed)
+    corners = torch.randn(200, 1, 3, generator=generator)
+    corners = corners + torch.rand(200, 1, 1) * torch.randn(200, 3, 3, generator=generator)
+    vertices, faces = corners.reshape(-1, 3), torch.arange(600).view(200, 3)
+    vertices[5] = torch.nan
+    vertices[9, 0] = 1e30
+    mask = silhouette(vertices, faces, camera())
+    monkeypatch.setattr(sys.modules[silhouette.__module__], "native", None)
+    assert mask.any() and torch.equal(mask, silhouette(vertices, faces, camera()))
 
 
 def test_a_body_far_away_and_a_body_behind():

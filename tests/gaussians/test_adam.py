@@ -1,30 +1,34 @@
-"""Several Adams stepped at once against each one's own step."""
+"""Our Adam, and several stepped at once, against each one's own step in torch.optim."""
+
+import subprocess
+import sys
 
 import pytest
 import torch
 
-from evsplat.gaussians import step_together
+from evsplat.gaussians import Adam, step_together
 
 SHAPES = ((40, 3), (40, 4), (7,), ())
 RATES = (1e-2, 3e-3, 1e-2, 0.0)
 
 
-def adams() -> list[torch.optim.Adam]:
+def adams(kind, **more):
     """Two of them, with groups of different and of equal rates."""
     generator = torch.Generator().manual_seed(0)
     values = [torch.nn.Parameter(torch.randn(shape, generator=generator)) for shape in SHAPES]
     groups = [{"params": [p], "lr": lr} for p, lr in zip(values, RATES, strict=True)]
     groups[1]["weight_decay"] = 0.1
-    return [torch.optim.Adam(some, eps=1e-15, fused=True) for some in (groups[:2], groups[2:])]
+    groups[2]["betas"] = (0.8, 0.98)
+    return [kind(some, eps=1e-15, **more) for some in (groups[:2], groups[2:])]
 
 
-def parameters(made: list[torch.optim.Adam]) -> list[torch.nn.Parameter]:
+def parameters(made) -> list[torch.nn.Parameter]:
     return [p for adam in made for group in adam.param_groups for p in group["params"]]
 
 
 @pytest.mark.parametrize("tells", [False, True])
 def test_it_is_the_step_of_each_adam_bit_for_bit(tells):
-    apart, together = adams(), adams()
+    apart, together = adams(torch.optim.Adam, fused=True), adams(Adam)
     generator = torch.Generator().manual_seed(1)
     for number in range(5):
         unsound = torch.tensor(float(number == 2)) if tells else None
@@ -41,15 +45,36 @@ def test_it_is_the_step_of_each_adam_bit_for_bit(tells):
         for one, other in zip(parameters(apart), parameters(together), strict=True):
             assert torch.equal(one, other)
     for one, other in zip(apart, together, strict=True):
-        states = zip(
-            one.state_dict()["state"].items(), other.state_dict()["state"].items(), strict=True
-        )
-        for (name, state), (other_name, other_state) in states:
-            assert name == other_name
-            assert all(torch.equal(state[key], other_state[key]) for key in state)
+        for of_one, of_other in zip(parameters([one]), parameters([other]), strict=True):
+            states = one.state[of_one], other.state[of_other]
+            assert states[0].keys() == states[1].keys()
+            assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
+
+
+def test_values_are_a_group_of_the_defaults():
+    value = torch.nn.Parameter(torch.tensor([1.0, -2.0]))
+    adam = Adam([value], lr=0.1)
+    value.grad = torch.tensor([0.5, -3.0])
+    adam.step()  # of the first one the size is the rate, whatever the gradient
+    torch.testing.assert_close(value.detach(), torch.tensor([0.9, -1.9]))
+    adam.zero_grad()
+    assert value.grad is None
 
 
 def test_without_gradients_nothing_happens():
-    made = adams()
+    made = adams(Adam)
     step_together(made)
     assert not any(adam.state for adam in made)
+
+
+def test_it_does_not_bring_the_compiler_along():
+    code = """
+import sys, torch
+from evsplat.gaussians import Adam
+value = torch.nn.Parameter(torch.ones(3))
+adam = Adam([value])
+value.sum().backward()
+adam.step()
+assert "torch._dynamo" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

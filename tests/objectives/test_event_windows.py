@@ -28,9 +28,6 @@ class Recording:
     def __len__(self) -> int:
         return len(self.stream)
 
-    def keeping(self, limit_bytes: int) -> "Recording":
-        return self
-
     def between(self, start: int, end: int) -> EventStream:
         assert any(low <= start and end <= high for low, high in self.readable_us)
         return self.stream.between(start, end)

@@ -1,5 +1,7 @@
 """A motion is corrected by pictures of it, by a known amount, and left where it is right."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from evsplat.camera import Camera
 from evsplat.capture import Frame, load_body_track
 from evsplat.pictures import decode, encode, luminance
 from evsplat.posing import refine as refining
+from evsplat.posing import surface_discs
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import Descent
 from evsplat.posing.refine import (
@@ -213,6 +216,38 @@ def staged(body, size):
     coloured = torch.ones(len(TIMES), dtype=torch.bool)
     targets = Targets(TIMES, frames, coloured, image, behind, weight, weight, camera, "power")
     return truth, Descent(correction, look, targets)
+
+
+@pytest.mark.parametrize("carried", [False, True])
+def test_differences_are_those_of_whole_pictures(body, carried):
+    """Only pixels with a weight are looked at; values and gradients as if all were."""
+    _, descent = staged(body, 1.0)
+    targets = descent.targets
+    weight = torch.rand(targets.weight.shape, generator=torch.Generator().manual_seed(3))
+    coloured = targets.coloured.clone()
+    coloured[1::2] = not carried
+    targets = replace(targets, weight=weight * (weight > 0.7), coloured=coloured)
+    drawn = descent.look.draw(*descent.correction.at(TIMES), targets.camera, targets.behind)
+    square = (targets.as_seen(drawn) - targets.image).square().sum(-1) / 0.06**2
+    expected = (torch.log1p(square / 2) * targets.weight).sum((1, 2))
+    descent.discs = 500
+    found = descent._differences(targets)
+    torch.testing.assert_close(found, expected)
+    parameters = [descent.correction.turns, descent.look.colours, descent.look.offsets]
+    for one, other in zip(
+        torch.autograd.grad(found.sum(), parameters),
+        torch.autograd.grad(expected.sum(), parameters),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-3 * float(other.abs().max()))
+
+
+def test_points_are_spread_the_same_without_the_compiled_module(body, monkeypatch):
+    points = body.sample_surface(700, torch.Generator().manual_seed(0)).points
+    rows = surface_discs._far_apart(points, 150)
+    assert len(rows.unique()) == 150
+    monkeypatch.setattr(surface_discs, "runs_native", lambda tensor: False)
+    assert torch.equal(rows, surface_discs._far_apart(points, 150))
 
 
 @torch.no_grad()

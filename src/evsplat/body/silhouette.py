@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from evsplat.camera import Camera
+from evsplat.compiled import native
 
 NEAR = 0.01
 """Triangles that come nearer to the camera plane than this (metres) are not drawn."""
@@ -15,11 +16,25 @@ def silhouette(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: Camera
 ) -> Bool[Tensor, "H W"]:
     """Pixels whose centre lies inside a projected triangle of the mesh (world coordinates)."""
-    height, width = camera.height, camera.width
     pixels, depth = camera.project(vertices.detach())
-    triangles = faces.cpu().numpy()
-    corners = pixels.double().cpu().numpy()[triangles]
-    corners = corners[(depth > NEAR).cpu().numpy()[triangles].all(1)]
+    places, in_front = pixels.double().cpu(), (depth > NEAR).cpu()
+    if native is not None:
+        filled = torch.zeros(camera.height, camera.width, dtype=torch.uint8)
+        mesh = places.contiguous(), in_front.byte(), faces.cpu().long().contiguous()
+        native.fill_triangles(*mesh, filled)
+        return filled.bool()
+    return torch.from_numpy(_filled(places.numpy(), in_front.numpy(), faces.cpu().numpy(), camera))
+
+
+def _filled(
+    places: Float[np.ndarray, "V 2"],
+    in_front: Bool[np.ndarray, "V"],
+    triangles: Int[np.ndarray, "F 3"],
+    camera: Camera,
+) -> Bool[np.ndarray, "H W"]:
+    """`silhouette` without the compiled module."""
+    height, width = camera.height, camera.width
+    corners = places[triangles][in_front[triangles].all(1)]
     # First and one-past-last pixel whose centre (index + 0.5) can lie inside.
     size = np.array([width, height])
     first = np.clip(np.ceil(corners.min(1) - 0.5), 0, size).astype(np.int64)
@@ -34,7 +49,7 @@ def silhouette(
         for chunk in np.array_split(np.flatnonzero(group), 1 + group.sum() * patch**2 // 2_000_000):
             _fill(mask, corners[chunk], first[chunk], last[chunk], patch)
         patch, smaller = patch * 2, patch
-    return torch.from_numpy(mask)
+    return mask
 
 
 def body_box(

@@ -22,6 +22,8 @@ from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS, EventStore, Span
 from evsplat.pictures.light import Transfer
 
+_KEPT_EVENT_BYTES = 256 << 20
+"""Of decoded events: estimates before a training and its steps ask for the same ones."""
 _KEPT_MASKS = 64
 """Estimated masks kept in memory; the least recently used one goes first."""
 
@@ -141,9 +143,14 @@ class TrainingCapture:
 
     @functools.cached_property
     def events(self) -> EventStore | None:
-        """The events that are seen, on the camera's clock; None where the capture has none."""
+        """The events that are seen, on the camera's clock; None where the capture has none.
+
+        Whoever asks again for what was read gets it decoded, as far as memory for that goes.
+        """
         events = self._source.events
-        return None if events is None else events.restricted_to(self._readable_us)
+        if events is None:
+            return None
+        return events.restricted_to(self._readable_us).keeping(_KEPT_EVENT_BYTES)
 
     @property
     def contrast_threshold(self) -> tuple[float, float] | None:

@@ -1,6 +1,6 @@
 """The Gaussian set: parameters, semantic attribute, start, densification."""
 
-from evsplat.gaussians.adam import step_together
+from evsplat.gaussians.adam import Adam, step_together
 from evsplat.gaussians.densify import DensifyLimits, Edit, ScreenStatistics, densify
 from evsplat.gaussians.flip import BodyFrames, flip_labels
 from evsplat.gaussians.gaussian_set import (
@@ -15,6 +15,7 @@ from evsplat.gaussians.row_adam import RowAdam
 
 __all__ = [
     "FEATURE_DIM",
+    "Adam",
     "BodyFrames",
     "DensifyLimits",
     "Edit",

@@ -1,4 +1,4 @@
-"""One step of several Adams at once."""
+"""Adam, and one step of several of them at once."""
 
 from collections import defaultdict
 from collections.abc import Iterable
@@ -8,9 +8,52 @@ import torch
 from torch import Tensor
 
 
+class Adam:
+    """Adam (Kingma and Ba 2015) with decay added to gradients, as `torch.optim.Adam` when fused.
+
+    The first optimiser that torch.optim makes brings PyTorch's compiler along, a second of a core.
+    """
+
+    def __init__(
+        self,
+        parameters: Iterable[Tensor | dict[str, Any]],
+        *,
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+        weight_decay: float = 0.0,
+    ) -> None:
+        """``parameters``: tensors, or groups of ``params`` with values of their own for the rest.
+
+        What else a group holds stays in it.
+        """
+        given = list(parameters)
+        groups = [one for one in given if isinstance(one, dict)] or [{"params": given}]
+        defaults = {"lr": lr, "betas": betas, "eps": eps, "weight_decay": weight_decay}
+        self.param_groups: list[dict[str, Any]] = [
+            {**defaults, **group, "params": list(group["params"])} for group in groups
+        ]
+        self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
+        """Of each parameter that has moved: ``step``, ``exp_avg``, ``exp_avg_sq``."""
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """Of all groups, in order."""
+        return [parameter for group in self.param_groups for parameter in group["params"]]
+
+    def zero_grad(self) -> None:
+        """Drop all gradients."""
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    def step(self) -> None:
+        """Move every parameter that has a gradient."""
+        step_together([self])
+
+
 @torch.no_grad()
-def step_together(adams: Iterable[torch.optim.Adam], unsound: Tensor | None = None) -> None:
-    """Step every parameter that has a gradient, as each of the fused ``adams`` would by itself.
+def step_together(adams: Iterable[Adam], unsound: Tensor | None = None) -> None:
+    """Step every parameter that has a gradient, as each of the ``adams`` would by itself.
 
     They would count steps group by group, two launches of a GPU for each of the twenty groups of a
     model. Here all are counted together, and groups of one rate are stepped together. Where
@@ -53,9 +96,9 @@ def step_together(adams: Iterable[torch.optim.Adam], unsound: Tensor | None = No
         torch._foreach_sub_(steps, [unsound] * len(steps))
 
 
-def _state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:
+def _state(adam: Adam, parameter: Tensor) -> dict[str, Tensor]:
     """Moments and step count of a parameter, zero at the start."""
-    state: dict[str, Tensor] = adam.state[parameter]
+    state = adam.state[parameter]
     if not state:
         state["step"] = torch.zeros((), device=parameter.device)
         for name in ("exp_avg", "exp_avg_sq"):

@@ -1,8 +1,9 @@
 """Adam over the rows of a Gaussian set: moments follow rows when rows are added and removed."""
 
-import torch
 from jaxtyping import Bool, Int
 from torch import Tensor, nn
+
+from evsplat.gaussians.adam import Adam
 
 
 class RowAdam:
@@ -13,13 +14,12 @@ class RowAdam:
     ) -> None:
         """Take the attributes by name; a learning rate of 0 freezes one."""
         self.base_rates = dict(learning_rates)
-        self.adam = torch.optim.Adam(
+        self.adam = Adam(
             [
                 {"params": [parameter], "lr": learning_rates[name], "name": name}
                 for name, parameter in parameters.items()
             ],
             eps=1e-15,
-            fused=True,
         )
 
     def set_factors(self, factors: dict[str, float]) -> None:
@@ -29,7 +29,7 @@ class RowAdam:
 
     def zero_grad(self) -> None:
         """Drop gradients."""
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
 
     def move_rows(
         self,

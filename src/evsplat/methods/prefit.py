@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from evsplat.capture import Camera
 from evsplat.devices import send
-from evsplat.gaussians import GaussianSet
+from evsplat.gaussians import Adam, GaussianSet
 from evsplat.models.layers import scene_splats
 from evsplat.models.networks.colour import SceneColour
 from evsplat.models.paper.model import PaperModel
@@ -24,7 +24,7 @@ def fit_skinning(
 ) -> None:
     """Start the skinning network at the body's weights instead of at random ones."""
     rate = 5e-3
-    adam = torch.optim.Adam(model.skinning.parameters(), lr=rate, fused=True)
+    adam = Adam(model.skinning.parameters(), lr=rate)
     for step in range(steps):
         for group in adam.param_groups:
             group["lr"] = rate * max(1 - step / steps, 0.02)
@@ -45,7 +45,7 @@ def fit_scene_colours(
     rows = gaussians.scene
     features = gaussians.get_parameter("features").detach()[rows]
     directions = _directions(gaussians.means.detach()[rows], camera)
-    adam = torch.optim.Adam(network.parameters(), lr=1e-2)
+    adam = Adam(network.parameters(), lr=1e-2)
     for step in range(steps):
         for group in adam.param_groups:
             group["lr"] = 1e-2 * 0.1 ** (step / steps)
@@ -82,7 +82,7 @@ def fit_scene(
         groups.append({"params": list(network.parameters()), "lr": 1e-3, "rate": 1e-3})
         directions = _directions(means, camera)
         rgb_at = lambda step: network(values[colour], directions * (step % 2))  # noqa: E731
-    adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    adam = Adam(groups, eps=1e-15)
     no_person = torch.zeros(len(means), device=means.device)
     for step in range(steps):
         for group in adam.param_groups:

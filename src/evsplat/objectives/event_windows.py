@@ -22,8 +22,6 @@ from evsplat.objectives.event_sensor import EventNoise, EventSensor
 
 _RATE_US = 1_000
 """Time before and after an instant in which events are counted for their rate there."""
-_KEPT_BYTES = 256 << 20
-"""Of decoded events, which the next steps ask for again."""
 RENDERS = 3
 """Rendered times around a held-out frame."""
 
@@ -68,7 +66,7 @@ class EventWindows(Objective):
         (`begun_counts`); 0: all at once, when the second one tells.
         """
         assert capture.events is not None
-        self.events = capture.events.keeping(_KEPT_BYTES)
+        self.events = capture.events
         self.blocks = EventBlocks(self.events)
         self.sensor, self.generator = sensor, generator
         self.start, self.eps, self.hue_from = start, eps, hue_from

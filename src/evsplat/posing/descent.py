@@ -8,9 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from evsplat.body import PoseErrors
 from evsplat.camera import Camera
+from evsplat.gaussians import Adam
 from evsplat.posing.correction import Correction
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets
@@ -50,6 +52,24 @@ class Stage:
     before: float
     after: float
     """Mean misfit of the pictures at its start and end, in units of one squared deviation."""
+
+
+class _At(torch.autograd.Function):
+    """Some values of a tensor, by their places in a row, each at most once."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, places: Tensor) -> Tensor:
+        ctx.shape = values.shape
+        ctx.save_for_backward(places)
+        return values.reshape(-1)[places]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (places,) = ctx.saved_tensors
+        whole = upstream[0].new_zeros(ctx.shape)
+        whole.view(-1)[places] = upstream[0]
+        return whole, None
 
 
 class Descent:
@@ -106,7 +126,7 @@ class Descent:
     def _descend(
         self, groups: list[dict[str, Any]], targets: Targets, shrink: int, steps: int
     ) -> None:
-        adam = torch.optim.Adam([{**g, "lr": g["rate"]} for g in groups], betas=(0.9, 0.98))
+        adam = Adam([{**g, "lr": g["rate"]} for g in groups], betas=(0.9, 0.98))
         count = len(targets.times_us)
         parts = [targets.rows(range(part, count, _PARTS)) for part in range(min(_PARTS, count))]
         for step, place in enumerate(self.limit.steps(steps)):
@@ -126,10 +146,15 @@ class Descent:
         return _PIXEL_SHARE * self._differences(targets).sum()
 
     def _differences(self, targets: Targets) -> Float[Tensor, "P"]:
+        looked = targets.looked
         rotations, transl = self.correction.at(targets.times_us)
-        drawn = self.look.draw(rotations, transl, targets.camera, targets.behind, self.discs)
-        square = (targets.as_seen(drawn) - targets.image).square().sum(-1) / _MISFIT**2
-        return (torch.log1p(square / 2) * targets.weight).sum((1, 2))
+        drawn = self.look.drawn(rotations, transl, targets.camera, self.discs)
+        shown: Tensor = _At.apply(drawn.image.permute(0, 3, 1, 2), looked.planes)
+        hidden: Tensor = _At.apply(drawn.alpha, looked.place)
+        colours = torch.addcmul(looked.behind, hidden[:, None], looked.behind, value=-1) + shown
+        apart = targets.greyed(colours, looked.grey) - looked.image
+        unlikely = torch.log1p(apart.square().sum(-1) / (2 * _MISFIT**2)) * looked.weight
+        return torch.stack([one.sum() for one in unlikely.split(looked.counts)])
 
     @torch.no_grad()
     def misfits(self, targets: Targets) -> Float[Tensor, "P"]:

@@ -8,9 +8,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from evsplat.body import Body
-from evsplat.body.body import skin
+from evsplat.body.body import skin_with_linear
 from evsplat.body.surface import SurfaceSamples, vertex_normals
 from evsplat.camera import Camera
+from evsplat.compiled import native, runs_native
 from evsplat.render import RenderOutput, Splats, render
 
 _OVERSAMPLED = 5
@@ -94,8 +95,7 @@ class SurfaceDiscs(nn.Module):
         offsets = offsets + weights @ self.bone_offsets
         points = self.samples.points[:n] + _OFFSET_M * offsets
         bones = self.body.canonical_to_world(rotations, transl)
-        means, blended = skin(points, weights, bones)
-        linear = blended[..., :3, :3]
+        means, _, linear = skin_with_linear(points, weights, bones)
         turned = (linear @ normals[:, :, None]).squeeze(-1)
         shade = 1 + _harmonics(nn.functional.normalize(turned, dim=-1)) @ self.light
         opacities = torch.full((len(points),), _OPACITY)
@@ -111,8 +111,22 @@ class SurfaceDiscs(nn.Module):
         count: int | None = None,
     ) -> Float[Tensor, "T H W 3"]:
         """Pictures of the discs before the scene; ``count`` as in `splats`."""
-        drawn = self._drawn(rotations, transl, camera, count)
+        drawn = self.drawn(rotations, transl, camera, count)
         return drawn.image + (1 - drawn.alpha[..., None]) * behind
+
+    def drawn(
+        self,
+        rotations: Float[Tensor, "T J 3 3"],
+        transl: Float[Tensor, "T 3"],
+        camera: Camera,
+        count: int | None = None,
+    ) -> RenderOutput:
+        """Pictures of the discs alone; ``count`` as in `splats`."""
+        moved = transl - self.nearer * self.nearer_m(transl, camera)
+        depth = camera.project(transl.detach() + self.body.rest_joints[0])[1]
+        pixel_m = float(depth.clamp_min(0.1).mean() / camera.K[0, 0])
+        splats = self.splats(rotations, moved, count, pixel_m)
+        return render(splats, camera, low_pass=_LOW_PASS)
 
     def colour_from(
         self,
@@ -129,7 +143,7 @@ class SurfaceDiscs(nn.Module):
         Those before ``first`` stay; ``count`` as in `splats`.
         """
         with torch.enable_grad():
-            drawn = self._drawn(rotations, transl, camera, count).image
+            drawn = self.drawn(rotations, transl, camera, count).image
             shares = [
                 torch.autograd.grad((drawn * of).sum(), self.colours, retain_graph=True)[0]
                 for of in (images, torch.ones_like(images))
@@ -162,19 +176,6 @@ class SurfaceDiscs(nn.Module):
         back = torch.linalg.solve(spread[:, :3, :3], moved[..., None])[..., 0]
         return replace(body, rest_vertices=body.rest_vertices + back)
 
-    def _drawn(
-        self,
-        rotations: Float[Tensor, "T J 3 3"],
-        transl: Float[Tensor, "T 3"],
-        camera: Camera,
-        count: int | None,
-    ) -> RenderOutput:
-        moved = transl - self.nearer * self.nearer_m(transl, camera)
-        depth = camera.project(transl.detach() + self.body.rest_joints[0])[1]
-        pixel_m = float(depth.clamp_min(0.1).mean() / camera.K[0, 0])
-        splats = self.splats(rotations, moved, count, pixel_m)
-        return render(splats, camera, low_pass=_LOW_PASS)
-
     def price(self) -> Float[Tensor, ""]:
         """What offsets and light cost, as minus the logarithm of a prior."""
         offsets = self.offsets.square().sum() + self.bone_offsets.square().sum()
@@ -199,6 +200,9 @@ def _nearness(points: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "N A"]:
 def _far_apart(points: Float[Tensor, "M 3"], count: int) -> Int[Tensor, "N"]:
     """Rows of ``count`` points, each the farthest from those before it."""
     chosen = torch.zeros(count, dtype=torch.long)
+    if runs_native(points):
+        native.spread_points(points.contiguous(), chosen)
+        return chosen
     distance = (points - points[0]).square().sum(-1)
     for k in range(1, count):
         chosen[k] = distance.argmax()

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
@@ -31,6 +32,23 @@ _DOUBTFUL = 0.06
 
 
 @dataclass(frozen=True, eq=False)
+class Looked:
+    """The N pixels of P pictures that count, picture by picture: the others tell nothing."""
+
+    counts: list[int]
+    """Of each picture."""
+    planes: Int[Tensor, "N 3"]
+    """Place of each channel among planes (P, 3, H, W) in a row."""
+    place: Int[Tensor, "N"]
+    """Place in (P, H, W) in a row."""
+    image: Float[Tensor, "N 3"]
+    behind: Float[Tensor, "N 3"]
+    weight: Float[Tensor, "N"]
+    grey: Int[Tensor, "G"]
+    """Those of pictures that have no colours."""
+
+
+@dataclass(frozen=True, eq=False)
 class Targets:
     """P pictures of a camera that stands still."""
 
@@ -52,8 +70,29 @@ class Targets:
 
     def as_seen(self, drawn: Float[Tensor, "P H W 3"]) -> Float[Tensor, "P H W 3"]:
         """Drawings of these pictures, grey where the pictures are."""
-        rows = torch.nonzero(~self.coloured)[:, 0]
+        return self.greyed(drawn, torch.nonzero(~self.coloured)[:, 0])
+
+    def greyed(self, drawn: Float[Tensor, "N *size 3"], rows: Int[Tensor, "G"]) -> Tensor:
+        """Drawings of which some are grey."""
         return drawn.index_copy(0, rows, _grey(drawn[rows], self.transfer)) if len(rows) else drawn
+
+    @cached_property
+    def looked(self) -> Looked:
+        """The pixels with a weight."""
+        picture, row, column = torch.nonzero(self.weight, as_tuple=True)
+        height, width = self.weight.shape[1:]
+        pixel = row * width + column
+        planes = (3 * picture[:, None] + torch.arange(3)) * (height * width) + pixel[:, None]
+        chosen = picture, row, column
+        return Looked(
+            torch.bincount(picture, minlength=len(self.times_us)).tolist(),
+            planes,
+            picture * (height * width) + pixel,
+            self.image[chosen],
+            self.behind[chosen],
+            self.weight[chosen],
+            torch.nonzero(~self.coloured[picture])[:, 0],
+        )
 
     def around(self, track: BodyTrack, nearness: float = 1.0) -> "Targets":
         """The same pictures; what is behind the person, and where it is, by another motion.
@@ -156,7 +195,7 @@ def find_targets(
         raise DataError(f"{capture.path}: {error}") from None
 
 
-def _grey(coded: Float[Tensor, "P H W 3"], transfer: Transfer) -> Float[Tensor, "P H W 3"]:
+def _grey(coded: Float[Tensor, "*size 3"], transfer: Transfer) -> Float[Tensor, "*size 3"]:
     """Coded luminance, thrice."""
     light = luminance(decode(coded.clamp_min(DARKEST), transfer))
     return encode(light, transfer)[..., None].expand(*coded.shape)

@@ -1,13 +1,12 @@
 """The optimisers of a run: Adam over Gaussian rows and Adam over networks."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from evsplat.gaussians import RowAdam, step_together
+from evsplat.gaussians import Adam, RowAdam, step_together
 from evsplat.methods.learning import Learning
 from evsplat.models.model import Model
 
@@ -29,7 +28,7 @@ class Optimiser:
             for name, rows in model.sets.items()
         }
         self.clipped = [p for group in learning.networks if group.clipped for p in group.parameters]
-        self.networks = torch.optim.Adam(
+        self.networks = Adam(
             [
                 {
                     "params": group.parameters,
@@ -39,7 +38,6 @@ class Optimiser:
                 for group in learning.networks
             ],
             eps=1e-15,
-            fused=True,
         )
 
     def set_progress(self, nominal: float) -> None:
@@ -55,7 +53,7 @@ class Optimiser:
         """Drop all gradients."""
         for adam in self.rows.values():
             adam.zero_grad()
-        self.networks.zero_grad(set_to_none=True)
+        self.networks.zero_grad()
 
     def step(self, nominal: float, sound: Tensor | None = None) -> None:
         """Mask what is frozen, clip the networks' gradient and step all Adams.
@@ -105,9 +103,9 @@ class Optimiser:
         """Moments and step counts, named by group and parameter number."""
         flat: dict[str, Tensor] = {}
         for label, adam in self._adams():
-            for number, state in adam.state_dict()["state"].items():
-                for key, value in state.items():
-                    flat[f"{label}.{number}.{key}"] = torch.as_tensor(value)
+            for number, parameter in enumerate(adam.parameters):
+                for key, value in adam.state.get(parameter, {}).items():
+                    flat[f"{label}.{number}.{key}"] = value
         return flat
 
     def load_state(self, flat: dict[str, Tensor]) -> None:
@@ -117,12 +115,12 @@ class Optimiser:
             ValueError: They have not, or some moments are missing: Adam would read beyond them.
         """
         for label, adam in self._adams():
-            states: dict[int, dict[str, Any]] = {}
+            states: dict[int, dict[str, Tensor]] = {}
             for name, value in flat.items():
                 which, number, key = name.rsplit(".", 2)
                 if which == label:
                     states.setdefault(int(number), {})[key] = value
-            parameters = [one for group in adam.param_groups for one in group["params"]]
+            parameters = adam.parameters
             for place, moments in states.items():
                 shapes = [tuple(moments[key].shape) for key in ("exp_avg", "exp_avg_sq")]
                 expected = tuple(parameters[place].shape)
@@ -131,9 +129,11 @@ class Optimiser:
                         f"optimiser.{label}.{place} has moments of shapes {shapes}, expected "
                         f"{expected}"
                     )
-            adam.load_state_dict(
-                {"state": states, "param_groups": adam.state_dict()["param_groups"]}
-            )
+            adam.state.clear()
+            for place, moments in states.items():
+                adam.state[parameters[place]] = {
+                    key: value.to(parameters[place]).clone() for key, value in moments.items()
+                }
 
     def learning_rates(self) -> dict[str, float]:
         """Learning rates of the Gaussians' attributes, for the log."""
@@ -144,7 +144,7 @@ class Optimiser:
             for group in adam.adam.param_groups
         }
 
-    def _adams(self) -> list[tuple[str, torch.optim.Adam]]:
+    def _adams(self) -> list[tuple[str, Adam]]:
         rows = [(name, adam.adam) for name, adam in self.rows.items()]
         return [*rows, ("networks", self.networks)]
 

@@ -7,6 +7,7 @@ from torch import Tensor
 from evsplat.body import SurfaceSamples
 from evsplat.body.rotations import matrix_to_six, quaternion_to_matrix
 from evsplat.devices import send
+from evsplat.gaussians import Adam
 from evsplat.gaussians.initialise import facing
 from evsplat.models.hugs.gaussians import TriplaneHuman
 from evsplat.neighbours import nearest
@@ -53,14 +54,13 @@ def fit_to_body(
     """
     size = spacing_m * 0.5 / float(human.multipliers().median())
     decoders = [*human.geometry.parameters(), *human.appearance.parameters()]
-    adam = torch.optim.Adam(
+    adam = Adam(
         [
             {"params": list(human.triplane.parameters()), "rate": TEXEL_RATE},
             {"params": decoders, "rate": DECODER_RATE},
             {"params": list(human.skinning.parameters()), "rate": DECODER_RATE},
         ],
         lr=DECODER_RATE,
-        fused=True,
     )
     targets = matrix_to_six(quaternion_to_matrix(facing(surface.normals)))
     for step in range(steps):
