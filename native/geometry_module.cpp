@@ -1,4 +1,4 @@
-// Python bindings of geometry.h, which evsplat/body and evsplat/posing call.
+// Python bindings of geometry.h, which evsplat/body and evsplat/neighbours call.
 
 #include "bindings.h"
 #include "geometry.h"

@@ -1,10 +1,11 @@
-"""Nearest points against every distance in float64."""
+"""Nearest points against every distance in float64, and points that are spread."""
 
 import pytest
 import torch
 
 from evsplat import neighbours
-from evsplat.neighbours import nearest
+from evsplat.body import default_body
+from evsplat.neighbours import far_apart, nearest
 
 
 def clouds(seed: int):
@@ -47,3 +48,11 @@ def test_no_queries_have_no_neighbours():
 def test_too_few_points_are_refused():
     with pytest.raises(ValueError, match="4 points have no 4 neighbours"):
         nearest(torch.zeros(4, 3), 4)
+
+
+def test_points_are_spread_the_same_without_the_compiled_module(monkeypatch):
+    points = default_body().sample_surface(700, torch.Generator().manual_seed(0)).points
+    rows = far_apart(points, 150)
+    assert len(rows.unique()) == 150
+    monkeypatch.setattr(neighbours, "runs_native", lambda tensor: False)
+    assert torch.equal(rows, far_apart(points, 150))

@@ -1,9 +1,11 @@
-"""The nearest points of a set."""
+"""The nearest points of a set, and those that are spread over it."""
 
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from evsplat.compiled import native, runs_native
 
 _ROWS_AT_ONCE = 2_048
 """Distances of so many points to all others are held at a time: 160 MB at 20,000 points."""
@@ -51,3 +53,17 @@ def _by_all_distances(
         distances.append(found.values)
         rows.append(found.indices)
     return torch.cat(distances), torch.cat(rows)
+
+
+def far_apart(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "M"]:
+    """Rows of ``count`` points, the first one and then each the farthest from those before it."""
+    chosen = torch.zeros(count, dtype=torch.long)
+    points = points.detach()
+    if runs_native(points):
+        native.spread_points(points.contiguous(), chosen)
+        return chosen
+    distance = (points - points[0]).square().sum(-1)
+    for k in range(1, count):
+        chosen[k] = distance.argmax()
+        distance = torch.minimum(distance, (points - points[chosen[k]]).square().sum(-1))
+    return chosen

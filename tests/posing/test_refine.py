@@ -13,7 +13,6 @@ from evsplat.camera import Camera
 from evsplat.capture import Frame, load_body_track
 from evsplat.pictures import decode, encode, luminance
 from evsplat.posing import refine as refining
-from evsplat.posing import surface_discs
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import Descent
 from evsplat.posing.refine import (
@@ -240,14 +239,6 @@ def test_differences_are_those_of_whole_pictures(body, carried):
         strict=True,
     ):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-3 * float(other.abs().max()))
-
-
-def test_points_are_spread_the_same_without_the_compiled_module(body, monkeypatch):
-    points = body.sample_surface(700, torch.Generator().manual_seed(0)).points
-    rows = surface_discs._far_apart(points, 150)
-    assert len(rows.unique()) == 150
-    monkeypatch.setattr(surface_discs, "runs_native", lambda tensor: False)
-    assert torch.equal(rows, surface_discs._far_apart(points, 150))
 
 
 @torch.no_grad()

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
@@ -11,7 +11,7 @@ from evsplat.body import Body
 from evsplat.body.body import skin_with_linear
 from evsplat.body.surface import SurfaceSamples, vertex_normals
 from evsplat.camera import Camera
-from evsplat.compiled import native, runs_native
+from evsplat.neighbours import far_apart
 from evsplat.render import RenderOutput, Splats, render
 
 _OVERSAMPLED = 5
@@ -56,7 +56,7 @@ class SurfaceDiscs(nn.Module):
         super().__init__()
         self.body = body
         drawn = body.sample_surface(_OVERSAMPLED * count, generator)
-        rows = _far_apart(drawn.points, count)
+        rows = far_apart(drawn.points, count)
         self.samples = SurfaceSamples(drawn.points[rows], drawn.normals[rows], drawn.weights[rows])
         a, b, c = body.canonical_vertices()[body.faces].unbind(1)
         area = float(torch.linalg.cross(b - a, c - a).norm(dim=-1).sum()) / 2
@@ -195,19 +195,6 @@ def _nearness(points: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "N A"]:
     apart = torch.cdist(points, points[: min(count, len(points))])
     near = torch.exp(-0.5 * (apart / _LAYER_REACH_M).square())
     return torch.nn.functional.normalize(near, dim=1)
-
-
-def _far_apart(points: Float[Tensor, "M 3"], count: int) -> Int[Tensor, "N"]:
-    """Rows of ``count`` points, each the farthest from those before it."""
-    chosen = torch.zeros(count, dtype=torch.long)
-    if runs_native(points):
-        native.spread_points(points.contiguous(), chosen)
-        return chosen
-    distance = (points - points[0]).square().sum(-1)
-    for k in range(1, count):
-        chosen[k] = distance.argmax()
-        distance = torch.minimum(distance, (points - points[chosen[k]]).square().sum(-1))
-    return chosen
 
 
 def _turned_to(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from evsplat.body import SurfaceSamples
 from evsplat.models.kept import Kept
 from evsplat.models.pose_spline import PoseSpline
+from evsplat.neighbours import far_apart
 
 _HANDLES = 100
 _REACH_M = 0.07
@@ -51,7 +52,8 @@ class Deformation(nn.Module):
         knot_us = max(_KNOT_US, 2 * float(np.median(gaps)), float(np.quantile(gaps, _GAPS)))
         self.spline = PoseSpline((times[0], times[-1]), knot_us, 0, centred_us=times, learned=False)
         self.handles = nn.Parameter(torch.zeros(self.spline.count, handles, 3))
-        apart = torch.cdist(surface.points, _spread(surface.points, handles))
+        spread = surface.points[far_apart(surface.points, handles)]
+        apart = torch.cdist(surface.points, spread)
         weights = torch.exp(-apart.square() / (2 * reach_m**2))
         weights = weights / weights.sum(1, keepdim=True)
         # A row for each handle: products of few rows with long ones are the faster.
@@ -73,12 +75,3 @@ class Deformation(nn.Module):
     def price(self) -> Float[Tensor, ""]:
         """Mean square, in the units that are learned."""
         return self.handles.square().mean()
-
-
-def _spread(points: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "H 3"]:
-    """As many of the points, each the farthest one from those before it."""
-    chosen, distance = [0], torch.full_like(points[:, 0], torch.inf)
-    for _ in range(count - 1):
-        distance = torch.minimum(distance, (points - points[chosen[-1]]).square().sum(1))
-        chosen.append(int(distance.argmax()))
-    return points[chosen]
