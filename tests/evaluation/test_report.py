@@ -186,7 +186,7 @@ def test_page_of_training_frames_says_so(tiny_capture, tmp_path):
     with pytest.raises(DataError, match="metrics.json: file not found"):
         Source.read(tmp_path, source.capture, source.reconstruction)
     (tmp_path / "metrics_train.json").unlink()
-    with pytest.raises(DataError, match="run `evsplat evaluate .* --split train` first"):
+    with pytest.raises(DataError, match="first run evsplat evaluate .* --split train"):
         Source.read(tmp_path, source.capture, source.reconstruction, "train")
 
 

@@ -92,11 +92,11 @@ def test_folder_with_pictures_of_two_sizes_names_the_odd_one(tmp_path):
 def test_what_is_no_footage_is_told(tmp_path):
     with pytest.raises(DataError, match="no such video file"):
         open_footage(tmp_path / "nothing.mp4")
-    with pytest.raises(ConfigError, match="--source-fps"):
-        open_footage(tmp_path)
+    with pytest.raises(ConfigError, match="with --fps"):
+        open_footage(tmp_path, rate_option="--fps")
     with pytest.raises(DataError, match="holds no picture"):
         open_footage(tmp_path, 10)
-    with pytest.raises(ConfigError, match="--source-fps -3"):
+    with pytest.raises(ConfigError, match="^fps -3"):
         open_footage(tmp_path, -3)
     (tmp_path / "noise.mp4").write_bytes(np.random.default_rng(0).bytes(4000))
     with pytest.raises(DataError, match=r"noise\.mp4: cannot be decoded"):

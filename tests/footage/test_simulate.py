@@ -79,7 +79,7 @@ def test_pictures_of_any_depth_give_the_sensors_events(
     )
     settings = sensor_settings("dvxplorer", shot_hz=20.0)
     count = ev.simulate(
-        source, tmp_path / "events.h5", settings=settings, fps=FPS, transfer=transfer, seed=4
+        source, tmp_path / "events.h5", settings=settings, source_fps=FPS, transfer=transfer, seed=4
     )
     light = [decode(torch.tensor(p / levels, dtype=torch.float32), transfer) for p in pictures]
     if kind.startswith("rgb"):
@@ -93,7 +93,7 @@ def test_video_has_its_own_times_and_another_rate_stretches_them(tmp_path: Path)
     pictures = [(255 * p).round().astype(np.uint8) for p in moving_disc(20)]
     write_video(tmp_path / "clip.mp4", pictures, fps=FPS, crf=4)
     own = ev.simulate(tmp_path / "clip.mp4", tmp_path / "own.h5")
-    slow = ev.simulate(tmp_path / "clip.mp4", tmp_path / "slow.h5", fps=FPS / 4)
+    slow = ev.simulate(tmp_path / "clip.mp4", tmp_path / "slow.h5", source_fps=FPS / 4)
     first, second = stored(tmp_path / "own.h5"), stored(tmp_path / "slow.h5")
     assert own == slow == len(first)
     assert first.t[-1] <= 19e6 / FPS and np.abs(second.t - 4 * first.t).max() <= 4
@@ -106,7 +106,9 @@ def test_video_has_its_own_times_and_another_rate_stretches_them(tmp_path: Path)
 def test_file_tells_how_it_was_made(tmp_path: Path) -> None:
     source = folder_of(tmp_path / "clip", moving_disc(3))
     settings = sensor_settings("evk4", contrast_on=0.3)
-    ev.simulate(source, tmp_path / "e.h5", settings=settings, fps=FPS, transfer="srgb", seed=9)
+    ev.simulate(
+        source, tmp_path / "e.h5", settings=settings, source_fps=FPS, transfer="srgb", seed=9
+    )
     with h5py.File(tmp_path / "e.h5") as file:
         attributes = dict(file.attrs)
     prefix = "sensor_"
@@ -126,7 +128,7 @@ def test_memory_does_not_grow_with_the_events(tmp_path: Path) -> None:
     for contrast in (0.2, 0.03):
         settings = SensorSettings(contrast_on=contrast, contrast_off=contrast)
         tracemalloc.start()
-        counts.append(ev.simulate(source, tmp_path / "e.h5", settings=settings, fps=200.0))
+        counts.append(ev.simulate(source, tmp_path / "e.h5", settings=settings, source_fps=200.0))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     # 13 bytes each, were all of them kept
@@ -192,11 +194,11 @@ def test_bad_options_say_what_is_wrong(
 
 def test_one_picture_is_no_footage(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="holds one picture; events need at least two"):
-        ev.simulate(folder_of(tmp_path / "in", moving_disc(1)), tmp_path / "e.h5", fps=FPS)
+        ev.simulate(folder_of(tmp_path / "in", moving_disc(1)), tmp_path / "e.h5", source_fps=FPS)
     with pytest.raises(DataError, match="no such video file or folder"):
         ev.simulate(tmp_path / "nothing.mp4", tmp_path / "e.h5")
     with pytest.raises(ConfigError, match="nan"):
-        ev.simulate(tmp_path / "in", tmp_path / "e.h5", fps=float("nan"))
+        ev.simulate(tmp_path / "in", tmp_path / "e.h5", source_fps=float("nan"))
     assert not (tmp_path / "e.h5").exists()
 
 
@@ -204,7 +206,7 @@ def test_pictures_far_apart_are_warned_about(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = folder_of(tmp_path / "in", moving_disc(3))
-    ev.simulate(source, tmp_path / "e.h5", fps=FPS)
+    ev.simulate(source, tmp_path / "e.h5", source_fps=FPS)
     assert not caplog.records
-    ev.simulate(source, tmp_path / "e.h5", fps=30.0)
+    ev.simulate(source, tmp_path / "e.h5", source_fps=30.0)
     assert "33.3 ms apart" in caplog.text

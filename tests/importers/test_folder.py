@@ -110,6 +110,14 @@ def test_exposures_of_a_list_and_pictures_without_a_pose(
     assert any("2 pictures have no pose" in note for note in capture.provenance["notes"])
 
 
+def test_pictures_without_a_mask_are_counted(recording: Path, tmp_path: Path) -> None:
+    (recording / "masks" / "shot3.png").unlink()
+    import_capture("folder", recording, tmp_path / "out", fps=25.0, exposure_us=3e4)
+    capture = load_capture(tmp_path / "out")
+    assert [capture.mask(frame) is None for frame in capture.frames].index(True) == 3
+    assert f"1 of {COUNT} pictures have no mask" in capture.provenance["notes"]
+
+
 def test_a_rig_of_ones_own(recording: Path, tmp_path: Path, tiny_capture: Callable) -> None:
     """body.npz as in a capture goes through as it is."""
     tiny = load_capture(tiny_capture(frames=COUNT))
@@ -188,6 +196,37 @@ FAULTS = {
         {},
         DataError,
         r"exposures.txt: has 2 lines of 2 numbers, expected start and end .* of the 6 pictures",
+    ),
+    "no folder of masks": (
+        lambda root: None,
+        {"fps": 25.0, "exposure_us": 3e4, "masks": Path("maks")},
+        DataError,
+        "--masks maks: no such folder, expected one of pictures NAME.png",
+    ),
+    "masks of other names": (
+        lambda root: [path.rename(f"{path}.png") for path in (root / "masks").iterdir()],
+        {},
+        DataError,
+        "masks: holds no mask of any picture, expected NAME.png",
+    ),
+    "a mask of another size": (
+        lambda root: save(root / "masks" / "shot2.png", np.zeros((8, 9), np.uint8)),
+        {},
+        DataError,
+        "shot2.png: has 9x8 pixels, expected 128x136 as its picture",
+    ),
+    "no event": (
+        lambda root: (root / "events.csv").write_text("t,x,y,p\n"),
+        {},
+        DataError,
+        "events.csv: holds no event",
+    ),
+    "events of another time": (
+        lambda root: (root / "events.csv").write_text("t,x,y,p\n1000000,1,3,1\n1000400,1,3,0\n"),
+        {},
+        DataError,
+        "events.csv: its events are from 1000000 to 1000400 us and the pictures from -15000 to "
+        "215000 us, .* give --clock-offset-us -1015000 .* --time-unit of 'evsplat convert'",
     ),
     "event beside the sensor": (
         lambda root: (root / "events.csv").write_text("t,x,y,p\n1,127,3,1\n2,128,3,0\n"),

@@ -70,7 +70,7 @@ def test_where_that_is_not_enough_the_newest_is_kept_and_named(
     message = str(error.value)
     assert message.count("000030.safetensors: not written, the disk is full") == 1
     assert (
-        "step 20 is kept: once that is mended, go on with 'evsplat train CAPTURE --out " in message
+        "step 20 is kept: once that is mended, go on with: evsplat train CAPTURE --out " in message
     )
     assert "\n" not in message
 

@@ -8,6 +8,7 @@ from evsplat.capture.policy import Policy
 from evsplat.capture.read import CaptureReader
 from evsplat.capture.training_capture import HumanFinder, TrainingCapture
 from evsplat.capture.validate import check_capture
+from evsplat.commands import command
 from evsplat.errors import DataError
 
 logger = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ def load_capture(path: Path | str, *, needs_body: bool = True) -> Capture:
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors or metadata is None:
         more = (
-            f"\n{len(errors) - 1} more errors: `evsplat inspect {path}` lists all."
+            f"\n{len(errors) - 1} more errors, which this lists: {command('inspect', path)}"
             if len(errors) > 1
             else ""
         )

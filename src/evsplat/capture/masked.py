@@ -5,6 +5,7 @@ from torch import Tensor
 
 from evsplat.capture.metadata import Frame
 from evsplat.capture.training_capture import TrainingCapture
+from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 
 HUMAN_ABOVE = 0.5
@@ -24,7 +25,7 @@ def require_masks(capture: TrainingCapture, method: str) -> None:
         raise DataError(
             f"{capture.path / 'capture.json'}: {len(without)} of {len(frames)} training frames "
             f"have no mask (the first is {without[0]!r}), and {method} learns the person from "
-            f"masks; make them with: evsplat masks {capture.path}, or pass --set "
+            f"masks; make them with: {command('masks', capture.path)}, or pass --set "
             "policy.masks=estimated."
         )
 

@@ -248,6 +248,12 @@ class CaptureWriter:
         }
         return count
 
+    @property
+    def exposed_us(self) -> tuple[int, int]:
+        """From the first exposure's start to the last one's end, of the frames added so far."""
+        spans = np.array([frame["exposure_us"] for frame in self._frames])
+        return int(spans[:, 0].min()), int(spans[:, 1].max())
+
     def set_points(self, points: ArrayLike, colours: ArrayLike | None = None) -> None:
         """Give first scene points (N, 3) in metres and their sRGB colours (N, 3) in [0, 1]."""
         write_points(

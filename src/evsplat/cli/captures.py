@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
+from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.options import PoseSearch, ReadOptions, StageSettings, SynthesisSettings
 from evsplat.options.declare import (
@@ -85,7 +86,7 @@ class Simulate:
             self.source,
             self.out,
             settings=from_dict(SensorSettings, values, where="--set"),
-            fps=self.source_fps,
+            source_fps=self.source_fps,
             transfer=self.transfer,
             seed=self.seed,
         )
@@ -130,7 +131,7 @@ class Synthesize:
             camera=self.camera,
             overwrite=self.overwrite,
         )
-        print(f"written: {path}\nlook at it with: evsplat inspect {path}")
+        print(f"written: {path}\nlook at it with: {command('inspect', path)}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
+from evsplat.commands import command
 from evsplat.errors import ConfigError
 from evsplat.options import PoseOptions
 from evsplat.options.declare import FLAT, CaptureFolder, Flag, option
@@ -46,9 +47,9 @@ class _Import:
             overwrite=self.overwrite,
             **self.going_on(),
         )
-        print(f"written: {path}\nlook at it with: evsplat inspect {path}")
+        print(f"written: {path}\nlook at it with: {command('inspect', path)}")
         if (path / "poses.html").is_file():
-            print(f"and at its poses: {path / 'poses.html'}\nthen: evsplat train {path}")
+            print(f"and at its poses: {path / 'poses.html'}\nthen: {command('train', path)}")
 
     def going_on(self) -> dict[str, Any]:
         """What follows the import, as arguments of `run_importer`."""
@@ -129,7 +130,7 @@ class _Poses:
             smpl=self.smpl,
             overwrite=self.overwrite,
         )
-        print(f"written: {path}\nlook at it with: evsplat inspect {path}")
+        print(f"written: {path}\nlook at it with: {command('inspect', path)}")
 
 
 def check_kind(arguments: Sequence[str]) -> None:
@@ -142,8 +143,8 @@ def check_kind(arguments: Sequence[str]) -> None:
     asked = arguments[0]
     if Path(asked).exists():
         raise ConfigError(
-            f"{asked}: the kind of source stands before it: evsplat import KIND {asked} ..., with "
-            f"one of {', '.join(kinds)}."
+            f"{asked}: the kind of source stands before it: "
+            f"{command('import', 'KIND', asked, '...')}, with one of {', '.join(kinds)}."
         )
     near = get_close_matches(asked, kinds, 1, cutoff=0.0)[0]
     raise ConfigError(

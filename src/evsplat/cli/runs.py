@@ -1,6 +1,5 @@
 """Verbs that make runs, measure them and show them; the table printed after an evaluation."""
 
-import shlex
 import sys
 from dataclasses import dataclass
 from datetime import datetime
@@ -10,6 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from evsplat.cli.captures import Poses
+from evsplat.commands import command
 from evsplat.options import BenchOptions, ExportOptions, Film, PoseSearch, TrainOptions
 from evsplat.options.declare import (
     FLAT,
@@ -100,8 +100,8 @@ class Train:
             if viewer:
                 viewer.wait()
         except Stopped as stop:
-            again = ["evsplat", "train", str(self.capture), "--out", str(stop.run), "--resume"]
-            raise KeyboardInterrupt(f"Stopped and saved. Go on with: {shlex.join(again)}") from None
+            again = command("train", self.capture, "--out", stop.run, "--resume")
+            raise KeyboardInterrupt(f"Stopped and saved. Go on with: {again}") from None
         finally:
             if viewer:
                 viewer.close()
@@ -110,9 +110,9 @@ class Train:
         try:
             self._finish(run)
         except KeyboardInterrupt:
-            command = shlex.join(["evsplat", "evaluate", str(run)])
             raise KeyboardInterrupt(
-                f"Stopped; the training is finished and saved. Go on with: {command}"
+                "Stopped; the training is finished and saved. Go on with: "
+                f"{command('evaluate', run)}"
             ) from None
 
     def _finish(self, run: Path) -> None:
@@ -279,15 +279,14 @@ class Bench:
         try:
             folder = bench(self.suite, self.options)
         except Stopped as stop:
-            command = shlex.join(["evsplat", *sys.argv[1:]])
-            raise KeyboardInterrupt(f"{stop} Go on with: {command}") from None
+            raise KeyboardInterrupt(f"{stop} Go on with: {command(*sys.argv[1:])}") from None
         print(f"tables: {folder / 'tables.md'}\npage:   {folder / 'index.html'}")
 
 
 def _print_summary(metrics: dict[str, Any], *, run: Path, report: Path) -> None:
     """Print the run's figures above the trivial rows, where the report is and how to view it."""
     print(summary_table(metrics))
-    print(f"run:    {run}\nreport: {report}\nview:   {_command()} view {shlex.quote(str(run))}")
+    print(f"run:    {run}\nreport: {report}\nview:   {command('view', run)}")
 
 
 def summary_table(metrics: dict[str, Any]) -> str:
@@ -321,9 +320,3 @@ def _cell(values: dict[str, float | None] | None) -> str:
     values = values or {}
     psnr, ssim = values.get("psnr"), values.get("ssim")
     return f"{'-' if psnr is None else f'{psnr:.2f}'} / {'-' if ssim is None else f'{ssim:.3f}'}"
-
-
-def _command() -> str:
-    """Command by which the user calls evsplat: as it was called, where that is a path to it."""
-    called = Path(sys.argv[0])
-    return str(called) if called.name == "evsplat" and not called.is_absolute() else "evsplat"

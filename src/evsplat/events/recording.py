@@ -96,11 +96,14 @@ def open_recording(
     source.width = options.width or source.width
     source.height = options.height or source.height
     if (source.width is None) != (source.height is None):
-        raise DataError(f"{path}: only one of width and height is known; give both.")
+        raise DataError(f"{path}: only one of --width and --height is known; give both.")
     if not all(size is None or 0 < size <= 1 << 16 for size in (source.width, source.height)):
         raise DataError(f"{path}: its header gives {source.width} x {source.height} pixels.")
     if source.width is None:
-        source.notes.append("the size of the sensor is not in the file: give width and height")
+        source.notes.append(
+            "the size of the sensor is not in the file; give it with --width and --height of "
+            "'evsplat convert'"
+        )
     return EventRecording(path, found.name, source, damage)
 
 

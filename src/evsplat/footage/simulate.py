@@ -29,7 +29,7 @@ def simulate(
     out: Path | str,
     *,
     settings: SensorSettings | None = None,
-    fps: float | None = None,
+    source_fps: float | None = None,
     transfer: Transfer = "power",
     seed: int = 0,
 ) -> int:
@@ -44,16 +44,16 @@ def simulate(
             HDF5 keeps settings and seed as attributes.
         settings: The sensor, such as ``sensor_settings("davis346", shot_hz=5.0)``; by default an
             ideal one with a threshold of 0.2.
-        fps: Rate at which the pictures were taken; a folder needs it.
+        source_fps: Rate at which the pictures were taken; a folder needs it.
         transfer: Between coded values and linear light.
         seed: Of everything random in the sensor.
 
     Raises:
         DataError: Footage that cannot be read or has a single picture.
-        ConfigError: ``fps`` is missing or makes no sense, or the suffix names no format.
+        ConfigError: ``source_fps`` is missing or makes no sense, or the suffix names no format.
     """
     settings = settings or SensorSettings()
-    footage = open_footage(source, fps)
+    footage = open_footage(source, source_fps, rate_option="--source-fps")
     steps_us = np.diff(footage.times_us)
     if not len(steps_us):
         raise DataError(f"{source}: holds one picture; events need at least two.")

@@ -24,7 +24,7 @@ class VideoFootage:
     upright, 16 bit where the video has more than 8.
     """
 
-    def __init__(self, path: Path, fps: float | None) -> None:
+    def __init__(self, path: Path, fps: float | None, rate_option: str) -> None:
         self.path = path
         first = next(self._decoded(), None)
         if first is None:
@@ -44,7 +44,7 @@ class VideoFootage:
             at = int(np.argmax(np.diff(self.times_us) <= 0)) + 1
             raise DataError(
                 f"{path}: pictures {at - 1} and {at} have the same time; give the rate at which "
-                "they were taken with --source-fps."
+                f"they were taken with {rate_option}."
             )
 
     def __iter__(self) -> Iterator[TimedPicture]:

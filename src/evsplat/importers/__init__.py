@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from evsplat.capture.write import CaptureWriter
+from evsplat.commands import command
 from evsplat.errors import ConfigError
 from evsplat.files import remove_folder
 from evsplat.importers.base import Importer
@@ -170,8 +171,8 @@ def _import(
             notes = [note for note in notes if not note.startswith("body:")]
             writer.leave_out_body()
         if not writer.has_body and not going_on:
-            ways = f"evsplat poses {writer.path} --out NEW"
-            notes.append(f"body: none; find the person's poses with: {ways}")
+            find = command("poses", writer.path, "--out", "NEW")
+            notes.append(f"body: none; find the person's poses with: {find}")
     for note in notes:
         logger.info("%s", note)
 
@@ -197,8 +198,9 @@ def _import_and_pose(
         find_poses(unposed, out, search, keypoints=keypoints, overwrite=overwrite)
     except BaseException:
         logger.info(
-            "without poses it is: %s; find them with: evsplat poses %s --out %s",
-            *(unposed, unposed, out),
+            "without poses it is: %s; find them with: %s",
+            unposed,
+            command("poses", unposed, "--out", out),
         )
         raise
     remove_folder(unposed)

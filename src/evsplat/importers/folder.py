@@ -12,7 +12,7 @@ from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
-from evsplat.footage import Footage, open_footage
+from evsplat.footage import Footage, TimedPicture, open_footage
 from evsplat.importers.base import (
     GUIDE,
     Importer,
@@ -82,7 +82,7 @@ class Folder(Importer):
         if self.fps is not None:
             check_positive(fps=self.fps)
         images = self._images(source)
-        footage = open_footage(images, self._rate(source, images))
+        footage = open_footage(images, self._rate(source, images), rate_option="--fps")
         exposures = self._exposures(source, footage)
         middles = exposures.sum(axis=1) // 2
         path = self._poses(source)
@@ -96,7 +96,7 @@ class Folder(Importer):
         writer.add_camera("main", *size, **camera)
         seen = frames_with_poses(motion, middles)
         views = _camera_poses(motion)
-        masks = self.masks or source / "masks"
+        masks = _Masks(self._masks(source))
         for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
             if index not in seen:
                 continue
@@ -105,10 +105,10 @@ class Folder(Importer):
                 "main",
                 timed.pixels,
                 (int(exposures[index, 0]), int(exposures[index, 1])),
-                mask=human_mask(masks / f"{timed.name}.png"),
+                mask=masks.of(timed),
                 world_to_camera=views.get(index),
             )
-        notes = add_recorded_events(
+        notes = masks.notes(len(seen)) + add_recorded_events(
             writer,
             self.events or next(iter(sorted(source.glob("events.*"))), None),
             size,
@@ -170,6 +170,18 @@ class Folder(Importer):
         times = footage.times_us + self.start_us
         return np.array([exposure_around(int(time), self.exposure_us) for time in times])
 
+    def _masks(self, source: Path) -> Path | None:
+        """Folder of the masks; None where there is none."""
+        if self.masks is None:
+            folder = source / "masks"
+            return folder if folder.is_dir() else None
+        if not self.masks.is_dir():
+            raise DataError(
+                f"--masks {self.masks}: no such folder, expected one of pictures NAME.png of the "
+                "person, named as the pictures; correct the path."
+            )
+        return self.masks
+
     def _poses(self, source: Path) -> Path | None:
         """The poses; None where there are none, or none are wanted."""
         if self.no_poses:
@@ -201,6 +213,41 @@ class Folder(Importer):
                 f"{GUIDE}."
             )
         return recorded_camera(None, self.focal, size)
+
+
+class _Masks:
+    """Masks of the person, NAME.png for each picture; knows how many there were."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._found = 0
+
+    def of(self, timed: TimedPicture) -> np.ndarray | None:
+        """(H, W) share of the person in a picture; None where it has no mask."""
+        if self._folder is None:
+            return None
+        path = self._folder / f"{timed.name}.png"
+        mask = human_mask(path)
+        if mask is None:
+            return None
+        if mask.shape != timed.pixels.shape[:2]:
+            (height, width), size = mask.shape, timed.pixels.shape
+            raise DataError(
+                f"{path}: has {width}x{height} pixels, expected {size[1]}x{size[0]} as its picture."
+            )
+        self._found += 1
+        return mask
+
+    def notes(self, pictures: int) -> list[str]:
+        """How many of so many pictures have no mask; raises where none of them has."""
+        if self._folder is None or self._found == pictures:
+            return []
+        if not self._found:
+            raise DataError(
+                f"{self._folder}: holds no mask of any picture, expected NAME.png for a picture "
+                "NAME.*; name the masks as the pictures, or leave the folder out."
+            )
+        return [f"{pictures - self._found} of {pictures} pictures have no mask"]
 
 
 def _camera_poses(motion: Motion | None) -> dict[int, np.ndarray]:

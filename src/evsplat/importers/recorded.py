@@ -1,13 +1,15 @@
 """Parts of importers of your own recordings: camera and events."""
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from evsplat.capture.write import CaptureWriter, read_camera
-from evsplat.errors import ConfigError
-from evsplat.events import open_recording
+from evsplat.errors import ConfigError, DataError
+from evsplat.events import EventStream, open_recording
+from evsplat.events.formats.base import SAY_UNIT
 from evsplat.importers.base import check_positive, need
 
 GUESSED_FOV_DEG = 60.0
@@ -65,11 +67,38 @@ def add_recorded_events(
     recording = open_recording(path, width=size[0], height=size[1], repair=repair)
     if not recording.has_polarity:
         return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
+    span: list[int] = []
     writer.set_events(
-        recording.chunks(),
+        _spanning(recording.chunks(), span),
         *size,
         contrast_threshold=contrast,
         simulated=False,
         clock_offset_us=clock_offset_us,
     )
+    _check_clock(path, span, writer.exposed_us, clock_offset_us)
     return list(recording.notes)
+
+
+def _spanning(pieces: Iterable[EventStream], span: list[int]) -> Iterator[EventStream]:
+    """The pieces; times of the first and of the last event so far are put into ``span``, us."""
+    for piece in pieces:
+        if len(piece):
+            span[:] = span[0] if span else int(piece.t[0]), int(piece.t[-1])
+        yield piece
+
+
+def _check_clock(path: Path, span: list[int], exposed: tuple[int, int], offset_us: int) -> None:
+    """Raise where no event is at the time of a picture: the clocks, or a unit, do not match."""
+    if not span:
+        raise DataError(
+            f"{path}: holds no event, expected those of the recording; give another file, or leave "
+            "the events out."
+        )
+    (first, last), (start, end) = (span[0] + offset_us, span[1] + offset_us), exposed
+    if last < start or first >= end:
+        raise DataError(
+            f"{path}: its events are from {first} to {last} us and the pictures from {start} to "
+            f"{end} us, expected events while there are pictures; give --clock-offset-us "
+            f"{start - span[0]} if the events begin with the first picture, or the unit of their "
+            f"times with {SAY_UNIT}."
+        )

@@ -49,7 +49,7 @@ class Video(Importer):
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read the video; see `Importer.write`."""
-        footage = open_footage(source, self.fps)
+        footage = open_footage(source, self.fps, rate_option="--fps")
         if self.exposure_us is None:
             raise ConfigError(
                 f"{source}: how long the shutter was open is not known, and blur is made of it; "

@@ -13,6 +13,7 @@ from evsplat.body import BodyTrack, silhouette
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.capture.finding import Finding, Findings
+from evsplat.commands import command
 from evsplat.errors import DataError
 from evsplat.events import count_map
 from evsplat.inspection.belonging import Belonging, judge_body
@@ -49,12 +50,13 @@ def check_body(capture: TrainingCapture, *, refuse: bool) -> Belonging:
         raise DataError(
             f"{capture.body_file.path}: the posed body is in none of the "
             f"{len(capture.train_frames)} training pictures, expected it in view of the camera; "
-            f"correct poses or camera (evsplat inspect {capture.path} draws them)."
+            f"correct poses or camera ({command('inspect', capture.path)} draws them)."
         )
     if found.verdict == "another" and refuse:
         raise DataError(
-            f"{capture.body_file.path}: {found.sentence}; give the body of this recording (evsplat "
-            f"inspect {capture.path} draws it), or pass --any-body to train on this one."
+            f"{capture.body_file.path}: {found.sentence}; give the body of this recording "
+            f"({command('inspect', capture.path)} draws it), or pass --any-body to train on this "
+            "one."
         )
     if found.verdict != "belongs":
         logger.warning("%s: %s.", capture.body_file.path, found.sentence)

@@ -18,6 +18,7 @@ from evsplat.body.smpl import smpl_body
 from evsplat.camera import Camera
 from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.derive import Derivation, derived_capture
+from evsplat.commands import command
 from evsplat.config import to_dict
 from evsplat.errors import ConfigError
 from evsplat.files import refuse_existing, try_target, write_text
@@ -285,5 +286,5 @@ def _summary(out: Path, track: BodyTrack, landmarks: Landmarks, seconds: dict[st
     return (
         f"written: {out} ({len(track.times_us)} key poses from {len(landmarks.times_us)} pictures; "
         f"{stages})\nlook at it: {out / 'poses.html'}\n"
-        f"then: evsplat train {out}"
+        f"then: {command('train', out)}"
     )

@@ -182,7 +182,7 @@ def _open(
     camera: Path | str | None,
 ) -> Source:
     if not (source / "capture.json").exists():
-        footage = open_footage(source, source_fps)
+        footage = open_footage(source, source_fps, rate_option="--source-fps")
         return FootageSource(
             footage,
             None if body is None else Path(body),

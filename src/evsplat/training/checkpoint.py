@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from evsplat.commands import command
 from evsplat.errors import DataError, OutputError
 from evsplat.files import remove_file, write_pieces
 from evsplat.models.model import Model
@@ -58,8 +59,8 @@ def kept_sentence(folder: Path) -> str:
     if newest is None:
         return "No checkpoint is kept: once that is mended, train again."
     return (
-        f"The checkpoint of step {int(newest.stem)} is kept: once that is mended, go on with "
-        f"'evsplat train CAPTURE --out {folder.parent} --resume'."
+        f"The checkpoint of step {int(newest.stem)} is kept: once that is mended, go on with: "
+        f"{command('train', 'CAPTURE', '--out', folder.parent, '--resume')}."
     )
 
 

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import shlex
 import signal
 import sys
 import time
@@ -16,6 +15,7 @@ from typing import Any
 from tqdm import tqdm
 
 from evsplat.capture import Capture, load_capture
+from evsplat.commands import command
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
 from evsplat.devices import use_threads
@@ -66,7 +66,8 @@ class Stopped(KeyboardInterrupt):
     """Training was interrupted by the user after the step was finished and saved."""
 
     def __init__(self, run: Path) -> None:
-        super().__init__(f"Stopped and saved. Go on with: evsplat train ... --out {run} --resume")
+        again = command("train", "...", "--out", run, "--resume")
+        super().__init__(f"Stopped and saved. Go on with: {again}")
         self.run = run
 
 
@@ -281,9 +282,9 @@ def _ended(clock: Clock, capture: Path, run: Path) -> str:
     why = "its schedule is finished" if clock.done else "the time that it was given is over"
     if clock.done and clock.ends_at:
         why += ", whose end was brought forward since little more was to come"
-    more = ["--out", str(run), "--resume", "--iterations", str(2 * clock.iteration)]
-    command = shlex.join(["evsplat", "train", str(capture), *more])
-    return f"training ended after {clock.iteration:,} steps: {why}. To go on: {command}"
+    more = "--resume", "--iterations", str(2 * clock.iteration)
+    longer = command("train", capture, "--out", run, *more)
+    return f"training ended after {clock.iteration:,} steps: {why}. To go on: {longer}"
 
 
 def _log_line(trainer: Trainer, report: StepReport) -> dict[str, object]:

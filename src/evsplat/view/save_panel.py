@@ -7,6 +7,7 @@ import viser
 from PIL import Image
 
 from evsplat.camera import Camera
+from evsplat.commands import command
 from evsplat.errors import DataError
 from evsplat.export.gaussians import FileKind, facts_of, file_rotation, write_file
 from evsplat.files import scratch_folder
@@ -100,7 +101,7 @@ class SavePanel:
         keys = self._keys or [self.client.compositor.camera(self.client.current)]
         name = f"{self.client.compositor.capture.name}-camera-path.json"
         self._send(name, json.dumps(camera_path_document(keys), indent=1).encode())
-        self._notify(name, f"{len(keys)} key frames: evsplat render RUN --path {name}")
+        self._notify(name, f"{len(keys)} key frames: {command('render', 'RUN', '--path', name)}")
 
     def _stem(self, request: ViewRequest) -> str:
         """File name of a request's instant, without ending."""

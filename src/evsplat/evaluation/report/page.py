@@ -1,12 +1,12 @@
 """The report page, put together from its sections."""
 
-import shlex
 from collections.abc import Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 
+from evsplat.commands import command
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.clip import make_clip
 from evsplat.evaluation.report.configuration import configuration, duration, made_with
@@ -279,16 +279,15 @@ def _next_steps(source: Source) -> str:
     """Commands that go on from the run, with its folder as it was named."""
     if not source.log:  # a method that does not train has nothing to animate
         return ""
-    run = shlex.quote(str(source.folder))
+    run = source.folder
     steps = {
-        "Look at it from anywhere, at any time": f"evsplat view {run}",
-        "Film another motion": f"evsplat render {run} --motion spin --path orbit",
-        "Share a page in which the person can be posed": f"evsplat export {run} avatar",
-        "Check a recording of your own (docs/own-capture.md)": "evsplat inspect FOLDER",
+        "Look at it from anywhere, at any time": command("view", run),
+        "Film another motion": command("render", run, *"--motion spin --path orbit".split()),
+        "Share a page in which the person can be posed": command("export", run, "avatar"),
+        "Check a recording of your own (docs/own-capture.md)": command("inspect", "FOLDER"),
     }
     listed = "".join(
-        f"<li>{escape(what)}: <code>{escape(command)}</code></li>"
-        for what, command in steps.items()
+        f"<li>{escape(what)}: <code>{escape(typed)}</code></li>" for what, typed in steps.items()
     )
     return section("What to do next", "", f"<ul>{listed}</ul>")
 

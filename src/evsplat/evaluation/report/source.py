@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from evsplat.capture import Capture
+from evsplat.commands import command
 from evsplat.config import load_yaml
 from evsplat.errors import DataError
 from evsplat.evaluation.splits import name_of
@@ -42,9 +43,9 @@ class Source:
         """Read the files of an evaluated run; only the split's metrics.json must be there."""
         metrics_file = folder / name_of("metrics", split, ".json")
         if not metrics_file.is_file():
-            option = "" if split == "test" else f" --split {split}"
+            option = () if split == "test" else ("--split", split)
             raise DataError(
-                f"{metrics_file}: file not found; run `evsplat evaluate {folder}{option}` first."
+                f"{metrics_file}: file not found; first run {command('evaluate', folder, *option)}."
             )
         config, versions = folder / "config.yaml", folder / "versions.json"
         return cls(

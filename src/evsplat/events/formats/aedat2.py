@@ -64,7 +64,8 @@ class Aedat2(Source):
             if options.width is None or options.height is None:
                 raise DataError(
                     f"{self.path}: recorded by chip {chip_name or '(not named)'}, expected one of "
-                    f"{', '.join(_CHIPS)}; for another DAVIS give width and height."
+                    f"{', '.join(_CHIPS)}; for another DAVIS give --width and --height of "
+                    "'evsplat convert'."
                 )
             chip = _davis(options.width, options.height)
             self.notes.append(f"chip {chip_name or '(not named)'} is read as a DAVIS")

@@ -16,6 +16,9 @@ from evsplat.errors import DataError
 from evsplat.options import ReadOptions
 from evsplat.untrusted.faults import open_bytes
 
+SAY_COLUMNS = "--columns of 'evsplat convert'"
+SAY_UNIT = "--time-unit of 'evsplat convert'"
+"""How a user says what a table does not, in the words of the verb that takes it."""
 BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
 _BUFFER_BYTES = 1 << 16

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import BLOCK_EVENTS, Damage, RawEvents
+from evsplat.events.formats.base import BLOCK_EVENTS, SAY_UNIT, Damage, RawEvents
 from evsplat.events.stream import EventStream
 
 _MAX_GAP_AT_WRAP_US = 60_000_000
@@ -84,7 +84,8 @@ class _Settled:
         if low < -_MAX_TIME_US or high > _MAX_TIME_US:
             raise DataError(
                 f"{self._damage.path}: events {index} to {index + len(t) - 1} have times from "
-                f"{low} to {high} us; no recording is that long, check the file or time_unit."
+                f"{low} to {high} us; no recording is that long, check the "
+                f"file, or give the unit of a table with {SAY_UNIT}."
             )
         if rising:
             return (t + self._shift_us if self._shift_us else t), True

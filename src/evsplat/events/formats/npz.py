@@ -8,6 +8,7 @@ import numpy as np
 from evsplat.errors import DataError
 from evsplat.events.formats.base import (
     BLOCK_EVENTS,
+    SAY_COLUMNS,
     RawEvents,
     Source,
 )
@@ -63,11 +64,11 @@ def _components(
         order = columns if isinstance(columns, tuple) else table_order(path, tables[0], options)
         if len(order) != tables[0].shape[1]:
             raise DataError(
-                f"{path}: its table has {tables[0].shape[1]} columns, columns names {len(order)}."
+                f"{path}: its table has {tables[0].shape[1]} columns, --columns names {len(order)}."
             )
         return {name: tables[0][:, i] for i, name in enumerate(order) if name in "txyp"}
     shapes = ", ".join(f"{key} {array.shape}" for key, array in arrays.items())
     raise DataError(
         f"{path}: no events found among its arrays ({shapes}); expected t, x, y, p (or xy, t, "
-        "p, or one table), or say which is which with columns."
+        f"p, or one table), or say which is which with {SAY_COLUMNS}."
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import RawEvents
+from evsplat.events.formats.base import SAY_COLUMNS, SAY_UNIT, RawEvents
 from evsplat.options import ReadOptions
 
 NAMES = {
@@ -42,7 +42,7 @@ class Table:
         t = self._columns["t"]
         self.unit = time_unit or guess_time_unit(t)
         if time_unit is None and self.unit != "us":
-            self.notes.append(f"times are taken for {self.unit}: give time_unit if they are not")
+            self.notes.append(assumed_unit(self.unit))
         if "p" not in components:
             self.has_polarity = False
             self.notes.append("no polarity: the recording says that pixels changed, not how")
@@ -76,7 +76,7 @@ def to_polarity(values: np.ndarray, where: str, first: int) -> np.ndarray:
         at = int(np.argmax(strange))
         raise DataError(
             f"{where}: polarity of event {first + at} is {values[at]}, expected 0 and 1, or -1 and "
-            "1; name the columns with columns."
+            f"1; name the columns with {SAY_COLUMNS}."
         )
     return values.astype(np.int8)
 
@@ -96,7 +96,7 @@ def table_order(path: Path, table: np.ndarray, options: ReadOptions) -> str:
     if len(fits) != 1:
         found = f"could be {' or '.join(fits)}" if fits else "are of no known order"
         raise DataError(
-            f"{path}: its {table.shape[1]} columns {found}; say which is which with columns."
+            f"{path}: its {table.shape[1]} columns {found}; say which is which with {SAY_COLUMNS}."
         )
     return fits[0]
 
@@ -132,6 +132,11 @@ def match_names(given: Iterable[str], wanted: Mapping[str, str] | None = None) -
     return found
 
 
+def assumed_unit(unit: str) -> str:
+    """The note that times are read in a unit that the file does not tell."""
+    return f"times are taken for {unit}; if they are not, write the file anew with {SAY_UNIT}"
+
+
 def guess_time_unit(t: np.ndarray) -> str:
     """Integers are microseconds (nanoseconds above 1e17), numbers with a fraction are seconds."""
     if t.dtype.kind in "iu" or not (t != np.floor(t)).any():
@@ -149,13 +154,13 @@ def to_microseconds(t: np.ndarray, unit: str, where: str, first: int = 0) -> np.
             raise DataError(f"{where}: time of event {first + at} is {t[at]}, expected a number.")
     if unit == "s" and len(t) and float(np.abs(t).max()) > _MAX_SECONDS:
         raise DataError(
-            f"{where}: times up to {float(t.max()):g} are taken for seconds; give time_unit (s, "
-            "ms, us or ns)."
+            f"{where}: times up to {float(t.max()):g} are taken for seconds; give their unit "
+            f"with {SAY_UNIT}."
         )
     if len(t) and max(-float(t.min()), float(t.max())) * _PER_US[unit] > _MAX_TIME_US:
         raise DataError(
             f"{where}: times from {t.min()} to {t.max()} {unit} are beyond any recording; check "
-            "the file or time_unit."
+            f"the file, or give {SAY_UNIT}."
         )
     if t.dtype.kind == "f":
         return np.rint(t * _PER_US[unit]).astype(np.int64)

@@ -6,9 +6,10 @@ import numpy as np
 
 from evsplat.compiled import native_for
 from evsplat.errors import DataError
-from evsplat.events.formats.base import ByteReader, RawEvents, Source
+from evsplat.events.formats.base import SAY_COLUMNS, ByteReader, RawEvents, Source
 from evsplat.events.formats.table import (
     NO_POLARITY,
+    assumed_unit,
     guess_time_unit,
     match_names,
     table_order,
@@ -71,7 +72,7 @@ class Text(Source):
             if not {"t", "x", "y"} <= set(named):
                 raise DataError(
                     f"{self.path}: its columns are named {', '.join(file.names)}; say which are "
-                    "t, x, y and p with columns."
+                    f"t, x, y and p with {SAY_COLUMNS}."
                 )
             component = {name: key for key, name in named.items()}
             return [component.get(name, "") for name in file.names]
@@ -87,16 +88,16 @@ class Text(Source):
             given = tuple(table_order(self.path, file.sample, options))
         if not isinstance(given, tuple) or len(given) != file.fields:
             raise DataError(
-                f"{self.path}: has {file.fields} columns and columns names {len(given)}; give one "
-                "name per column, '-' to pass over one."
+                f"{self.path}: has {file.fields} columns and --columns names {len(given)}; give "
+                "one name per column, '-' to pass over one."
             )
         columns = [name for name in given if name != _PASSED_OVER]
         if not {"t", "x", "y"} <= set(columns) <= set(_COMPONENTS) or len(set(columns)) < len(
             columns
         ):
             raise DataError(
-                f"{self.path}: columns is {','.join(given)}, expected t, x, y and perhaps p, each "
-                "once, and '-' for what to pass over."
+                f"{self.path}: --columns is {','.join(given)}, expected t, x, y and perhaps p, "
+                "each once, and '-' for what to pass over."
             )
         return ["" if name == _PASSED_OVER else name for name in given]
 
@@ -106,7 +107,7 @@ class Text(Source):
         whole = not len(times) or self._file.whole_times[column]
         unit = guess_time_unit(times.astype(np.int64) if whole else times)
         if unit != "us":
-            self.notes.append(f"times are taken for {unit}: give time_unit if they are not")
+            self.notes.append(assumed_unit(unit))
         return unit
 
     def _any_polarity(self) -> bool:
