@@ -38,6 +38,15 @@ def test_table_has_the_run_above_the_trivial_rows_and_the_cameras_own_picture():
     assert summary_table(metrics).startswith("No test figures. Every frame and every event trained")
 
 
+def test_without_a_sharp_truth_a_sentence_stands_in_place_of_dashes():
+    regions = dict.fromkeys(_regions(0.0), {"psnr": None, "ssim": None})
+    metrics = {"method": "paper", "protocols": {"standard": regions}, "trivial": {}}
+    metrics |= {"frames": {"test": 3}, "blurry_input": regions}
+    summary = summary_table(metrics)
+    assert "- / -" not in summary and "\n" not in summary
+    assert "Of 3 held-out frames none has a sharp picture to be compared with." in summary
+
+
 def test_what_was_not_measured_is_a_dash():
     regions = _regions(30.0)
     regions["person_mask"] = {"psnr": None, "ssim": None}

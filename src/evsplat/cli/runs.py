@@ -295,10 +295,12 @@ def summary_table(metrics: dict[str, Any]) -> str:
     The last row is what the camera itself took at those times, which no method sees.
     """
     from evsplat.evaluation.splits import count_of, words_of
-    from evsplat.evaluation.tables import composited, terms
+    from evsplat.evaluation.tables import composited, terms, without_truth
 
     if not count_of(metrics):
         return f"No test figures. {terms(metrics)}"
+    if why := without_truth(metrics):
+        return f"No figures. {why} Look at the pictures of the report. {terms(metrics)}"
     rows = {
         metrics["method"]: metrics["protocols"]["standard"],
         **composited(metrics),

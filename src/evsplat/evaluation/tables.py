@@ -168,6 +168,17 @@ def composited(metrics: dict[str, Any]) -> dict[str, Any]:
     return {"on_median_background": metrics["composited"]["standard"]}
 
 
+def without_truth(metrics: dict[str, Any]) -> str | None:
+    """A sentence where no frame that was measured has a sharp picture; None where one has."""
+    rows = [metrics["protocols"]["standard"], metrics.get("blurry_input") or {}]
+    if not count_of(metrics) or any(row.get("full", {}).get("psnr") is not None for row in rows):
+        return None
+    return (
+        f"Of {count_of(metrics)} {words_of(metrics).frames} none has a sharp picture to be compared "
+        "with."
+    )
+
+
 def terms(metrics: dict[str, Any]) -> str:
     """Terms of the run: a sentence on what training saw, and one on poses that were not given."""
     policy = policy_of(metrics)
@@ -183,12 +194,14 @@ def missing_networks(metrics: dict[str, Any]) -> list[str]:
 def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
     """Write metrics.md and metrics.tex, or those of training frames (metrics_train.md ...)."""
     count, words, split = count_of(metrics), words_of(metrics), split_of(metrics)
-    tables = tables_of(metrics) if count else []
+    why = without_truth(metrics)
+    tables = tables_of(metrics) if count and not why else []
     if views := metrics["novel_views"]:
         tables.append(_table("Novel views", "Protocol standard.", views, {}))
     frames = words.title.lower()
-    means = f"Means over {count} {frames} against the sharp truth. " if count else ""
-    intro = f"{means}{terms(metrics)} {LEGEND.format(second='in italics')}"
+    means = f"Means over {count} {frames} against the sharp truth." if count else None
+    legend = LEGEND.format(second="in italics") if tables else None
+    intro = " ".join(filter(None, (why or means, terms(metrics), legend)))
     title = f"{metrics['method']} on {metrics['capture']}"
     notes = [*metrics.get("remarks", ()), *missing_networks(metrics)]
     page = markdown(title, intro, tables, notes)

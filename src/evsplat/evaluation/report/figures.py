@@ -14,6 +14,7 @@ from evsplat.evaluation.tables import (
     missing_networks,
     tables_of,
     terms,
+    without_truth,
 )
 from evsplat.pages import folded, section
 
@@ -38,10 +39,8 @@ def figures(source: Source) -> str:
         else ""
     )
     count, frames = count_of(metrics), words_of(metrics).frames
-    measured = (
+    measured = without_truth(metrics) or (
         f"Means over {count} {frames} against the sharp picture at mid-exposure."
-        if first.headings
-        else f"{count} frames were held out, and none has a sharp picture to be compared with."
     )
     return section(
         "Figures",
