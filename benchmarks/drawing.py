@@ -33,8 +33,8 @@ from evsplat.models.discs import model as discs_model
 from evsplat.render import Backdrop
 from evsplat.shipped import demo_capture
 from evsplat.training import load_run, train
-from evsplat.training import run as run_module
-from evsplat.training.run import GaussianReconstruction
+from evsplat.training import reconstruction as run_module
+from evsplat.training.reconstruction import GaussianReconstruction
 
 LIMITS_MS = {256: 20.0, 512: 35.0, 1080: 90.0}
 STEPS = 300

@@ -36,7 +36,8 @@ from evsplat.capture import load_capture
 from evsplat.config import override
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.shipped import demo_capture
-from evsplat.training.run import GaussianReconstruction, Run
+from evsplat.training.reconstruction import GaussianReconstruction
+from evsplat.training.run import Run
 from evsplat.view.request import Motion
 from evsplat.view.server import Viewer
 

@@ -7,7 +7,7 @@ import torch
 
 from evsplat.capture import load_capture
 from evsplat.export import run as exporting
-from evsplat.training.run import GaussianReconstruction
+from evsplat.training.reconstruction import GaussianReconstruction
 
 from ..small_model import built
 

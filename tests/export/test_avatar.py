@@ -30,7 +30,7 @@ from evsplat.export.bake import measure_loss
 from evsplat.export.cloud import cloud_of
 from evsplat.models.at_rest import SkinnedGaussians, mean_at_rest
 from evsplat.render import Splats
-from evsplat.training.run import GaussianReconstruction
+from evsplat.training.reconstruction import GaussianReconstruction
 
 from ..body.helpers import reference_bones
 from ..small_model import built

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from evsplat.body import BodyTrack
 from evsplat.capture import load_capture
 from evsplat.models.drawing import draw_depth
-from evsplat.training.run import GaussianReconstruction
+from evsplat.training.reconstruction import GaussianReconstruction
 
 from ..small_model import built
 

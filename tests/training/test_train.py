@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,13 +16,15 @@ import yaml
 from safetensors.torch import save_file
 
 from evsplat.cli import main
-from evsplat.config import load_yaml
+from evsplat.config import load_yaml, to_dict
+from evsplat.config_docs import save_yaml
 from evsplat.errors import BackendError, ConfigError, DataError
+from evsplat.methods import TRAINABLE, method_config
 from evsplat.training import load_run, train
 from evsplat.training.bad_steps import MAX_BAD_STEPS
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.clock import Clock
-from evsplat.training.run import RunFolder, read_config
+from evsplat.training.run import RunFolder, _settings_of, read_config
 from evsplat.training.train import _ended
 from evsplat.training.trainer import Trainer
 from evsplat.untrusted.text import read_json
@@ -331,6 +334,35 @@ def test_a_run_of_the_version_before_says_what_became_of_its_settings(tiny_captu
         assert "versions.json beside it names it" in advice and "train again" in advice
 
 
+@pytest.mark.parametrize("method", list(TRAINABLE))
+def test_settings_read_back_have_the_digest_of_those_that_were_written(tmp_path, method):
+    config = method_config(method, {}, where="defaults")
+    save_yaml(tmp_path / "config.yaml", config, method=method)
+    written = _settings_of({"method": method, **to_dict(config)})
+    assert _settings_of(load_yaml(tmp_path / "config.yaml")) == written
+
+
+def test_settings_edited_after_the_start_are_refused(tiny_capture, tmp_path, capsys):
+    capture, out = tiny_capture(frames=10), tmp_path / "my run"
+    train(capture, out=out, iterations=2, overrides=small("evsplat"))
+    path = out / "config.yaml"
+    written = path.read_text()
+    path.write_text("# a comment changes nothing\n" + written)
+    train(capture, out=out, resume=True, iterations=3)
+    path.write_text(re.sub("(?m)^event_weight: .*", "event_weight: 0.125", written))
+    before = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    capsys.readouterr()
+    assert main(["train", str(capture), "--out", str(out), "--resume", "--iterations", "4"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"{path}: its settings are others than" in said
+    assert f"evsplat train CAPTURE --config '{path}' --out NEW" in said
+    assert before == {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    with pytest.raises(ConfigError, match="its settings are others"):
+        load_run(out)
+    path.write_text(written)
+    assert load_run(out).iteration == 3
+
+
 @pytest.mark.parametrize("changed", ["capture", "policy"])
 def test_what_was_trained_on_is_no_test_frame_later(tiny_capture, tmp_path, changed):
     path = tiny_capture(frames=10)
@@ -338,6 +370,9 @@ def test_what_was_trained_on_is_no_test_frame_later(tiny_capture, tmp_path, chan
     out = train(path, out=tmp_path / "run", iterations=2, overrides=small("evsplat"), use=use)
     assert load_run(out).capture.name
     if changed == "policy":
+        facts = read_json(out / "versions.json")
+        del facts["settings"]  # of a version that did not record them
+        (out / "versions.json").write_text(json.dumps(facts))
         settings = (out / "config.yaml").read_text()
         (out / "config.yaml").write_text(settings.replace("use: everything", "use: training"))
     else:

@@ -19,7 +19,8 @@ from PIL import Image  # noqa: E402
 
 from evsplat.capture import load_capture  # noqa: E402
 from evsplat.film.camera_path import read_camera_path  # noqa: E402
-from evsplat.training.run import GaussianReconstruction, Run  # noqa: E402
+from evsplat.training.reconstruction import GaussianReconstruction  # noqa: E402
+from evsplat.training.run import Run  # noqa: E402
 from evsplat.view.request import Motion  # noqa: E402
 from evsplat.view.server import Viewer  # noqa: E402
 from evsplat.view.viewed_run import ViewedRun  # noqa: E402

@@ -10,7 +10,8 @@ import torch
 from evsplat.capture import load_capture
 from evsplat.film import Look
 from evsplat.film.surroundings import Room
-from evsplat.training.run import GaussianReconstruction, Run
+from evsplat.training.reconstruction import GaussianReconstruction
+from evsplat.training.run import Run
 from evsplat.view.posing import HeldPose, PoseSlider, turned
 from evsplat.view.request import Motion
 from evsplat.view.viewed_run import ViewedRun

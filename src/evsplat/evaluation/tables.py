@@ -174,8 +174,8 @@ def without_truth(metrics: dict[str, Any]) -> str | None:
     if not count_of(metrics) or any(row.get("full", {}).get("psnr") is not None for row in rows):
         return None
     return (
-        f"Of {count_of(metrics)} {words_of(metrics).frames} none has a sharp picture to be compared "
-        "with."
+        f"Of {count_of(metrics)} {words_of(metrics).frames} none has a sharp picture to be "
+        "compared with."
     )
 
 

@@ -25,7 +25,7 @@ from evsplat.files import new_folder, write_json, write_text
 from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.models.correctives import Correctives
 from evsplat.models.discs.shading import SurfaceLight
-from evsplat.training.run import GaussianReconstruction
+from evsplat.training.reconstruction import GaussianReconstruction
 
 BONES_EACH = 4
 _MOST_JOINTS = 256

@@ -20,7 +20,8 @@ from evsplat.methods.reconstruction import Parts
 from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.render import Splats, render
 from evsplat.similarity import psnr
-from evsplat.training.run import GaussianReconstruction, Run
+from evsplat.training.reconstruction import GaussianReconstruction
+from evsplat.training.run import Run
 
 logger = logging.getLogger(__name__)
 

@@ -17,7 +17,8 @@ from evsplat.film import camera_at
 from evsplat.film.camera_path import check_camera
 from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import FileKind, UpAxis
-from evsplat.training.run import GaussianReconstruction, Run
+from evsplat.training.reconstruction import GaussianReconstruction
+from evsplat.training.run import Run
 
 _AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 ALWAYS_Y_UP = {"spz": "right, up, back (RUB)", "gltf": "+Y up"}

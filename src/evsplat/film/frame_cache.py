@@ -17,7 +17,7 @@ from evsplat.errors import DataError
 from evsplat.files import atomic_path, make_folder, remove_folder, write_json
 from evsplat.film.looks import Exposure, Look
 from evsplat.names import checked_name
-from evsplat.training.run import GaussianReconstruction
+from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.untrusted.pictures import read_picture
 from evsplat.untrusted.text import read_json
 

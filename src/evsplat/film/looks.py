@@ -14,7 +14,7 @@ from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import Shown
 from evsplat.pictures import Transfer, decode, encode, luminance, shown
 from evsplat.pictures.colours import colours
-from evsplat.training.run import GaussianReconstruction
+from evsplat.training.reconstruction import GaussianReconstruction
 
 Exposure = np.ndarray
 """A picture as it is cached: (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16."""

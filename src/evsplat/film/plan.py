@@ -16,7 +16,7 @@ from evsplat.film.frame_cache import FilmFrame
 from evsplat.film.motion import load_motion_of
 from evsplat.film.surroundings import Painted, Room
 from evsplat.options import Film
-from evsplat.training.run import GaussianReconstruction
+from evsplat.training.reconstruction import GaussianReconstruction
 
 _HELD_SECONDS = 4.0
 

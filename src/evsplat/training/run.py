@@ -1,8 +1,8 @@
 """The run folder: configuration, versions, log, checkpoints; and a trained run read back."""
 
 import hashlib
+import json
 import platform
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -10,27 +10,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
-from evsplat.config import load_yaml
+from evsplat.commands import command
+from evsplat.config import load_yaml, to_dict
 from evsplat.devices import hardware
 from evsplat.errors import ConfigError, DataError
 from evsplat.files import write_json, write_text
 from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
-from evsplat.methods.reconstruction import Parts, Rendering
-from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest, with_correctives
 from evsplat.models.beyond import Beyond
-from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
-from evsplat.models.layers import Layers
 from evsplat.models.model import Model
-from evsplat.models.seen import Seen, draw_values, roughness
+from evsplat.models.seen import Seen, roughness
 from evsplat.options.inputs import check_run_folder
-from evsplat.render import Backdrop, Splats, choose_device, render
+from evsplat.render import Backdrop, choose_device
 from evsplat.training.checkpoint import (
     below,
     check_fits,
@@ -40,6 +35,7 @@ from evsplat.training.checkpoint import (
     load_model,
     misfits_of,
 )
+from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.untrusted.faults import brief
 from evsplat.untrusted.records import read_record
 from evsplat.untrusted.text import parse_json, read_text
@@ -85,7 +81,12 @@ def new_run_folder(capture: Capture, method: str) -> RunFolder:
 
 
 def write_facts(
-    folder: RunFolder, seen: TrainingCapture, method: str, device: str, seed: int
+    folder: RunFolder,
+    seen: TrainingCapture,
+    method: str,
+    config: MethodConfig,
+    device: str,
+    seed: int,
 ) -> None:
     """Record what the run was made with; ``seen`` is what its training is given."""
     versions = {}
@@ -101,6 +102,7 @@ def write_facts(
             "capture_name": seen.name,
             "training_frames": _frames_of(seen),
             "method": method,
+            "settings": _settings_of({"method": method, **to_dict(config)}),
             "device": device,
             "threads": torch.get_num_threads(),
             **hardware(),
@@ -110,163 +112,6 @@ def write_facts(
             "packages": versions,
         },
     )
-
-
-@dataclass(frozen=True)
-class GaussianReconstruction:
-    """A trained model, drawn from any camera at any time of the recording."""
-
-    name: str
-    model: Skinned
-    seen: Seen | None = None
-    """What training saw of the person; None in checkpoints from before its end."""
-    backdrop: Backdrop | None = None
-    """What the scene looked like to the picture before, for a camera that mostly stands still."""
-    shadow_step_px: int = SHADOW_STEP_PX
-    """Shadows are looked up so far apart."""
-    changes: tuple[Callable[[Layers, Camera], Layers], ...] = ()
-    """What a film makes of the posed Gaussians before they are drawn."""
-    beyond: Beyond | None = None
-    """What pictures of person and scene show where nothing is; black without."""
-
-    def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
-        """Pictures at the given times; see `Reconstruction`."""
-        with torch.no_grad():
-            camera, layers = self._posed(camera, times_us)
-            if parts == "all":
-                drawing = draw(
-                    layers, camera, backdrop=self.backdrop, shadow_step_px=self.shadow_step_px
-                )
-                rgb, human = _stacked(drawing.rgb), _stacked(drawing.semantic)
-                alpha = drawing.output.alpha
-                if self.beyond is not None:
-                    rgb = self.beyond.fill(rgb, alpha, camera)
-            else:
-                layer = layers.human if parts == "human" else layers.scene
-                output = render(layer, camera, low_pass=layers.low_pass)
-                rgb, human, alpha = output.image[..., :3], output.image[..., 3], output.alpha
-        # The scene alone is drawn once.
-        shape = len(times_us), camera.height, camera.width
-        return Rendering(
-            rgb=rgb.cpu().clamp(0, 1).expand(*shape, 3),
-            alpha=alpha.cpu().expand(shape),
-            human=human.cpu().clamp(0, 1).expand(shape),
-        )
-
-    def depth(
-        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
-    ) -> Float[Tensor, "T H W"]:
-        """Mean of z in the camera over what a pixel shows, metres; 0 where it shows nothing."""
-        with torch.no_grad():
-            camera, layers = self._posed(camera, times_us)
-            depth = draw_depth(layers, camera, parts=parts).cpu()
-        return depth.expand(len(times_us), *depth.shape[1:])
-
-    def certainties(self) -> Float[Tensor, " H"] | None:
-        """How well training saw each Gaussian of the person, 0 to 1; None where nothing tells."""
-        return None if self.seen is None else self.seen.certainty()
-
-    @torch.no_grad()
-    def certainty(
-        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
-    ) -> Float[Tensor, "T H W"]:
-        """How well training saw what a pixel shows of the person, 0 to 1; the scene counts as 1.
-
-        Raises:
-            DataError: The checkpoint does not tell.
-        """
-        if self.seen is None:
-            raise DataError(
-                "--show certainty: the run's checkpoint does not say what training saw, being from "
-                "before its end or from an older version; go on with 'evsplat train CAPTURE --out "
-                "RUN --resume', which adds it."
-            )
-        camera, layers = self._posed(camera, times_us)
-        human = (
-            self.seen.certainty().to(self.model.device)[None, :, None].expand(len(times_us), -1, -1)
-        )
-        scene = layers.scene.means.new_ones(1, layers.scene.means.shape[1], 1)
-        if parts == "all":
-            return draw_values(layers, camera, human, scene)[..., 0].cpu().clamp(0, 1)
-        layer = replace(layers.human, channels=human)
-        if parts == "scene":
-            layer = replace(layers.scene, channels=scene)
-        picture = render(layer, camera, low_pass=layers.low_pass).image[..., 0].cpu().clamp(0, 1)
-        return picture.expand(len(times_us), *picture.shape[1:])
-
-    def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
-        camera = camera.to(self.model.device)
-        layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
-        for change in self.changes:
-            layers = change(layers, camera)
-        return camera, layers
-
-    @property
-    def track(self) -> BodyTrack:
-        """The recorded motion and its body."""
-        return self.model.track
-
-    def following(self, track: BodyTrack) -> "GaussianReconstruction":
-        """The same person and scene with the motion ``track`` (same body, own times) instead."""
-        return GaussianReconstruction(self.name, self.model.following(track), self.seen)
-
-    def in_new_motion(self, track: BodyTrack) -> "GaussianReconstruction":
-        """As `following`, for poses that were not recorded: neighbours on the skin stay together.
-
-        What was learned fits the recorded poses without that, by 0.2 dB of the person's pixels.
-        """
-        moving = self.following(track)
-        moving.model.stay_together()
-        return moving
-
-    def changed_by(self, *changes: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
-        """The same, with the posed Gaussians changed by each in turn before they are drawn."""
-        return replace(self, changes=changes)
-
-    @property
-    def low_pass(self) -> float:
-        """Variance of the filter of a pixel in its pictures, px^2; viewers of others take 0.3."""
-        return self.model.low_pass
-
-    @torch.no_grad()
-    def splats(
-        self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all"
-    ) -> list[Splats]:
-        """Gaussians that `render` draws, world metres; the person first.
-
-        Channels are R, G, B (sRGB) and the semantic attribute (1 = person). Colours that depend on
-        the direction are those seen from ``camera``.
-        """
-        _, layers = self._posed(camera, times_us)
-        if parts == "all":
-            return [layers.human, shadowed_scene(layers)]
-        return [layers.human if parts == "human" else layers.scene]
-
-    def at_rest(self, views: Sequence[tuple[int, Camera]]) -> SkinnedGaussians:
-        """The person's mean over ``views`` (times in us and their cameras), in canonical space."""
-        return mean_at_rest(self.model, views)
-
-    def with_correctives(
-        self, rest: SkinnedGaussians, views: Sequence[tuple[int, Camera]]
-    ) -> SkinnedGaussians:
-        """A person at rest and what the poses at ``views`` change beyond skinning."""
-        return with_correctives(rest, self.model, views)
-
-    @torch.no_grad()
-    def pose(
-        self, times_us: Sequence[int]
-    ) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T J 4 4"]]:
-        """The recorded motion with what the method corrected of it.
-
-        Rotations of joints against their parents, and bone transforms canonical to world.
-        """
-        rotations, bones = self.model.pose(list(times_us))
-        return rotations.cpu(), bones.cpu()
-
-
-def _stacked(pictures: tuple[Tensor, ...]) -> Tensor:
-    """With an axis of times; one picture is not copied."""
-    return pictures[0][None] if len(pictures) == 1 else torch.stack(pictures)
 
 
 @dataclass(frozen=True)
@@ -319,9 +164,14 @@ class Run:
 
 
 def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
-    """Method, configuration and facts of a run folder."""
+    """Method, configuration and facts of a run folder.
+
+    Settings that were edited after the start are a `ConfigError`: no step was made with them, and a
+    policy would claim what is not so.
+    """
     check_run_folder(folder.path)
     values = load_yaml(folder.config)
+    digest = _settings_of(values)
     method = values.pop("method", DEFAULT_METHOD)
     try:
         config = method_config(method, values, where=str(folder.config))
@@ -331,6 +181,13 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
             "it), open it with that one, or train again."
         ) from None
     facts = read_record(folder.facts, _FACTS, "restore the file, or train again")
+    if facts.get("settings", digest) != digest:
+        again = command("train", "CAPTURE", "--config", folder.config, "--out", "NEW")
+        raise ConfigError(
+            f"{folder.config}: its settings are others than those that the run was started with, "
+            f"by their digest in {folder.facts.name}; put them back, or train a new run with them: "
+            f"{again}"
+        )
     return method, config, facts
 
 
@@ -352,8 +209,17 @@ def check_frames(facts: dict[str, Any], seen: TrainingCapture, folder: RunFolder
 def _frames_of(seen: TrainingCapture) -> str:
     """Number of the training frames, and a digest of their names."""
     names = [frame.name for frame in seen.train_frames]
-    digest = hashlib.sha256("\0".join(names).encode("utf-8", "surrogatepass")).hexdigest()
-    return f"{len(names)}, digest {digest[:16]}"
+    digest = _digest("\0".join(names))
+    return f"{len(names)}, digest {digest}"
+
+
+def _settings_of(values: dict[str, Any]) -> str:
+    """A digest of a method and its settings, as config.yaml gives them."""
+    return _digest(json.dumps(values, sort_keys=True, default=str))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
 def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:

@@ -170,7 +170,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     try_target(folder.path, _KEPT_AND_NEW * _WITH_OPTIMISER * state_bytes)
     if loaded is None:
         if not options.resume:
-            write_facts(folder, seen, start.method, device, start.seed)
+            write_facts(folder, seen, start.method, start.settings, device, start.seed)
             # The last of what resuming needs.
             save_yaml(folder.config, start.settings, method=start.method)
         if fitting is not None and fitting.verdict != "belongs":

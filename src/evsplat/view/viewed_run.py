@@ -25,7 +25,8 @@ from evsplat.film.surroundings import Room
 from evsplat.methods.reconstruction import Parts
 from evsplat.pictures import Transfer
 from evsplat.render import Backdrop
-from evsplat.training.run import GaussianReconstruction, Run, load_run, reload_run
+from evsplat.training.reconstruction import GaussianReconstruction
+from evsplat.training.run import Run, load_run, reload_run
 from evsplat.training.watching import is_training, newest_state, watch
 from evsplat.view.network_cache import set_draft, with_cached_networks
 from evsplat.view.posing import HeldPose, PoseSlider, pose_sliders, turned
