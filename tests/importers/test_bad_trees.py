@@ -339,8 +339,8 @@ BAD_OPTIONS = {
     "option": (("zju-mocap", {"shrin": 2}), "shrin: no such option; did you mean shrink"),
     "camera": (("zju-mocap", {"camera": "5"}), "has no camera '5'; there are 1, 2, 7"),
     "frames": (("zju-mocap", {"frames": (90, 99)}), r"no frame in 90..98; there are 0..5"),
-    "shrink": (("zju-mocap", {"shrink": 0}), "shrink is 0, expected a number above 0"),
-    "fps": (("zju-mocap", {"fps": -1.0}), "fps is -1.0, expected a number above 0"),
+    "shrink": (("zju-mocap", {"shrink": 0}), "--shrink 0: expected a number above 0"),
+    "fps": (("zju-mocap", {"fps": -1.0}), "--fps -1: expected a number above 0"),
 }
 
 

@@ -1,7 +1,9 @@
 """Your own recording: parts found, paired by time and index, and what is missing named."""
 
 import json
-from collections.abc import Callable
+import re
+import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +120,49 @@ def test_pictures_without_a_mask_are_counted(recording: Path, tmp_path: Path) ->
     assert f"1 of {COUNT} pictures have no mask" in capture.provenance["notes"]
 
 
+ODD = {
+    "milliseconds": (
+        "t,x,y,p\n" + "".join(f"{t},1,2,{t % 2}\n" for t in range(240)),
+        {},
+        "events.csv covers 0.1% of the pictures' time .*unit of the times",
+    ),
+    "one polarity": (
+        "t,x,y,p\n" + "".join(f"{t * 1000},1,2,1\n" for t in range(-20, 240)),
+        {},
+        "all 260 of events.csv are brighter, as no scene makes them",
+    ),
+    "an exposure in milliseconds": (
+        "t,x,y,p\n" + "".join(f"{t * 1000},1,2,{t % 2}\n" for t in range(-20, 240)),
+        {"exposure_us": 30.0},
+        "exposure: 30 microseconds, in which nothing blurs",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_what_is_odd_but_possible_is_a_note(recording: Path, tmp_path: Path, what: str) -> None:
+    text, options, note = ODD[what]
+    (recording / "events.csv").write_text(text)
+    options = {"fps": 25.0, "exposure_us": 3e4, "no_poses": True, "start_us": 0} | options
+    import_capture("folder", recording, tmp_path / "out", **options)
+    notes = load_capture(tmp_path / "out").provenance["notes"]
+    assert [bool(re.search(note, said)) for said in notes].count(True) == 1, notes
+    others = [ODD[other][2] for other in ODD if other != what]
+    assert not any(re.search(other, said) for other in others for said in notes), notes
+
+
+def test_poses_of_another_time_are_refused(
+    recording: Path, tmp_path: Path, tiny_capture: Callable
+) -> None:
+    tiny = load_capture(tiny_capture(frames=COUNT))
+    (recording / "poses.npz").unlink()
+    shutil.copy(tiny.path / "body.npz", recording / "body.npz")
+    options = {"fps": 25.0, "exposure_us": 3e4, "start_us": 10**9}
+    with pytest.raises(DataError, match="body.npz: has no pose at the middle of any of the 6 exp"):
+        import_capture("folder", recording, tmp_path / "out", pose_source="exact", **options)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_rig_of_ones_own(recording: Path, tmp_path: Path, tiny_capture: Callable) -> None:
     """body.npz as in a capture goes through as it is."""
     tiny = load_capture(tiny_capture(frames=COUNT))
@@ -151,6 +196,11 @@ def test_without_poses_the_body_is_left_out(recording: Path, tmp_path: Path, how
     assert capture.events is not None and len(capture.events) == 400
     origin = {"absent": "guessed", "not wanted": "calibrated"}[how]
     assert capture.provenance["focal"] == origin
+
+
+def exposures(order: Sequence[int] = range(COUNT), scale: float = 1.0) -> str:
+    starts = [PERIOD_US * index for index in order]
+    return "".join(f"{t * scale:g} {(t + EXPOSURE_US) * scale:g}\n" for t in starts)
 
 
 def rewrite_camera(root: Path, **changes) -> None:
@@ -196,6 +246,54 @@ FAULTS = {
         {},
         DataError,
         r"exposures.txt: has 2 lines of 2 numbers, expected start and end .* of the 6 pictures",
+    ),
+    "exposures with a header": (
+        lambda root: (root / "exposures.txt").write_text("start end\n" + "0 9\n" * 6),
+        {},
+        DataError,
+        "exposures.txt: not a table of numbers .*expected start and end in microseconds of each",
+    ),
+    "exposures in seconds": (
+        lambda root: (root / "exposures.txt").write_text(exposures(scale=1e-6)),
+        {},
+        DataError,
+        "exposures.txt: line 1 of numbers is 0 0.03, expected when .* in microseconds",
+    ),
+    "an exposure that is none": (
+        lambda root: (root / "exposures.txt").write_text(exposures().replace("110000", "nan")),
+        {},
+        DataError,
+        "exposures.txt: line 3 of numbers is 80000 nan, expected when",
+    ),
+    "exposures out of order": (
+        lambda root: (root / "exposures.txt").write_text(exposures((0, 2, 1, 3, 4, 5))),
+        {},
+        DataError,
+        "exposures.txt: line 3 of numbers is 40000 70000, expected a start after 80000",
+    ),
+    "a name twice": (
+        lambda root: save(root / "images" / "shot3.bmp", np.zeros((136, 128), np.uint8)),
+        {},
+        DataError,
+        "shot3.png: has the name of shot3.bmp, expected one picture of each name",
+    ),
+    "a file": (
+        lambda root: (shutil.rmtree(root), root.write_bytes(b"1")),
+        {},
+        DataError,
+        "mine: is a file, expected the folder of the recording; .* 'evsplat import video'",
+    ),
+    "endless exposures": (
+        lambda root: None,
+        {"fps": 25.0, "exposure_us": float("inf")},
+        ConfigError,
+        "--exposure-us inf: expected a number above 0",
+    ),
+    "a clock of no events": (
+        lambda root: (root / "events.csv").unlink(),
+        {"fps": 25.0, "exposure_us": 3e4, "clock_offset_us": 5},
+        ConfigError,
+        "--clock-offset-us: there are no events; give --events, or leave it out",
     ),
     "no folder of masks": (
         lambda root: None,

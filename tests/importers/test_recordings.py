@@ -268,5 +268,7 @@ def test_events_in_the_pixels_of_another_sensor_are_refused(
             exposure_us=EXPOSURE_US,
             events=tmp_path / "events.h5",
         )
-    assert f"convert events.h5 NEW.h5 --width {WIDTH} --height {HEIGHT}" in str(e.value)
+    assert f"convert {tmp_path / 'events.h5'} NEW.h5 --width {WIDTH} --height {HEIGHT}" in str(
+        e.value
+    )
     assert not (tmp_path / "out").exists()

@@ -251,6 +251,7 @@ class CaptureWriter:
     @property
     def exposed_us(self) -> tuple[int, int]:
         """From the first exposure's start to the last one's end, of the frames added so far."""
+        assert self._frames, "frames are added before this is asked"
         spans = np.array([frame["exposure_us"] for frame in self._frames])
         return int(spans[:, 0].min()), int(spans[:, 1].max())
 

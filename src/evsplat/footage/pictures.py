@@ -56,6 +56,14 @@ class FolderFootage:
         )
         if not self._files:
             raise DataError(f"{path}: holds no picture; expected PNG, JPEG, WebP, BMP or TIFF.")
+        by_name: dict[str, Path] = {}
+        for file in self._files:
+            other = by_name.setdefault(file.stem, file)
+            if other is not file:
+                raise DataError(
+                    f"{file}: has the name of {other.name}, expected one picture of each name; "
+                    "remove one, or rename it."
+                )
         self.width, self.height = image_size(self._files[0])
         self.times_us = times_of_rate(len(self._files), fps)
 

@@ -1,5 +1,6 @@
 """Parts that importers share: finding files, checking numbers, cameras, pictures, masks."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,8 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 # Rotations of data sets are rounded; further off than this they are something else.
 _ROTATION_TOLERANCE = 1e-2
 _MOST_DIGITS = 18
+_SHORT_US = 100
+"""Shutters of cameras are open for longer: 125 us are an eight-thousandth of a second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,10 +210,20 @@ def chosen_frames(frames: tuple[int, int] | None, available: list[int], source: 
 
 
 def check_positive(**values: float) -> None:
-    """Options that must be above zero."""
+    """Options that must be above zero, and finite."""
     for name, value in values.items():
-        if not value > 0:
-            raise ConfigError(f"{name} is {value}, expected a number above 0.")
+        if not 0 < value < math.inf:
+            raise ConfigError(f"--{name.replace('_', '-')} {value:g}: expected a number above 0.")
+
+
+def short_exposure(exposure_us: float | None) -> list[str]:
+    """A note where an exposure was meant in other units than microseconds, by its length."""
+    if exposure_us is None or exposure_us >= _SHORT_US:
+        return []
+    return [
+        f"exposure: {exposure_us:g} microseconds, in which nothing blurs; --exposure-us 20000 is a "
+        "fiftieth of a second"
+    ]
 
 
 def exposure_around(time_us: float, exposure_us: float) -> tuple[int, int]:

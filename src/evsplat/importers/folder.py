@@ -20,7 +20,9 @@ from evsplat.importers.base import (
     exposure_around,
     human_mask,
     need,
+    short_exposure,
 )
+from evsplat.importers.exposures import read_exposures
 from evsplat.importers.option_types import (
     Contrast,
     Curve,
@@ -35,7 +37,6 @@ from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_
 from evsplat.importers.recorded import add_recorded_events, recorded_camera
 from evsplat.importers.smpl import chosen_poses
 from evsplat.options.declare import Flag, option
-from evsplat.untrusted.arrays import read_table
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -79,6 +80,11 @@ class Folder(Importer):
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Put the parts together; see `Importer.write`."""
         need(source, "the folder of the recording")
+        if not source.is_dir():
+            raise DataError(
+                f"{source}: is a file, expected the folder of the recording; a video alone is read "
+                "by 'evsplat import video', a DAVIS recording by 'evsplat import davis'."
+            )
         if self.fps is not None:
             check_positive(fps=self.fps)
         images = self._images(source)
@@ -95,6 +101,12 @@ class Folder(Importer):
             camera["transfer"] = self.transfer
         writer.add_camera("main", *size, **camera)
         seen = frames_with_poses(motion, middles)
+        if not seen:
+            raise DataError(
+                f"{path}: has no pose at the middle of any of the {len(middles)} exposures, which "
+                f"are from {middles[0]} to {middles[-1]} us; correct --fps, --start-us or "
+                "exposures.txt, or leave the poses out with --no-poses."
+            )
         views = _camera_poses(motion)
         masks = _Masks(self._masks(source))
         for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
@@ -116,7 +128,7 @@ class Folder(Importer):
             clock_offset_us=self.clock_offset_us,
             repair=self.repair,
         )
-        notes += [note] if note else []
+        notes += [*short_exposure(self.exposure_us), *([note] if note else [])]
         if len(seen) < len(middles):
             notes.append(f"{len(middles) - len(seen)} pictures have no pose and were left out")
         writer.provenance |= {"source": "own recording", "focal": focal, "notes": notes}
@@ -151,16 +163,7 @@ class Folder(Importer):
         """Start and end of every picture's exposure."""
         path, count = source / "exposures.txt", len(footage.times_us)
         if path.exists():
-            try:
-                rows = read_table(path)
-            except ValueError as error:
-                raise DataError(f"{path}: not a table of numbers ({error}).") from None
-            if rows.shape != (count, 2):
-                raise DataError(
-                    f"{path}: has {len(rows)} lines of {rows.shape[-1]} numbers, expected start "
-                    f"and end in microseconds of each of the {count} pictures."
-                )
-            return np.rint(rows).astype(np.int64)
+            return read_exposures(path, count)
         if self.exposure_us is None:
             raise ConfigError(
                 f"{source}: how long the shutter was open is not known; give --exposure-us, or the "

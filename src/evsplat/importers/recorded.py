@@ -1,12 +1,14 @@
 """Parts of importers of your own recordings: camera and events."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from evsplat.capture.write import CaptureWriter, read_camera
+from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
@@ -15,6 +17,10 @@ from evsplat.importers.base import check_positive, need
 GUESSED_FOV_DEG = 60.0
 """Angle of view across the longer side where nothing tells the focal length: a phone held upright
 has about 65 degrees, a DAVIS346 with its usual 6 mm lens 61."""
+_COVERED = 0.9
+"""Share of the pictures' time below which events that cover no more are remarked."""
+_MANY = 100
+"""Events of which some are of either polarity."""
 
 
 def recorded_camera(
@@ -54,51 +60,79 @@ def add_recorded_events(
 ) -> list[str]:
     """Write the events of a recording of any format; gives notes for the user."""
     if path is None:
+        of_events = {"contrast": contrast, "clock-offset-us": clock_offset_us, "repair": repair}
+        for name, value in of_events.items():
+            if value:
+                raise ConfigError(f"--{name}: there are no events; give --events, or leave it out.")
         return ["events: none; simulate them, or give --events"]
     sensor = open_recording(need(path, "the events"), repair=repair)
     if sensor.width is not None and (sensor.width, sensor.height) != size:
-        width, height = size
+        width, height = map(str, size)
+        said = command("convert", path, "NEW.h5", "--width", width, "--height", height)
         raise ConfigError(
             f"{path}: its sensor has {sensor.width}x{sensor.height} pixels, the pictures have "
             f"{width}x{height}, and events have to lie in the pixels of the pictures; warp them "
-            "there first (docs/own-capture.md, two sensors). If they do already, say so: evsplat "
-            f"convert {path.name} NEW.h5 --width {width} --height {height}"
+            f"there first (docs/own-capture.md, two sensors). If they do already, say so: {said}"
         )
     recording = open_recording(path, width=size[0], height=size[1], repair=repair)
     if not recording.has_polarity:
         return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
-    span: list[int] = []
+    passed = _Passed()
     writer.set_events(
-        _spanning(recording.chunks(), span),
+        passed.watching(recording.chunks()),
         *size,
         contrast_threshold=contrast,
         simulated=False,
         clock_offset_us=clock_offset_us,
     )
-    _check_clock(path, span, writer.exposed_us, clock_offset_us)
-    return list(recording.notes)
+    return [*recording.notes, *passed.notes(path, writer.exposed_us, clock_offset_us)]
 
 
-def _spanning(pieces: Iterable[EventStream], span: list[int]) -> Iterator[EventStream]:
-    """The pieces; times of the first and of the last event so far are put into ``span``, us."""
-    for piece in pieces:
-        if len(piece):
-            span[:] = span[0] if span else int(piece.t[0]), int(piece.t[-1])
-        yield piece
+@dataclass
+class _Passed:
+    """Events that were written: from when to when, how many, and how many of them brighter."""
 
+    first_us: int = 0
+    last_us: int = 0
+    count: int = 0
+    brighter: int = 0
 
-def _check_clock(path: Path, span: list[int], exposed: tuple[int, int], offset_us: int) -> None:
-    """Raise where no event is at the time of a picture: the clocks, or a unit, do not match."""
-    if not span:
-        raise DataError(
-            f"{path}: holds no event, expected those of the recording; give another file, or leave "
-            "the events out."
-        )
-    (first, last), (start, end) = (span[0] + offset_us, span[1] + offset_us), exposed
-    if last < start or first >= end:
-        raise DataError(
-            f"{path}: its events are from {first} to {last} us and the pictures from {start} to "
-            f"{end} us, expected events while there are pictures; give --clock-offset-us "
-            f"{start - span[0]} if the events begin with the first picture, or the unit of their "
-            f"times with {SAY_UNIT}."
-        )
+    def watching(self, pieces: Iterable[EventStream]) -> Iterator[EventStream]:
+        """The pieces, one after the other."""
+        for piece in pieces:
+            if len(piece):
+                self.first_us = self.first_us if self.count else int(piece.t[0])
+                self.last_us = int(piece.t[-1])
+                self.count += len(piece)
+                self.brighter += int((piece.p > 0).sum())
+            yield piece
+
+    def notes(self, path: Path, exposed_us: tuple[int, int], offset_us: int) -> list[str]:
+        """What is odd about them; raises where none is at the time of a picture."""
+        if not self.count:
+            raise DataError(
+                f"{path}: holds no event, expected those of the recording; give another file, or "
+                "leave the events out."
+            )
+        first, last, (start, end) = self.first_us + offset_us, self.last_us + offset_us, exposed_us
+        times = f"from {first} to {last} us and the pictures from {start} to {end} us"
+        if last < start or first >= end:
+            raise DataError(
+                f"{path}: its events are {times}, expected events while there are pictures; give "
+                f"--clock-offset-us {start - self.first_us} if the events begin with the first "
+                f"picture, or the unit of their times with {SAY_UNIT}."
+            )
+        notes = []
+        covered = (min(last, end) - max(first, start)) / (end - start)
+        if covered < _COVERED:
+            notes.append(
+                f"events: {path.name} covers {covered:.1%} of the pictures' time (it is {times}); "
+                f"check clock, rate of the pictures and unit of the times ({SAY_UNIT})"
+            )
+        if self.count >= _MANY and self.brighter in (0, self.count):
+            sign = "brighter" if self.brighter else "darker"
+            notes.append(
+                f"events: all {self.count:,} of {path.name} are {sign}, as no scene makes them; "
+                "check its polarity"
+            )
+        return notes

@@ -8,7 +8,7 @@ from tqdm import tqdm
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
 from evsplat.footage import open_footage
-from evsplat.importers.base import Importer, check_positive, exposure_around
+from evsplat.importers.base import Importer, check_positive, exposure_around, short_exposure
 from evsplat.importers.option_types import (
     Contrast,
     Curve,
@@ -73,7 +73,7 @@ class Video(Importer):
             clock_offset_us=self.clock_offset_us,
             repair=self.repair,
         )
-        notes += [note] if note else []
+        notes += [*short_exposure(self.exposure_us), *([note] if note else [])]
         writer.provenance |= {"source": f"video {source.name}", "focal": focal, "notes": notes}
         writer.leave_out_body()
         return notes

@@ -39,5 +39,6 @@ def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
             yield container, stream
     except (av.error.FFmpegError, OSError, UnicodeError) as error:
         raise DataError(
-            f"{path}: cannot be decoded as video ({reason(error)}); encode it again."
+            f"{path}: cannot be decoded as video ({reason(error)}), expected MP4, MOV, MKV, WebM, "
+            "AVI or the like; encode it again."
         ) from error

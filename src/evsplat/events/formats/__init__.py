@@ -87,9 +87,10 @@ def find_format(path: Path, name: str | None = None) -> Format:
         head = peek(path, _HEAD_BYTES)
     found = next((entry for entry in FORMATS.values() if entry.matches(head)), None)
     if found is None:
+        found_there = f"begins with {head[:16]!r}" if head else "is empty"
         raise DataError(
-            f"{path}: not a recording that evsplat reads (begins with {head[:16]!r}); expected one "
-            f"of {', '.join(FORMATS)}."
+            f"{path}: not a recording that evsplat reads ({found_there}); expected one of "
+            f"{', '.join(FORMATS)}."
         )
     if not found.is_stream and path.is_file() and is_gzipped(path):
         raise DataError(f"{path}: a gzipped {found.name} file; gunzip it first.")

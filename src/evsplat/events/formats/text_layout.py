@@ -63,7 +63,8 @@ def inspect_text(path: Path) -> TextFile:
                 if not is_comment and not all(_NAME.fullmatch(field) for field in fields):
                     raise DataError(
                         f"{path}: line {raw[:60]!r} at byte {start} is neither numbers nor names "
-                        "of columns; not a recording that evsplat reads."
+                        "of columns; not a recording that evsplat reads. Expected an event in each "
+                        "line: numbers with a decimal point, between commas, semicolons or blanks."
                     )
                 if len(fields) >= 3:
                     names, size = _read_names([field.decode("latin-1") for field in fields])
@@ -83,7 +84,10 @@ def inspect_text(path: Path) -> TextFile:
                 sample,
                 whole,
             )
-    raise DataError(f"{path}: no line of numbers among its first {_MAX_HEADER_LINES}.")
+    raise DataError(
+        f"{path}: no line of numbers among its first {_MAX_HEADER_LINES} (the last is "
+        f"{raw[:60]!r}); expected an event in each line, with polarity 0 and 1, or -1 and 1."
+    )
 
 
 def _split(line: bytes, delimiter: bytes) -> list[bytes]:
