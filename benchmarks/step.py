@@ -40,14 +40,14 @@ from evsplat.capture import Frame, load_capture
 from evsplat.gaussians import GaussianSet
 from evsplat.methods import TRAINABLE
 from evsplat.models import drawing
-from evsplat.models.discs import DiscModel
+from evsplat.models.discs import DiscModel, shadow_grids
 from evsplat.models.discs import model as discs_model
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.paper import model as paper_model
-from evsplat.objectives import base as objectives_base
 from evsplat.objectives import event_windows, exposure
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event_windows import EventWindows
+from evsplat.pictures import CodedPictures
 from evsplat.render import native as native_backend
 from evsplat.shipped import demo_capture
 from evsplat.training.clock import Clock
@@ -293,8 +293,9 @@ def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
         watch.calls(model, "_light", "light")
         watch.calls(model.lamps, "places", "lamps")
         watch.calls(model.shadow, "place", "casters")
-        watch.calls(model.shadow, "lit", "shadow on the person")
-        watch.calls(model.shadow, "forward", "shadow on the scene")
+        watch.calls(shadow_grids, "shadow_on_scene", "shadow on the scene")
+        watch.calls(shadow_grids, "light_on_body", "shadow on the person")
+        watch.calls(model.shadow, "both", "both shadows, rest")
         watch.calls(model.places, "of", "places of the scene")
         watch.calls(drawing, "_enlarge", "shadow enlarged")
     else:
@@ -308,7 +309,7 @@ def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
     watch.calls(model, "_layers", "posing, rest")
     watch.calls(drawing, "render", "render")
     watch.calls(model, "training_drawing", "drawing, rest")
-    watch.calls(exposure, "mean_light", "mean light")
+    watch.calls(CodedPictures, "mean_light", "mean light")
     watch.calls(exposure, "encode", "encode")
     watch.calls(exposure, "l1_and_ssim", "L1 and SSIM")
     for objective in trainer.composition.objectives:
@@ -316,7 +317,7 @@ def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
         if isinstance(objective, EventWindows):
             watch.calls(objective.events, "between", "events read")
             watch.calls(event_windows, "window_counts", "events counted")
-            watch.calls(objectives_base, "log_luminance", "log luminance")
+            watch.calls(CodedPictures, "log_luminance", "log luminance")
     watch.calls(trainer, "_count", "densification")
     watch.calls(trainer.optimiser, "step", "optimiser")
     watch.calls(trainer.optimiser, "finite", "finite check")

@@ -4,7 +4,7 @@ import threading
 
 import torch
 
-from evsplat.devices import DeviceCache, send, use_threads
+from evsplat.devices import DeviceCache, constant, send, use_threads
 
 
 def maker(log, key, count=100):
@@ -92,3 +92,13 @@ def test_threads_that_draw_take_the_number_that_was_set():
         assert seen == [before + 2] and torch.get_num_threads() == before + 2
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_constant_is_made_once_for_each_kind_and_device():
+    like = torch.zeros(1, dtype=torch.float64)
+    matrix = constant([[1, 2.5], [3, 4]], like)
+    assert torch.equal(matrix, torch.tensor([[1, 2.5], [3, 4]], dtype=torch.float64))
+    assert constant(((1, 2.5), (3, 4)), like) is matrix
+    assert constant([[1, 2.5], [3, 4]], like.float()).dtype == torch.float32
+    assert constant([1.0], like.to("meta")).device.type == "meta"
+    assert constant((True, False), torch.zeros(1, dtype=torch.bool)).tolist() == [True, False]

@@ -1,11 +1,13 @@
 """Tensors on a device: sending them without waiting, keeping recorded data there; what it is."""
 
+import functools
 import os
 import platform
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,6 +27,24 @@ def send(tensor: Tensor, device: torch.device | str) -> Tensor:
     if device.type == "cuda" and not tensor.requires_grad:
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
+
+
+def constant(values: Sequence[Any], like: Tensor) -> Tensor:
+    """Numbers, which may be nested, as a tensor of the kind and on the device of ``like``.
+
+    Not to be written to: it is made once, and sent once.
+    """
+    return kept_constant(_frozen(values), like.device, like.dtype)
+
+
+@functools.lru_cache(maxsize=64)
+def kept_constant(values: tuple[Any, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    """`constant`, by device and kind."""
+    return send(torch.tensor(values, dtype=torch.float64).to(dtype), device)
+
+
+def _frozen(values: Any) -> Any:
+    return tuple(map(_frozen, values)) if isinstance(values, Sequence) else values
 
 
 def use_threads(count: int | None) -> None:

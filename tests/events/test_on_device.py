@@ -10,8 +10,7 @@ from evsplat.capture import load_capture
 from evsplat.devices import DeviceCache
 from evsplat.errors import HeldOutError
 from evsplat.events import EventStream, polarity_counts, window_counts
-from evsplat.events.maps import event_pixels
-from evsplat.events.on_device import DeviceEvents, EventBlocks
+from evsplat.events.on_device import DeviceEvents, EventBlocks, packed
 
 HEIGHT, WIDTH = 5, 7
 
@@ -37,9 +36,7 @@ def test_windows_on_a_device_are_those_of_the_host(seed, count, times, reach_us,
     stream = random_stream(seed, count, signs)
     at = np.sort(np.random.default_rng(seed).integers(1_000, 24_000, times)).tolist()
     within = max(at[0] - reach_us - 500, 0), min(at[-1] + reach_us + 500, 25_000)
-    place = event_pixels(stream, HEIGHT, WIDTH) + (stream.p < 0) * (HEIGHT * WIDTH)
-    columns = (torch.from_numpy(c.astype(np.int32)) for c in (stream.t - 70, place))
-    events = DeviceEvents(*columns, 70, HEIGHT, WIDTH)
+    events = DeviceEvents(packed(stream, -70, HEIGHT, WIDTH), -70, HEIGHT, WIDTH)
     expected = window_counts(stream.between(*within), at, HEIGHT, WIDTH, reach_us=reach_us)
     counts = events.window_counts(at, within, reach_us=reach_us)
     if reach_us == 0:

@@ -69,7 +69,11 @@ class StepAt(SimpleNamespace):
 
     data = DeviceCache("cpu", 0)
 
-    def log_luminance(self, which: slice, eps: float, *, keeps_hue: bool) -> torch.Tensor:
+    @property
+    def pictures(self) -> "StepAt":
+        return self
+
+    def log_luminance(self, eps: float, which: slice, *, keeps_hue: bool) -> torch.Tensor:
         if keeps_hue:
             return log_luminance(self.linear[which].unbind(0), eps, "linear", keeps_hue=True)
         return torch.log(luminance(self.linear[which]) + eps)
@@ -186,7 +190,7 @@ class Elsewhere:
         return make()
 
     def prefetch(self, key, make):
-        assert make().dtype == torch.int32
+        assert make().dtype == torch.int64
 
 
 def test_thresholds_are_held_where_they_started():

@@ -7,6 +7,7 @@ import torch
 
 from evsplat.objectives import Exposure, renders_for
 from evsplat.objectives.exposure import CHROMA_START
+from evsplat.pictures import CodedPictures
 from evsplat.similarity import ssim
 
 
@@ -46,7 +47,7 @@ def test_the_loss_is_that_of_the_mean_in_linear_light_of_what_lies_inside(seed):
         transfer="power",
         frame=frame(),
         times_us=(500, 2_000, 16_000, 30_999),
-        rgb=pictures,
+        pictures=CodedPictures(pictures.unbind(0)),
         observed=lambda _: observed,
     )
     terms = Exposure(None, lambda frame: 3, generator).loss(step)
@@ -82,7 +83,7 @@ def test_renders_before_and_after_the_exposure_count_for_nothing(seed, before, a
         transfer="power",
         frame=frame(),
         times_us=tuple(times),
-        rgb=coded.unbind(0),
+        pictures=CodedPictures(coded.unbind(0)),
         observed=lambda _: observed,
     )
     terms = Exposure(None, lambda frame: 3, generator).loss(step)
@@ -101,7 +102,7 @@ def test_a_black_exposure_has_a_finite_gradient():
         transfer="power",
         frame=frame(),
         times_us=(2_000, 16_000, 30_000),
-        rgb=pictures.unbind(0),
+        pictures=CodedPictures(pictures.unbind(0)),
         observed=lambda _: torch.ones(16, 16, 3),
     )
     Exposure(None, lambda frame: 3, torch.Generator()).loss(step)["l1"].backward()

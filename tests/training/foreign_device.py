@@ -21,6 +21,7 @@ from torch._subclasses.fake_tensor import (
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from evsplat import devices
 from evsplat.render import api, cuda
 
 NAME = "lazy"  # a device type that CPU builds of PyTorch know and never use
@@ -40,6 +41,7 @@ class ForeignDevice(TorchDispatchMode):
     def __init__(self):
         super().__init__()
         self.fake = FakeTensorMode(allow_non_fake_inputs=True)
+        devices.kept_constant.cache_clear()  # they are of another mode
         self.may_wait = True
         self.launches = 0
         """Operations so far that make a GPU work: all but views and memory that is only taken."""

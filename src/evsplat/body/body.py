@@ -142,29 +142,36 @@ def _skinned(
             linear,
         )
         return skinned
-    moved, blended = _PlainSkin.apply(points, weights, bones)
-    return moved, blended, blended[..., :3, :3]
+    plain: tuple[Tensor, Tensor, Tensor] = _PlainSkin.apply(points, weights, bones)
+    return plain
 
 
 class _PlainSkin(torch.autograd.Function):
-    """`skin` in plain torch; both results' gradients are one of the matrices before they go on."""
+    """`skin` in plain torch; all results' gradients are one of the matrices before they go on."""
 
     @staticmethod
     def forward(
         ctx: Any, points: Tensor, weights: Tensor, bones: Tensor
-    ) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N 4 4"]]:
+    ) -> tuple[Float[Tensor, "T N 3"], Float[Tensor, "T N 4 4"], Float[Tensor, "T N 3 3"]]:
         blended = (weights @ bones.flatten(-2)).unflatten(-1, (4, 4))
-        moved = (blended[..., :3, :3] * points[..., None, :]).sum(-1) + blended[..., :3, 3]
+        linear = blended[..., :3, :3]
+        moved = (linear * points[..., None, :]).sum(-1) + blended[..., :3, 3]
+        ctx.set_materialize_grads(False)
         ctx.save_for_backward(points, weights, bones, blended)
-        return moved, blended
+        return moved, blended, linear
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         points, weights, bones, blended = ctx.saved_tensors
-        pad, (by_moved, by_blended) = torch.nn.functional.pad, upstream
+        pad, (by_moved, by_blended, by_linear) = torch.nn.functional.pad, upstream
+        if by_moved is None:
+            by_moved = blended.new_zeros(*blended.shape[:2], 3)
         moving = by_moved[..., None] * pad(points, (0, 1), value=1.0)[..., None, :]
-        flat = (by_blended + pad(moving, (0, 0, 0, 1))).flatten(-2)
+        if by_linear is not None:
+            moving[..., :3].add_(by_linear)
+        whole = pad(moving, (0, 0, 0, 1))
+        flat = (whole if by_blended is None else whole + by_blended).flatten(-2)
         to_points, to_weights, to_bones = ctx.needs_input_grad
         given = [
             (blended[..., :3, :3] * by_moved[..., None]).sum(-2) if to_points else None,

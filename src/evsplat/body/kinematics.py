@@ -68,7 +68,7 @@ class _Frames(torch.autograd.Function):
         frames = pad(rotations, (0, 1, 0, 1, 0, 1)) + tree.bones.to(rotations.dtype)
         for jump in tree.jumps:
             frames = frames.index_select(-3, jump) @ frames
-        frames[..., :-1, :3, 3] += transl[..., None, :]
+        frames[..., :-1, :3, 3].add_(transl[..., None, :])
         ctx.tree = tree
         ctx.save_for_backward(frames)
         return frames[..., :-1, :, :].clone()

@@ -8,6 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from evsplat.devices import constant
+
+_IDENTITY = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
 
 def axis_angle_to_matrix(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of axis-angle vectors (radians), differentiable at zero too, once."""
@@ -23,7 +27,7 @@ class _Exponential(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, vectors: Tensor) -> Tensor:
-        identity = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
+        identity = constant(_IDENTITY, vectors)
         cross = torch.linalg.cross(identity.expand(*vectors.shape, 3), vectors[..., None, :])
         twice = cross @ cross
         angle = vectors.norm(dim=-1)[..., None, None]

@@ -8,11 +8,16 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
-from evsplat.devices import DeviceCache, send
+from evsplat.devices import DeviceCache, constant, send
 from evsplat.events.maps import event_pixels
 from evsplat.events.store import EventStore, Span
+from evsplat.events.stream import EventStream
 
+_TIME_BITS = 32
+_TIME = (1 << _TIME_BITS) - 1
+_NOBODY = 1 << 62
 _BLOCK_US = 200_000
 """Of events that are kept on a device together, eight bytes each."""
 
@@ -21,10 +26,8 @@ _BLOCK_US = 200_000
 class DeviceEvents:
     """Consecutive events on a device."""
 
-    after_us: Int[Tensor, " N"]
-    """Time after ``origin_us``, ascending."""
-    place: Int[Tensor, " N"]
-    """In a flat map of both polarities, ON first."""
+    keys: Int[Tensor, " N"]
+    """Of `packed` events whose times, after ``origin_us``, ascend."""
     origin_us: int
     height: int
     width: int
@@ -36,52 +39,60 @@ class DeviceEvents:
         pixels, count = self.height * self.width, len(times_us)
         edges = self._sent([within_us[0], *times_us, within_us[1]])
         # Parts 0 and T + 2 lie outside, 1 and T + 1 before the first time and from the last one on.
-        part = torch.searchsorted(edges, self.after_us, right=True)
-        maps = self._sums(part * (2 * pixels) + self.place, None, count + 3)[2 : count + 1]
+        part = torch.searchsorted(edges, self.keys & _TIME, right=True)
+        place = self.keys >> _TIME_BITS
+        maps = self._sums(place.add(part, alpha=2 * pixels), None, count + 3)[2 : count + 1]
         if reach_us <= 0 or not len(part):
             return maps
-        begun = self._begun(part, edges[1:-1], reach_us)
+        begun = self._begun(place, part, edges[1:-1], reach_us)
         return maps + begun[1:] - begun[:-1]
 
     def counts_around(self, spans_us: Sequence[Span]) -> Float[Tensor, "T 2 H W"]:
         """Number of ON and of OFF events in each span, which may overlap."""
         starts, ends = self._sent(np.transpose(spans_us).tolist())[..., None]
-        inside = (self.after_us >= starts) & (self.after_us < ends)
+        after = self.keys & _TIME
+        inside = (after >= starts) & (after < ends)
         maps = torch.arange(len(spans_us), device=inside.device)[:, None]
-        place = maps * (2 * self.height * self.width) + self.place
+        place = maps * (2 * self.height * self.width) + (self.keys >> _TIME_BITS)
         return self._sums(place.flatten(), inside.flatten().float(), len(spans_us))
 
     def _begun(
-        self, part: Int[Tensor, " N"], times: Int[Tensor, " T"], reach_us: int
+        self,
+        place: Int[Tensor, " N"],
+        part: Int[Tensor, " N"],
+        times: Int[Tensor, " T"],
+        reach_us: int,
     ) -> Float[Tensor, "T 2 H W"]:
         """As `evsplat.events.begun_counts`: each pixel's last event before a time, its next one."""
         pixels, rows, count = self.height * self.width, len(times) + 3, len(part)
-        index = part * pixels + self.place % pixels
-        order = torch.arange(count, device=part.device)
-        last = order.new_full((rows * pixels,), -1).scatter_reduce_(0, index, order, "amax")
-        first = order.new_full((rows * pixels,), count).scatter_reduce_(0, index, order, "amin")
+        index = (place % pixels).add(part, alpha=pixels)
+        order = torch.arange(1, count + 1, device=part.device)
+        last = order.new_zeros(rows * pixels).scatter_reduce_(0, index, order, "amax")
+        first = order.new_full((rows * pixels,), count + 1).scatter_reduce_(0, index, order, "amin")
         last = last.view(rows, pixels)[1:-2].cummax(0).values
         first = first.view(rows, pixels)[2:-1].flip(0).cummin(0).values.flip(0)
-        before, after = last.clamp_min(0), first.clamp_max(count - 1)
-        place, since = self.place[before], self.after_us[before]
-        gap = self.after_us[after] - since
-        known = (last >= 0) & (first < count) & (place == self.place[after]) & (gap <= reach_us)
-        shares = torch.where(known, (times[:, None] - since).double() / gap, 0.0).float()
-        off = place >= pixels
-        begun = torch.stack([shares.masked_fill(off, 0.0), shares.masked_fill(~off, 0.0)], 1)
+        # Where there is none stands one at either end whose key is far from all others.
+        keys = F.pad(self.keys, (1, 1), value=_NOBODY)
+        before = keys[last]
+        # Keys of two places or polarities lie farther apart than any reach.
+        gap = keys[first] - before
+        known = (gap > 0) & (gap <= reach_us)
+        on = before < pixels << _TIME_BITS
+        of_each = (on[:, None] == constant((True, False), on)[:, None]) & known[:, None]
+        shares = (times[:, None] - (before & _TIME)) / gap
+        begun = torch.where(of_each, shares[:, None], 0.0)
         return begun.unflatten(-1, (self.height, self.width))
 
     def _sent(self, times_us: object) -> Int[Tensor, "..."]:
         """Times after the origin, on the device."""
-        after = (torch.tensor(times_us) - self.origin_us).to(torch.int32)
-        return send(after, self.place.device)
+        return send(torch.tensor(times_us) - self.origin_us, self.keys.device)
 
     def _sums(
         self, place: Int[Tensor, " N"], weights: Float[Tensor, " N"] | None, maps: int
     ) -> Float[Tensor, "M 2 H W"]:
         sums = torch.zeros(maps * 2 * self.height * self.width, device=place.device)
         if weights is None:
-            weights = torch.ones((), device=place.device).expand(len(place))
+            weights = constant((1.0,), sums).expand(len(place))
         return sums.index_add_(0, place, weights).view(maps, 2, self.height, self.width)
 
 
@@ -103,18 +114,25 @@ class EventBlocks:
         keys = list(self._keys(start_us, end_us))
         origin = keys[0][1]
         blocks = [data.get(key, partial(self._block, *key[1:])) for key in keys]
-        times = [block[0] + (key[1] - origin) for key, block in zip(keys, blocks, strict=True)]
-        places = torch.cat([block[1] for block in blocks])
-        return DeviceEvents(torch.cat(times), places, origin, self.events.height, self.events.width)
+        late = [block + (key[1] - origin) for key, block in zip(keys[1:], blocks[1:], strict=True)]
+        joined = torch.cat([blocks[0], *late]) if late else blocks[0]
+        return DeviceEvents(joined, origin, self.events.height, self.events.width)
 
     def _keys(self, start_us: int, end_us: int) -> Iterator[tuple[str, int, int]]:
         low, high = self.events.readable_around(start_us)
         for block in range(start_us // _BLOCK_US, -(-max(end_us, start_us + 1) // _BLOCK_US)):
             yield "events", max(block * _BLOCK_US, low), min((block + 1) * _BLOCK_US, high)
 
-    def _block(self, start_us: int, end_us: int) -> Int[Tensor, "2 N"]:
-        """Times after the start, and places in a map of both polarities."""
+    def _block(self, start_us: int, end_us: int) -> Int[Tensor, " N"]:
+        """Times after the start, and places in a map of both polarities, `packed`."""
         stream = self.events.between(start_us, end_us)
-        height, width = self.events.height, self.events.width
-        place = event_pixels(stream, height, width) + (stream.p < 0) * (height * width)
-        return torch.from_numpy(np.stack([stream.t - start_us, place]).astype(np.int32))
+        return packed(stream, start_us, self.events.height, self.events.width)
+
+
+def packed(stream: EventStream, origin_us: int, height: int, width: int) -> Int[Tensor, " N"]:
+    """A number per event: its place in a flat map of both polarities, ON first, then its time.
+
+    Times are those after ``origin_us``, where none may lie before it, in the lower 32 bits.
+    """
+    place = event_pixels(stream, height, width) + (stream.p < 0) * (height * width)
+    return torch.from_numpy((place << _TIME_BITS) + (stream.t - origin_us))

@@ -11,12 +11,9 @@ from torch.nn import functional as F
 
 from evsplat.camera import Camera
 from evsplat.compiled import native, runs_native
-from evsplat.models.layers import Layers
+from evsplat.models.layers import SHADOW_STEP_PX, Layers
 from evsplat.models.scene_places import LEAST_SCENE, ScenePlaces
 from evsplat.render import Backdrop, RenderOutput, Splats, render, split_channels
-
-SHADOW_STEP_PX = 2
-"""Shadows are soft: they are looked up at every second pixel and interpolated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +61,9 @@ def draw(
         human, scene = _with_centers(human), _with_centers(scene)
     layers = replace(layers, human=human, scene=scene)
     light = None
-    if layers.shadow is not None:
+    if layers.shaded is not None:
+        light = _enlarge(layers.shaded, camera, SHADOW_STEP_PX)
+    elif layers.shadow is not None:
         if places is None:
             places = ScenePlaces() if backdrop is None else backdrop.beside(ScenePlaces)
         factors = layers.shadow(places.of(layers, camera, shadow_step_px))
@@ -79,7 +78,7 @@ def draw(
         static_light=light,
     )
     rgb, semantic = split_channels(output.image, (3, 1))
-    return Drawing(rgb, tuple(s[..., 0] for s in semantic), output, layers)
+    return Drawing(rgb, tuple(s.squeeze(-1) for s in semantic), output, layers)
 
 
 def _behind(rgb: Float[Tensor, "3"], layer: Splats) -> Float[Tensor, "C"]:
@@ -128,7 +127,7 @@ def _enlarge(light: Float[Tensor, "T h w"], camera: Camera, step: int) -> Float[
         large: Tensor = _Enlarge.apply(light, camera.height, camera.width, step)
         return large
     full = F.interpolate(light[:, None], scale_factor=step, mode="bilinear")
-    return full[:, 0, : camera.height, : camera.width]
+    return full.squeeze(1)[:, : camera.height, : camera.width]
 
 
 class _Enlarge(torch.autograd.Function):

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from evsplat.render import LOW_PASS, Splats
 
+SHADOW_STEP_PX = 2
+"""Shadows are soft: they are looked up at every second pixel and interpolated."""
+
 SceneShadow = Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "T H W"]]
 """Factors in 0..1 on the scene's colours at world places, one picture per time."""
 
@@ -31,6 +34,9 @@ class Layers:
     """The person's shadow on the scene."""
     low_pass: float = LOW_PASS
     """Variance of the filter of a pixel, px^2; see `evsplat.render.render`."""
+    shaded: Float[Tensor, "T h w"] | None = None
+    """The shadow at every `SHADOW_STEP_PX`-th pixel of the one picture that will be drawn, where it
+    was found beside that on the person."""
 
     @property
     def times(self) -> int:

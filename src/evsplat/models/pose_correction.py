@@ -102,19 +102,20 @@ class PoseCorrection(nn.Module):
     ) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T 3"]]:
         """Axis-angle vectors, radians, and shifts of the root, metres."""
         times = torch.as_tensor(times_us, dtype=torch.float64, device="cpu")
+        if bool(self.exact) and self.between is not None:
+            turns, shifts = self.between.values(times)
+            return turns * self.between_rad[:, None], shifts * self.between_m
         turns = self.joint_rad.new_zeros(len(times), self.joint_rad.shape[1], 3)
         shifts = self.root_m.new_zeros(len(times), 3)
-        if not bool(self.exact):
-            for name, spline in self._errors():
-                some_turns, some_shifts = spline.values(times)
-                turns = turns + SHARES[name] ** 0.5 * some_turns
-                shifts = shifts + SHARES[name] ** 0.5 * some_shifts
-            joint_rad, root_m = self._expected(times)
-            smoothed, moved = self.smoothing.values(times)
-            return turns * joint_rad[..., None] + smoothed, shifts * root_m + moved
-        if self.between is not None:
-            turns, shifts = self.between.values(times)
-        return turns * self.between_rad[:, None], shifts * self.between_m
+        if bool(self.exact):
+            return turns, shifts
+        for name, spline in self._errors():
+            some_turns, some_shifts = spline.values(times)
+            turns = turns + SHARES[name] ** 0.5 * some_turns
+            shifts = shifts + SHARES[name] ** 0.5 * some_shifts
+        joint_rad, root_m = self._expected(times)
+        smoothed, moved = self.smoothing.values(times)
+        return turns * joint_rad[..., None] + smoothed, shifts * root_m + moved
 
     def price(self, generator: torch.Generator | None = None) -> Float[Tensor, ""]:
         """Squares in units of what is expected, averaged over moving joints, root, axes and keys.

@@ -1,6 +1,7 @@
 """Where in the world each pixel's scene is, without the person: that is where shadows fall."""
 
 from dataclasses import replace
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -9,11 +10,29 @@ from torch.nn import functional as F
 
 from evsplat.camera import Camera
 from evsplat.models.kept import Unchanged
-from evsplat.models.layers import Layers
-from evsplat.render import render, same_values
+from evsplat.render import Splats, render, same_values
 
 LEAST_SCENE = 1e-3
 """Share of a pixel below which its scene has no place of its own."""
+
+
+class WithScene(Protocol):
+    """Layers, or what is known of them before the person's."""
+
+    @property
+    def scene(self) -> Splats:
+        """With a leading axis of one time."""
+
+    @property
+    def low_pass(self) -> float:
+        """Variance of the filter of a pixel, px^2."""
+
+
+class SceneAlone(NamedTuple):
+    """`WithScene` before there is a person."""
+
+    scene: Splats
+    low_pass: float
 
 
 class ScenePlaces:
@@ -33,7 +52,7 @@ class ScenePlaces:
         """The one of the kept places."""
 
     @torch.no_grad()
-    def of(self, layers: Layers, camera: Camera, step: int) -> Float[Tensor, "h w 3"]:
+    def of(self, layers: WithScene, camera: Camera, step: int) -> Float[Tensor, "h w 3"]:
         """Places at every ``step``-th pixel; no gradients, as a shadow is not to move the scene."""
         shape = -(-camera.height // step), -(-camera.width // step), 3
         kept = tuple(self.kept.shape) == shape
@@ -75,7 +94,7 @@ class ScenePlaces:
         self.seen = [state[f"seen{number}"] for number in range(len(state) - 2)]
 
 
-def scene_depth(layers: Layers, camera: Camera) -> Float[Tensor, "H W 2"]:
+def scene_depth(layers: WithScene, camera: Camera) -> Float[Tensor, "H W 2"]:
     """Of each pixel: z of its scene (metres) times the scene's share of it, and that share."""
     scene, pose = layers.scene, camera.world_to_camera
     depth = (scene.means @ pose[2, :3] + pose[2, 3])[..., None]

@@ -14,7 +14,7 @@ from evsplat.devices import DeviceCache
 from evsplat.models.drawing import Drawing
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
-from evsplat.pictures import Transfer, log_luminance
+from evsplat.pictures import CodedPictures, Transfer
 
 ModelType = TypeVar("ModelType", bound=Model)
 
@@ -58,11 +58,10 @@ class Step(Generic[ModelType]):
         """The curve of the frame's camera, by which the pictures are coded."""
         return self.capture.transfer(self.frame)
 
-    def log_luminance(
-        self, which: slice, eps: float, *, keeps_hue: bool = False
-    ) -> Float[Tensor, "T H W"]:
-        """`evsplat.pictures.log_luminance` of some pictures."""
-        return log_luminance(self.rgb[which], eps, self.transfer, keeps_hue=keeps_hue)
+    @cached_property
+    def pictures(self) -> CodedPictures:
+        """The rendered pictures, by their light."""
+        return CodedPictures(self.rgb, self.transfer)
 
     def index(self, time_us: int) -> int:
         """Place of a time among the pictures."""

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.compiled import native, runs_native
-from evsplat.devices import DeviceCache, send
+from evsplat.devices import DeviceCache, constant, send
 from evsplat.events import Span, polarity_counts, window_counts
 from evsplat.events.on_device import EventBlocks
 from evsplat.objectives.base import Objective, Step
@@ -140,7 +140,8 @@ class EventWindows(Objective):
         late = [time + self._late_us for time in step.times_us[kept]]
         low, high = self.events.readable_around(step.frame.mid_us)
         # A sensor compares logarithms of light, before any transfer curve of a camera.
-        brightness = step.log_luminance(kept, self.eps, keeps_hue=step.nominal >= self.hue_from)
+        pulls_at_all = step.nominal >= self.hue_from
+        brightness = step.pictures.log_luminance(self.eps, kept, keeps_hue=pulls_at_all)
         reach = max(_RATE_US, self.ramp_us)
         within = max(late[0] - reach, low), min(late[-1] + reach, high)
         # Events per microsecond at each instant tell what a later clock would have counted.
@@ -157,7 +158,8 @@ class EventWindows(Objective):
             with torch.no_grad():
                 rate = self.sensor.change(*rates.unbind(1))
                 drift = rate[1:] - rate[:-1]
-        return _Seen(brightness, send(counts, brightness.device), drift)
+        sound = step.data.get("sound pixels", lambda: self.noise.sound)
+        return _Seen(brightness, send(counts, brightness.device), drift, sound)
 
     def _counted(
         self, data: DeviceCache, late_us: Sequence[int], within_us: Span, around_us: Sequence[Span]
@@ -196,10 +198,10 @@ class EventWindows(Objective):
         event: Tensor = _Compared.apply(
             seen.brightness,
             self.sensor.thresholds,
-            self.sensor.thresholds.new_zeros(()) if offset is None else offset,
+            offset,
             seen.counts,
             seen.drift,
-            self.noise.sound,
+            seen.sound,
             torch.tensor(each) * (0.5 / pixels),
             self.noise.weight(whole_us) * (0.5 / pixels),
         )
@@ -225,6 +227,8 @@ class _Seen:
     """Events between the times, of either polarity."""
     drift: Float[Tensor, "T-1 H W"] | None
     """Slope of the reported change by the lag of the events' clock, per microsecond."""
+    sound: Float[Tensor, "H W"]
+    """0 at hot pixels, 1 elsewhere."""
 
 
 class _Compared(torch.autograd.Function):
@@ -235,7 +239,7 @@ class _Compared(torch.autograd.Function):
         ctx: Any,
         brightness: Float[Tensor, "T H W"],
         thresholds: Float[Tensor, "2"],
-        offset: Float[Tensor, ""],
+        offset: Float[Tensor, ""] | None,
         counts: Float[Tensor, "T-1 2 H W"],
         drift: Float[Tensor, "T-1 H W"] | None,
         sound: Tensor,
@@ -266,7 +270,8 @@ class _Compared(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         slope, by = ctx.saved_tensors
         by = by * upstream[0]
-        return slope * upstream[0], by[:2], by[2], None, None, None, None, None
+        by_offset = by[2] if ctx.needs_input_grad[2] and len(by) > 2 else None
+        return slope * upstream[0], by[:2], by_offset, None, None, None, None, None
 
 
 def _compared(
@@ -277,20 +282,25 @@ def _compared(
     sound: Tensor,
     weights: Float[Tensor, "T-1"],
     whole: float,
-) -> tuple[Float[Tensor, ""], Float[Tensor, "T H W"], Float[Tensor, "3"]]:
-    """Value, and its slopes by the brightness and by thresholds and offset, in plain torch."""
-    both = send(torch.tensor([1.0, -1.0]), counts.device)[:, None, None] * counts
-    wrong = brightness.diff(dim=0) - (thresholds[:, None, None] * both).sum(1)
+) -> tuple[Float[Tensor, ""], Float[Tensor, "T H W"], Float[Tensor, "P"]]:
+    """Value, and its slopes by the brightness and by thresholds and offset, in plain torch.
+
+    The slope by the offset is left out where no ``drift`` tells it.
+    """
+    signed = thresholds * constant((1.0, -1.0), thresholds)
+    reported = (signed[:, None, None] * counts).sum(1)
+    wrong = brightness.diff(dim=0) - reported
     each = torch.cat([wrong, wrong.sum(0, keepdim=True)])
     weighed = torch.cat([weights, weights.new_tensor([whole])]).to(each.dtype)
     weighed = send(weighed, each.device)
-    slopes = each.sign() * (send(sound, each.device) * weighed[:, None, None])
+    slopes = each.sign() * (sound * weighed[:, None, None])
     value = torch.dot(slopes.flatten(), each.flatten())
     by_wrong = slopes[:-1] + slopes[-1:]
-    by_threshold = (by_wrong[:, None] * both).sum((0, 2, 3))
-    by_offset = by_wrong.new_zeros(1) if drift is None else (by_wrong * drift).sum()[None]
+    by = (by_wrong[:, None] * counts).sum((0, 2, 3)) * constant((-1.0, 1.0), by_wrong)
+    if drift is not None:
+        by = torch.cat([by, -(by_wrong * drift).sum()[None]])
     ends = torch.nn.functional.pad(by_wrong, (0, 0, 0, 0, 1, 1))
-    return value, ends[:-1] - ends[1:], -torch.cat([by_threshold, by_offset])
+    return value, ends[:-1] - ends[1:], by
 
 
 class HeldOutWindows(Objective):

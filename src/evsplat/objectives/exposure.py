@@ -10,7 +10,7 @@ from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.devices import DeviceCache
 from evsplat.objectives.base import Objective, Step, picture
-from evsplat.pictures import chroma, encode, mean_light
+from evsplat.pictures import chroma, encode
 from evsplat.similarity.psnr_ssim import l1_and_ssim
 
 DARKEST_LINEAR = 1e-6
@@ -78,8 +78,8 @@ class Exposure(Objective):
         start, end = step.frame.exposure_us
         first, last = (bisect_left(step.times_us, time) for time in (start, end))
         # Times of other objectives lie outside. A shutter adds light up before it is coded.
-        mean = mean_light(step.rgb[first:last], step.transfer)
-        drawn = encode(mean.clamp_min(DARKEST_LINEAR), step.transfer)
+        mean = step.pictures.mean_light(slice(first, last))
+        drawn = encode(mean, step.transfer, least=DARKEST_LINEAR)
         observed = step.observed(step.frame)
         l1, similarity = l1_and_ssim(drawn, observed)
         terms = {"l1": l1, "dssim": 1 - similarity}

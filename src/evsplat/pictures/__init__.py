@@ -3,6 +3,7 @@
 from evsplat.pictures.colours import error_map, signed_map, to_bytes
 from evsplat.pictures.light import (
     BT601,
+    CodedPictures,
     Transfer,
     chroma,
     decode,
@@ -18,6 +19,7 @@ from evsplat.pictures.light import (
 
 __all__ = [
     "BT601",
+    "CodedPictures",
     "Transfer",
     "chroma",
     "decode",

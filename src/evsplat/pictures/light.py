@@ -1,6 +1,8 @@
 """Coded values of pictures, linear light, luminance and its logarithm, which events report."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import torch
@@ -9,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from evsplat.compiled import native, runs_native
-from evsplat.devices import send
+from evsplat.devices import constant
 
 Transfer = Literal["power", "srgb", "linear"]
 """``power``: exponent 2.2 (paper eq. 8); ``srgb``: the exact piecewise curve of IEC 61966-2-1;
@@ -20,11 +22,10 @@ GAMMA = 2.2
 REC709 = (0.2126, 0.7152, 0.0722)
 BT601 = (0.299, 0.587, 0.114)
 """Weights of coded channels in luma, from which colour differences are taken."""
-_LARGEST = 2 * (1 - BT601[2]), 2 * (1 - BT601[0])
-_CHROMA = (
-    (torch.eye(3, dtype=torch.float64)[[2, 0]] - torch.tensor(BT601, dtype=torch.float64))
-    / torch.tensor(_LARGEST, dtype=torch.float64)[:, None]
-).T
+_CHROMA = tuple(
+    tuple(((channel == own) - weight) / (2 * (1 - BT601[own])) for own in (2, 0))
+    for channel, weight in enumerate(BT601)
+)
 """Cb and Cr of red, green and blue."""
 DARKEST = 1.0 / 255.0
 """Coded values are clamped here first: below one 8-bit level the logarithm only sees rounding."""
@@ -32,6 +33,7 @@ _BLACK = 1e-6
 """Coded values below are no light, and have no slope."""
 _MOST_PICTURES = 256
 """That the compiled module takes together."""
+_ALL = slice(None)
 
 
 def decode(coded: Float[Tensor, "*shape"], transfer: Transfer = "power") -> Float[Tensor, "*shape"]:
@@ -49,10 +51,10 @@ def decode(coded: Float[Tensor, "*shape"], transfer: Transfer = "power") -> Floa
 
 
 def encode(
-    linear: Float[Tensor, "*shape"], transfer: Transfer = "power"
+    linear: Float[Tensor, "*shape"], transfer: Transfer = "power", *, least: float = 0.0
 ) -> Float[Tensor, "*shape"]:
-    """Coded values in [0, 1] of linear light in [0, 1]; values below 0 count as 0."""
-    linear = linear.clamp_min(0.0)
+    """Coded values in [0, 1] of linear light in [0, 1]; values below ``least`` count as that."""
+    linear = linear.clamp_min(least)
     if transfer == "power":
         coded: Tensor = _PowerEncode.apply(linear)
         return coded
@@ -89,17 +91,57 @@ def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
 
 def chroma(coded: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 2"]:
     """Cb and Cr (ITU-R BT.601) of coded RGB, each of range 1."""
-    return coded @ send(_CHROMA.to(coded.dtype), coded.device)
+    return coded @ constant(_CHROMA, coded)
+
+
+@dataclass(frozen=True, eq=False)
+class CodedPictures:
+    """Pictures of one size and one curve, whose light several losses look at.
+
+    The compiled module decodes what each of them asks for; in plain torch all are decoded once.
+    """
+
+    coded: tuple[Float[Tensor, "H W 3"], ...]
+    transfer: Transfer = "power"
+
+    def mean_light(self, which: slice = _ALL) -> Float[Tensor, "H W 3"]:
+        """Mean of some of the pictures in linear light."""
+        coded = self.coded[which]
+        if self._native and len(coded) <= _MOST_PICTURES:
+            mean: Tensor = _NativeMeanLight.apply(*coded)
+            return mean
+        return self._light[which].mean(0).movedim(0, -1)
+
+    def log_luminance(
+        self, eps: float, which: slice = _ALL, *, keeps_hue: bool = False
+    ) -> Float[Tensor, "T H W"]:
+        """Natural logarithm of some pictures' luminance in linear light, and ``eps``.
+
+        ``keeps_hue`` leaves the value and changes the gradient: to that of the mean over channels
+        of log(light + eps). It pulls at the logarithms of all channels alike, that of luminance at
+        green ten times as hard as at blue.
+        """
+        if self._native:
+            result: Tensor = _NativeLogLuminance.apply(eps, keeps_hue, *self.coded[which])
+            return result
+        plain: Tensor = _LogLuminance.apply(self._light[which], eps, keeps_hue)
+        return plain
+
+    @property
+    def _native(self) -> bool:
+        return self.transfer == "power" and all(map(runs_native, self.coded))
+
+    @cached_property
+    def _light(self) -> Float[Tensor, "T 3 H W"]:
+        planes = torch.stack([picture.movedim(-1, 0) for picture in self.coded])
+        return decode(planes, self.transfer)
 
 
 def mean_light(
     coded: Sequence[Float[Tensor, "H W 3"]], transfer: Transfer = "power"
 ) -> Float[Tensor, "H W 3"]:
-    """Mean of coded pictures in linear light."""
-    if transfer == "power" and all(map(runs_native, coded)) and len(coded) <= _MOST_PICTURES:
-        mean: Tensor = _NativeMeanLight.apply(*coded)
-        return mean
-    return decode(_planes(coded), transfer).mean(0).movedim(0, -1)
+    """See `CodedPictures.mean_light`."""
+    return CodedPictures(tuple(coded), transfer).mean_light()
 
 
 def log_luminance(
@@ -109,24 +151,8 @@ def log_luminance(
     *,
     keeps_hue: bool = False,
 ) -> Float[Tensor, "T H W"]:
-    """Natural logarithm of coded pictures' luminance in linear light, and ``eps``.
-
-    ``keeps_hue`` leaves the value and changes the gradient: to that of the mean over channels of
-    log(light + eps). It pulls at the logarithms of all channels alike, that of luminance at green
-    ten times as hard as at blue.
-    """
-    if transfer == "power" and all(map(runs_native, coded)):
-        result: Tensor = _NativeLogLuminance.apply(eps, keeps_hue, *coded)
-        return result
-    linear = decode(_planes(coded), transfer)
-    if keeps_hue:
-        result = _LogLuminanceKeepingHue.apply(linear, eps)
-        return result
-    return torch.log(luminance(linear.movedim(1, -1)) + eps)
-
-
-def _planes(pictures: Sequence[Float[Tensor, "H W 3"]]) -> Float[Tensor, "T 3 H W"]:
-    return torch.stack([picture.movedim(-1, 0) for picture in pictures])
+    """See `CodedPictures.log_luminance`."""
+    return CodedPictures(tuple(coded), transfer).log_luminance(eps, keeps_hue=keeps_hue)
 
 
 def _planar(picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
@@ -215,20 +241,27 @@ class _NativeMeanLight(torch.autograd.Function):
         return grads.movedim(1, -1).unbind(0)
 
 
-class _LogLuminanceKeepingHue(torch.autograd.Function):
-    """`log_luminance` of planes of light, whose gradient pulls at all channels alike."""
+class _LogLuminance(torch.autograd.Function):
+    """`CodedPictures.log_luminance` of planes of light; autograd would go back by channels."""
 
     @staticmethod
-    def forward(ctx: Any, linear: Float[Tensor, "T 3 H W"], eps: float) -> Float[Tensor, "T H W"]:
-        ctx.save_for_backward(linear)
-        ctx.eps = eps
-        return torch.log(luminance(linear.movedim(1, -1)) + eps)
+    def forward(
+        ctx: Any, linear: Float[Tensor, "T 3 H W"], eps: float, keeps_hue: bool
+    ) -> Float[Tensor, "T H W"]:
+        light = (linear * constant(REC709, linear)[:, None, None]).sum(1) + eps
+        ctx.eps, ctx.keeps_hue = eps, keeps_hue
+        ctx.save_for_backward(linear if keeps_hue else light)
+        return torch.log(light)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
-        (linear,) = ctx.saved_tensors
-        return upstream[0][:, None] / (linear + ctx.eps) / linear.shape[1], None
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
+        (light,) = ctx.saved_tensors
+        above = upstream[0][:, None]
+        if ctx.keeps_hue:
+            return above / (light + ctx.eps) / light.shape[1], None, None
+        weights = constant(REC709, light)[:, None, None]
+        return above / light[:, None] * weights, None, None
 
 
 class _NativeLogLuminance(torch.autograd.Function):

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from evsplat.compiled import native, runs_native
-from evsplat.devices import send
+from evsplat.devices import constant
 
 
 def psnr(
@@ -133,7 +133,7 @@ def _smooth(planes: Float[Tensor, "C H W"], settings: Ssim, pad: int) -> Float[T
     """Weighted means in each window, ``pad`` pixels of zeros around the planes."""
     if planes.device.type != "cpu":
         # The number of operations counts there; channels apart, as no tensor cores round those.
-        weights = send(planes.new_tensor(_window(settings), device="cpu"), planes.device)
+        weights = constant(_window(settings), planes)
         down = weights.expand(len(planes), 1, -1)[..., None]
         smooth = F.conv2d(planes[None], down, padding=(pad, 0), groups=len(planes))
         return F.conv2d(smooth, down.mT, padding=(0, pad), groups=len(planes))[0]
@@ -250,7 +250,7 @@ class _PlainL1Ssim(torch.autograd.Function):
         x, y = (picture.detach().movedim(-1, 0) for picture in (image, reference))
         y = y.to(x.dtype)
         settings, (c1, c2) = GAUSSIAN_SSIM, GAUSSIAN_SSIM.stabilisers
-        planes = torch.cat([x, y, x * x + y * y, x * y])
+        planes = torch.cat([x, y, torch.addcmul(x * x, y, y), x * y])
         mean_x, mean_y, squares, product = _smooth(planes, settings, 0).split(len(x))
         means, both = 2 * mean_x * mean_y, torch.addcmul(mean_x * mean_x, mean_y, mean_y)
         over = (means + c1, 2 * product - means + c2)

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from evsplat.errors import DataError
@@ -29,7 +29,7 @@ class BadSteps:
         self.skipped = 0
         """Ever, as far as the host knows."""
         self._in_a_row = 0
-        self._found = torch.zeros(2, dtype=torch.long, device=device)  # in a row, not settled yet
+        self._found = torch.zeros(2, device=device)  # in a row, not settled yet
 
     def refuse(
         self, sound: Bool[Tensor, ""], culprits: Callable[[], list[str]], iteration: int
@@ -44,19 +44,20 @@ class BadSteps:
         self._stop_if_it_goes_on(found[0])
         return True
 
-    def count(self, sound: Bool[Tensor, ""]) -> None:
-        """A step was made, or will have been left out by the device."""
+    def count(self, sound: Bool[Tensor, ""]) -> Float[Tensor, ""] | None:
+        """A step is made, or will be left out by the device; then 1 where it is, else 0."""
         if self.at_once:
             self._in_a_row = 0
-            return
-        bad = (~sound).long()
-        in_a_row, new = self._found.unbind()
-        self._found = torch.stack([(in_a_row + 1) * bad, new + bad])
+            return None
+        bad = (~sound).float()
+        self._found += bad
+        self._found[0].mul_(bad)
+        return bad
 
     def settle(self) -> int:
         """Take over what the device counted, which waits for it; the number of skipped steps."""
         if not self.at_once:
-            self._in_a_row, new = self._found.tolist()
+            self._in_a_row, new = map(int, self._found.tolist())
             self._found[1] = 0
             self.skipped += new
             if new:

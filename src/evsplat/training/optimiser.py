@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from evsplat.gaussians import Adam, RowAdam, step_together
@@ -55,10 +55,10 @@ class Optimiser:
             adam.zero_grad()
         self.networks.zero_grad()
 
-    def step(self, nominal: float, sound: Tensor | None = None) -> None:
+    def step(self, nominal: float, unsound: Float[Tensor, ""] | None = None) -> None:
         """Mask what is frozen, clip the networks' gradient and step all Adams.
 
-        Where ``sound`` is false (one value, on the device) nothing moves; nobody waits for it.
+        Where ``unsound`` is 1 (one value, on the device) nothing moves; nobody waits for it.
         """
         for name, rows in self.model.sets.items():
             for attribute in rows.attributes:
@@ -70,9 +70,7 @@ class Optimiser:
                     parameter.grad[rows.human] = 0
         if self.learning.clip is not None:
             _clip([p.grad for p in self.clipped if p.grad is not None], self.learning.clip)
-        step_together(
-            [adam for _, adam in self._adams()], None if sound is None else (~sound).float()
-        )
+        step_together([adam for _, adam in self._adams()], unsound)
 
     def step_only(self, parameters: list[nn.Parameter], gradients: Sequence[Tensor]) -> None:
         """Step these parameters of networks, by these gradients, and nothing else.
@@ -97,7 +95,7 @@ class Optimiser:
             if p.grad is not None
         ]
         # A sum is NaN or infinite exactly if an entry is (or it overflows, which is as bad).
-        return torch.stack(torch._foreach_norm(gradients, 1)).isfinite().all()
+        return (torch.stack(torch._foreach_norm(gradients, 1)) < torch.inf).all()
 
     def state(self) -> dict[str, Tensor]:
         """Moments and step counts, named by group and parameter number."""

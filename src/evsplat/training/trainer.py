@@ -121,18 +121,17 @@ class Trainer:
         loss = self._weighted(terms, nominal)
 
         self.optimiser.zero_grad()
-        sound = loss.detach().isfinite()
+        sound = loss.detach().abs() < torch.inf
         if self.bad.refuse(sound, lambda: _not_numbers(terms) or ["loss"], self.clock.iteration):
             return None
         loss.backward()
         sound = sound & self.optimiser.finite()
         if self.bad.refuse(sound, lambda: ["gradient"], self.clock.iteration):
             return None
-        self.bad.count(sound)
-        # The host knows that the step is sound, or a GPU will know it.
-        if_sound = None if self.bad.at_once else sound
-        self.optimiser.step(nominal, if_sound)
-        self._count(step.drawing, nominal, if_sound)
+        # None where the host knows that the step is sound; else a GPU will know it.
+        unsound = self.bad.count(sound)
+        self.optimiser.step(nominal, unsound)
+        self._count(step.drawing, nominal, None if unsound is None else sound)
         self._edit(nominal)
         self._learn_held_out(nominal)
         drawn = step.drawing.rgb[step.index(frame.mid_us)].detach()

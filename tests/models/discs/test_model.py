@@ -82,13 +82,13 @@ def test_a_disc_on_the_body_has_its_own_colour_and_the_shade_of_the_pose(tiny_ca
     rotations, bones = model.pose(times)
     expected, _ = skin(deformed(model, times), weights, bones)
     assert torch.allclose(layers.human.means, expected, atol=1e-5)
-    assert torch.equal(layers.human.scales[0], gaussians.scales_log[gaussians.human].exp())
+    assert torch.equal(layers.human.scales[0], gaussians.scales_log.exp()[gaussians.human])
     assert torch.equal(layers.human.quaternions[0], gaussians.quaternions[gaussians.human])
     # Wherever the rows have been moved to, they are drawn with the weights they have.
     assert torch.equal(model.skinning_weights(canonical + 0.3), weights)
     colours = gaussians.colour_logits[gaussians.human].sigmoid() * model.shade(canonical, rotations)
     assert torch.allclose(layers.human.channels[..., :3], colours, atol=1e-6)
-    colours = gaussians.colour_logits[gaussians.scene].sigmoid()
+    colours = gaussians.colour_logits.sigmoid()[gaussians.scene]
     assert torch.equal(layers.scene.channels[0, :, :3], colours)
     assert torch.equal(layers.scene.means[0], gaussians.means[gaussians.scene])
     names = {name.partition(".")[0] for name, _ in model.named_parameters()}

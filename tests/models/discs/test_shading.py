@@ -99,6 +99,30 @@ def test_the_compiled_light_is_the_plain_one_in_float64(lamps, lit_times, count)
         assert (found - right).norm() < 1e-3 * right.norm() + 1e-5
 
 
+@pytest.mark.parametrize("lit_times", [None, 1, 4])
+@pytest.mark.parametrize("seed", range(2))
+def test_gradients_of_light_on_a_fixed_surface_are_those_that_autograd_finds(seed, lit_times):
+    generator = torch.Generator().manual_seed(seed)
+    random = partial(torch.randn, generator=generator, dtype=torch.float64)
+    shading = Shading(random(3).float(), 1.7, lamps=3).double()
+    with torch.no_grad():
+        shading.coefficients.copy_(0.1 * random(4, 9, 3))
+        shading.intensities.copy_(0.6 * random(3, 3))
+    places, transforms = 2 * random(4, 50, 3), random(4, 50, 4, 4)
+    lamps = (2 * random(3, 3)).requires_grad_()
+    places[:, :3] = lamps.detach() + 0.1  # nearer than light grows
+    normals = sphere(50, generator).normals.double()
+    lit = None if lit_times is None else random(3, lit_times, 50).sigmoid().requires_grad_()
+    learned = [shading.coefficients, shading.intensities, lamps, *([] if lit is None else [lit])]
+    light, above = SurfaceLight(shading, normals, lamps), random(4, 50, 3)
+    turned = torch.nn.functional.normalize(transforms[..., :3, :3] @ normals[..., None], dim=-2)
+    found = light.factors(transforms, places, lit), shading(turned[..., 0], places, lamps, lit)
+    assert (found[0] - found[0].clamp(0.2, 3.0)).abs().max() == 0 < (found[0] == 3.0).sum()
+    gradients = [torch.autograd.grad((one * above).sum(), learned) for one in found]
+    for one, other in zip((found[0], *gradients[0]), (found[1], *gradients[1]), strict=True):
+        assert torch.allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
 def test_gradcheck():
     shading = Shading(torch.zeros(3), 2.0, lamps=2).double()
     with torch.no_grad():

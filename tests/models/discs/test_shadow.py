@@ -135,6 +135,33 @@ def test_gradients_of_lamps_body_and_places_equal_finite_differences():
     assert torch.autograd.gradcheck(lit, (body, lamps), eps=1e-7, atol=1e-5)
 
 
+@pytest.mark.parametrize("count", [5, 60])
+@pytest.mark.parametrize("seed", range(2))
+def test_both_shadows_found_together_are_those_found_apart_with_their_gradients(seed, count):
+    generator = torch.Generator().manual_seed(seed)
+    shadow, places = make(lamps=2), floor()[10:31:5, 10:31:5].clone().requires_grad_()
+    with torch.no_grad():
+        shadow.own_widths_log.fill_(-1.5)
+    moved = torch.tensor([[[0.0, 0.0, 0.0]], [[0.05, -0.1, 0.02]], [[0.1, 0.1, -0.05]]])
+    body = (column(seed)[:, ::10] + moved).requires_grad_()
+    lamps = (LAMP + torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.5, -0.7]])).requires_grad_()
+    own = column(seed + 1)[:, :count]
+    learned = [body, places, lamps, *shadow.parameters()]
+    at = slice(1, 2)
+    apart = shadow(body, places, lamps), shadow.lit(body[at].detach(), own, lamps)
+    together = shadow.both(body, places, own.requires_grad_(), lamps, at)
+    weights = [torch.randn(a.shape, generator=generator, dtype=a.dtype) for a in apart]
+    gradients = []
+    for found in (apart, together):
+        total = sum((a * w).sum() for a, w in zip(found, weights, strict=True))
+        gradients.append(torch.autograd.grad(total, learned))
+    for one, other in zip((*apart, *gradients[0]), (*together, *gradients[1]), strict=True):
+        assert torch.allclose(one, other, atol=1e-12, rtol=1e-9)
+    # By the light on itself the body learns nothing, nor do its places.
+    light = shadow.both(body, places, own, lamps, at)[1]
+    assert torch.autograd.grad(light.sum(), own, allow_unused=True) == (None,)
+
+
 def test_lamps_start_around_the_zenith():
     center, up = torch.tensor([1.0, 2.0, 0.9]), torch.tensor([0.0, 1.0, 0.0])
     lamps = Lamps(center, up, 4)

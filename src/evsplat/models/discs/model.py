@@ -25,12 +25,12 @@ from evsplat.models.discs.shadow import BodyShadow, Lamps
 from evsplat.models.discs.still import Still
 from evsplat.models.drawing import Drawing, draw
 from evsplat.models.kept import Kept
-from evsplat.models.layers import Layers, SceneShadow, human_splats
+from evsplat.models.layers import SHADOW_STEP_PX, Layers, SceneShadow, human_splats
 from evsplat.models.model import PosedModel, RowCache
 from evsplat.models.networks.colour import SceneColour, scene_rgb
 from evsplat.models.networks.non_rigid import draw_pose_noise
 from evsplat.models.pose_correction import PoseCorrection
-from evsplat.models.scene_places import ScenePlaces
+from evsplat.models.scene_places import SceneAlone, ScenePlaces
 from evsplat.render import rows_in_view
 
 NORMAL_SAMPLES = 20_000
@@ -51,7 +51,8 @@ _DIRECTION_DROPOUT = 0.5
 class _View:
     """Camera that colours are seen from."""
 
-    center: Float[Tensor, "3"]
+    center: Float[Tensor, "3"] | None
+    """Where a network is asked for colours."""
     hide_direction: bool = False
     shown: Camera | None = None
     """Only this camera's picture is asked for."""
@@ -200,7 +201,7 @@ class DiscModel(PosedModel):
         joints = rotations.shape[1]
         rotations = rotations + draw_pose_noise(joints, self.pose_noise, generator, self.device)
         nearest = min(range(len(times_us)), key=lambda t: abs(times_us[t] - frame.mid_us))
-        view = _View(camera.center())
+        view = _View(None, shown=camera)
         if self.scene_colour is not None:
             hidden = float(torch.rand((), generator=generator)) < _DIRECTION_DROPOUT
             view = _View(camera.center(), hidden, camera)
@@ -248,27 +249,31 @@ class DiscModel(PosedModel):
         ``lit_at``: the times, one or all, at which shadows on the person are looked up.
         """
         still = self._still(view, hard_semantics=hard_semantics)
-        means, scales_log, quaternions = still.means, still.scales_log, still.quaternions
+        means, shape = still.means, (still.quaternions[None], still.scales[None], still.opacities)
         weights = self.surface.weights(means)[None]
         placed = means[None] if offsets is None else means + offsets
         world, transforms, linear = skin_with_linear(placed, weights, bones)
         casters = None if self.shadow is None else self.shadow.place(bones)
         light = self.surface_light()
-        rgb = still.rgb[None] * self._light(light, world, transforms, casters, lit_at)
+        # Detached: a colour must not be bought by moving or turning the body.
+        places = world.detach()
+        scene = SceneAlone(still.scene, self.low_pass)
+        lit, shaded = self._shadows(light, places[lit_at], casters, lit_at, scene, view.shown)
+        rgb = still.rgb[None] * self._light(light, places, transforms, lit)
         if float(self.nominal) >= self.shade_start:
             rgb = rgb * self.shade(means, rotations)
-        turned, scales = quaternions[None], scales_log.exp()[None]
         return Layers(
-            human_splats(world, turned, scales, still.opacities, rgb, still.semantics, linear),
+            human_splats(world, *shape, rgb, still.semantics, linear),
             still.scene,
             transforms,
             self._cast(light, casters),
             self.low_pass,
+            shaded,
         )
 
     def _still(self, view: _View, *, hard_semantics: bool) -> Still:
         """What is the same at all times, kept from one picture to the next where nobody learns."""
-        colours = partial(self._scene_rgb, view)
+        colours = None if self.scene_colour is None else partial(self._scene_rgb, view)
         make = partial(Still.of, self.gaussians, colours, hard_semantics=hard_semantics)
         # A network's colours depend on the view; soft labels are asked for in training alone.
         if self.scene_colour is not None or not hard_semantics:
@@ -282,9 +287,8 @@ class DiscModel(PosedModel):
         means: Float[Tensor, "S 3"],
         scales: Float[Tensor, "S 3"],
     ) -> Float[Tensor, "S 3"]:
-        """Colours of the scene; those by the network may be black outside of the picture."""
-        if self.scene_colour is None:
-            return colours.sigmoid()
+        """The network's colours of the scene, which may be black outside of the picture."""
+        assert self.scene_colour is not None and view.center is not None
         rows = None if view.shown is None else rows_in_view(means, scales, view.shown)
         return scene_rgb(
             self.scene_colour,
@@ -298,18 +302,12 @@ class DiscModel(PosedModel):
     def _light(
         self,
         light: SurfaceLight | None,
-        world: Float[Tensor, "T H 3"],
+        places: Float[Tensor, "T H 3"],
         transforms: Float[Tensor, "T H 4 4"],
-        casters: Float[Tensor, "T P 3"] | None,
-        lit_at: slice,
+        lit: Float[Tensor, "L #T H"] | None,
     ) -> Float[Tensor, "T H 3"] | float:
         """Factors on the person's colours; 1 without shading."""
-        if light is None:
-            return 1.0
-        # Detached: a colour must not be bought by moving or turning the body.
-        places = world.detach()
-        lit = self._lit(light, places[lit_at], None if casters is None else casters[lit_at])
-        return light.factors(transforms.detach(), places, lit)
+        return 1.0 if light is None else light.factors(transforms.detach(), places, lit)
 
     def light_terms(self, layers: Layers, time_us: int) -> tuple[Tensor, Tensor]:
         """What the light on the person at a time is linear in, and the light itself.
@@ -320,16 +318,37 @@ class DiscModel(PosedModel):
         assert light is not None
         casters = None if self.shadow is None else self.shadow.place(self.pose([time_us])[1])
         places, transforms = layers.human.means.detach(), layers.transforms.detach()
-        lit = self._lit(light, places, casters)
+        lit, _ = self._shadows(light, places, casters, slice(None))
         return light.terms(transforms, places, lit), light.factors(transforms, places, lit)
 
-    def _lit(
-        self, light: SurfaceLight, places: Float[Tensor, "T H 3"], casters: Tensor | None
-    ) -> Float[Tensor, "L T H"] | None:
-        """Share of the lamps' light that the body leaves its own places; None: all of it."""
-        if self.shadow is None or casters is None or not self.shadow.on_body or light.lamps is None:
-            return None
-        return self.shadow.lit(casters.detach(), places, light.lamps)
+    def _shadows(
+        self,
+        light: SurfaceLight | None,
+        places: Float[Tensor, "T H 3"],
+        casters: Float[Tensor, "T P 3"] | None,
+        at: slice,
+        scene: SceneAlone | None = None,
+        shown: Camera | None = None,
+    ) -> tuple[Float[Tensor, "L T H"] | None, Float[Tensor, "T h w"] | None]:
+        """Shares of the lamps' light that the body leaves its own ``places``, of the times ``at``.
+
+        None: all of it. And where the one picture that is ``shown`` is known, the shadow in it,
+        which costs less beside the other.
+        """
+        shadow, lamps = self.shadow, None if light is None else light.lamps
+        if shadow is None or casters is None or not shadow.on_body or lamps is None:
+            return None, None
+        if scene is None or shown is None:
+            return shadow.lit(casters[at].detach(), places, lamps), None
+        lit: list[Tensor] = []
+
+        def both(fallen_on: Float[Tensor, "h w 3"]) -> Float[Tensor, "T h w"]:
+            factors, light_on_body = shadow.both(casters, fallen_on, places, lamps, at)
+            lit.append(light_on_body)
+            return factors
+
+        shaded = self._on_relief(both)(self.places.of(scene, shown, SHADOW_STEP_PX))
+        return lit[0], shaded
 
     def _cast(self, light: SurfaceLight | None, casters: Tensor | None) -> SceneShadow | None:
         """The shadow that the body throws on places of the scene."""
@@ -337,6 +356,9 @@ class DiscModel(PosedModel):
         if shadow is None or self.lamps is None or casters is None:
             return None
         lamps = self.lamps.places() if light is None or light.lamps is None else light.lamps
-        cast: SceneShadow = lambda places: shadow(casters, places, lamps)  # noqa: E731
+        return self._on_relief(lambda places: shadow(casters, places, lamps))
+
+    def _on_relief(self, shadow: SceneShadow) -> SceneShadow:
+        """The same where the scene's places truly are, as far as that is learned."""
         relief = self.relief if float(self.nominal) >= _RELIEF_START else None
-        return cast if relief is None else lambda places: relief.shade(places, cast)
+        return shadow if relief is None else lambda places: relief.shade(places, shadow)

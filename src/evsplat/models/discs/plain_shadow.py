@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-REACH_M = 1.5
-"""Half side of the square around the body, across the light, outside of which nothing is shaded."""
-_CELLS = 49
+from evsplat.devices import constant
+from evsplat.models.discs.shadow_views import CELLS, REACH_M, Bells, Views, evenly
+
 _LAYERS = 31
 """Of the space around the body along the light, in which it shades itself."""
 _LAYER_EDGE_M = 0.03
@@ -23,7 +23,6 @@ _OWN_SURFACE_M = 0.12
 """How far nearer to the lamp a part of the body must be to shade another."""
 _BEHIND_M, _BEHIND_EDGE_M = -0.2, 0.1
 """From where on behind the body's middle the scene is shaded, and how softly that begins."""
-_NEAREST_M = 0.1
 DENSITY = 3.0
 """Optical depth through the middle of a body that covers `AREA_M2` across the light."""
 AREA_M2 = 0.5
@@ -52,45 +51,52 @@ def light_on_places(
     return light
 
 
+def shadow_and_light(
+    body: Float[Tensor, "T P 3"],
+    places: Float[Tensor, "N 3"],
+    own: Float[Tensor, "K M 3"],
+    lamps: Float[Tensor, "L 3"],
+    widths: Float[Tensor, "2 L"],
+    shares: Float[Tensor, "L"],
+    at: slice,
+) -> tuple[Float[Tensor, "T N"], Float[Tensor, "L K M"]]:
+    """`shadow_on_places`, and `light_on_places` of the times ``at``: seen by each lamp together.
+
+    ``widths``: of the former and of the latter. Of the latter neither the body nor its ``own``
+    places get a gradient.
+    """
+    both: tuple[Tensor, Tensor] = _Together.apply(body, places, own, lamps, widths, shares, at)
+    return both
+
+
 class _OnScene(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, body: Tensor, places: Tensor, lamps: Tensor, widths: Tensor, shares: Tensor
     ) -> Float[Tensor, "T N"]:
-        views = _Views.of(lamps, body)
+        views = Views.of(lamps, body)
         seen = views.project(body, places.expand(len(body), -1, -1))
-        bells = _Bells.at(seen.cast, widths)
-        scale = _scale(body, widths)
-        density = scale * (bells.across @ bells.down.mT)
+        bells = Bells.at(seen.cast, widths[:, None])
         at, behind = seen.at[:, :, views.count :], seen.behind[:, :, views.count :]
-        sampled, grid = _sample(density.flatten(0, 1)[:, None], at.flatten(0, 1)[:, None])
-        sampled = sampled.view(behind.shape)
-        gate = torch.sigmoid((behind - _BEHIND_M) / _BEHIND_EDGE_M)
-        lost = 1 - torch.exp(-sampled * gate)
-        factors = 1 - shares[:, None, None] * lost
-        ctx.parts = views, seen, bells
-        ctx.save_for_backward(widths, shares, scale, density, grid, sampled, gate, lost, factors)
-        return factors.prod(0)
+        scene = _Scene.of(bells.values, _scale(body, widths[:, None]), at, behind, shares)
+        ctx.parts = views, seen, bells, scene
+        ctx.save_for_backward(widths)
+        return scene.factors.prod(0)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, ...]:
-        views, seen, bells = ctx.parts
-        widths, shares, scale, density, grid, sampled, gate, lost, factors = ctx.saved_tensors
-        tiny = torch.finfo(factors.dtype).tiny
-        by_lost = -upstream[0] * factors.prod(0) / factors.clamp_min(tiny)
-        by_share = (by_lost * lost).sum((1, 2))
-        by_depth = by_lost * shares[:, None, None] * (1 - lost)
-        by_gate = by_depth * sampled * gate * ((1 - gate) / _BEHIND_EDGE_M)
-        by_density, by_at = _sample_backward(by_depth * gate, density.flatten(0, 1)[:, None], grid)
-        by_density, by_at = by_density.view_as(density), by_at.view(*by_gate.shape, 2)
-        scaled = scale * by_density
-        by_cast, by_width = bells.backward(scaled @ bells.down, scaled.mT @ bells.across)
-        by_width = _of_scale(by_width, by_density, density, widths)
+        views, seen, bells, scene = ctx.parts
+        (widths,) = ctx.saved_tensors
+        slopes = scene.backward(upstream[0])
+        by_cast, by_width = bells.backward(slopes.across, slopes.down)
+        by_width = slopes.of_width(by_width.sum(1), widths)
         by_lamps, by_body, by_places = views.backward(
-            seen, torch.cat([by_cast, by_at], 2), F.pad(by_gate, (views.count, 0))
+            seen,
+            torch.cat([by_cast, slopes.at], 2),
+            F.pad(slopes.behind, (views.count, 0)),
         )
-        return by_body, by_places.sum(0), by_lamps, by_width, by_share
+        return by_body, by_places.sum(0), by_lamps, by_width, slopes.share
 
 
 class _OnBody(torch.autograd.Function):
@@ -98,173 +104,224 @@ class _OnBody(torch.autograd.Function):
     def forward(
         ctx: Any, body: Tensor, places: Tensor, lamps: Tensor, widths: Tensor
     ) -> Float[Tensor, "L T N"]:
-        views = _Views.of(lamps, body)
+        views = Views.of(lamps, body)
         seen = views.project(body, places)
-        bells = _Bells.at(seen.cast, widths)
-        scale = _scale(body, widths)
-        in_front = seen.behind[:, :, : views.count]
-        layers = torch.linspace(-REACH_M, REACH_M, _LAYERS, dtype=lamps.dtype, device=lamps.device)
-        nearer = torch.sigmoid((layers[:, None] - in_front[:, :, None]) / _LAYER_EDGE_M)
-        rows = (nearer[:, :, :, None] * bells.across[:, :, None]).flatten(2, 3)
-        density = scale * (rows @ bells.down.mT)
-        at, behind = seen.at[:, :, views.count :], seen.behind[:, :, views.count :]
-        where = torch.cat([at, (behind - _OWN_SURFACE_M)[..., None]], -1)
-        depth, grid = _sample(
-            density.flatten(0, 1).unflatten(1, (1, _LAYERS, _CELLS)),
-            where.flatten(0, 1)[:, None, None],
-        )
-        light = torch.exp(-depth.view(behind.shape))
-        ctx.parts = views, seen, bells
-        ctx.save_for_backward(widths, scale, density, grid, nearer, rows, light)
+        bells = Bells.at(seen.cast, widths[:, None])
+        in_front, behind = seen.behind.tensor_split([views.count], 2)
+        scale = _scale(body, widths[:, None])
+        own, light = _Own.of(bells.values, scale, in_front, seen.at[:, :, views.count :], behind)
+        ctx.parts = views, seen, bells, own
+        ctx.save_for_backward(widths, light)
         return light
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, ...]:
-        views, seen, bells = ctx.parts
-        widths, scale, density, grid, nearer, rows, light = ctx.saved_tensors
-        layered = density.flatten(0, 1).unflatten(1, (1, _LAYERS, _CELLS))
-        by_density, by_where = _sample_backward(-upstream[0] * light, layered, grid)
-        by_density = by_density.view_as(density)
-        by_where = by_where.view(*light.shape, 3)
-        scaled = scale * by_density
-        by_rows = (scaled @ bells.down).unflatten(2, (_LAYERS, _CELLS))
-        by_across = (by_rows * nearer[:, :, :, None]).sum(2)
-        by_nearer = (by_rows * bells.across[:, :, None]).sum(3)
-        by_behind = (by_nearer * nearer * (nearer - 1)).sum(2) / _LAYER_EDGE_M
-        by_cast, by_width = bells.backward(by_across, scaled.mT @ rows)
-        by_width = _of_scale(by_width, by_density, density, widths)
+        views, seen, bells, own = ctx.parts
+        widths, light = ctx.saved_tensors
+        slopes = own.backward(upstream[0], light)
+        by_cast, by_width = bells.backward(slopes.across, slopes.down)
+        by_width = slopes.of_width(by_width.sum(1), widths)
         by_lamps, by_body, by_places = views.backward(
-            seen,
-            torch.cat([by_cast, by_where[..., :2]], 2),
-            torch.cat([by_behind, by_where[..., 2]], 2),
+            seen, torch.cat([by_cast, slopes.at], 2), slopes.behind
         )
         return by_body, by_places, by_lamps, by_width
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Points on the plane through the body's middle that faces a lamp: the body's P, then places.
+class _Together(torch.autograd.Function):
+    """Rows are the T times of the scene, then those of the body's own places.
 
-    Together, since each operation on both is one launch of a GPU.
+    Where one has fewer places than the other, the rest stand in the origin and count for nothing.
     """
 
-    rays: Float[Tensor, "L T P+N 3"]
-    """From the lamp, world axes."""
-    along: Float[Tensor, "L T P+N"]
-    """The light, from the lamp."""
-    spread: Float[Tensor, "L T P+N"]
-    """Of the plane by what lies in front of it."""
-    at: Float[Tensor, "L T P+N 2"]
-    behind: Float[Tensor, "L T P+N"]
-    """How far behind the plane, metres."""
-    cast: Float[Tensor, "L T P 2"]
-    """Where the body's own are."""
+    @staticmethod
+    def forward(
+        ctx: Any,
+        body: Tensor,
+        places: Tensor,
+        own: Tensor,
+        lamps: Tensor,
+        widths: Tensor,
+        shares: Tensor,
+        at: slice,
+    ) -> tuple[Float[Tensor, "T N"], Float[Tensor, "L K M"]]:
+        times, count, most = len(body), len(places), max(len(places), own.shape[1])
+        rows = torch.cat([body, body[at]])
+        shown = _padded(places[None], most).expand(times, -1, -1)
+        each = widths[0, :, None].expand(-1, times), widths[1, :, None].expand(-1, len(own))
+        wide = torch.cat(each, 1)
+        views = Views.of(lamps, rows)
+        seen = views.project(rows, torch.cat([shown, _padded(own, most)]))
+        bells, scale = Bells.at(seen.cast, wide), _scale(rows, wide)
+        first, end = views.count, views.count + count
+        scene = _Scene.of(
+            bells.values[:, :, :times],
+            scale[:, :times],
+            seen.at[:, :times, first:end],
+            seen.behind[:, :times, first:end],
+            shares,
+        )
+        last = slice(first, first + own.shape[1])
+        lit, light = _Own.of(
+            bells.values[:, :, times:],
+            scale[:, times:],
+            seen.behind[:, times:, :first],
+            seen.at[:, times:, last],
+            seen.behind[:, times:, last],
+        )
+        ctx.parts = views, seen, bells, scene, lit
+        ctx.save_for_backward(widths, light)
+        return scene.factors.prod(0), light
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        views, seen, bells, scene, lit = ctx.parts
+        widths, light = ctx.saved_tensors
+        slopes, own = scene.backward(upstream[0]), lit.backward(upstream[1], light)
+        times, most = slopes.at.shape[1], seen.at.shape[2] - views.count
+        by_cast, by_wide = bells.backward(
+            torch.cat([slopes.across, own.across], 1), torch.cat([slopes.down, own.down], 1)
+        )
+        by_at = torch.cat([_padded(slopes.at, most), _padded(own.at, most)], 1)
+        behind = F.pad(slopes.behind, (views.count, most - slopes.behind.shape[2]))
+        own_behind = F.pad(own.behind, (0, seen.at.shape[2] - own.behind.shape[2]))
+        by_lamps, by_body, by_places = views.backward(
+            seen, torch.cat([by_cast, by_at], 2), torch.cat([behind, own_behind], 1)
+        )
+        by_widths = torch.stack([by_wide[:, :times].sum(1), by_wide[:, times:].sum(1)])
+        by_density = torch.stack([slopes.density, own.density])
+        return (
+            by_body[:times],
+            by_places[:times, : slopes.at.shape[2]].sum(0),
+            None,
+            by_lamps,
+            torch.addcdiv(by_widths, by_density, widths, value=-2),
+            slopes.share,
+            None,
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class _Views:
-    """The lamps' axes: two across the light (`_across`), and along it towards the body's middle."""
+class _Slopes:
+    """Gradients of what a shadow was made of."""
 
-    lamps: Float[Tensor, "L 3"]
-    frames: Float[Tensor, "L T 3 3"]
-    twist: Float[Tensor, "L T 3"]
-    """By how much the axes turn about the light as that turns."""
-    distance: Float[Tensor, "L T 1"]
-    count: int
-    """Points of the body."""
+    across: Float[Tensor, "L T C P"]
+    down: Float[Tensor, "L T C P"]
+    """Of the bells."""
+    density: Float[Tensor, "L"]
+    """Of a factor on the densities."""
+    at: Float[Tensor, "L T N 2"]
+    behind: Float[Tensor, "L T *N"]
+    """Of places, or of the body's points and then places."""
+    share: Float[Tensor, "L"] | None = None
 
-    @classmethod
-    def of(cls, lamps: Float[Tensor, "L 3"], body: Float[Tensor, "T P 3"]) -> "_Views":
-        ray = body.mean(1) - lamps[:, None]
-        distance = ray.norm(dim=-1, keepdim=True)
-        axis = ray / distance
-        across, twist = _across(axis)
-        frames = torch.cat([across, axis[..., None, :]], -2)
-        return cls(lamps, frames, twist, distance, body.shape[1])
-
-    def project(self, body: Float[Tensor, "T P 3"], places: Float[Tensor, "T N 3"]) -> _Seen:
-        rays = torch.cat([body, places], 1) - self.lamps[:, None, None]
-        local = rays @ self.frames.mT
-        along = local[..., 2]
-        spread = self.distance / along.clamp_min(_NEAREST_M)
-        at = local[..., :2] * spread[..., None]
-        return _Seen(rays, along, spread, at, along - self.distance, at[:, :, : self.count])
-
-    def backward(
-        self,
-        seen: _Seen,
-        by_at: Float[Tensor, "L T P+N 2"],
-        by_behind: Float[Tensor, "L T P+N"],
-    ) -> tuple[Float[Tensor, "L 3"], Float[Tensor, "T P 3"], Float[Tensor, "T N 3"]]:
-        """Gradients of lamps, body and places from those of what `project` gave."""
-        reach = (by_at * seen.at).sum(-1) / self.distance
-        nears = seen.spread * (seen.along > _NEAREST_M)
-        by_along = torch.addcmul(by_behind, reach, nears, value=-1)
-        by_distance = (reach - by_behind).sum(-1, keepdim=True)
-        by_local = torch.cat([by_at * seen.spread[..., None], by_along[..., None]], -1)
-        by_rays = by_local @ self.frames
-        by_ray = self._by_ray(by_local.mT @ seen.rays, by_distance)
-        by_points = by_rays.sum(0)
-        by_lamps = -by_ray.sum(1) - by_rays.sum((1, 2))
-        by_body = by_points[:, : self.count] + by_ray.sum(0)[:, None] / self.count
-        return by_lamps, by_body, by_points[:, self.count :]
-
-    def _by_ray(
-        self, by_frame: Float[Tensor, "L T 3 3"], by_distance: Float[Tensor, "L T 1"]
-    ) -> Float[Tensor, "L T 3"]:
-        """Gradient of the way from the lamp to the body's middle."""
-        axis = self.frames[..., 2, :]
-        turned = by_frame @ self.frames.mT
-        about = turned[..., 0, 1] - turned[..., 1, 0]
-        by_axis = by_frame[..., 2, :] - (turned[..., :2, 2:] * self.frames[..., :2, :]).sum(-2)
-        by_axis = torch.addcmul(by_axis, about[..., None], self.twist)
-        # Only what turns the axis, and what makes the ray longer.
-        along = (by_axis * axis).sum(-1, keepdim=True)
-        return torch.addcmul((by_axis - along * axis) / self.distance, by_distance, axis)
+    def of_width(self, by_width: Float[Tensor, "L"], widths: Float[Tensor, "L"]) -> Tensor:
+        """That of the widths with what `_scale` adds to that of the bells."""
+        return torch.addcdiv(by_width, self.density, widths, value=-2)
 
 
 @dataclass(frozen=True, eq=False)
-class _Bells:
-    """Round Gaussians at points of the plane, one factor per axis, at the cells of the grid."""
+class _Scene:
+    """Shadows on places behind the body."""
 
-    widths: Float[Tensor, "L 1 1 1"]
-    away: Float[Tensor, "2 L T C P"]
-    """Of the cells from the points, in widths."""
-    values: Float[Tensor, "2 L T C P"]
+    bells: Float[Tensor, "2 L T C P"]
+    scale: Float[Tensor, "L #T 1 1"]
+    density: Float[Tensor, "L T C C"]
+    grid: Tensor
+    shares: Float[Tensor, "L 1 1"]
+    sampled: Float[Tensor, "L T N"]
+    gate: Float[Tensor, "L T N"]
+    lost: Float[Tensor, "L T N"]
+    factors: Float[Tensor, "L T N"]
+    """Of each lamp."""
 
     @classmethod
-    def at(cls, at: Float[Tensor, "L T P 2"], widths: Float[Tensor, "L"]) -> "_Bells":
-        wide = widths[:, None, None, None]
-        grid = torch.linspace(-REACH_M, REACH_M, _CELLS, dtype=at.dtype, device=at.device)
-        away = (grid[:, None] - at.movedim(-1, 0)[..., None, :]) / wide
-        return cls(wide, away, torch.exp(-0.5 * away.square()))
+    def of(
+        cls, bells: Tensor, scale: Tensor, at: Tensor, behind: Tensor, shares: Tensor
+    ) -> "_Scene":
+        density = scale * (bells[0] @ bells[1].mT)
+        sampled, grid = _sample(density.flatten(0, 1)[:, None], at.flatten(0, 1)[:, None])
+        sampled = sampled.view(behind.shape)
+        gate = torch.sigmoid((behind - _BEHIND_M) / _BEHIND_EDGE_M)
+        lost, wide = 1 - torch.exp(-sampled * gate), shares.detach()[:, None, None]
+        return cls(bells, scale, density, grid, wide, sampled, gate, lost, 1 - wide * lost)
 
-    @property
-    def across(self) -> Float[Tensor, "L T C P"]:
-        return self.values[0]
+    def backward(self, above: Float[Tensor, "T N"]) -> _Slopes:
+        tiny = torch.finfo(self.factors.dtype).tiny
+        by_lost = -above * self.factors.prod(0) / self.factors.clamp_min(tiny)
+        by_depth = by_lost * self.shares * (1 - self.lost)
+        by_gate = by_depth * self.sampled * self.gate * ((1 - self.gate) / _BEHIND_EDGE_M)
+        grids = self.density.flatten(0, 1)[:, None]
+        by_density, by_at = _sample_backward(by_depth * self.gate, grids, self.grid)
+        by_density = by_density.view_as(self.density)
+        scaled = self.scale * by_density
+        return _Slopes(
+            scaled @ self.bells[1],
+            scaled.mT @ self.bells[0],
+            (by_density * self.density).sum((1, 2, 3)),
+            by_at.view(*by_gate.shape, 2),
+            by_gate,
+            (by_lost * self.lost).sum((1, 2)),
+        )
 
-    @property
-    def down(self) -> Float[Tensor, "L T C P"]:
-        return self.values[1]
 
-    def backward(
-        self, by_across: Float[Tensor, "L T C P"], by_down: Float[Tensor, "L T C P"]
-    ) -> tuple[Float[Tensor, "L T P 2"], Float[Tensor, "L"]]:
-        """Gradients of the points and the widths."""
-        slopes = torch.stack([by_across, by_down]) * self.values * self.away / self.widths
-        return slopes.sum(-2).movedim(0, -1), (slopes * self.away).sum((0, 2, 3, 4))
+@dataclass(frozen=True, eq=False)
+class _Own:
+    """Light on places of the body itself, by layers along it each of which holds what is nearer."""
+
+    bells: Float[Tensor, "2 L T C P"]
+    scale: Float[Tensor, "L #T 1 1"]
+    density: Float[Tensor, "L T Z*C C"]
+    grid: Tensor
+    nearer: Float[Tensor, "L T Z P"]
+    rows: Float[Tensor, "L T Z*C P"]
+
+    @classmethod
+    def of(
+        cls, bells: Tensor, scale: Tensor, in_front: Tensor, at: Tensor, behind: Tensor
+    ) -> tuple["_Own", Float[Tensor, "L T N"]]:
+        layers = constant(evenly(_LAYERS), in_front)[:, None]
+        nearer = torch.sigmoid((layers - in_front[:, :, None]) / _LAYER_EDGE_M)
+        rows = (nearer[:, :, :, None] * bells[0][:, :, None]).flatten(2, 3)
+        density = scale * (rows @ bells[1].mT)
+        where = torch.cat([at, (behind - _OWN_SURFACE_M)[..., None]], -1)
+        depth, grid = _sample(
+            density.flatten(0, 1).unflatten(1, (1, _LAYERS, CELLS)),
+            where.flatten(0, 1)[:, None, None],
+        )
+        light = torch.exp(-depth.view(behind.shape))
+        return cls(bells, scale, density, grid, nearer, rows), light
+
+    def backward(self, above: Float[Tensor, "L T N"], light: Tensor) -> _Slopes:
+        layered = self.density.flatten(0, 1).unflatten(1, (1, _LAYERS, CELLS))
+        by_density, by_where = _sample_backward(-above * light, layered, self.grid)
+        by_density = by_density.view_as(self.density)
+        by_where = by_where.view(*light.shape, 3)
+        scaled = self.scale * by_density
+        by_rows = (scaled @ self.bells[1]).unflatten(2, (_LAYERS, CELLS))
+        by_nearer = (by_rows * self.bells[0][:, :, None]).sum(3)
+        by_front = (by_nearer * self.nearer * (self.nearer - 1)).sum(2) / _LAYER_EDGE_M
+        return _Slopes(
+            (by_rows * self.nearer[:, :, :, None]).sum(2),
+            scaled.mT @ self.rows,
+            (by_density * self.density).sum((1, 2, 3)),
+            by_where[..., :2],
+            torch.cat([by_front, by_where[..., 2]], 2),
+        )
 
 
-def _scale(body: Float[Tensor, "T P 3"], widths: Float[Tensor, "L"]) -> Float[Tensor, "L 1 1 1"]:
+def _padded(places: Float[Tensor, "*T N D"], count: int) -> Float[Tensor, "*T M D"]:
+    """With zeros up to so many places."""
+    missing = count - places.shape[-2]
+    return F.pad(places, (0, 0, 0, missing)) if missing else places
+
+
+def _scale(
+    body: Float[Tensor, "T P 3"], widths: Float[Tensor, "L #T"]
+) -> Float[Tensor, "L #T 1 1"]:
     scale = DENSITY * AREA_M2 / (body.shape[1] * 2 * torch.pi)
-    return (scale * widths.pow(-2))[:, None, None, None]
-
-
-def _of_scale(by_width: Tensor, by_density: Tensor, density: Tensor, widths: Tensor) -> Tensor:
-    """The widths' gradient with that of `_scale` added."""
-    total = (by_density * density).sum((1, 2, 3))
-    return torch.addcdiv(by_width, total, widths, value=-2)
+    return (scale * widths.pow(-2))[..., None, None]
 
 
 def _sample(
@@ -291,20 +348,3 @@ def _as_sampled(places: Tensor) -> Tensor:
     if places.shape[-1] == 2:
         return places.flip(-1) / REACH_M
     return torch.cat([places[..., :2].flip(-1), places[..., 2:]], -1) / REACH_M
-
-
-def _across(axis: Float[Tensor, "*T 3"]) -> tuple[Float[Tensor, "*T 2 3"], Float[Tensor, "*T 3"]]:
-    """Two unit vectors at right angles to ``axis`` and each other (Duff et al. 2017, JCGT 6).
-
-    They are the first rows of the reflection that takes the axis to the z axis or its opposite; the
-    second one turns with the sign. And their twist: how far the first one moves along the second
-    for a small move of the axis is the product with it.
-    """
-    sign = torch.copysign(torch.ones_like(axis[..., 2:]), axis[..., 2:])
-    between = axis + F.pad(sign, (2, 0))
-    ratio = between[..., :2] / between[..., 2:]
-    identity = torch.eye(3, dtype=axis.dtype, device=axis.device)[:2]
-    # The identity less (ratio * sign) between.
-    rows = torch.addcmul(identity, (ratio * sign)[..., None], between[..., None, :], value=-1)
-    twist = F.pad(torch.stack([ratio[..., 1], -ratio[..., 0]], -1), (0, 1))
-    return rows * F.pad(sign, (1, 0), value=1.0)[..., None], twist

@@ -9,6 +9,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from evsplat.camera import Camera
+from evsplat.devices import constant
 from evsplat.models.kept import Kept
 from evsplat.models.layers import SceneShadow
 
@@ -53,13 +54,16 @@ class Relief(nn.Module):
         self, places: Float[Tensor, "H W 3"]
     ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
         """Where the scene of ``places`` (world, metres) is, and the exponents of its shadows."""
-        seen = places @ self.to_picture[:, :3].T + self.to_picture[:, 3]
-        at = seen[..., :2] / seen[..., 2:].clamp_min(_NEAREST_M)
+        to_picture = self.to_picture
+        seen = torch.addmm(to_picture[:, 3], places.flatten(0, 1), to_picture[:, :3].T)
+        at = seen[:, :2] / seen[:, 2:].clamp_min(_NEAREST_M)
+        at = at.view(*places.shape[:2], 2)
         learned = F.grid_sample(
             self._learned(), at[None], padding_mode="border", align_corners=False
-        )[0]
-        farther = (_LOG_DEPTH * learned[0]).exp()[..., None]
-        return self.center + (places - self.center) * farther, (_LOG_STRENGTH * learned[1]).exp()
+        ).squeeze(0)
+        units = constant((_LOG_DEPTH, _LOG_STRENGTH), learned)[:, None, None]
+        farther, exponents = (units * learned).exp().unbind(0)
+        return self.center + (places - self.center) * farther[..., None], exponents
 
     def price(self) -> Float[Tensor, ""]:
         """Differences of neighbours, squared, and a tenth of the squares; to be kept small.

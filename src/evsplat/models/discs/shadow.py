@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body.body import skin
 from evsplat.body.surface import SurfaceSamples
-from evsplat.models.discs.shadow_grids import light_on_body, shadow_on_scene
+from evsplat.models.discs.shadow_grids import both_shadows, light_on_body, shadow_on_scene
 
 _LEAST_WIDTH_M = 0.03
 _START_DISTANCE_M = 3.0
@@ -121,3 +121,19 @@ class BodyShadow(nn.Module):
         assert self.own_widths_log is not None
         widths = _LEAST_WIDTH_M + self.own_widths_log.exp()
         return light_on_body(body, places, lamps, widths)
+
+    def both(
+        self,
+        body: Float[Tensor, "T P 3"],
+        places: Float[Tensor, "H W 3"],
+        own: Float[Tensor, "K N 3"],
+        lamps: Float[Tensor, "L 3"],
+        at: slice,
+    ) -> tuple[Float[Tensor, "T H W"], Float[Tensor, "L K N"]]:
+        """As called, and `lit` at its ``own`` places, whose times are ``at`` among all.
+
+        By the latter neither the body nor these places learn anything.
+        """
+        assert self.own_widths_log is not None
+        widths = _LEAST_WIDTH_M + torch.stack([self.widths_log, self.own_widths_log]).exp()
+        return both_shadows(body, places, own, lamps, widths, self.share_logits.sigmoid(), at)

@@ -13,7 +13,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from evsplat.compiled import native, runs_native
-from evsplat.models.discs.plain_shadow import AREA_M2, DENSITY, light_on_places, shadow_on_places
+from evsplat.models.discs.plain_shadow import (
+    AREA_M2,
+    DENSITY,
+    light_on_places,
+    shadow_and_light,
+    shadow_on_places,
+)
 
 _MOST_LAMPS = 16
 """That the compiled module takes."""
@@ -52,6 +58,28 @@ def light_on_body(
         light: Tensor = _Cast.apply(body, places, lamps, widths, None)
         return light
     return light_on_places(body, places, lamps, widths)
+
+
+def both_shadows(
+    body: Float[Tensor, "T P 3"],
+    places: Float[Tensor, "H W 3"],
+    own: Float[Tensor, "K N 3"],
+    lamps: Float[Tensor, "L 3"],
+    widths: Float[Tensor, "2 L"],
+    shares: Float[Tensor, "L"],
+    at: slice,
+) -> tuple[Float[Tensor, "T H W"], Float[Tensor, "L K N"]]:
+    """`shadow_on_scene`, and `light_on_body` at its ``own`` places at the times ``at``.
+
+    ``widths``: of the former and of the latter. The latter moves neither the body nor its places.
+    """
+    own = own.detach()
+    if native is not None and body.device.type == "cpu":
+        scene, person = widths
+        light = light_on_body(body[at].detach(), own, lamps, person)
+        return shadow_on_scene(body, places, lamps, scene, shares), light
+    factors, light = shadow_and_light(body, places.flatten(0, 1), own, lamps, widths, shares, at)
+    return factors.unflatten(1, places.shape[:2]), light
 
 
 def _all_native(*tensors: Tensor) -> bool:

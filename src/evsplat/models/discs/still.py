@@ -23,7 +23,8 @@ class Still:
     scene: Splats
     means: Float[Tensor, "H 3"]
     """Of the person, canonical metres."""
-    scales_log: Float[Tensor, "H 3"]
+    scales: Float[Tensor, "H 3"]
+    """Of the person, metres."""
     quaternions: Float[Tensor, "H 4"]
     rgb: Float[Tensor, "H 3"]
     """The person's own colours, sRGB."""
@@ -33,30 +34,38 @@ class Still:
 
     @classmethod
     def of(
-        cls, gaussians: GaussianSet, scene_colours: SceneColours, *, hard_semantics: bool
+        cls, gaussians: GaussianSet, scene_colours: SceneColours | None, *, hard_semantics: bool
     ) -> "Still":
-        """Read from the attributes; labels are the soft ones, or hard."""
+        """Read from the attributes; labels are the soft ones, or hard.
+
+        ``scene_colours``: where the scene's colours are not their own.
+        """
         means, scene_means = gaussians.of_parts(gaussians.means)
-        scales_log, scene_scales_log = gaussians.of_parts(gaussians.scales_log)
+        scales, scene_scales = gaussians.of_parts(gaussians.scales_log.exp())
         quaternions, scene_quaternions = gaussians.of_parts(gaussians.quaternions)
-        colours, scene_features = gaussians.of_parts(gaussians.get_parameter(gaussians.colour))
+        colours = gaussians.get_parameter(gaussians.colour)
+        if scene_colours is None:
+            rgb, scene_rgb = gaussians.of_parts(colours.sigmoid())
+        else:
+            own, features = gaussians.of_parts(colours)
+            rgb = own[:, :3].sigmoid()
+            scene_rgb = scene_colours(features, scene_means, scene_scales)
         opacities, scene_opacities = gaussians.of_parts(gaussians.opacities())
         labels = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
         semantics, scene_semantics = gaussians.of_parts(labels)
-        scene_scales = scene_scales_log.exp()
         return cls(
             scene_splats(
                 scene_means,
                 scene_quaternions,
                 scene_scales,
                 scene_opacities,
-                scene_colours(scene_features, scene_means, scene_scales),
+                scene_rgb,
                 scene_semantics,
             ),
             means,
-            scales_log,
+            scales,
             quaternions,
-            colours[:, :3].sigmoid(),
+            rgb,
             opacities,
             semantics,
         )

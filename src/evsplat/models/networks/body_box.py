@@ -32,6 +32,6 @@ class BodyBox(nn.Module):
         """``encoding`` of canonical places, [0, 1] over that box; kept where nobody learns them."""
 
         def encode() -> Tensor:
-            return encoding(0.5 * (self.normalise(places) + 1))
+            return encoding((places - self.box_low) / (self.box_high - self.box_low))
 
         return self._encoded.of([places], encode)

@@ -86,7 +86,10 @@ def plain_mlp(
 
     ``bias`` is the first layer's, ``layers`` are weight and bias of each later layer.
     """
-    hidden = (point @ point_weight.T) + bias[:, None]
+    if len(bias) == 1:
+        hidden = nn.functional.linear(point, point_weight, bias[0])[None]
+    else:
+        hidden = (point @ point_weight.T) + bias[:, None]
     if both is not None:
         hidden = hidden + both @ both_weight.T
     for weight, layer_bias in zip(layers[::2], layers[1::2], strict=True):

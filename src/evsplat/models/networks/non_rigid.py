@@ -29,6 +29,7 @@ class OneBlobEncoding(nn.Module):
 
     between: Tensor
     edges: Tensor
+    rest: Tensor
 
     def __init__(self, bins: int = 16) -> None:
         super().__init__()
@@ -42,15 +43,18 @@ class OneBlobEncoding(nn.Module):
         between[-1, 0] -= 1
         self.register_buffer("between", between, persistent=False)
         self.register_buffer("edges", torch.arange(bins + 1.0), persistent=False)
+        # Of the constant halves of the integrals, and of the ends that meet, this is what stays.
+        rest = torch.zeros(bins)
+        rest[[0, -1]] = 0.5
+        self.register_buffer("rest", rest, persistent=False)
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch D"]:
         """Encode positions in [0, 1]."""
         if runs_native(positions):
             encoded: Tensor = _NativeOneBlob.apply(positions, self.bins)
             return encoded
-        plain: Tensor = _PlainOneBlob.apply(
-            positions, self.edges.to(positions.dtype), self.between.to(positions.dtype)
-        )
+        constants = (part.to(positions.dtype) for part in (self.edges, self.between, self.rest))
+        plain: Tensor = _PlainOneBlob.apply(positions, *constants)
         return plain
 
 
@@ -59,15 +63,14 @@ class _PlainOneBlob(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, positions: Tensor, edges: Tensor, between: Tensor
+        ctx: Any, positions: Tensor, edges: Tensor, between: Tensor, rest: Tensor
     ) -> Float[Tensor, "*batch D"]:
         bins = len(edges) - 1
         u = (edges - bins * positions.clamp(0, 1)[..., None]).clamp(-1, 1)
         square = u * u
-        # The integral from -1 to u of 15/16 (1 - v^2)^2.
-        upto = 0.5 + u * (square * (0.1875 * square - 0.625) + 0.9375)
-        encoded = upto @ between
-        encoded[..., 0] += 1
+        # The integral from 0 to u of 15/16 (1 - v^2)^2; that from -1 is a half more.
+        upto = u * (square * (0.1875 * square - 0.625) + 0.9375)
+        encoded = torch.nn.functional.linear(upto, between.mT, rest)
         ctx.save_for_backward(positions, square, between)
         return encoded.flatten(-2)
 
@@ -79,7 +82,7 @@ class _PlainOneBlob(torch.autograd.Function):
         above = upstream[0].unflatten(-1, (-1, bins)) @ between.T
         slopes = (above * (1 - square).square()).sum(-1)
         inside = (positions - 0.5).abs() <= 0.5
-        return slopes * inside * (-0.9375 * bins), None, None
+        return slopes * inside * (-0.9375 * bins), None, None, None
 
 
 class _NativeOneBlob(torch.autograd.Function):

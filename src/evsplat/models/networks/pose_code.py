@@ -54,7 +54,7 @@ class PoseCode(nn.Module):
     def forward(self, rotations: Float[Tensor, "T J 3 3"]) -> Float[Tensor, "T P"]:
         """Numbers of about -2 to 2."""
         code = (_entries(rotations) - self.middle) @ self.directions
-        return torch.minimum(torch.maximum(code, self.low), self.high)
+        return code.clamp(self.low, self.high)
 
 
 def _entries(rotations: Float[Tensor, "T J 3 3"]) -> Float[Tensor, "T E"]:
