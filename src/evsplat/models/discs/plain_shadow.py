@@ -189,14 +189,16 @@ class _Together(torch.autograd.Function):
         by_lamps, by_body, by_places = views.backward(
             seen, torch.cat([by_cast, by_at], 2), torch.cat([behind, own_behind], 1)
         )
-        by_widths = torch.stack([by_wide[:, :times].sum(1), by_wide[:, times:].sum(1)])
-        by_density = torch.stack([slopes.density, own.density])
+        by_widths = [
+            slopes.of_width(by_wide[:, :times].sum(1), widths[0]),
+            own.of_width(by_wide[:, times:].sum(1), widths[1]),
+        ]
         return (
             by_body[:times],
             by_places[:times, : slopes.at.shape[2]].sum(0),
             None,
             by_lamps,
-            torch.addcdiv(by_widths, by_density, widths, value=-2),
+            torch.stack(by_widths),
             slopes.share,
             None,
         )
