@@ -64,6 +64,12 @@ from ..importers.test_bad_trees import write as write_tree
 from ..landmarks.test_keypoints import WRITERS, points
 from ..posing.moving import CAMERA, landmarks
 from ..small_model import small
+from .recordings import (
+    Source,
+    write_davis_recording,
+    write_folder_recording,
+    write_video_recording,
+)
 
 
 class Accepted(AssertionError):
@@ -482,25 +488,37 @@ def tree(kind: str) -> Reader:
         # People-Snapshot's sequences begin with the gender.
         name, source, options = write_tree(kind, root / "female-1")
         place = source.relative_to(root).as_posix()
-        (root / "how.where").write_text(json.dumps([name, place, options]))
+        (root / "how.where").write_text(json.dumps([name, place, options, {}]))
 
-    def read(root: Path, damaged: Path) -> None:
-        if damaged.suffix == ".where":
-            return
-        name, place, options = json.loads((root / "how.where").read_text())
-        out = root.with_name(f"{root.name}-out")
-        shutil.rmtree(out, ignore_errors=True)
-        try:
-            import_capture(name, root / place, out, **options)
-            for finding in validate_capture(out):
-                if finding.severity == "error":
-                    raise Accepted(f"what the check calls wrong: {finding}")
-        except EvsplatError:
-            if out.exists():
-                raise Accepted("a capture left behind, though it is refused") from None
-            raise
+    return Reader(write_data, read_import, 3)
 
-    return Reader(write_data, read, 3)
+
+def own(kind: str, write: Callable[[Path], Source], share: int) -> Reader:
+    """A recording of one's own, imported."""
+
+    def write_data(root: Path) -> None:
+        (root / "how.where").write_text(json.dumps([kind, *write(root)]))
+
+    return Reader(write_data, read_import, share)
+
+
+def read_import(root: Path, damaged: Path) -> None:
+    """The import that how.where tells of: a capture that is sound, or none."""
+    if damaged.suffix == ".where":
+        return
+    name, place, options, files = json.loads((root / "how.where").read_text())
+    out = root.with_name(f"{root.name}-out")
+    shutil.rmtree(out, ignore_errors=True)
+    options |= {option: root / file for option, file in files.items()}
+    try:
+        import_capture(name, root / place, out, **options)
+        for finding in validate_capture(out):
+            if finding.severity == "error":
+                raise Accepted(f"what the check calls wrong: {finding}")
+    except EvsplatError:
+        if out.exists():
+            raise Accepted("a capture left behind, though it is refused") from None
+        raise
 
 
 def read_training(root: Path, damaged: Path) -> None:
@@ -575,5 +593,8 @@ READERS = {
             "zju-mocap-blur",
         )
     },
+    "import video": own("video", write_video_recording, 20),
+    "import davis": own("davis", write_davis_recording, 20),
+    "import folder": own("folder", write_folder_recording, 20),
 }
 """By name."""

@@ -12,8 +12,9 @@ CHEAP = {
     **{"json": 60, "settings": 20, "arrays": 60, "pickles": 60, "points": 60, "poses": 10},
     **{"motions": 20, "keypoints": 30, "camera paths": 40, "pictures": 40, "weights": 30},
     **{"event files": 20, "captures": 4},
+    **{"import video": 6, "import davis": 6, "import folder": 6},
 }
-"""Inputs by reader; training, imports, runs and benches take too long here."""
+"""Inputs by reader; training, data sets, runs and benches take too long here."""
 
 
 @pytest.mark.parametrize("name", CHEAP)

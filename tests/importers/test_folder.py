@@ -151,6 +151,30 @@ def test_what_is_odd_but_possible_is_a_note(recording: Path, tmp_path: Path, wha
     assert not any(re.search(other, said) for other in others for said in notes), notes
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"transl": None}, "transl: found nothing, expected an array of real numbers"),
+        ({"model": None}, "model: found '', expected one of rig, default, smpl"),
+        ({"times_us": np.array(["a"] * COUNT)}, "times_us: found 6 of <U1, expected"),
+        ({"times_us": np.zeros(0, np.int64)}, "times_us: found no pose|poses: found"),
+        ({"weights": np.zeros((3, 2))}, "weights: found 3x2"),
+    ],
+)
+def test_a_rig_is_held_to_what_a_captures_body_is(
+    recording: Path, tmp_path: Path, tiny_capture: Callable, change: dict[str, Any], message: str
+) -> None:
+    tiny = load_capture(tiny_capture(frames=COUNT))
+    (recording / "poses.npz").unlink()
+    arrays = {**np.load(tiny.path / "body.npz")} | change
+    kept = {name: value for name, value in arrays.items() if value is not None}
+    np.savez(recording / "body.npz", **kept)
+    options = {"fps": 25.0, "exposure_us": 3e4, "start_us": 15_000}
+    with pytest.raises(DataError, match=f"body.npz: ({message})") as caught:
+        import_capture("folder", recording, tmp_path / "out", pose_source="exact", **options)
+    assert str(recording) in str(caught.value) and not (tmp_path / "out").exists()
+
+
 def test_poses_of_another_time_are_refused(
     recording: Path, tmp_path: Path, tiny_capture: Callable
 ) -> None:
@@ -240,6 +264,48 @@ FAULTS = {
         {},
         DataError,
         "camera.json: K: expected 3x3 numbers",
+    ),
+    "K that is no number": (
+        lambda root: rewrite_camera(root, K=[[float("inf"), 0, 1], [0, 1, 1], [0, 0, 1]]),
+        {},
+        DataError,
+        "camera.json: K: expected 3x3 numbers",
+    ),
+    "K too large for a number": (
+        lambda root: rewrite_camera(root, K=[[10**400, 0, 1], [0, 1, 1], [0, 0, 1]]),
+        {},
+        DataError,
+        "camera.json: K: expected 3x3 numbers",
+    ),
+    "a time of another year": (
+        lambda root: (root / "events.csv").write_text(f"t,x,y,p\n0,1,3,1\n{10**15},1,3,0\n"),
+        {},
+        DataError,
+        "events.csv: has events from 0 to 10{15} us, expected a recording of at most a day",
+    ),
+    "a lens of words": (
+        lambda root: rewrite_camera(root, distortion=["r", 0, 0, 0]),
+        {},
+        DataError,
+        "camera.json: distortion: found .* expected 4, 5 or 8 numbers",
+    ),
+    "a lens that is a number": (
+        lambda root: rewrite_camera(root, distortion=0.5),
+        {},
+        DataError,
+        "camera.json: distortion: found 0.5, expected 4, 5 or 8 numbers",
+    ),
+    "a curve of another name": (
+        lambda root: rewrite_camera(root, transfer="gamma"),
+        {},
+        DataError,
+        "camera.json: transfer: found 'gamma', expected one of power, srgb, linear",
+    ),
+    "a device of exposures": (
+        lambda root: (root / "exposures.txt").symlink_to("/dev/zero"),
+        {},
+        DataError,
+        "exposures.txt: a device or pipe, expected a file",
     ),
     "exposures of fewer": (
         lambda root: (root / "exposures.txt").write_text("0 10\n20 30\n"),

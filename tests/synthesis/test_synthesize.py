@@ -311,7 +311,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(
         (DataError, "lens.json: K: expected 3x3", (folder,), {"camera": "lens.json"}),
         (DataError, "small.json: width: found 3", (folder,), {"camera": "small.json"}),
         (DataError, "bare.json: width, height", (folder,), {"camera": "bare.json"}),
-        (DataError, "short.npz: poses missing", (folder,), {"body": "short.npz"}),
+        (DataError, "short.npz: poses: found nothing, expected", (folder,), {"body": "short.npz"}),
         (DataError, "pickled", (folder,), {"body": "pickled.npz"}),
     ]
     text = posed["camera"].read_text()

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
-from evsplat.errors import DataError
+from evsplat.body.pose_errors import PoseErrors, PoseSource
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +68,6 @@ class BodyFile:
 
 
 RIG_ARRAYS = ("joint_names", "parents", "rest_joints", "rest_vertices", "faces", "weights")
-
-
-def stated_body(path: Path, arrays: dict[str, np.ndarray], source: PoseSource | None) -> BodyFile:
-    """A `BodyFile` outside of a capture, whose poses' ``source`` the user states."""
-    if source is None and "pose_std_rad" in arrays:
-        raise DataError(
-            f"{path}: says how far its poses err (pose_std_rad), expected their source as well; "
-            f"give --pose-source ({', '.join(POSE_SOURCES)})."
-        )
-    return body_from_arrays(path, arrays, "", source)
 
 
 def body_from_arrays(

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
+from evsplat.capture.body_file import BodyFile, body_from_arrays
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import Metadata
+from evsplat.capture.parse import BODY_MODELS
 from evsplat.errors import DataError
 from evsplat.untrusted.arrays import read_plain_npz
 
@@ -30,17 +32,37 @@ def check_body(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
         return
     _check_model(metadata, arrays, findings)
     check = _Check(metadata.body_file, arrays, findings)
-    check.poses(_JOINTS.get(metadata.body_model))
-    check.errors(metadata.body_source)
-    if metadata.body_model == "rig":
-        check.rig()
-    else:
-        check.shape_parameters(with_gender=metadata.body_model != "default")
+    check.body(metadata.body_model, metadata.body_source)
     if findings.error_count() == before:
         _check_coverage(metadata, arrays, findings)
     dense = metadata.path / "body_dense.npz"
     if deep and dense.exists():
         check_dense(dense, _read(dense, findings), check.joint_count(), findings)
+
+
+def stated_body(path: Path, source: PoseSource | None) -> BodyFile:
+    """Read a body.npz outside of a capture; the user states the ``source`` of its poses.
+
+    Raises:
+        DataError: It is not what a capture may have (docs/capture-format.md).
+    """
+    arrays = read_plain_npz(path)
+    if source is None and "pose_std_rad" in arrays:
+        raise DataError(
+            f"{path}: says how far its poses err (pose_std_rad), expected their source as well; "
+            f"give --pose-source ({', '.join(POSE_SOURCES)})."
+        )
+    model = str(arrays.get("model", ""))
+    if model not in BODY_MODELS:
+        raise DataError(
+            f"{path}: model: found {model[:80]!r}, expected one of {', '.join(BODY_MODELS)}, with "
+            "the arrays of body.npz (docs/capture-format.md); add it."
+        )
+    findings = Findings()
+    _Check(path, arrays, findings).body(model, source)
+    for finding in findings.items:
+        raise DataError(f"{finding}")
+    return body_from_arrays(path, arrays, model, source)
 
 
 def check_dense(
@@ -132,6 +154,14 @@ class _Check:
         """J of the poses, None where they are not well-formed."""
         poses = self.arrays.get("poses")
         return poses.shape[1] if poses is not None and poses.ndim == 3 else None
+
+    def body(self, model: str, source: PoseSource | None) -> None:
+        self.poses(_JOINTS.get(model))
+        self.errors(source)
+        if model == "rig":
+            self.rig()
+        else:
+            self.shape_parameters(with_gender=model != "default")
 
     def poses(self, joints: int | None) -> None:
         times = self.array("times_us", (None,), "iu")

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import PoseSource
 from evsplat.capture.body_file import key_poses, save_arrays, write_body
+from evsplat.capture.distortion import COEFFICIENT_COUNTS
 from evsplat.capture.parse import FORMAT, VERSION
 from evsplat.capture.parse_frames import default_split
 from evsplat.capture.points import write_points
@@ -28,9 +29,11 @@ from evsplat.files import (
 )
 from evsplat.names import checked_name
 from evsplat.pictures.files import read_image, write_image
-from evsplat.pictures.light import Transfer
+from evsplat.pictures.light import TRANSFERS, Transfer
+from evsplat.untrusted.faults import brief
 from evsplat.untrusted.text import read_json
 
+_LARGEST_COEFFICIENT = 1e9
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -350,24 +353,46 @@ def read_camera(
             raise DataError(
                 f"{path}: {key}: found {entry[key]}, expected {size} as the pictures have."
             )
-    lens = entry.get("distortion") or {}
+    transfer = entry.get("transfer")
+    if transfer is not None and transfer not in TRANSFERS:
+        raise DataError(
+            f"{path}: transfer: found {brief(transfer)}, expected one of "
+            f"{', '.join(TRANSFERS)}; correct it or leave it out."
+        )
     pose = _matrix(path, entry, "world_to_camera", 4) if "world_to_camera" in entry else None
     return {
         "K": _matrix(path, entry, "K", 3),
         "world_to_camera": pose,
-        "distortion": lens.get("coefficients") if isinstance(lens, dict) else lens,
-        "transfer": entry.get("transfer"),
+        "distortion": _coefficients(path, entry.get("distortion")),
+        "transfer": transfer,
     }
 
 
 def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarray:
     try:
         matrix = np.array(entry[key], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
-    if matrix.shape != (size, size):
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         raise DataError(f"{path}: {key}: expected {size}x{size} numbers.")
     return matrix
+
+
+def _coefficients(path: Path, lens: Any) -> list[float] | None:
+    """Of a lens as capture.json has it, or of OpenCV's numbers alone; None where there is none."""
+    values = lens.get("coefficients") if isinstance(lens, dict) else lens
+    if not lens:
+        return None
+    numbers = values if isinstance(values, list) else []
+    numeric = all(
+        isinstance(value, int | float) and abs(value) < _LARGEST_COEFFICIENT for value in numbers
+    )
+    if not numeric or len(numbers) not in COEFFICIENT_COUNTS:
+        raise DataError(
+            f"{path}: distortion: found {brief(values)}, expected 4, 5 or 8 numbers: OpenCV's k1, "
+            "k2, p1, p2, k3, k4, k5, k6; give them, or null."
+        )
+    return [float(value) for value in numbers]
 
 
 def _numbers(matrix: ArrayLike) -> list[Any]:

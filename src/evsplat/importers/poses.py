@@ -14,13 +14,13 @@ from evsplat.body.pose_files.sequence import moved
 from evsplat.body.smpl_skeleton import approximate_rest_joints, rest_pelvis
 from evsplat.camera import Camera
 from evsplat.capture import Capture, CaptureWriter, load_capture
-from evsplat.capture.body_file import BodyFile, stated_body
+from evsplat.capture.body_file import BodyFile
+from evsplat.capture.check_body import stated_body
 from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.errors import DataError
 from evsplat.files import remove_file
 from evsplat.importers.smpl import add_body, chosen_poses, model_file
 from evsplat.inspection import warn_of_body
-from evsplat.untrusted.arrays import read_plain_npz
 
 logger = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ def read_motion(
 ) -> Motion:
     """Poses of any known tool, or those of a capture's ``body.npz``."""
     if path.name == "body.npz":
-        return stated_body(path, read_plain_npz(path), pose_source)
+        return stated_body(path, pose_source)
     sequence = read_poses(path, person=person, image_size=size, body_models=smpl)
     return replace(sequence, pose_source=pose_source or sequence.pose_source)
 

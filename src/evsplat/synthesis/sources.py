@@ -12,14 +12,13 @@ from jaxtyping import Int64
 
 from evsplat.body import PoseSource
 from evsplat.capture import BodyFile, Capture, CaptureWriter, Frame, load_capture
-from evsplat.capture.body_file import RIG_ARRAYS, stated_body
+from evsplat.capture.check_body import stated_body
 from evsplat.capture.write import read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture
 from evsplat.pictures.files import read_image
 from evsplat.pictures.light import Transfer
-from evsplat.untrusted.arrays import read_plain_npz
 
 logger = logging.getLogger(__name__)
 
@@ -243,7 +242,7 @@ class FootageSource(Source):
                 "description with --camera."
             )
         self.footage: Footage = footage
-        self._body = None if body is None else _read_body(body, pose_source)
+        self._body = None if body is None else stated_body(body, pose_source)
         self._camera = None
         if camera is not None:
             self._camera = read_camera(camera, footage.width, footage.height, _CAMERA_KEYS)
@@ -282,26 +281,3 @@ class FootageSource(Source):
             writer.leave_out_body()
             return
         set_body(writer, self._body, None, np.array(list(frames.values())))
-
-
-def _read_body(path: Path, source: PoseSource | None) -> BodyFile:
-    arrays = read_plain_npz(path)
-    needed: tuple[str, ...] = ("model", "times_us", "poses", "transl")
-    if "model" in arrays and str(arrays["model"]) == "rig":
-        needed += RIG_ARRAYS
-    missing = [name for name in needed if name not in arrays]
-    if missing:
-        raise DataError(
-            f"{path}: {', '.join(missing)} missing, expected the arrays of body.npz "
-            "(docs/capture-format.md); add them."
-        )
-    count = len(np.atleast_1d(arrays["times_us"]))
-    for name in ("poses", "transl"):
-        if arrays[name].ndim < 2 or len(arrays[name]) != count:
-            raise DataError(
-                f"{path}: {name} has shape {arrays[name].shape}, expected one row for each of the "
-                f"{count} times_us."
-            )
-    if count == 0:
-        raise DataError(f"{path}: times_us is empty, expected at least one pose.")
-    return stated_body(path, arrays, source)

@@ -3,6 +3,7 @@
 An array's header is compared with the bytes that are there before memory is taken for it.
 """
 
+import io
 import warnings
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from evsplat.errors import DataError
 from evsplat.untrusted.faults import BROKEN, ordinary_file, reason
 from evsplat.untrusted.pickles import StandIns, Unpickler, read_guarded
 from evsplat.untrusted.sizes import count_of, open_zip, sound_text
+from evsplat.untrusted.text import read_text
 
 _KINDS = "biufcSU"
 _HEADERS = {
@@ -96,7 +98,12 @@ def read_plain_arrays(path: Path) -> dict[str, np.ndarray]:
 def read_table(
     source: Path | IO[bytes], *, rows: int | None = None
 ) -> Float64[np.ndarray, "rows columns"]:
-    """Numbers in lines of plain text, the first ``rows`` or all; a `ValueError` where others."""
+    """Numbers in lines of plain text, the first ``rows`` or all; a `ValueError` where others.
+
+    A path that leads to no ordinary text is a `DataError`.
+    """
+    if isinstance(source, Path):
+        source = io.BytesIO(read_text(source).encode())
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # empty lines, no lines

@@ -14,6 +14,7 @@ _MAX_GAP_AT_WRAP_US = 60_000_000
 _COUNTER_RANGES_US = ((1 << 32, 0), (1 << 31, -(1 << 31)), (1 << 31, 0))
 _MIN_BLOCK_EVENTS = 1 << 16
 _MAX_TIME_US = 1 << 60
+_LONGEST_US = 24 * 3600 * 1_000_000
 _SORTS = "sorts events that are out of order"
 
 
@@ -39,7 +40,24 @@ def checked(
     polarity among others that have one are left out. Otherwise the first of these is a `DataError`.
     """
     settled = _Settled(blocks, damage, width, height, has_polarity)
-    return _sorted(settled, damage) if damage.repair else _ascending(settled, damage)
+    ordered = _sorted(settled, damage) if damage.repair else _ascending(settled, damage)
+    return _within_a_day(ordered, damage)
+
+
+def _within_a_day(streams: Iterable[EventStream], damage: Damage) -> Iterator[EventStream]:
+    """The streams; a `DataError` where one wild time would make an index of years."""
+    first_us: int | None = None
+    for stream in streams:
+        if len(stream):
+            first_us = int(stream.t[0]) if first_us is None else first_us
+            last_us = int(stream.t[-1])
+            if last_us - first_us > _LONGEST_US:
+                raise DataError(
+                    f"{damage.path}: has events from {first_us} to {last_us} us, expected a "
+                    "recording of at most a day; leave out what has a wrong time, or give the unit "
+                    f"of a table with {SAY_UNIT}."
+                )
+        yield stream
 
 
 class _Settled:
