@@ -62,4 +62,54 @@ void spread_points(const float* points, size_t count, int64_t* chosen, size_t wa
     }
 }
 
+struct Turned {
+    float n[3];
+    float length;
+};
+
+static Turned turned(const float* m, const float* normal) {
+    float t[3];
+    for (int i = 0; i < 3; ++i) t[i] = m[3 * i] * normal[0] + m[3 * i + 1] * normal[1] + m[3 * i + 2] * normal[2];
+    const float length = std::max(std::sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]), 1e-12f);
+    return {{t[0] / length, t[1] / length, t[2] / length}, length};
+}
+
+static void harmonics(const float* n, float* h) {
+    const float x = n[0], y = n[1], z = n[2];
+    h[0] = x, h[1] = y, h[2] = z, h[3] = x * y, h[4] = y * z, h[5] = x * z, h[6] = x * x - y * y, h[7] = 3 * z * z - 1;
+}
+
+void shade_normals(const TurnedNormals& s, float* brightness) {
+    for (size_t i = 0; i < s.times * s.count; ++i) {
+        float h[8], sum = 1;
+        harmonics(turned(s.linear + 9 * i, s.normals + 3 * (i % s.count)).n, h);
+        for (int k = 0; k < 8; ++k) sum += s.light[k] * h[k];
+        brightness[i] = sum;
+    }
+}
+
+void shade_normals_backward(const TurnedNormals& s, const float* above, float* by_linear, float* by_light) {
+    double sums[8] = {};
+    const float* l = s.light;
+    for (size_t i = 0; i < s.times * s.count; ++i) {
+        const float* normal = s.normals + 3 * (i % s.count);
+        const Turned t = turned(s.linear + 9 * i, normal);
+        float h[8];
+        harmonics(t.n, h);
+        for (int k = 0; k < 8; ++k) sums[k] += above[i] * h[k];
+        if (!by_linear) continue;
+        const float x = t.n[0], y = t.n[1], z = t.n[2];
+        const float by[3] = {l[0] + l[3] * y + l[5] * z + 2 * l[6] * x, l[1] + l[3] * x + l[4] * z - 2 * l[6] * y,
+                             l[2] + l[4] * y + l[5] * x + 6 * l[7] * z};
+        // Only what turns a normal: its length is 1 again. One of no length has no direction to lose.
+        const float along = t.length > 1e-12f ? x * by[0] + y * by[1] + z * by[2] : 0;
+        const float scale = above[i] / t.length;
+        for (int j = 0; j < 3; ++j) {
+            const float by_turned = scale * (by[j] - along * t.n[j]);
+            for (int k = 0; k < 3; ++k) by_linear[9 * i + 3 * j + k] = by_turned * normal[k];
+        }
+    }
+    for (int k = 0; k < 8; ++k) by_light[k] = float(sums[k]);
+}
+
 }  // namespace evsplat

@@ -26,6 +26,28 @@ void py_spread_points(In points, Column<int64_t> chosen) {
     spread_points(points.data(), points.shape(0), chosen.data(), chosen.size());
 }
 
+TurnedNormals turned_normals(In linear, In normals, In light) {
+    require(linear.ndim() == 4 && linear.shape(2) == 3 && linear.shape(3) == 3, "the matrices");
+    require(normals.ndim() == 2 && normals.shape(0) == linear.shape(1) && normals.shape(1) == 3, "the normals");
+    require(light.ndim() == 1 && light.shape(0) == 8, "the light");
+    return {linear.data(), normals.data(), light.data(), linear.shape(0), linear.shape(1)};
+}
+
+void py_shade_normals(In linear, In normals, In light, Out brightness) {
+    const TurnedNormals given = turned_normals(linear, normals, light);
+    require(brightness.size() == given.times * given.count, "the brightness");
+    nb::gil_scoped_release release;
+    shade_normals(given, brightness.data());
+}
+
+void py_shade_normals_backward(In linear, In normals, In light, In above, std::optional<Out> by_linear, Out by_light) {
+    const TurnedNormals given = turned_normals(linear, normals, light);
+    require(above.size() == given.times * given.count && by_light.size() == 8, "the gradients");
+    require(!by_linear || by_linear->size() == linear.size(), "the matrices' gradient");
+    nb::gil_scoped_release release;
+    shade_normals_backward(given, above.data(), by_linear ? by_linear->data() : nullptr, by_light.data());
+}
+
 }  // namespace
 
 void bind_geometry(nb::module_& m) {
@@ -33,6 +55,10 @@ void bind_geometry(nb::module_& m) {
           nb::arg("mask"), "Sets the pixels whose centre lies in a projected triangle.");
     m.def("spread_points", &py_spread_points, nb::arg("points"), nb::arg("chosen"),
           "Writes rows of points, each the farthest from those before it.");
+    m.def("shade_normals", &py_shade_normals, nb::arg("linear"), nb::arg("normals"), nb::arg("light"),
+          nb::arg("brightness"), "Brightness of turned normals by harmonics of first and second order.");
+    m.def("shade_normals_backward", &py_shade_normals_backward, nb::arg("linear"), nb::arg("normals"),
+          nb::arg("light"), nb::arg("above"), nb::arg("by_linear").none(), nb::arg("by_light"));
 }
 
 }  // namespace evsplat

@@ -270,6 +270,23 @@ def test_pictures_of_another_motion_correct_it_and_are_explained_better(body):
     assert errors.root_m.max() < 0.02
 
 
+def test_while_the_look_is_learned_the_motion_stays_and_has_no_gradient(body):
+    found = []
+    for whole in (False, True):
+        _, descent = staged(body, 1.0)
+        descent.discs = 500
+        motion = descent.correction.turns, descent.correction.shifts
+        if whole:
+            descent._descend(descent._look_groups(), descent.targets, 1, 6)
+        else:
+            descent.learn_look(descent.targets, 1, 6)
+        assert all((one.grad is not None) == whole and one.requires_grad for one in motion)
+        assert not any(bool(one.any()) for one in motion)
+        found.append(descent.look.state_dict())
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
+    assert not torch.equal(found[0]["offsets"], torch.zeros(500))
+
+
 def test_how_far_away_somebody_is_stays_as_unknown_as_their_size(body):
     """Two shares of one sum: each keeps c^2 s^2 / (c^2 + s^2), here all of it along the view."""
     _, descent = staged(body, 0.0)

@@ -110,8 +110,15 @@ class Descent:
         return min(len(self.look.colours), round(_COARSE_DISCS * finer))
 
     def learn_look(self, targets: Targets, shrink: int, steps: int) -> None:
-        """Leave the motion as it is."""
-        self._descend(self._look_groups(), targets, shrink, steps)
+        """Leave the motion as it is, and ask for no gradient of it."""
+        motion = self.correction.turns, self.correction.shifts
+        for held in motion:
+            held.requires_grad_(False)
+        try:
+            self._descend(self._look_groups(), targets, shrink, steps)
+        finally:
+            for held in motion:
+                held.requires_grad_(True)
 
     def _look_groups(self) -> list[dict[str, Any]]:
         look = self.look

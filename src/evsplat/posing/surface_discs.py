@@ -1,16 +1,19 @@
 """A body as flat discs on its surface, drawn in one colour each under a smooth light."""
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from evsplat.body import Body
 from evsplat.body.body import skin_with_linear
 from evsplat.body.surface import SurfaceSamples, vertex_normals
 from evsplat.camera import Camera
+from evsplat.compiled import native, runs_native
 from evsplat.neighbours import far_apart
 from evsplat.render import RenderOutput, Splats, render
 
@@ -96,8 +99,7 @@ class SurfaceDiscs(nn.Module):
         points = self.samples.points[:n] + _OFFSET_M * offsets
         bones = self.body.canonical_to_world(rotations, transl)
         means, _, linear = skin_with_linear(points, weights, bones)
-        turned = (linear @ normals[:, :, None]).squeeze(-1)
-        shade = 1 + _harmonics(nn.functional.normalize(turned, dim=-1)) @ self.light
+        shade = shade_normals(linear, normals, self.light)
         opacities = torch.full((len(points),), _OPACITY)
         colours = self.colours[:n] * shade[..., None]
         return Splats(means, self.quaternions[:n], sizes, opacities, colours, linear=linear)
@@ -182,6 +184,39 @@ class SurfaceDiscs(nn.Module):
         offsets = offsets + self.layer.square().sum() + (self.inset / _INSET).square()
         offsets = offsets + self.nearer.square()
         return 0.5 * offsets + 2 * self.light.square().sum()
+
+
+def shade_normals(
+    linear: Float[Tensor, "T N 3 3"], normals: Float[Tensor, "N 3"], light: Float[Tensor, "8"]
+) -> Float[Tensor, "T N"]:
+    """Brightness of turned unit normals: 1 and the harmonics of `_harmonics` by their ``light``."""
+    if all(map(runs_native, (linear, normals, light))):
+        shade: Tensor = _NativeShade.apply(linear, normals, light)
+        return shade
+    turned = (linear @ normals[:, :, None]).squeeze(-1)
+    return 1 + _harmonics(nn.functional.normalize(turned, dim=-1)) @ light
+
+
+class _NativeShade(torch.autograd.Function):
+    """`shade_normals` in the compiled module, for normals that nobody learns."""
+
+    @staticmethod
+    def forward(ctx: Any, linear: Tensor, normals: Tensor, light: Tensor) -> Tensor:
+        given = [tensor.detach().contiguous() for tensor in (linear, normals, light)]
+        shade = linear.new_empty(linear.shape[:2])
+        native.shade_normals(*given, shade)
+        ctx.save_for_backward(*given)
+        return shade
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        linear, normals, light = ctx.saved_tensors
+        by_linear = torch.empty_like(linear) if ctx.needs_input_grad[0] else None
+        by_light = torch.empty_like(light)
+        above = upstream[0].contiguous()
+        native.shade_normals_backward(linear, normals, light, above, by_linear, by_light)
+        return by_linear, None, by_light
 
 
 def _harmonics(normals: Float[Tensor, "*T N 3"]) -> Float[Tensor, "*T N 8"]:
