@@ -17,11 +17,16 @@ from evsplat.pictures.files import save_png
 
 TILE_PX = 240
 """Height of the pictures."""
-_LABEL_PX = 34
+_LINE_PX = 17
+_TITLE_LINES = 3
 _GAP_PX = 6
 _FONT_PX = 13
 _WIDEST, _LETTERS = 4, 200
 
+_NO_GLYPH = str.maketrans("", "", "†")
+"""Marks of titles that the font does not have."""
+
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 Tile = tuple[str, str, UInt8[np.ndarray, "H W 3"]]
 """Title, figure, picture."""
 
@@ -46,14 +51,18 @@ def strip(tiles: list[Tile]) -> UInt8[np.ndarray, "H W 3"]:
     """Pictures beside each other on white, titles and figures below them."""
     scaled = [_scaled(picture) for _, _, picture in tiles]
     width = sum(image.width + _GAP_PX for image in scaled) - _GAP_PX
-    page = Image.new("RGB", (width, TILE_PX + _LABEL_PX), "white")
-    draw, font = ImageDraw.Draw(page), ImageFont.load_default(_FONT_PX)
+    font = ImageFont.load_default(_FONT_PX)
+    labels = [
+        [*_lines(title, font, image.width), *_lines(note, font, image.width)]
+        for (title, note, _), image in zip(tiles, scaled, strict=True)
+    ]
+    page = Image.new("RGB", (width, TILE_PX + 2 + _LINE_PX * max(map(len, labels))), "white")
+    draw = ImageDraw.Draw(page)
     x = 0
-    for (title, note, _), image in zip(tiles, scaled, strict=True):
+    for label, image in zip(labels, scaled, strict=True):
         page.paste(image, (x, 0))
-        for line, text in enumerate((title, note)):
-            fitting = _fitting(draw, text, font, image.width)
-            draw.text((x, TILE_PX + 2 + line * (_LABEL_PX // 2)), fitting, "black", font)
+        for line, text in enumerate(label):
+            draw.text((x, TILE_PX + 2 + line * _LINE_PX), text, "black", font)
         x += image.width + _GAP_PX
     return np.asarray(page)
 
@@ -66,17 +75,25 @@ def _scaled(picture: UInt8[np.ndarray, "H W 3"]) -> Image.Image:
     return Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS)
 
 
-def _fitting(
-    draw: ImageDraw.ImageDraw,
-    text: str,
-    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
-    width: int,
-) -> str:
+def _lines(text: str, font: Font, width: int) -> list[str]:
+    """The text between words in at most `_TITLE_LINES` lines, cut where a line is too long."""
+    lines: list[str] = []
+    for word in text[:_LETTERS].translate(_NO_GLYPH).split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and font.getlength(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    if len(lines) > _TITLE_LINES:
+        lines = [*lines[: _TITLE_LINES - 1], " ".join(lines[_TITLE_LINES - 1 :])]
+    return [_cut_short(line, font, width) for line in lines]
+
+
+def _cut_short(text: str, font: Font, width: int) -> str:
     """The text, cut where it would run into its neighbour."""
-    if len(text) <= _LETTERS and draw.textlength(text, font) <= width:
+    if font.getlength(text) <= width:
         return text
-    text = text[:_LETTERS]
-    while text and draw.textlength(f"{text}…", font) > width:
+    while text and font.getlength(f"{text}…") > width:
         text = text[:-1]
     return f"{text}…"
 
