@@ -1,18 +1,16 @@
 """Settings explained: what each takes and means, from its annotation and its docstring."""
 
-import ast
 import dataclasses
-import inspect
 import math
 import textwrap
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
 import yaml
 
 from evsplat.config import Setting, expected, settings, to_dict
+from evsplat.field_docs import field_docs
 from evsplat.files import write_text
 
 _WIDTH = 100
@@ -44,7 +42,7 @@ def explained(config: Any) -> list[Explained]:
     """Every setting of a configuration in words; a section comes before what is in it."""
     # A list of sections is one setting.
     every = [setting for setting in settings(config) if "[" not in setting.name]
-    docs = {owner: _field_docs(owner) for owner in {setting.owner for setting in every}}
+    docs = {owner: field_docs(owner) for owner in {setting.owner for setting in every}}
     return [_explained(setting, docs[setting.owner], every) for setting in every]
 
 
@@ -105,21 +103,3 @@ def _names(hint: Any, section: type[Any]) -> bool:
     """Whether a type is a section or may be one."""
     is_section = hint is section and dataclasses.is_dataclass(section)
     return is_section or any(_names(part, section) for part in get_args(hint))
-
-
-def _field_docs(kind: type[Any]) -> dict[str, str]:
-    """Docstrings of a dataclass's fields, in one line each; none where there is no source."""
-    docs = {}
-    for base in reversed(kind.__mro__):
-        try:
-            tree = ast.parse(textwrap.dedent(inspect.getsource(base)))
-        except (OSError, TypeError, SyntaxError):
-            continue
-        for pair in pairwise(part for node in tree.body for part in getattr(node, "body", [])):
-            match pair:
-                case (
-                    ast.AnnAssign(target=ast.Name(id=name)),
-                    ast.Expr(value=ast.Constant(value=str(text))),
-                ):
-                    docs[name] = " ".join(text.split())
-    return docs

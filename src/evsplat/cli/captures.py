@@ -56,8 +56,8 @@ class Simulate:
     """Write the events that an event camera would have sent, seeing a video."""
 
     source: Annotated[Positional[Path], option("SOURCE"), Input(check_footage)]
-    """A video, or a folder of pictures in the order of their names;
-    200 a second or more, as light is taken to change evenly between two."""
+    """A video, or a folder of pictures in the order of their names; 200 a second or more, as light
+    is taken to change evenly between two."""
     out: Annotated[Path, option("FILE")]
     """Event file to write, such as events.h5."""
     preset: Sensor = "clean"
@@ -72,7 +72,7 @@ class Simulate:
     """Rate at which the pictures were taken; a folder needs it."""
     transfer: Transfer = "power"
     """From coded values to light: exponent 2.2, sRGB's curve, or as they are."""
-    seed: int = 0
+    seed: Annotated[int, option("S")] = 0
     """Seed of everything random in the sensor."""
 
     def __call__(self) -> None:
@@ -141,12 +141,12 @@ class Stage:
     Blur and events are made from at least 1000 pictures per second.
     """
 
-    out: Annotated[Positional[Path | None], option("CAPTURE", default="")] = None
-    """New capture folder."""
-    settings: Annotated[StageSettings, FLAT]
-    threads: Threads = None
+    out: Annotated[Positional[Path | None], option("[CAPTURE]", default="")] = None
+    """New capture folder; only --list needs none."""
     list: Flag = False
     """Say which characters and motions ship."""
+    settings: Annotated[StageSettings, FLAT]
+    threads: Threads = None
 
     def __call__(self) -> None:
         from evsplat import staging

@@ -17,7 +17,7 @@ from evsplat.options.declare import FLAT, CaptureFolder, Flag, option
 def import_() -> None:
     """Turn a data set, or your own recording, into a capture.
 
-    'evsplat import KIND --help' tells the options of a kind; docs/import.md has the trees.
+    See 'evsplat import KIND --help' for the options of a kind, docs/import.md for the trees.
     """
 
 
@@ -29,12 +29,12 @@ class _Import:
     """Folder, video or recording (docs/import.md shows each)."""
     out: Annotated[Path, option("CAPTURE")]
     """Capture to write."""
+    options: Any
+    """The `Importer` of the kind."""
     smpl: Annotated[Path | None, option("PATH", default="EVSPLAT_BODY_MODELS")] = None
     """Your SMPL model file, or the folder that holds it."""
     overwrite: Flag = False
     """Replace a capture that is there."""
-    options: Any
-    """The `Importer` of the kind."""
 
     def __call__(self) -> None:
         from evsplat.importers import run_importer
@@ -61,7 +61,7 @@ class _ImportToPose(_Import):
     """The import of a recording whose poses may have to be found."""
 
     find_poses: Flag = False
-    """Go on to find the person's poses: evsplat poses, whose options stand last."""
+    """Go on to find the person's poses: evsplat poses, whose options follow."""
     search: Annotated[PoseOptions, FLAT]
     keypoints: Annotated[Path | None, option("FILE", default="found by the network")] = None
     """Key points of COCO (17, 133), OpenPose (25) or BlazePose (33)."""

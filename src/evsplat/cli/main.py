@@ -16,6 +16,7 @@ from evsplat.cli.exits import end_quietly, exit_code
 from evsplat.cli.import_ import check_kind, import_, import_with_kinds
 from evsplat.errors import ConfigError
 from evsplat.options.inputs import check_inputs
+from evsplat.options.reading import IN_ORDER
 
 _VERBS: dict[str, Callable[..., Any]] = {
     "demo": runs.demo,
@@ -73,13 +74,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
         if arguments[:1] == ["import"]:
             check_kind(arguments[1:])
-        asked = tyro.extras.subcommand_cli_from_dict(
-            verbs,
-            prog="evsplat",
-            description=_DESCRIPTION,
-            args=arguments or ["--help"],
-            config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
-        )
+        with IN_ORDER:
+            asked = tyro.extras.subcommand_cli_from_dict(
+                verbs,
+                prog="evsplat",
+                description=_DESCRIPTION,
+                args=arguments or ["--help"],
+                config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
+            )
         if callable(asked):
             check_inputs(asked)
             asked()

@@ -184,11 +184,11 @@ class Render:
     """
 
     run: RunFolder
+    out: Annotated[Path | None, option("PATH", default="in RUN/renders")] = None
+    """NAME.mp4, .webp, .gif or a folder."""
     film: Annotated[Film, FLAT]
     events: Annotated[Path | None, option("FILE", default="no")] = None
     """Write its events as well, such as to events.h5."""
-    out: Annotated[Path | None, option("PATH", default="in RUN/renders")] = None
-    """NAME.mp4, .webp, .gif or a folder."""
     device: Device = "auto"
     """Device that draws."""
     threads: Threads = None
@@ -214,7 +214,7 @@ class View:
     run: RunFolder
     other: Annotated[
         Positional[Path | None],
-        option("RUN2", default="no comparison"),
+        option("[RUN2]", default="no comparison"),
         Input(check_run_folder),
     ] = None
     """A second run of the same capture to compare with."""

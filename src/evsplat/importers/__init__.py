@@ -30,14 +30,14 @@ __all__ = ["KINDS", "Blur", "Importer", "attach_poses", "import_capture", "run_i
 logger = logging.getLogger(__name__)
 
 KINDS: dict[str, type[Importer]] = {
+    "folder": Folder,
+    "video": Video,
+    "davis": Davis,
     "zju-mocap": ZjuMocap,
     "mmhpsd": Mmhpsd,
     "neuman": Neuman,
     "people-snapshot": PeopleSnapshot,
     "zju-mocap-blur": ZjuMocapBlur,
-    "folder": Folder,
-    "video": Video,
-    "davis": Davis,
 }
 
 

@@ -50,8 +50,8 @@ class Folder(Importer):
     events: FileOption = None
     """Event recording of any known format; by default SOURCE/events.* if there is one."""
     poses: FileOption = None
-    """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE, and
-    no body where there are none."""
+    """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE;
+    without any there is no body."""
     pose_source: Annotated[PoseSource | None, option(default="")] = None
     """Where the poses come from; by default what the tool is known for."""
     camera: FileOption = None

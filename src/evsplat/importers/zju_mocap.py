@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from tqdm import tqdm
@@ -32,6 +32,7 @@ from evsplat.importers.base import (
 )
 from evsplat.importers.option_types import FrameRange, Rate, Shrink
 from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
+from evsplat.options.declare import option
 from evsplat.untrusted.arrays import read_npy, read_npz
 from evsplat.untrusted.text import read_json
 
@@ -45,9 +46,9 @@ class ZjuMocap(Importer):
 
     blur_recipe: ClassVar[str | None] = "zju-mocap-blur"
 
-    camera: str = "1"
+    camera: Annotated[str, option("NAME")] = "1"
     """Number of the camera whose pictures become the frames."""
-    novel_cameras: tuple[str, ...] = ()
+    novel_cameras: Annotated[tuple[str, ...], option("[CAMERA ...]", default="none")] = ()
     """Numbers of other cameras whose pictures are added for evaluation, one per frame each."""
     frames: FrameRange = None
     """First frame and one past the last; by default those of 3DGS-Avatar."""

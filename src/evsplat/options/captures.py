@@ -149,8 +149,8 @@ class StageSettings:
     """Tripod (static), arc round the person (orbit) or handheld."""
     orbit_deg: Annotated[float, Within(-360, 360), option("DEG", name="orbit")] = 30.0
     """Arc of an orbiting camera over the whole capture."""
-    shadows: Annotated[Flag, option(default="", name="shadow")] = True
-    """The person's shadow on the room, unless switched off."""
+    shadows: Annotated[Flag, option(name="shadow")] = True
+    """Leave out the person's shadow on the room."""
     brightness: Annotated[float, Within(0.01, 100), option("X")] = 1.0
     """Factor of all light."""
     events: Annotated[Sensor, option("SENSOR")] = "clean"

@@ -31,12 +31,12 @@ def option(
     """Annotation of an option: its placeholder, help and, in words, what happens without it.
 
     ``name`` and ``alias`` are what it is called on the command line where that is not the field,
-    ``read_as`` the type of what stands there.
+    ``read_as`` the type of what stands there. Of a switch no default is shown.
     """
 
     def hint(value: str) -> str:
         shown = value.removesuffix(".0") if default is None else default
-        return shown and f"(default: {shown})"
+        return f"(default: {shown})" if shown and value not in ("True", "False") else ""
 
     return tyro.conf.arg(
         name=name,
@@ -48,7 +48,7 @@ def option(
     )
 
 
-Flag = Annotated[bool, option(default="")]
+Flag = Annotated[bool, option()]
 CaptureFolder = Annotated[
     tyro.conf.Positional[Path],
     option("CAPTURE", "Capture folder (docs/capture-format.md)."),

@@ -23,34 +23,34 @@ from evsplat.options.declare import (
 class TrainOptions:
     """Training of a method on a capture, and the place of the run."""
 
+    out: NewRun = None
     method: Annotated[str | None, option("NAME", default="that of --config, or evsplat")] = None
     """Name of the method."""
-    out: NewRun = None
-    device: Device = "auto"
-    """Device; auto takes what the installed rasterisers can use."""
-    iterations: Annotated[int | None, AtLeast(1), option("N", default="the method's")] = None
-    """Exactly so many training steps; every schedule is scaled to it."""
     max_minutes: Annotated[float | None, Above(0), option("M", default="no limit")] = None
     """Minutes of training after which to stop gracefully, save and evaluate."""
-    resume: Flag = False
-    """Go on from the last checkpoint in --out."""
+    iterations: Annotated[int | None, AtLeast(1), option("N", default="the method's")] = None
+    """Exactly so many training steps; every schedule is scaled to it."""
     config: Annotated[Path | None, option("FILE", default="the method's")] = None
     """A config.yaml of an earlier run to start from."""
     overrides: Annotated[
         tuple[str, ...], option("[KEY=VALUE ...]", default="none", name="set")
     ] = ()
     """Settings to change, such as event_weight=0.2; see docs/settings.md."""
+    resume: Flag = False
+    """Go on from the last checkpoint in --out."""
+    seed: Annotated[int | None, option("S", default="0")] = None
+    """Seed of every random number."""
+    use: Annotated[Use | None, option("{training,everything}", default="training")] = None
+    """everything trains on all that was recorded and holds nothing out for test figures."""
+    any_body: Flag = False
+    """Train even with a body that follows nothing that moves in the recording."""
+    device: Device = "auto"
+    """Device; auto takes what the installed rasterisers can use."""
     threads: Threads = None
     device_memory_gb: Annotated[
         float | None, AtLeast(0), option("GB", default="a quarter of the free")
     ] = None
     """GPU memory for recorded pictures and event maps."""
-    seed: Annotated[int | None, option("S", default="0")] = None
-    """Seed of every random number."""
-    any_body: Flag = False
-    """Train even with a body that follows nothing that moves in the recording."""
-    use: Annotated[Use | None, option("{training,everything}", default="training")] = None
-    """everything trains on all that was recorded and holds nothing out for test figures."""
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -1,0 +1,64 @@
+"""How the command line reads a verb: its options in the order of its fields."""
+
+from collections.abc import Iterator
+from dataclasses import MISSING, Field, fields, is_dataclass
+from typing import Any, Generic, get_args, get_type_hints
+
+import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from evsplat.field_docs import field_docs
+from evsplat.options.declare import FLAT
+
+IN_ORDER = ConstructorRegistry()
+"""Context in which a verb's options stand as declared, those of a `FLAT` field in its place.
+
+The parser itself puts them last, and breaks the lines of their docstrings.
+"""
+
+
+@IN_ORDER.struct_rule
+def _in_order(info: StructTypeInfo) -> StructConstructorSpec | None:
+    if not is_dataclass(info.type) or issubclass(info.type, Generic):
+        return None  # the parser's own wrapper
+
+    def make(**values: Any) -> Any:
+        return _made(info.type, **values)
+
+    make.__doc__ = info.type.__doc__  # the page's first lines
+    return StructConstructorSpec(make, tuple(_options(info.type)))
+
+
+def _options(kind: type[Any]) -> Iterator[StructFieldSpec]:
+    docs, hints = field_docs(kind), get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        hint = hints[field.name]
+        if (part := _flat_part(hint)) is not None:
+            yield from _options(part)
+        else:
+            yield StructFieldSpec(field.name, hint, _default(field), docs.get(field.name))
+
+
+def _made(kind: type[Any], /, **values: Any) -> Any:
+    """An object of ``kind``, whose `FLAT` fields take their own of the ``values``."""
+    hints, made = get_type_hints(kind, include_extras=True), {}
+    for field in fields(kind):
+        part = _flat_part(hints[field.name])
+        made[field.name] = values[field.name] if part is None else _made(part, **values)
+    return kind(**made)
+
+
+def _flat_part(hint: Any) -> type[Any] | None:
+    is_flat = any(mark is FLAT for mark in getattr(hint, "__metadata__", ()))
+    return get_args(hint)[0] if is_flat else None
+
+
+def _default(field: Field[Any]) -> Any:
+    if field.default_factory is not MISSING:
+        return field.default_factory()
+    return tyro.MISSING if field.default is MISSING else field.default
