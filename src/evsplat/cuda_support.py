@@ -26,7 +26,7 @@ class Need:
     name: str
     there: bool
     detail: str
-    """What was found, or what is missing: one sentence."""
+    """What was found, in words, or what is missing, in one sentence."""
     remedy: str = ""
 
 
@@ -52,7 +52,7 @@ def _driver() -> Need:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
         return Need(name, False, "no libcuda.so.1 on this machine.", "Install NVIDIA's driver.")
-    return Need(name, True, "libcuda.so.1 loads.")
+    return Need(name, True, "libcuda.so.1 loads")
 
 
 def _torch() -> Need:
@@ -77,7 +77,7 @@ def _torch() -> Need:
     if capability < CAPABILITY:
         remedy = f"gsplat needs {CAPABILITY[0]}.{CAPABILITY[1]} (Volta) or newer: use the CPU."
         return Need(name, False, f"{detail}.", remedy)
-    return Need(name, True, f"{detail}.")
+    return Need(name, True, detail)
 
 
 def _gsplat() -> Need:
@@ -88,7 +88,7 @@ def _gsplat() -> Need:
         return Need("gsplat", False, "not installed.", remedy)
     if _numbers(found) < _numbers(GSPLAT):
         return Need("gsplat", False, f"{found} is older than {GSPLAT}.", remedy)
-    return Need("gsplat", True, f"{found}.")
+    return Need("gsplat", True, found)
 
 
 def _compiler() -> Need:
@@ -97,7 +97,7 @@ def _compiler() -> Need:
     spec = find_spec("gsplat")
     folder = Path(spec.origin).parent if spec is not None and spec.origin else None
     if folder is not None and any(folder.glob("csrc*.so")):
-        return Need(name, True, "not needed, gsplat came with its kernels built.")
+        return Need(name, True, "not needed, gsplat came with its kernels built")
     lacking = [tool for tool, there in _tools().items() if not there]
     if lacking:
         return Need(
@@ -107,7 +107,7 @@ def _compiler() -> Need:
             "Install the CUDA toolkit of torch's CUDA version (set CUDA_HOME if it lies elsewhere "
             "than /usr/local/cuda), g++ and: pip install ninja.",
         )
-    return Need(name, True, "nvcc, ninja and g++ are there; gsplat builds its kernels once.")
+    return Need(name, True, "nvcc, ninja and g++ are there; gsplat builds its kernels once")
 
 
 def _tools() -> dict[str, bool]:

@@ -45,6 +45,20 @@ def test_video_gives_its_pixels_and_its_uneven_times(tmp_path):
     assert [picture.name for picture in read] == [f"{i:06d}" for i in range(5)]
 
 
+def test_a_bare_stream_is_told_what_it_wants(tmp_path):
+    with av.open(str(tmp_path / "clip.h264"), "w", format="h264") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 32, 24, "yuv420p"
+        for picture in some_pictures(3):
+            frame = av.VideoFrame.from_ndarray(picture).reformat(32, 24, "yuv420p")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(
+        DataError, match="clip.h264: is no video with times.* expected MP4.*ffmpeg -framerate"
+    ):
+        open_footage(tmp_path / "clip.h264")
+
+
 def test_sixteen_bit_grey_video_keeps_its_depth(tmp_path):
     pictures = np.random.default_rng(1).integers(0, 2**16, (3, 16, 16), dtype=np.uint16)
     write_video(tmp_path / "deep.mkv", pictures, [0, 1, 2])

@@ -1,5 +1,6 @@
 """`inspect_capture`: right words, right pictures, and nothing drawn of a broken capture."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,6 +32,14 @@ def test_summary_states_what_was_recorded(tiny_capture: Factory, tmp_path: Path)
     for picture in report.pictures:
         with Image.open(picture) as image:
             assert image.width >= 700 and len(np.unique(np.asarray(image.convert("L")))) > 50
+
+
+def test_one_frame_has_no_delay(
+    tiny_capture: Factory, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    report = inspect_capture(tiny_capture(frames=1), tmp_path / "out")
+    assert report.usable and "1: 1 train, 0 test" in report.summary
+    assert not recwarn.list and not re.search("frames? (ahead|behind)", report.summary)
 
 
 def test_broken_capture_is_reported_and_not_drawn(tiny_capture: Factory, tmp_path: Path) -> None:

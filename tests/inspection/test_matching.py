@@ -104,6 +104,7 @@ def test_what_changes_in_time_tells_delays_of_somebody_who_stays():
     assert np.corrcoef(now.ravel(), late.ravel())[0, 1] > 0.95
     assert _changing(now, late) < 0.3
     assert _changing(now, np.ones_like(now)) == 0
+    assert _changing(now[:1], now[:1]) == _changing(now[:0], now[:0]) == 0
 
 
 def test_delays_are_told_where_both_halves_say_so():

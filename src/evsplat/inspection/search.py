@@ -60,8 +60,10 @@ class BestPlace:
         ]
         overall = np.mean([one.overall for one in searched], axis=0)
         grouped = np.mean([one.grouped for one in searched], axis=0)
-        place = np.unravel_index(overall.argmax(), overall.shape)
-        delay, down, right = int(place[0]), int(place[1]) - REACH_PX, int(place[2]) - REACH_PX
+        places = np.argwhere(overall == overall.max())
+        # delays that make no difference, as those of one frame, are none
+        place = tuple(min(places.tolist(), key=lambda found: abs(found[0] - NOW)))
+        delay, down, right = place[0], place[1] - REACH_PX, place[2] - REACH_PX
         highest = np.maximum(grouped.max((1, 2, 3)), 1e-9)
         told = [
             OwnTimes.of(
@@ -104,8 +106,11 @@ class BestPlace:
 def _changing(moves: Float32[np.ndarray, "K h w"], drawn: Float32[np.ndarray, "K h w"]) -> float:
     """Correlation of two films, each less its mean over time: of what differs between frames.
 
-    It tells delays of people who stay where they are, most of whom is the same in all frames.
+    It tells delays of people who stay where they are, most of whom is the same in all frames. In
+    less than two frames nothing changes: 0.
     """
+    if len(moves) < 2:
+        return 0.0
     one, other = (film - film.mean(0) for film in (moves, drawn))
     size = float(np.sqrt(np.square(one).sum() * np.square(other).sum()))
     return float((one * other).sum()) / size if size > 0 else 0.0

@@ -4,6 +4,7 @@ In plain torch, on any device and in any precision.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -18,6 +19,7 @@ CELLS = 49
 _NEAREST_M = 0.1
 
 
+@cache
 def evenly(count: int) -> tuple[float, ...]:
     """So many values from ``-REACH_M`` to `REACH_M`."""
     return tuple(REACH_M * (2 * k / (count - 1) - 1) for k in range(count))
