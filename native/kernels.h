@@ -127,6 +127,7 @@ struct GaussianGrads {
     KERNEL(void, power_mean_backward, (const PowerMean&, size_t begin, size_t end, const float* above, float* const* grads)) \
     KERNEL(void, add_sign, (const float*, const float*, float, float, size_t, float*)) \
     KERNEL(double, membership, (const Membership&, size_t begin, size_t end)) /* begin: a multiple of 16 */ \
+    KERNEL(double, misfit, (const Misfit&, size_t begin, size_t end)) \
     /* Of two maps: squares; absolute differences and their signs times the first; the gradient of those. */ \
     KERNEL(PairOfSums, square_sums, (const float*, const float*, size_t)) \
     KERNEL(PairOfSums, difference_sums, (const float*, const float*, float, float, size_t)) \

@@ -119,6 +119,48 @@ double membership(const Membership& job, size_t count, int threads) {
     return sum_of_pieces(count, threads, piece).first;
 }
 
+namespace {
+
+// Calls work(p, begin, end) for each picture with the pixels that are looked at in it.
+template <class Work>
+void in_pictures(size_t pictures, const int64_t* ends, int threads, const Work& work) {
+    parallel_for(threads, pictures, [&](size_t p) { work(p, size_t(p ? ends[p - 1] : 0), size_t(ends[p])); });
+}
+
+}  // namespace
+
+void colours_before(const Before& job, int threads, float* colours) {
+    const size_t area = job.looked.area;
+    in_pictures(job.looked.pictures, job.looked.ends, threads, [&](size_t p, size_t begin, size_t end) {
+        const float *drawn = job.drawn + 3 * p * area, *alpha = job.alpha + p * area;
+        for (size_t i = begin; i < end; ++i) {
+            const int32_t pixel = job.looked.pixel[i];
+            const float through = 1 - alpha[pixel];
+            for (int c = 0; c < 3; ++c) colours[3 * i + c] = drawn[c * area + pixel] + through * job.behind[3 * i + c];
+        }
+    });
+}
+
+void colours_before_backward(const Before& job, const float* above, int threads, float* by_drawn, float* by_alpha) {
+    const size_t area = job.looked.area;
+    in_pictures(job.looked.pictures, job.looked.ends, threads, [&](size_t p, size_t begin, size_t end) {
+        float *drawn = by_drawn + 3 * p * area, *alpha = by_alpha + p * area;
+        std::fill_n(drawn, 3 * area, 0.f);
+        std::fill_n(alpha, area, 0.f);
+        for (size_t i = begin; i < end; ++i) {
+            const int32_t pixel = job.looked.pixel[i];
+            const float *by = above + 3 * i, *behind = job.behind + 3 * i;
+            for (int c = 0; c < 3; ++c) drawn[c * area + pixel] += by[c];
+            alpha[pixel] -= by[0] * behind[0] + by[1] * behind[1] + by[2] * behind[2];
+        }
+    });
+}
+
+void misfit(const Misfit& job, int threads, float* sums) {
+    const auto kernel = select_kernels().misfit;
+    in_pictures(job.pictures, job.ends, threads, [&](size_t p, size_t begin, size_t end) { sums[p] = float(kernel(job, begin, end)); });
+}
+
 MapDifference map_difference(const float* map, const float* reference, float floor, size_t count, int threads) {
     const Kernels& kernels = select_kernels();
     const PairOfSums squares = sum_of_pieces(count, threads, [&](size_t begin, size_t end) {

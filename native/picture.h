@@ -72,6 +72,33 @@ struct Membership {
 
 double membership(const Membership&, size_t count, int threads);
 
+// The pixels of pictures that are looked at: of picture p the `pixel`s up to ends[p].
+struct Looked {
+    size_t pictures, area, count;  // of pixels in each, and looked at in all
+    const int32_t* pixel;          // (count), in its picture
+    const int64_t* ends;           // (pictures), the last one is count
+};
+
+// Their colours (count, 3) where drawings, planes (pictures, 3, area) and (pictures, area), are before what is `behind`,
+// (count, 3): drawn + (1 - alpha) behind.
+struct Before {
+    Looked looked;
+    const float *drawn, *alpha, *behind;
+};
+void colours_before(const Before&, int threads, float* colours);
+void colours_before_backward(const Before&, const float* above, int threads, float* by_drawn, float* by_alpha);
+
+// How far they are from pictures' colours: of each picture the sum of weight log(1 + scale |colour - image|^2).
+// `slope` is null or takes the derivatives by the colours.
+struct Misfit {
+    size_t pictures;
+    const int64_t* ends;                    // as above
+    const float *colours, *image, *weight;  // (count, 3) twice, and (count)
+    float scale;
+    float* slope;
+};
+void misfit(const Misfit&, int threads, float* sums);
+
 // Two maps of `count` pixels, each divided by sqrt(sum of squares + count floor^2).
 struct MapDifference {
     double scale[2];     // one over the divisors

@@ -51,6 +51,27 @@ double membership(const Membership& job, size_t begin, size_t end) {
     return sum(total);
 }
 
+double misfit(const Misfit& job, size_t begin, size_t end) {
+    F total = {};
+    vectors(begin, end, PER_VECTOR {
+        const F weight = load_some(job.weight + at, count);
+        F apart[3], square = {};
+        for (int c = 0; c < 3; ++c) {
+            apart[c] = gather<3>(job.colours + 3 * at + c, count) - gather<3>(job.image + 3 * at + c, count);
+            square += apart[c] * apart[c];
+        }
+        const F odds = 1.f + square * job.scale;
+        total += weight * log2(odds) * 0.693147181f + (odds - odds);  // the logarithm of no number is none
+        if (!job.slope) return;
+        const F by = 2.f * job.scale * weight / odds;
+        for (int c = 0; c < 3; ++c) {
+            const F slope = by * apart[c];
+            for (size_t l = 0; l < count; ++l) job.slope[3 * (at + l) + c] = slope[l];
+        }
+    });
+    return sum(total);
+}
+
 PairOfSums square_sums(const float* first, const float* second, size_t count) {
     F a = {}, b = {};
     for (size_t i = 0; i < count; i += W) {

@@ -23,6 +23,56 @@ double py_membership(In share, Bits bits, float lowest, std::optional<Out> slope
     return membership({share.data(), bits.data(), bits.data() + bytes, lowest, data_of(slope)}, count, threads);
 }
 
+void check_ends(Column<const int64_t> ends, size_t count) {
+    int64_t last = 0;
+    bool ordered = true;
+    for (size_t p = 0; p < ends.size(); last = ends.data()[p++]) ordered &= ends.data()[p] >= last;
+    require(ordered && size_t(last) == count, "the pictures' ends");
+}
+
+Looked looked_at(Array<const int32_t> pixel, Column<const int64_t> ends, size_t area) {
+    check_ends(ends, pixel.size());
+    bool inside = true;
+    for (size_t i = 0; i < pixel.size(); ++i) inside &= uint32_t(pixel.data()[i]) < area;
+    require(inside, "the pixels: outside of the picture");
+    return {ends.size(), area, pixel.size(), pixel.data(), ends.data()};
+}
+
+template <class Planes>
+Before before(const Planes& drawn, const Planes& alpha, Array<const int32_t> pixel, Column<const int64_t> ends, In behind) {
+    require(drawn.ndim() == 4 && drawn.shape(0) == ends.size() && drawn.shape(1) == 3 && 3 * alpha.size() == drawn.size(),
+            "the drawings");
+    require(behind.size() == 3 * pixel.size(), "what is behind");
+    const Looked looked = looked_at(pixel, ends, drawn.shape(2) * drawn.shape(3));
+    return {looked, drawn.data(), alpha.data(), behind.data()};
+}
+
+void py_colours_before(In drawn, In alpha, Array<const int32_t> pixel, Column<const int64_t> ends, In behind, Out colours,
+                       int threads) {
+    const Before job = before(drawn, alpha, pixel, ends, behind);
+    require(colours.size() == behind.size(), "the colours");
+    nb::gil_scoped_release release;
+    colours_before(job, threads, colours.data());
+}
+
+void py_colours_before_backward(Array<const int32_t> pixel, Column<const int64_t> ends, In behind, In above, Out by_drawn,
+                                Out by_alpha, int threads) {
+    const Before job = before(by_drawn, by_alpha, pixel, ends, behind);
+    require(above.size() == behind.size(), "the colours' gradient");
+    nb::gil_scoped_release release;
+    colours_before_backward(job, above.data(), threads, by_drawn.data(), by_alpha.data());
+}
+
+void py_misfit(In colours, Column<const int64_t> ends, In image, In weight, float scale, std::optional<Out> slope, Out sums,
+               int threads) {
+    const size_t count = weight.size();
+    require(colours.size() == 3 * count && image.size() == 3 * count && (!slope || slope->size() == 3 * count), "the colours");
+    require(sums.size() == ends.size(), "the sums");
+    check_ends(ends, count);
+    nb::gil_scoped_release release;
+    misfit({ends.size(), ends.data(), colours.data(), image.data(), weight.data(), scale, data_of(slope)}, threads, sums.data());
+}
+
 std::array<double, 4> py_map_difference(In map, In reference, float floor, int threads) {
     require(map.size() == reference.size(), "the maps");
     nb::gil_scoped_release release;
@@ -245,6 +295,14 @@ void py_surface_light_backward(In transforms, In normals, In places, In coeffici
 }  // namespace
 
 void evsplat::bind_step(nb::module_& m) {
+    m.def("colours_before", &py_colours_before, nb::arg("drawn"), nb::arg("alpha"), nb::arg("pixel"), nb::arg("ends"),
+          nb::arg("behind"), nb::arg("colours"), nb::arg("threads"),
+          "Colours of drawings before what is behind them, where pictures are looked at.");
+    m.def("colours_before_backward", &py_colours_before_backward, nb::arg("pixel"), nb::arg("ends"), nb::arg("behind"),
+          nb::arg("above"), nb::arg("by_drawn"), nb::arg("by_alpha"), nb::arg("threads"));
+    m.def("misfit", &py_misfit, nb::arg("colours"), nb::arg("ends"), nb::arg("image"), nb::arg("weight"), nb::arg("scale"),
+          nb::arg("slope").none(), nb::arg("sums"), nb::arg("threads"),
+          "How far colours are from those of pictures: sums of each, and the slopes.");
     m.def("membership", &py_membership, nb::arg("share"), nb::arg("bits"), nb::arg("lowest"), nb::arg("slope").none(),
           nb::arg("threads"), "Sum of the logarithms of what pixels surely are, by two bit masks, and its slope.");
     m.def("map_difference", &py_map_difference, nb::arg("map"), nb::arg("reference"), nb::arg("floor"),

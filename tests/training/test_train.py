@@ -176,6 +176,14 @@ def test_random_cube_is_selectable(tiny_capture, tmp_path):
     assert bool(picture.rgb.isfinite().all())
 
 
+def test_a_training_brings_no_compiler_along(tiny_capture, tmp_path):
+    """PyTorch imports it, which takes a second, for gradients of more than plain sums."""
+    last = 'assert not {"sympy", "torch._dynamo"} & set(sys.modules)'
+    command = [sys.executable, "-c", SCRIPT + last, tiny_capture(frames=10), tmp_path / "run"]
+    command += [3, 0, "evsplat", *small("evsplat")]
+    subprocess.run([str(part) for part in command], check=True)
+
+
 def test_non_finite_steps_are_skipped_counted_and_finally_stop(tiny_capture, caplog):
     capture = tiny_capture(frames=10)
     composition = built("paper", capture)

@@ -109,8 +109,16 @@ def shares_in(
     image = draw_values(layers, camera, channels)
     signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
     signs[..., 0] = 1
-    (gradient,) = torch.autograd.grad((image * signs).sum(), channels)
-    return gradient[0]
+    return transposed(image, channels, signs)[0]
+
+
+def transposed(image: Tensor, values: Tensor, weights: Tensor) -> Tensor:
+    """``J^T weights`` of the matrix J by which an image comes from values.
+
+    As the gradient of a sum: PyTorch imports its compiler, which takes a second, for one that is
+    begun with weights of its own (``grad_outputs``).
+    """
+    return torch.autograd.grad((image * weights).sum(), values)[0]
 
 
 @torch.no_grad()

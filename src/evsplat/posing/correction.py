@@ -17,6 +17,8 @@ _KINDS = ((0.3, math.inf), (0.5, 0.2), (0.2, 0.03))
 """Shares of the variance of errors that last throughout, and for about so long (s)."""
 _SHORTEST_US, _LONGEST_US = 20_000.0, 40_000.0
 """Bounds of the time between knots."""
+_KEPT = 16
+"""Sets of times whose given poses are kept."""
 _LEAST_SHARE = 1e-4
 """Coordinates of less of the variance are left out."""
 
@@ -49,6 +51,7 @@ class Correction(nn.Module):
         self.register_buffer("joint_rad", torch.as_tensor(joint_rad).float()[self.joints])
         self.register_buffer("root_m", torch.as_tensor(root_m).float())
         self.register_buffer("mixing", self._independent())
+        self._known: dict[tuple[int, ...], tuple[Tensor, Tensor, Tensor]] = {}
         coordinates = self.mixing.shape[1]
         self.turns = nn.Parameter(torch.zeros(coordinates, len(self.joints), 3))
         self.shifts = nn.Parameter(torch.zeros(coordinates, 3))
@@ -59,12 +62,19 @@ class Correction(nn.Module):
 
     def at(self, times_us: Sequence[int]) -> tuple[Float[Tensor, "T J 3 3"], Float[Tensor, "T 3"]]:
         """The corrected motion: rotations local to the parent and the root's place."""
-        rotations, transl = self.track.at(times_us)
-        weights = self.weights(times_us)
+        rotations, transl, weights = self._given_at(tuple(times_us))
         turns = torch.einsum("tm,mjc->tjc", weights, self.turns) * self.joint_rad[:, None]
         turned = rotations[:, self.joints] @ axis_angle_to_matrix(turns)
         rotations = rotations.index_copy(1, self.joints, turned)
         return rotations, transl + self.root_m * (weights @ self.shifts)
+
+    def _given_at(self, times_us: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
+        """Given rotations and places, and `weights`: a descent asks for few times, in turns."""
+        if times_us not in self._known:
+            if len(self._known) == _KEPT:
+                self._known.clear()
+            self._known[times_us] = *self.track.at(times_us), self.weights(times_us)
+        return self._known[times_us]
 
     def price(self) -> Float[Tensor, ""]:
         """Minus the logarithm of the prior, up to a constant."""

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from evsplat.body import PoseErrors
 from evsplat.camera import Camera
 from evsplat.gaussians import Adam
 from evsplat.posing.correction import Correction
+from evsplat.posing.misfit import misfits
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets
 from evsplat.posing.time_limit import TimeLimit
@@ -31,8 +31,6 @@ does. Without it errors were 1.9 to 2.1 times what was told (man, three motions 
 to 1.3 times."""
 _UNSEEN_ALONG = 0.3
 """The same of the root's distance from the camera, for which limbs that lean make up."""
-_MISFIT = 0.06
-"""Difference of coded colours from which on more of it counts little."""
 _PIXEL_SHARE = 0.05
 """Independent values that a pixel's three colours count for: neighbours err alike."""
 _COARSE_DISCS = 1_500
@@ -54,24 +52,6 @@ class Stage:
     before: float
     after: float
     """Mean misfit of the pictures at its start and end, in units of one squared deviation."""
-
-
-class _At(torch.autograd.Function):
-    """Some values of a tensor, by their places in a row, each at most once."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, places: Tensor) -> Tensor:
-        ctx.shape = values.shape
-        ctx.save_for_backward(places)
-        return values.reshape(-1)[places]
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
-        (places,) = ctx.saved_tensors
-        whole = upstream[0].new_zeros(ctx.shape)
-        whole.view(-1)[places] = upstream[0]
-        return whole, None
 
 
 class Descent:
@@ -155,15 +135,9 @@ class Descent:
         return _PIXEL_SHARE * self._differences(targets).sum()
 
     def _differences(self, targets: Targets) -> Float[Tensor, "P"]:
-        looked = targets.looked
         rotations, transl = self.correction.at(targets.times_us)
         drawn = self.look.drawn(rotations, transl, targets.camera, self.discs)
-        shown: Tensor = _At.apply(drawn.image.permute(0, 3, 1, 2), looked.planes)
-        hidden: Tensor = _At.apply(drawn.alpha, looked.place)
-        colours = torch.addcmul(looked.behind, hidden[:, None], looked.behind, value=-1) + shown
-        apart = targets.greyed(colours, looked.grey) - looked.image
-        unlikely = torch.log1p(apart.square().sum(-1) / (2 * _MISFIT**2)) * looked.weight
-        return torch.stack([one.sum() for one in unlikely.split(looked.counts)])
+        return misfits(drawn, targets)
 
     @torch.no_grad()
     def misfits(self, targets: Targets) -> Float[Tensor, "P"]:

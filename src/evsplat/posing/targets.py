@@ -35,17 +35,25 @@ _DOUBTFUL = 0.06
 class Looked:
     """The N pixels of P pictures that count, picture by picture: the others tell nothing."""
 
-    counts: list[int]
+    counts: Int[Tensor, "P"]
     """Of each picture."""
-    planes: Int[Tensor, "N 3"]
-    """Place of each channel among planes (P, 3, H, W) in a row."""
-    place: Int[Tensor, "N"]
-    """Place in (P, H, W) in a row."""
+    ends: Int[Tensor, "P"]
+    """Where each picture's end."""
+    pixel: Int[Tensor, "N"]
+    """Place in the picture (H, W) in a row, int32."""
+    area: int
+    """Pixels of a picture."""
     image: Float[Tensor, "N 3"]
     behind: Float[Tensor, "N 3"]
     weight: Float[Tensor, "N"]
     grey: Int[Tensor, "G"]
     """Those of pictures that have no colours."""
+
+    @property
+    def place(self) -> Int[Tensor, "N"]:
+        """Place in (P, H, W) in a row."""
+        first = self.area * torch.arange(len(self.counts))
+        return first.repeat_interleave(self.counts) + self.pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +89,13 @@ class Targets:
         """The pixels with a weight."""
         picture, row, column = torch.nonzero(self.weight, as_tuple=True)
         height, width = self.weight.shape[1:]
-        pixel = row * width + column
-        planes = (3 * picture[:, None] + torch.arange(3)) * (height * width) + pixel[:, None]
+        counts = torch.bincount(picture, minlength=len(self.times_us))
         chosen = picture, row, column
         return Looked(
-            torch.bincount(picture, minlength=len(self.times_us)).tolist(),
-            planes,
-            picture * (height * width) + pixel,
+            counts,
+            counts.cumsum(0),
+            (row * width + column).int(),
+            height * width,
             self.image[chosen],
             self.behind[chosen],
             self.weight[chosen],

@@ -18,7 +18,7 @@ from evsplat.gaussians.surface_graph import closest, harmonic, laplacian, mirror
 from evsplat.models.discs.first_colours import EVEN, LEAST, MOST, MOST_FRAMES
 from evsplat.models.discs.model import DiscModel
 from evsplat.models.layers import Layers
-from evsplat.models.seen import Seen, draw_values, facing, shares_in
+from evsplat.models.seen import Seen, draw_values, facing, shares_in, transposed
 
 STEPS = 8
 """Of conjugate gradients, twice."""
@@ -200,7 +200,7 @@ class _Pictures:
             scene = layers.scene.channels[..., :3]
             picture = draw_values(layers, view.camera, leaf[None] * light, scene)
             lacks = view.picture - picture.detach()
-            total += torch.autograd.grad(picture, leaf, lacks)[0]
+            total += transposed(picture, leaf, lacks)
         return total
 
     def twice(self, values: Float[Tensor, "H 3"]) -> Float[Tensor, "H 3"]:
@@ -209,5 +209,5 @@ class _Pictures:
         for view, layers, light in zip(self.views, self.layers, self.light, strict=True):
             leaf = values.clone().requires_grad_()
             picture = draw_values(layers, view.camera, leaf[None] * light)
-            total += torch.autograd.grad(picture, leaf, picture.detach())[0]
+            total += transposed(picture, leaf, picture.detach())
         return total

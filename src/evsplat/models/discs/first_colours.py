@@ -11,7 +11,7 @@ from torch import Tensor
 from evsplat.capture import TrainingCapture
 from evsplat.gaussians.surface_graph import harmonic, laplacian, mirror_plane
 from evsplat.models.discs.model import DiscModel
-from evsplat.models.seen import draw_values, facing
+from evsplat.models.seen import draw_values, facing, transposed
 
 MOST_FRAMES = 24
 """Training frames that are looked at, spread evenly: drawing them takes the time."""
@@ -43,8 +43,8 @@ def first_colours(model: DiscModel, capture: TrainingCapture) -> Float[Tensor, "
         drawn = draw_values(layers, camera, channels)
         picture = capture.image(frame).to(drawn)
         shown = torch.cat([picture, torch.ones_like(picture[..., :1])], dim=-1)
-        (shares,) = torch.autograd.grad(drawn, channels, shown[None])
-        sums += shares[0] * facing(layers, normals, camera).clamp_min(0)[:, None]
+        shares = transposed(drawn, channels, shown)[0]
+        sums += shares * facing(layers, normals, camera).clamp_min(0)[:, None]
     weight = sums[:, 3]
     own = sums[:, :3] / weight[:, None].clamp_min(torch.finfo(weight.dtype).tiny)
     rough = laplacian(means, normals, bones, mirror_plane(model.track.body))
