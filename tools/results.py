@@ -35,8 +35,11 @@ PAGES = ("README.md", "docs/bench.md", "docs/results.md")
 FIGURE = ROOT / "docs" / "images" / "convergence.png"
 COMPARED = ("man_dance_hard_256", "woman_dance_b_256", "real_beam_256")
 """Captures that every method is compared on."""
-FOUND = "_found_poses"
-"""Ends the name of a capture whose poses `evsplat poses` found in place of the given ones."""
+FOUND = {
+    "_found_poses": "poses found by `evsplat poses`",
+    "_found_poses_by_events": "poses found by `evsplat poses --held-out-events`",
+}
+"""Ends of the names of captures whose given poses were left out, and what is said of them."""
 GAIN_DB = 0.2
 """Less than so much from a doubling of the steps ends a curve of benchmarks/convergence.py."""
 _OF_POINT = ("full_psnr_db", "crop_psnr_db", "mask_psnr_db")
@@ -112,9 +115,10 @@ def _rows(records: Records) -> Iterator[tuple[SuiteRow, str, list[str]]]:
     """Rows, their titles and captures; a second time those that ran with found poses."""
     for row in records.plan.suite.rows:
         yield row, title_of(records, row, COMPARED), list(COMPARED)
-        found = [capture + FOUND for capture in COMPARED]
-        if any(records.of(capture, row.name) for capture in found):
-            yield row, f"{title_of(records, row, found)}; poses found by `evsplat poses`", found
+        for end, words in FOUND.items():
+            found = [capture + end for capture in COMPARED]
+            if any(records.of(capture, row.name) for capture in found):
+                yield row, f"{title_of(records, row, found)}; {words}", found
 
 
 def _test_frames(records: Records) -> str:
@@ -128,7 +132,7 @@ def _test_frames(records: Records) -> str:
 def captures(records: Records) -> str:
     """`evsplat` and `paper` on every capture, beside what needs no method."""
     rows = ("evsplat", "paper", "nearest_frame", "own_picture")
-    names = [name for name in records.captures if not name.endswith(FOUND)]
+    names = [name for name in records.captures if not name.endswith(tuple(FOUND))]
     lines = [
         "| capture | `evsplat` | `paper` | nearest training frame | own blurry picture |",
         "|---|---|---|---|---|",
