@@ -68,7 +68,7 @@ def main() -> None:
     print(f"  {'part':22s} {'forward':>8s} {'backward':>8s}")
     for part in parts:
         print(f"  {part:22s} {forward[part]:8.0f} {backward[part]:8.0f}")
-    print(f"  {'rest':22s} {total - forward.total() - backward.total():8.0f}")
+    print(f"  {'rest':22s} {total - sum(forward.values()) - sum(backward.values()):8.0f}")
     around = forward["render"] + backward["render"]
     results = {
         "method": arguments.method,

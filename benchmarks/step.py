@@ -23,7 +23,7 @@ import shutil
 import statistics
 import tempfile
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -53,6 +53,9 @@ from evsplat.shipped import demo_capture
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
+Times = dict[str, float]
+"""By part of a step."""
+
 
 def main() -> None:
     """Print the table and one line of JSON."""
@@ -73,8 +76,8 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     folder = tempfile.TemporaryDirectory()
     capture = arguments.capture or resized_demo(arguments.size, Path(folder.name))
-    size = (None, None) if arguments.capture else (arguments.human, arguments.scene)
-    trainer = build_on(capture, *size, arguments.renders, method=arguments.method)
+    human, scene = (None, None) if arguments.capture else (arguments.human, arguments.scene)
+    trainer = build_on(capture, human, scene, arguments.renders, method=arguments.method)
     draw_one_frame(trainer)
     for _ in range(5):
         trainer.step()
@@ -92,11 +95,11 @@ def main() -> None:
         f"{arguments.threads} thread(s)"
     )
     print(f"  {'part':22s} {'forward':>8s} {'backward':>8s} ms   share")
-    parts = sorted(forward | backward, key=lambda part: -(forward[part] + backward[part]))
-    for part in parts:
-        share = 100 * (forward[part] + backward[part]) / median
-        print(f"  {part:22s} {forward[part]:8.2f} {backward[part]:8.2f}    {share:5.1f} %")
-    rest = median - forward.total() - backward.total()
+    both = {part: (forward.get(part, 0.0), backward.get(part, 0.0)) for part in forward | backward}
+    for part, times in sorted(both.items(), key=lambda item: -sum(item[1])):
+        share = 100 * sum(times) / median
+        print(f"  {part:22s} {times[0]:8.2f} {times[1]:8.2f}    {share:5.1f} %")
+    rest = median - sum(map(sum, both.values()))
     print(f"  {'rest':22s} {rest:17.2f}    {100 * rest / median:5.1f} %")
     print("  inside render: " + ", ".join(f"{k} {v:.2f} ms" for k, v in stages.items()))
     print(f"  matrix products {gflop:.1f} GFLOP: {limit:.1f} ms at {peak:.0f} GFLOP/s")
@@ -114,8 +117,8 @@ def main() -> None:
         "products_limit_percent": round(100 * limit / median, 1),
         "peak_rss_mb": round(peak_mb),
     }
-    for label, times in (("forward", forward), ("backward", backward), ("render", stages)):
-        for part, value in times.items():
+    for label, parts in (("forward", forward), ("backward", backward), ("render", stages)):
+        for part, value in parts.items():
             results[f"{label}_{part.replace(',', '').replace(' ', '_')}_ms"] = round(value, 3)
     print(json.dumps(results))
 
@@ -144,7 +147,8 @@ def build_on(
         composition.objectives.append(MoreTimes(renders))
         composition.weights["more_times"] = 1e-6
     if scene is not None:
-        composition.model.gaussians = with_scene_count(composition.model.gaussians, scene)
+        model: Any = composition.model
+        model.gaussians = with_scene_count(model.gaussians, scene)
     return Trainer(composition, capture, Clock(100_000, fraction=0.4))
 
 
@@ -166,7 +170,8 @@ def draw_one_frame(trainer: Trainer) -> None:
     generator.set_state(state)
     most = [frame for frame, count in counts.items() if count == max(counts.values())]
     frame = most[len(most) // 2]
-    trainer._draw_frame = lambda: frame
+    changed: Any = trainer
+    changed._draw_frame = lambda: frame
 
 
 def resized_demo(size: int, folder: Path) -> Path:
@@ -230,7 +235,7 @@ def work(trainer: Trainer, steps: int) -> tuple[float, float]:
     """Means per step: rendered times, and the networks' matrix products in GFLOP, both ways."""
     flop: list[float] = []
     times: list[int] = []
-    model = trainer.model
+    model: Any = trainer.model
     draw = model.training_drawing
 
     def counted(times_us: Sequence[int], *rest: Any) -> Any:
@@ -254,7 +259,7 @@ def work(trainer: Trainer, steps: int) -> tuple[float, float]:
     return sum(times) / steps, sum(flop) / steps / 1e9
 
 
-def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], dict[str, float]]:
+def measure(trainer: Trainer, steps: int) -> tuple[Times, Times, Times]:
     """Milliseconds per step: forward and backward by part, and the stages of render."""
     watch = Stopwatch()
     watch_parts(watch, trainer)
@@ -270,20 +275,20 @@ def measure(trainer: Trainer, steps: int) -> tuple[Counter[str], Counter[str], d
         watch.nodes.clear()
     native_backend.native = _native
     threads = torch.get_num_threads()
-    stages: dict[str, float] = defaultdict(float)
+    stages: Times = defaultdict(float)
     for job in jobs:
         for stage, seconds in job.seconds.items():
             stages[stage] += 1e3 * seconds / threads / steps
 
-    def per_step(seconds: Counter[str]) -> Counter[str]:
-        return Counter({part: 1e3 * value / steps for part, value in seconds.items()})
+    def per_step(seconds: Times) -> Times:
+        return {part: 1e3 * value / steps for part, value in seconds.items()}
 
-    return per_step(watch.forward), per_step(watch.backward), dict(stages)
+    return per_step(watch.forward), per_step(watch.backward), stages
 
 
 def watch_parts(watch: "Stopwatch", trainer: Trainer) -> None:
     """Let it look at all parts of a step."""
-    model = trainer.model
+    model: Any = trainer.model
     watch.calls(model, "pose", "body pose")
     if isinstance(model, DiscModel):
         watch.calls(model.shade, "forward", "shade by the pose")
@@ -331,8 +336,8 @@ class Stopwatch:
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.clock = clock
-        self.forward: Counter[str] = Counter()
-        self.backward: Counter[str] = Counter()
+        self.forward: Times = defaultdict(float)
+        self.backward: Times = defaultdict(float)
         self.nodes: dict[Any, str] = {}
         self._inner = [0.0]
 

@@ -77,12 +77,17 @@ def test_clone_split_and_prune_do_what_the_limits_say(seed):
     grow = (statistics.gradient_sum > 2e-4) & ~pruned
     expected = count - 8 + int(grow.sum())
 
-    edit = densify(gaussians, adam, statistics, LIMITS, 5_000, generator)
-    assert (edit.pruned, edit.cloned) == (8, int((grow & (largest <= 0.03)).sum()))
-    assert edit.split == int((grow & (largest > 0.03)).sum())
+    before = gaussians.scales_log.detach().clone()
+    densify(gaussians, adam, statistics, LIMITS, 5_000, generator)
     assert len(gaussians) == expected
 
     after = gaussians.semantic_logits.detach()
+    assert len(label.unique()) == count
+    for row in range(count):
+        descendants = gaussians.scales_log.detach()[after == label[row]].exp()
+        shrunk = 1.6 if grow[row] and largest[row] > 0.03 else 1.0
+        assert len(descendants) == (0 if pruned[row] else 2 if grow[row] else 1)
+        assert torch.allclose(descendants, (before[row].exp() / shrunk).expand_as(descendants))
     # Labels are inherited exactly: every label of the new set is one of the old set's.
     assert bool(torch.isin(after, label).all())
     assert bool((after[gaussians.human] > 0).all()) and bool((after[gaussians.scene] < 0).all())

@@ -12,9 +12,15 @@ from evsplat.errors import DataError
 from evsplat.posing.fit import FitSettings, fit_focal, fit_landmarks
 from evsplat.posing.kinematics import pose
 from evsplat.posing.problem import State
-from evsplat.posing.rig import MEASURED, default_rig, make_rig
+from evsplat.posing.rig import default_rig, make_rig
 
 TIMES = np.arange(50_000, 800_000, 100_000)
+MEASURED = tuple(
+    f"{side}_{part}"
+    for part in ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
+    for side in ("left", "right")
+) + ("neck", "head")
+"""The 14 joints that errors are measured at: a limb's is where that part begins."""
 
 
 def _fit(marks, camera: Camera = CAMERA, **options):

@@ -1,7 +1,7 @@
 """The Gaussian set: parameters, semantic attribute, start, densification."""
 
 from evsplat.gaussians.adam import Adam, step_together
-from evsplat.gaussians.densify import DensifyLimits, Edit, ScreenStatistics, densify
+from evsplat.gaussians.densify import DensifyLimits, ScreenStatistics, densify
 from evsplat.gaussians.flip import BodyFrames, flip_labels
 from evsplat.gaussians.gaussian_set import (
     FEATURE_DIM,
@@ -18,7 +18,6 @@ __all__ = [
     "Adam",
     "BodyFrames",
     "DensifyLimits",
-    "Edit",
     "GaussianSet",
     "OneClassRows",
     "Part",

@@ -87,15 +87,6 @@ class ScreenStatistics:
         return self.gradient_sum / self.seen.clamp_min(1)
 
 
-@dataclass(frozen=True)
-class Edit:
-    """Numbers of Gaussians that one densification changed, for the log."""
-
-    cloned: int = 0
-    split: int = 0
-    pruned: int = 0
-
-
 def densify(
     gaussians: Rows,
     optimiser: RowAdam,
@@ -103,7 +94,7 @@ def densify(
     limits: dict[Part, DensifyLimits],
     nominal: float,
     generator: torch.Generator,
-) -> Edit:
+) -> None:
     """Clone, split and prune every class that is in its window; labels are inherited exactly.
 
     ``limits`` may name ``human`` and ``scene``; a class without limits is left alone. Optimiser
@@ -111,7 +102,7 @@ def densify(
     """
     due = {part: limit for part, limit in limits.items() if limit.start <= nominal < limit.end}
     if not due:
-        return Edit()
+        return
     shape = gaussians.shape()
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     clone, split = torch.zeros_like(keep), torch.zeros_like(keep)
@@ -119,7 +110,7 @@ def densify(
         rows = gaussians.rows_of(part)
         keep[rows], clone[rows], split[rows] = _decide(shape, statistics, rows, limit, nominal)
     if bool(keep.all()) and not bool((clone | split).any()):
-        return Edit()
+        return
 
     every = torch.arange(len(gaussians), device=keep.device)
     survivors = every[keep & ~split]
@@ -134,7 +125,6 @@ def densify(
     values["means"][first_child:] += offsets
     values["scales_log"][first_child:] -= torch.log(torch.tensor(1.6))
     rebuild(gaussians, optimiser, values, source, fresh, gaussians.human_mask()[source])
-    return Edit(int(clone.sum()), int(split.sum()), int((~keep & ~split).sum()))
 
 
 def rebuild(

@@ -60,10 +60,10 @@ class BestPlace:
         ]
         overall = np.mean([one.overall for one in searched], axis=0)
         grouped = np.mean([one.grouped for one in searched], axis=0)
-        places = np.argwhere(overall == overall.max())
+        best = np.argwhere(overall == overall.max()).tolist()
         # delays that make no difference, as those of one frame, are none
-        place = tuple(min(places.tolist(), key=lambda found: abs(found[0] - NOW)))
-        delay, down, right = place[0], place[1] - REACH_PX, place[2] - REACH_PX
+        delay, y, x = min(best, key=lambda found: abs(found[0] - NOW))
+        place, down, right = (delay, y, x), y - REACH_PX, x - REACH_PX
         highest = np.maximum(grouped.max((1, 2, 3)), 1e-9)
         told = [
             OwnTimes.of(

@@ -8,8 +8,6 @@ from torch import Tensor
 
 COMPONENTS = 8
 """Most correctives; each costs four bytes per Gaussian."""
-COLUMNS = 4
-"""Of a corrective: offset of the centre (metres, canonical) and relative brightness."""
 _OFFSET_WEIGHT = 30.0
 """Of a metre beside a brightness of 1: a centimetre counts as much as a third of the colour."""
 _RIDGE = 0.03
@@ -68,7 +66,9 @@ def _features(rotations: Float[Tensor, "T J 3 3"]) -> Float[Tensor, "T F"]:
 def bake_correctives(
     changes: Float[Tensor, "T H 4"], rotations: Float[Tensor, "T J 3 3"]
 ) -> Correctives:
-    """Fields that show ``changes`` (see `COLUMNS`) at the poses best, and their regression.
+    """Fields that show ``changes`` at the poses best, and their regression.
+
+    A change is an offset of the centre, canonical metres, and a relative brightness.
 
     The fields are the principal components about zero, the shares a ridge regression on the
     features: in as many unknowns as there are poses, by the kernel of the features.

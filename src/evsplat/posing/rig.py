@@ -32,12 +32,6 @@ LIMBS = {
     for limb, parts in (("leg", ("thigh", "shin", "foot")), ("arm", ("upper_arm", "forearm")))
 }
 """Limbs by the parts that make them."""
-MEASURED = tuple(
-    f"{side}_{part}"
-    for part in ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
-    for side in ("left", "right")
-) + ("neck", "head")
-"""The 14 joints that errors are measured at: a limb's is where that part begins."""
 _CHAIN = 3
 """Joints in spine and neck of the body that ships, over which their bend was learned."""
 
@@ -57,7 +51,6 @@ class Rig:
     parents: tuple[int, ...]
     rest: Float[Tensor, "J 3"]
     """Rest joints of the mean shape, in the body's own axes."""
-    rest_directions: Float[Tensor, "B J 3"]
     bones: Float[Tensor, "J 3"]
     """From the parent's joint to the own at the mean shape, in the parent's frame."""
     bone_directions: Float[Tensor, "B J 3"]
@@ -131,7 +124,6 @@ def make_rig(body: Callable[[Float[np.ndarray, "B"]], Body], model: str, coeffic
         skeleton=skeleton,
         parents=parents,
         rest=torch.from_numpy(rest),
-        rest_directions=torch.from_numpy(directions),
         bones=torch.from_numpy(bones),
         bone_directions=torch.from_numpy(bent),
         frames=torch.from_numpy(frames),
