@@ -1,16 +1,25 @@
 """Rigs of other bodies move as the body that ships would."""
 
+import sys
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from tests.posing.moving import stick_figure
+from tests.posing.moving import CAMERA, motion, stick_figure
 
-from evsplat.body import default_body
-from evsplat.body.rotations import axis_angle_to_matrix
+from evsplat.body import BodyTrack, default_body
+from evsplat.body.rotations import axis_angle_to_matrix, six_to_matrix
 from evsplat.errors import DataError
 from evsplat.landmarks import BLAZEPOSE_33, COCO_17, OPENPOSE_25
+from evsplat.posing.kinematics import PLACE, SIX, TURNS, Points, pose
 from evsplat.posing.prior import ROWS, mirrored, pose_prior
-from evsplat.posing.rig import attach, default_rig, make_rig
+from evsplat.posing.rig import attach, blazepose_offsets, default_rig, make_rig
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+import learn_posing  # noqa: E402
 
 
 def test_the_body_that_ships_keeps_its_own_frames():
@@ -69,3 +78,26 @@ def test_a_motion_can_be_left_out_of_the_prior():
     assert torch.linalg.eigvalsh(without.precision).min() > 0
     with pytest.raises(DataError, match="no motion is named 'waltz'"):
         pose_prior(without=("waltz",))
+
+
+def test_offsets_are_learned_back_from_landmarks_that_lie_at_them():
+    """Somebody from the front and from the left; offsets a millimetre or two from given ones."""
+    rig, times = default_rig(), np.arange(0, 800_000, 50_000)
+    vectors = motion(times)
+    poses = rig.poses(six_to_matrix(vectors[:, SIX]), vectors[:, TURNS].unflatten(1, (-1, 3)))
+    body = default_body()
+    transl = vectors[:, PLACE].numpy() - body.rest_joints[0].double().numpy()
+    track = BodyTrack(body, times, poses, transl)
+    attached = attach(rig, BLAZEPOSE_33)
+    points = Points(attached.origin, attached.turner, attached.offset)
+    places = points.of(pose(rig, vectors, torch.zeros(10, dtype=torch.float64)))
+    left = torch.tensor([[0.0, 1, 0, 0], [0, 0, -1, 0.2], [-1, 0, 0, 3.5], [0, 0, 0, 1]])
+    data = []
+    for camera in (CAMERA, replace(CAMERA, world_to_camera=left)):
+        pixels = camera.project(places)[0].numpy()
+        seen = np.ones(pixels.shape[:2])
+        data.append(learn_posing.residuals_of(track, camera, times, pixels, seen, BLAZEPOSE_33))
+    learned = learn_posing.offsets_of(data)
+    for name, (origin, turner, offset) in blazepose_offsets().items():
+        assert learned[name][:2] == [origin, turner]
+        assert learned[name][2] == pytest.approx(offset, abs=2e-3), name
