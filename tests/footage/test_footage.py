@@ -66,6 +66,35 @@ def test_sixteen_bit_grey_video_keeps_its_depth(tmp_path):
     assert read[0].dtype == np.uint16 and np.array_equal(read, pictures)
 
 
+UPRIGHT = {
+    1: lambda stored: stored,
+    2: lambda stored: stored[:, ::-1],
+    3: lambda stored: stored[::-1, ::-1],
+    4: lambda stored: stored[::-1],
+    5: lambda stored: stored.swapaxes(0, 1),
+    6: lambda stored: np.rot90(stored, -1),
+    7: lambda stored: np.rot90(stored, 2).swapaxes(0, 1),
+    8: lambda stored: np.rot90(stored),
+}
+"""By the orientation of EXIF 2.32, table 6: where the stored first row and column are seen."""
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".jpg"])
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_a_picture_is_turned_as_its_camera_was_held(tmp_path, orientation, suffix):
+    stored = np.kron(some_pictures(1)[0], np.ones((8, 8, 1), np.uint8))
+    exif = Image.Exif()
+    exif[274] = orientation
+    path = tmp_path / f"a{suffix}"
+    options = {"lossless": True} if suffix == ".webp" else {"quality": 100, "subsampling": 0}
+    Image.fromarray(stored).save(path, exif=exif, **options)
+    footage = open_footage(tmp_path, 25)
+    (read,) = (picture.pixels for picture in footage)
+    expected = UPRIGHT[orientation](stored)
+    assert (footage.height, footage.width) == expected.shape[:2] == read.shape[:2]
+    assert np.abs(read.astype(int) - expected).max() <= (0 if suffix == ".webp" else 3)
+
+
 def test_given_rate_replaces_the_times_of_a_slow_motion_file(tmp_path):
     write_video(tmp_path / "slow.mkv", some_pictures(4), [0, 33, 67, 100])
     assert open_footage(tmp_path / "slow.mkv", 240).times_us.tolist() == [0, 4167, 8333, 12500]

@@ -7,13 +7,15 @@ from typing import TypeVar
 import av
 import numpy as np
 from jaxtyping import UInt16
-from PIL import Image
+from PIL import Image, ImageOps
 
 from evsplat.errors import DataError
 from evsplat.untrusted.faults import BROKEN, ordinary_file, reason
 
 # Pillow gives an EPS to a program that runs what it says, and knows others as rarely used.
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP", "GIF", "JPEG2000")
+_OF_CAMERAS = ("JPEG", "MPO", "WEBP")
+"""Their EXIF is looked at; of a PNG that would decode the pixels, and Pillow turns TIFF itself."""
 _MOST_PIXELS = 100_000_000
 _UNREADABLE = "cannot be decoded as a picture"
 _SAVE_AGAIN = "save it again as PNG"
@@ -30,7 +32,7 @@ def read_picture(
 ) -> Value:
     """What ``take`` gives of the picture in a file; one that cannot be decoded is a `DataError`.
 
-    Pixels are decoded as ``take`` asks for them.
+    Pixels are decoded as ``take`` asks for them, upright: turned as a camera's EXIF says.
     """
     ordinary_file(path)
     try:
@@ -40,15 +42,21 @@ def read_picture(
                 raise DataError(
                     f"{path}: {fault} ({image.width}x{image.height} pixels); make it smaller."
                 )
-            return take(image)
+            return take(_upright(image))
     except Image.DecompressionBombError as error:
         raise DataError(f"{path}: {fault} ({reason(error)}); make it smaller.") from error
     except BROKEN as error:
         raise DataError(f"{path}: {fault} ({reason(error)}); {remedy}.") from error
 
 
+def _upright(image: Image.Image) -> Image.Image:
+    if image.format in _OF_CAMERAS:
+        ImageOps.exif_transpose(image, in_place=True)
+    return image
+
+
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header, without decoding the pixels."""
+    """(width, height) from the header; the pixels are decoded only where they have to be turned."""
     return read_picture(path, lambda image: image.size, fault="not a readable picture")
 
 
