@@ -137,8 +137,12 @@ def draw_values(
     camera: Camera,
     human: Float[Tensor, "T H C"],
     scene: Float[Tensor, "1 S C"] | None = None,
+    kept: Float[Tensor, " H"] | None = None,
 ) -> Float[Tensor, "T H W C"]:
-    """Values of Gaussians drawn instead of their colours, without shadow; the scene's may be 0."""
+    """Values of Gaussians drawn instead of their colours, without shadow; the scene's may be 0.
+
+    ``kept``: factors on the person's opacities, which alone of the geometry take a gradient.
+    """
     static: Splats | None = layers.scene
     if scene is None:
         static = _hiding(layers, camera)
@@ -147,6 +151,8 @@ def draw_values(
     if static is not None and scene is not None:
         static = fixed(static, scene)
     person = fixed(layers.human, human)
+    if kept is not None:
+        person = replace(person, opacities=person.opacities * kept)
     return render(person, camera, static=static, low_pass=layers.low_pass).image
 
 

@@ -10,6 +10,7 @@ from evsplat.capture import Policy, load_capture
 from evsplat.errors import DataError
 from evsplat.film.looks import Look
 from evsplat.models.discs.fill import _Pictures, _shade, _views, filled
+from evsplat.models.discs.transparent import OFF_FROM_M, off_the_body
 from evsplat.models.drawing import draw
 from evsplat.models.seen import Seen, seen_by
 from evsplat.training.checkpoint import below, load_latest, load_model, write_state
@@ -76,6 +77,27 @@ def test_the_fill_evens_what_is_unseen_and_leaves_the_pictures(spoilt):
         with torch.no_grad():
             change = (draw(layers, camera).output.image - draw(old, camera).output.image)[..., :3]
         assert float(change.square().mean().sqrt()) < 0.01
+
+
+def test_discs_off_the_body_that_no_picture_misses_become_transparent(spoilt):
+    model, capture, seen = spoilt
+    rows = model.gaussians.human
+    normals = model.surface.normals(model.gaussians.means[rows])
+    unseen = seen.squares.argsort()[:5]
+    with torch.no_grad():
+        model.gaussians.means[rows][unseen] += 0.05 * normals[unseen]
+    seen = seen_by(model, capture)
+    before = model.gaussians.opacity_logits.detach().clone()
+    found = filled(model, capture, 0.005, seen)["gaussians.opacity_logits"]
+    assert torch.equal(found[rows.stop :], before[rows.stop :])
+    assert bool((found <= before).all())
+    still = seen.squares[unseen] < 1e-4
+    assert bool(still.any())
+    assert float(found[rows][unseen][still].sigmoid().max()) < 0.1
+    facing = (seen.directions * normals).sum(-1) > 0
+    off = off_the_body(model.gaussians.means[rows], normals, model.surface)
+    stays = facing & (off < OFF_FROM_M)
+    assert torch.equal(found[rows][stays], before[rows][stays])
 
 
 def test_what_was_well_seen_keeps_its_look_in_a_light_twice_as_bright(spoilt):

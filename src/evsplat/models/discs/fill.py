@@ -1,12 +1,13 @@
 """Colours and light where training saw little: neighbours tell them, and what was seen stays.
 
 Adam moves a colour that no picture tells of a third as far as the others, since gradients a
-thousand times smaller are still gradients; what the front lets through tells it nonsense.
+thousand times smaller are still gradients; what the front lets through tells it nonsense. What can
+be given no other colour without being missed may become transparent (`transparent`).
 """
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,13 +18,15 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.gaussians.surface_graph import closest, harmonic, laplacian, mirror_plane
 from evsplat.models.discs.first_colours import EVEN, LEAST, MOST, MOST_FRAMES
 from evsplat.models.discs.model import DiscModel
+from evsplat.models.discs.transparent import Sight, areas, kept_opacity, off_the_body, prices
 from evsplat.models.layers import Layers
 from evsplat.models.seen import Seen, draw_values, facing, shares_in, transposed
 
 STEPS = 8
 """Of conjugate gradients, twice."""
-MOST_BEHIND = 0.25
-"""Largest difference to what neighbours say where a surface was seen from behind alone."""
+MOST_BEHIND, BARELY_PX = 0.25, 0.01
+"""Largest difference to what neighbours say where a surface was seen from behind alone; half of it
+where the squares of its shares sum to the second: what shines through the front has its colour."""
 CALM = 0.000125
 """Weight of the squares of the light's numbers, the constant one apart, against the mean squared
 change of the factors that were seen."""
@@ -35,6 +38,8 @@ _BACK = -0.1
 _FAST = 1e6
 _LEAST_SHARE = 1e-6
 """Pixels; where nothing was seen a colour is taken as it is."""
+_LEAST_OPACITY = 1e-6
+"""Of a Gaussian that became transparent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +65,11 @@ def filled(
 
     First the light: as it is where it was seen, and no brighter elsewhere than in the shade. Then
     what neighbours would say of each colour: the even transition between those that were well seen
-    and facing (`harmonic`); the more was seen, the more its own colour counts instead. Last the
+    and facing (`harmonic`); the more was seen, the more its own colour counts instead. Then the
     colours closest to that with which the training frames look as before (`closest`): what shines
     through the front, or has a small share of its pixels, gives way, and what is well seen stays.
+    What turns its back and is still far from what neighbours say, or floats off the body, becomes
+    transparent as far as the frames bear it (`kept_opacity`), and colours are found once more.
     ``strength`` is what a difference to the neighbours costs, per training frame, against one of a
     whole pixel.
     """
@@ -75,7 +82,7 @@ def filled(
     views = _views(model, capture, normals)
     # An hour's motion is large, and no colour changes it.
     new = copy.deepcopy(model, {id(part): part for part in (model.track, model.residual)})
-    names = [f"gaussians.{gaussians.colour}"]
+    names = [f"gaussians.{gaussians.colour}", "gaussians.opacity_logits"]
     if new.shading is not None:
         _dim(new, views)
         names += ["shading.coefficients", "shading.intensities"]
@@ -83,23 +90,47 @@ def filled(
     rough = laplacian(gaussians.means[rows], normals, bones, mirror_plane(new.track.body))
     facing = (seen.directions * normals).sum(-1) / seen.weight.clamp_min(1e-9)
     sure = (seen.squares * facing.clamp_min(0).square()).masked_fill(seen.little(), 0)
-    told = harmonic(own, sure, EVEN * rough)
+    even = harmonic(own, sure, EVEN * rough)
     pictures = _Pictures.of(new, views, own)
-    told = told.lerp(pictures.relit(own), seen.certainty()[:, None])
-    share = len(views) / len(capture.train_frames)
-    diagonal = share * seen.squares * pictures.brightness()
-    held = torch.full_like(diagonal, strength * len(views))
+    told = even.lerp(pictures.relit(own), seen.certainty()[:, None])
+    share, behind = len(views) / len(capture.train_frames), facing < 0
+    squares = share * seen.squares
+    colours = _closest(pictures, told, squares, strength, behind)
+    wrong = (colours - even).norm(dim=-1) * behind
+    off_m = off_the_body(gaussians.means[rows], normals, model.surface)
+    pixels = share * seen.weight.mean() * areas(gaussians)
+    kept = kept_opacity(pictures.sights(colours), prices(wrong, off_m, pixels))
+    colours = _closest(pictures.thinned(kept), told, squares, strength, behind)
+    with torch.no_grad():
+        new.gaussians.get_parameter(gaussians.colour)[rows, :3] = colours.logit()
+        opacities = (gaussians.opacities()[rows] * kept).clamp_min(_LEAST_OPACITY)
+        thinner = torch.where(kept < 1, opacities.logit(), gaussians.opacity_logits[rows])
+        new.gaussians.opacity_logits[rows] = thinner
+    state = new.state_dict()
+    return {name: state[name].detach().clone() for name in names}
+
+
+def _closest(
+    pictures: "_Pictures",
+    told: Float[Tensor, "H 3"],
+    squares: Float[Tensor, " H"],
+    strength: float,
+    behind: Bool[Tensor, " H"],
+) -> Float[Tensor, "H 3"]:
+    """Colours closest to those ``told`` with which the pictures look as before the fill.
+
+    ``squares``: of the shares of all pictures' pixels. What was seen from ``behind`` alone must not
+    glare; the front makes up for it.
+    """
+    diagonal = squares * pictures.brightness()
+    held = torch.full_like(diagonal, strength * len(pictures.views))
     colours = closest(told, pictures.missing(told), pictures.twice, diagonal, held, STEPS)
-    # What is seen through the front alone must not glare; the front makes up for it.
-    behind = facing < 0
-    limited = told + (colours - told).clamp(-MOST_BEHIND, MOST_BEHIND)
+    most = (MOST_BEHIND * squares / (squares + BARELY_PX))[:, None]
+    limited = told + (colours - told).clamp(-most, most)
     start = torch.where(behind[:, None], limited, colours).clamp(LEAST, MOST)
     held = held.masked_fill(behind, _FAST)
     colours = closest(start, pictures.missing(start), pictures.twice, diagonal, held, STEPS)
-    with torch.no_grad():
-        new.gaussians.get_parameter(gaussians.colour)[rows, :3] = colours.clamp(LEAST, MOST).logit()
-    state = new.state_dict()
-    return {name: state[name].detach().clone() for name in names}
+    return colours.clamp(LEAST, MOST)
 
 
 @torch.no_grad()
@@ -178,6 +209,21 @@ class _Pictures:
         """``own``: the colours of ``model``, sRGB without light."""
         layers = [_layers(model, view.frame, view.camera) for view in views]
         return cls(views, layers, [each.human.channels[..., :3] / own for each in layers])
+
+    def thinned(self, kept: Float[Tensor, " H"]) -> "_Pictures":
+        """The same with factors on the person's opacities."""
+        layers = [
+            replace(each, human=replace(each.human, opacities=each.human.opacities * kept))
+            for each in self.layers
+        ]
+        return replace(self, layers=layers)
+
+    def sights(self, colours: Float[Tensor, "H 3"]) -> list[Sight]:
+        """The views as drawn with these colours, and as they shall look."""
+        return [
+            Sight(layers, view.camera, colours[None] * light, view.picture)
+            for view, layers, light in zip(self.views, self.layers, self.light, strict=True)
+        ]
 
     def brightness(self) -> Float[Tensor, " H"]:
         """Mean square of the factors."""
