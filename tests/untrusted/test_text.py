@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from evsplat.errors import ConfigError, DataError
+from evsplat.untrusted.arrays import read_table
+from evsplat.untrusted.faults import open_text
 from evsplat.untrusted.text import parse_yaml, read_json, read_text
 
 
@@ -30,6 +32,15 @@ def refused(path: Path) -> str:
 def test_broken_json_is_one_sentence(tmp_path: Path, content: bytes, said: str) -> None:
     (tmp_path / "a.json").write_bytes(content)
     assert said in refused(tmp_path / "a.json")
+
+
+def test_the_mark_that_windows_begins_a_text_with_is_none_of_it(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(b'\xef\xbb\xbf{"a": 1}\r\n')
+    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf0 10\r\n20 30\r\n")
+    assert read_json(tmp_path / "a.json") == {"a": 1}
+    assert read_table(tmp_path / "a.txt").tolist() == [[0, 10], [20, 30]]
+    with open_text(tmp_path / "a.txt") as lines:
+        assert [line.split() for line in lines] == [["0", "10"], ["20", "30"]]
 
 
 def test_what_is_no_file_is_said_to_be_none(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def plan_exposures(times_us: Int64[np.ndarray, "N"], settings: SynthesisSettings
     spacing. Raises `ConfigError` where settings and footage do not go together.
     """
     if len(times_us) < 2:
-        raise ConfigError(f"the footage has {len(times_us)} picture, expected at least 2.")
+        raise ConfigError("the footage is a single picture, expected at least 2.")
     gap_us = float(np.median(np.diff(times_us)))
     subframes = _subframes(times_us, settings.factor)
     spacing_us = gap_us / settings.factor

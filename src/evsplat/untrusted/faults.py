@@ -65,7 +65,7 @@ def open_bytes(
 def open_text(path: Path | str, *, newline: str | None = None) -> io.TextIOWrapper:
     """A text in UTF-8 opened to be read; a `DataError` where `ordinary_file` refuses it."""
     ordinary_file(path)
-    return open(path, encoding="utf-8", newline=newline)
+    return open(path, encoding="utf-8-sig", newline=newline)
 
 
 def why_not_read(error: OSError | ValueError) -> str:

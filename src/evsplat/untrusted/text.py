@@ -20,13 +20,13 @@ _MISFITS = (TypeError, KeyError, IndexError, AttributeError, OverflowError)
 
 
 def read_text(path: Path | str, *, error: type[EvsplatError] = DataError) -> str:
-    """Read a UTF-8 text; a file that is missing, no text or not to be read is an ``error``."""
+    """Read a UTF-8 text, less the mark that Windows begins one with; else an ``error``."""
     path = Path(path)
     size = ordinary_file(path, error=error)
     if size > _MOST_BYTES:
         raise error(f"{path}: {size:,} bytes are too many for a text, expected {_MOST_BYTES:,}.")
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except OSError as fault:
         raise error(f"{path}: {why_not_read(fault)}.") from None
     except UnicodeDecodeError as fault:

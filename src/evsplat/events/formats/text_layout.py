@@ -10,6 +10,8 @@ from evsplat.errors import DataError
 from evsplat.events.formats.base import ByteReader
 
 MAX_LINE_BYTES = 4096
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+"""First bytes of a text that Windows wrote."""
 _MAX_HEADER_LINES = 100
 _SAMPLE_LINES = 2000
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -53,7 +55,9 @@ def inspect_text(path: Path) -> TextFile:
                     empty = np.zeros((0, len(names)))
                     return TextFile("", len(names), start, names, *size, empty, [])
                 raise DataError(f"{path}: holds no events.")
-            line = raw.strip().removeprefix(b"\xef\xbb\xbf")
+            if start == 0 and raw.startswith(_BYTE_ORDER_MARK):
+                raw, start = raw[len(_BYTE_ORDER_MARK) :], len(_BYTE_ORDER_MARK)
+            line = raw.strip()
             delimiter = next((d for d in _DELIMITERS if d in line), b"")
             fields = _split(line.lstrip(b"#% "), delimiter)
             if not fields or not fields[0]:
