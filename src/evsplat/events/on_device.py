@@ -76,11 +76,10 @@ class DeviceEvents:
         before = keys[last]
         # Keys of two places or polarities lie farther apart than any reach.
         gap = keys[first] - before
-        known = (gap > 0) & (gap <= reach_us)
+        held = gap.clamp(1, reach_us)
         on = before < pixels << _TIME_BITS
-        of_each = (on[:, None] == constant((True, False), on)[:, None]) & known[:, None]
-        shares = (times[:, None] - (before & _TIME)) / gap
-        begun = torch.where(of_each, shares[:, None], 0.0)
+        of_each = (on[:, None] == constant((True, False), on)[:, None]) & (gap == held)[:, None]
+        begun = ((times[:, None] - (before & _TIME)) / held)[:, None] * of_each
         return begun.unflatten(-1, (self.height, self.width))
 
     def _sent(self, times_us: object) -> Int[Tensor, "..."]:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from evsplat.body import BodyTrack
 from evsplat.body.smoothing import SplineError
 from evsplat.devices import send
+from evsplat.models.kept import Kept
 from evsplat.models.pose_spline import PoseSpline
 from evsplat.models.ridge import Ridge
 
@@ -90,6 +91,7 @@ class PoseCorrection(nn.Module):
         self.register_buffer("root_m", torch.as_tensor(root_m).float())
         self.register_buffer("exact", torch.tensor(exact))
         self.register_buffer("started", torch.tensor(False))
+        self._moving = Kept()
 
     def _apply(self, fn: Any, recurse: bool = True) -> "PoseCorrection":
         exact, started = self.exact, self.started
@@ -123,27 +125,34 @@ class PoseCorrection(nn.Module):
         A part with fewer knots than keys costs the less: each knot is one unknown. Of more than
         `_PRICED` keys a stretch drawn from ``generator`` stands for all.
         """
-        keys, price = self.key_us, self.joint_rad.new_zeros(())
+        keys = self.key_us
         if generator is not None and len(keys) > _PRICED:
             stretches = keys.tensor_split(-(-len(keys) // _PRICED))
             keys = stretches[int(torch.randint(len(stretches), (), generator=generator))]
         if not bool(self.exact):
-            moving = (self.joint_rad > 0).any(0)
+            price = self.joint_rad.new_zeros(())
             parts = dict(self._errors())
             for spline in parts.values():
                 share = spline.count / parts["fast"].count
-                price = price + share * self._price(spline, keys, moving)
-        elif self.between is not None:
+                price = price + share * self._price(spline, keys, self.joint_rad)
+            return price
+        if self.between is not None:
             middles = ((keys[1:] + keys[:-1]) / 2).floor()
             if not self.between.still_zero(middles):
-                price = self._price(self.between, middles, self.between_rad > 0)
-        return price
+                return self._price(self.between, middles, self.between_rad[None])
+        return self.joint_rad.new_zeros(())
 
-    @staticmethod
-    def _price(spline: PoseSpline, times_us: Tensor, moving: Tensor) -> Tensor:
+    def _price(
+        self, spline: PoseSpline, times_us: Tensor, expected: Float[Tensor, "#P J"]
+    ) -> Tensor:
+        def joints() -> tuple[Tensor, Tensor]:
+            moving = (expected > 0).any(0)
+            return moving[:, None], 3 * (moving.sum() + 1)
+
         turns, shifts = spline.values(times_us)
-        every = torch.cat([(turns * moving[:, None]).flatten(1), shifts], 1).flatten()
-        return torch.dot(every, every) / (shifts.numel() * (moving.sum() + 1))
+        moving, axes = self._moving.of([expected], joints)
+        every = torch.cat([(turns * moving).flatten(1), shifts], 1).flatten()
+        return torch.dot(every, every) / (len(shifts) * axes)
 
     def _expected(self, times_us: Tensor) -> tuple[Tensor, Tensor]:
         """Errors expected at times, linear between the keys."""

@@ -242,45 +242,53 @@ class _NativeL1Ssim(torch.autograd.Function):
 class _PlainL1Ssim(torch.autograd.Function):
     """`l1_and_ssim` of `GAUSSIAN_SSIM` in plain torch; gradients are found on the way forward.
 
-    Autograd would take three times as many operations, which is what a GPU waits for.
+    Autograd would take three times as many operations, which is what a GPU waits for. Of sums
+    s = x + y and differences d = x - y of the pictures, with squared means A and B in a window and
+    variances V and W, twice the similarity's numerators are A - B + 2 c1 and V - W + 2 c2 and twice
+    its denominators A + B + 2 c1 and V + W + 2 c2, both pairs in one operation.
     """
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
         x, y = (picture.detach().movedim(-1, 0) for picture in (image, reference))
-        y = y.to(x.dtype)
-        settings, (c1, c2) = GAUSSIAN_SSIM, GAUSSIAN_SSIM.stabilisers
-        planes = torch.cat([x, y, torch.addcmul(x * x, y, y), x * y])
-        mean_x, mean_y, squares, product = _smooth(planes, settings, 0).split(len(x))
-        means, both = 2 * mean_x * mean_y, torch.addcmul(mean_x * mean_x, mean_y, mean_y)
-        over = (means + c1, 2 * product - means + c2)
-        under = (both + c1, squares - both + c2)
-        divisor = under[0] * under[1]
-        similarity = over[0] * over[1] / divisor
-        # Slopes by the three means that the picture is in.
-        by_square = -similarity / under[1]
-        by_product = 2 * over[0] / divisor
-        by_mean = torch.addcmul(
-            2 * mean_y * (over[1] - over[0]) / divisor,
-            mean_x,
-            similarity / under[0] + by_square,
-            value=-2,
-        )
-        slopes = torch.cat([by_mean, by_square, by_product])
+        settings = GAUSSIAN_SSIM
+        # First s and d, then their squares.
+        planes = x.new_empty(2, 2, *x.shape)
+        torch.add(x, y.to(x.dtype), out=planes[0, 0])
+        torch.sub(x, y.to(x.dtype), out=planes[0, 1])
+        torch.mul(planes[0], planes[0], out=planes[1])
+        means, squares = _smooth(planes.flatten(0, 2), settings, 0).unflatten(0, (2, 2, -1))
+        # First A and B, then V and W.
+        moments = means.new_empty(2, *means.shape)
+        torch.mul(means, means, out=moments[0])
+        torch.sub(squares, moments[0], out=moments[1])
+        of_sums, of_differences = moments.unbind(1)
+        twice = constant([[[[2 * c]]] for c in settings.stabilisers], x)
+        of_sums = of_sums + twice
+        under = of_sums + of_differences
+        ratios = (of_sums - of_differences) / under
+        similarity = ratios[0] * ratios[1]
+        # Slopes by A and V, and those by B and W with the other sign.
+        slopes, scale = moments, ratios.flip(0) / under
+        less = scale * ratios
+        torch.sub(scale, less, out=slopes[:, 0])
+        torch.add(scale, less, out=slopes[:, 1])
+        # By half of the means, on which the variances depend too, and by the means of squares.
+        slopes[0].sub_(slopes[1]).mul_(means)
         # Windows are even: the sum over the windows of a pixel is again one of these means.
-        back = _smooth(slopes, settings, settings.size - 1).split(len(x))
-        gradient = torch.addcmul(torch.addcmul(back[0], x, back[1], value=2), y, back[2])
-        apart = x - y
-        ctx.windows = similarity.numel()
-        ctx.save_for_backward(gradient, apart)
+        back = _smooth(slopes.flatten(0, 2), settings, settings.size - 1)
+        by_means, by_squares = back.unflatten(0, (2, 2, -1))
+        half = torch.addcmul(by_means, planes[0], by_squares)
+        ctx.windows, apart = similarity.numel(), planes[0, 1]
+        ctx.save_for_backward(half[0] - half[1], apart)
         return apart.abs().mean(), similarity.mean()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
-        gradient, apart = ctx.saved_tensors
-        by_l1, by_similarity = upstream[0] / apart.numel(), upstream[1] / ctx.windows
-        return torch.addcmul(gradient * by_similarity, apart.sign(), by_l1).movedim(0, -1), None
+        half, apart = ctx.saved_tensors
+        by_l1, by_similarity = upstream[0] / apart.numel(), upstream[1] * (2 / ctx.windows)
+        return torch.addcmul(half * by_similarity, apart.sign(), by_l1).movedim(0, -1), None
 
 
 def _check_same_shape(image: Tensor, reference: Tensor) -> None:

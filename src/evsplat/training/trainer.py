@@ -184,7 +184,7 @@ class Trainer:
     def _weighted(self, terms: dict[str, Tensor], nominal: float) -> Tensor:
         values = torch.stack(list(terms.values()))
         weights = [weight_at(self.composition.weights[name], nominal) for name in terms]
-        return (values * send(values.new_tensor(weights, device="cpu"), values.device)).sum()
+        return values.dot(send(values.new_tensor(weights, device="cpu"), values.device))
 
     def _learn_held_out(self, nominal: float) -> None:
         """Now and then a step of what frames teach whose pictures stay unseen."""

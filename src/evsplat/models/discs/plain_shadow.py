@@ -26,6 +26,8 @@ _BEHIND_M, _BEHIND_EDGE_M = -0.2, 0.1
 DENSITY = 3.0
 """Optical depth through the middle of a body that covers `AREA_M2` across the light."""
 AREA_M2 = 0.5
+_sigmoid_slope = torch.ops.aten.sigmoid_backward
+"""Gradient by what a sigmoid was taken of, from its own gradient and value."""
 
 
 def shadow_on_places(
@@ -81,7 +83,7 @@ class _OnScene(torch.autograd.Function):
         scene = _Scene.of(bells.values, _scale(body, widths[:, None]), at, behind, shares)
         ctx.parts = views, seen, bells, scene
         ctx.save_for_backward(widths)
-        return scene.factors.prod(0)
+        return scene.all
 
     @staticmethod
     @once_differentiable
@@ -155,7 +157,7 @@ class _Together(torch.autograd.Function):
         bells, scale = Bells.at(seen.cast, wide), _scale(rows, wide)
         first, end = views.count, views.count + count
         scene = _Scene.of(
-            bells.values[:, :, :times],
+            bells.values[:, :, :times].contiguous(),
             scale[:, :times],
             seen.at[:, :times, first:end],
             seen.behind[:, :times, first:end],
@@ -171,7 +173,7 @@ class _Together(torch.autograd.Function):
         )
         ctx.parts = views, seen, bells, scene, lit
         ctx.save_for_backward(widths, light)
-        return scene.factors.prod(0), light
+        return scene.all, light
 
     @staticmethod
     @once_differentiable
@@ -230,30 +232,38 @@ class _Scene:
     bells: Float[Tensor, "2 L T C P"]
     scale: Float[Tensor, "L #T 1 1"]
     density: Float[Tensor, "L T C C"]
+    """Negative, as light is its exponential."""
     grid: Tensor
     shares: Float[Tensor, "L 1 1"]
     sampled: Float[Tensor, "L T N"]
     gate: Float[Tensor, "L T N"]
-    lost: Float[Tensor, "L T N"]
+    passed: Float[Tensor, "L T N"]
+    """The share of each lamp's light that the body lets through."""
     factors: Float[Tensor, "L T N"]
     """Of each lamp."""
+    all: Float[Tensor, "T N"]
+    """Their product."""
 
     @classmethod
     def of(
         cls, bells: Tensor, scale: Tensor, at: Tensor, behind: Tensor, shares: Tensor
     ) -> "_Scene":
         density = scale * (bells[0] @ bells[1].mT)
-        sampled, grid = _sample(density.flatten(0, 1)[:, None], at.flatten(0, 1)[:, None])
-        sampled = sampled.view(behind.shape)
-        gate = torch.sigmoid((behind - _BEHIND_M) / _BEHIND_EDGE_M)
-        lost, wide = 1 - torch.exp(-sampled * gate), shares.detach()[:, None, None]
-        return cls(bells, scale, density, grid, wide, sampled, gate, lost, 1 - wide * lost)
+        grid = (at.flip(-1) / REACH_M).flatten(0, 1)[:, None]
+        sampled = _sample(density.flatten(0, 1)[:, None], grid).view(behind.shape)
+        edge = constant((-_BEHIND_M / _BEHIND_EDGE_M,), behind)
+        gate = torch.sigmoid(torch.add(edge, behind, alpha=1 / _BEHIND_EDGE_M))
+        passed, wide = torch.exp(sampled * gate), shares.detach()[:, None, None]
+        factors = torch.addcmul(1 - wide, wide, passed)
+        each = bells, scale, density, grid, wide, sampled, gate, passed
+        return cls(*each, factors, factors.prod(0))
 
     def backward(self, above: Float[Tensor, "T N"]) -> _Slopes:
         tiny = torch.finfo(self.factors.dtype).tiny
-        by_lost = -above * self.factors.prod(0) / self.factors.clamp_min(tiny)
-        by_depth = by_lost * self.shares * (1 - self.lost)
-        by_gate = by_depth * self.sampled * self.gate * ((1 - self.gate) / _BEHIND_EDGE_M)
+        by_factor = above * self.all / self.factors.clamp_min(tiny)
+        by_log = by_factor * self.passed
+        by_depth = by_log * self.shares
+        by_gate = _sigmoid_slope(by_depth * self.sampled, self.gate) / _BEHIND_EDGE_M
         grids = self.density.flatten(0, 1)[:, None]
         by_density, by_at = _sample_backward(by_depth * self.gate, grids, self.grid)
         by_density = by_density.view_as(self.density)
@@ -262,9 +272,9 @@ class _Scene:
             scaled @ self.bells[1],
             scaled.mT @ self.bells[0],
             (by_density * self.density).sum((1, 2, 3)),
-            by_at.view(*by_gate.shape, 2),
+            (by_at.flip(-1) / REACH_M).view(*by_gate.shape, 2),
             by_gate,
-            (by_lost * self.lost).sum((1, 2)),
+            (by_log - by_factor).sum((1, 2)),
         )
 
 
@@ -275,6 +285,7 @@ class _Own:
     bells: Float[Tensor, "2 L T C P"]
     scale: Float[Tensor, "L #T 1 1"]
     density: Float[Tensor, "L T Z*C C"]
+    """Negative, as light is its exponential."""
     grid: Tensor
     nearer: Float[Tensor, "L T Z P"]
     rows: Float[Tensor, "L T Z*C P"]
@@ -283,32 +294,31 @@ class _Own:
     def of(
         cls, bells: Tensor, scale: Tensor, in_front: Tensor, at: Tensor, behind: Tensor
     ) -> tuple["_Own", Float[Tensor, "L T N"]]:
-        layers = constant(evenly(_LAYERS), in_front)[:, None]
-        nearer = torch.sigmoid((layers - in_front[:, :, None]) / _LAYER_EDGE_M)
+        layers = constant([place / _LAYER_EDGE_M for place in evenly(_LAYERS)], in_front)[:, None]
+        nearer = torch.sigmoid(torch.sub(layers, in_front[:, :, None], alpha=1 / _LAYER_EDGE_M))
         rows = (nearer[:, :, :, None] * bells[0][:, :, None]).flatten(2, 3)
         density = scale * (rows @ bells[1].mT)
-        where = torch.cat([at, (behind - _OWN_SURFACE_M)[..., None]], -1)
-        depth, grid = _sample(
-            density.flatten(0, 1).unflatten(1, (1, _LAYERS, CELLS)),
-            where.flatten(0, 1)[:, None, None],
-        )
-        light = torch.exp(-depth.view(behind.shape))
+        where, surface = torch.cat([at.flip(-1), behind[..., None]], -1), -_OWN_SURFACE_M / REACH_M
+        grid = torch.add(constant((0.0, 0.0, surface), where), where, alpha=1 / REACH_M)
+        grid = grid.flatten(0, 1)[:, None, None]
+        depth = _sample(density.flatten(0, 1).unflatten(1, (1, _LAYERS, CELLS)), grid)
+        light = torch.exp(depth.view(behind.shape))
         return cls(bells, scale, density, grid, nearer, rows), light
 
     def backward(self, above: Float[Tensor, "L T N"], light: Tensor) -> _Slopes:
         layered = self.density.flatten(0, 1).unflatten(1, (1, _LAYERS, CELLS))
-        by_density, by_where = _sample_backward(-above * light, layered, self.grid)
+        by_density, by_where = _sample_backward(above * light, layered, self.grid)
         by_density = by_density.view_as(self.density)
-        by_where = by_where.view(*light.shape, 3)
+        by_where = by_where.view(*light.shape, 3) / REACH_M
         scaled = self.scale * by_density
         by_rows = (scaled @ self.bells[1]).unflatten(2, (_LAYERS, CELLS))
         by_nearer = (by_rows * self.bells[0][:, :, None]).sum(3)
-        by_front = (by_nearer * self.nearer * (self.nearer - 1)).sum(2) / _LAYER_EDGE_M
+        by_front = _sigmoid_slope(by_nearer, self.nearer).sum(2) * (-1 / _LAYER_EDGE_M)
         return _Slopes(
             (by_rows * self.nearer[:, :, :, None]).sum(2),
             scaled.mT @ self.rows,
             (by_density * self.density).sum((1, 2, 3)),
-            by_where[..., :2],
+            by_where[..., :2].flip(-1),
             torch.cat([by_front, by_where[..., 2]], 2),
         )
 
@@ -322,31 +332,23 @@ def _padded(places: Float[Tensor, "*T N D"], count: int) -> Float[Tensor, "*T M 
 def _scale(
     body: Float[Tensor, "T P 3"], widths: Float[Tensor, "L #T"]
 ) -> Float[Tensor, "L #T 1 1"]:
-    scale = DENSITY * AREA_M2 / (body.shape[1] * 2 * torch.pi)
+    scale = -DENSITY * AREA_M2 / (body.shape[1] * 2 * torch.pi)
     return (scale * widths.pow(-2))[..., None, None]
 
 
 def _sample(
-    grids: Float[Tensor, "M 1 *cells"], places: Float[Tensor, "M *one N D"]
-) -> tuple[Tensor, Tensor]:
-    """Values of the grids at places, metres along their axes; and the places as torch has them."""
-    # grid_sample wants the coordinate along the last axis first.
-    at = _as_sampled(places)
-    return F.grid_sample(grids, at, align_corners=True), at
+    grids: Float[Tensor, "M 1 *cells"], at: Float[Tensor, "M *one N D"]
+) -> Float[Tensor, "M *one N"]:
+    """Values of the grids at places in [-1, 1], of which the last axis comes first."""
+    return F.grid_sample(grids, at, align_corners=True)
 
 
 def _sample_backward(above: Tensor, grids: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of grids and places, metres."""
+    """Gradients of grids and places."""
     flat = grids.dim() == 4
     run = (
         torch.ops.aten.grid_sampler_2d_backward if flat else torch.ops.aten.grid_sampler_3d_backward
     )
     above = above.reshape(len(grids), 1, *at.shape[1:-1]).contiguous()
     by_grids, by_at = run(above, grids, at, 0, 0, True, [True, True])
-    return by_grids, _as_sampled(by_at)
-
-
-def _as_sampled(places: Tensor) -> Tensor:
-    if places.shape[-1] == 2:
-        return places.flip(-1) / REACH_M
-    return torch.cat([places[..., :2].flip(-1), places[..., 2:]], -1) / REACH_M
+    return by_grids, by_at

@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body.surface import SurfaceSamples
 from evsplat.compiled import native, runs_native
+from evsplat.devices import constant
 from evsplat.gaussians.surface_graph import harmonic, laplacian
 from evsplat.models.networks.spherical_harmonics import sh_basis
 from evsplat.neighbours import nearest
@@ -75,13 +76,13 @@ class Shading(nn.Module):
     ) -> tuple[Float[Tensor, "L T N"], Float[Tensor, "L T N"], Float[Tensor, "L T N"]]:
         """Light of lamps that hide nowhere, of intensity 1.
 
-        And that by metre by which a place faces the lamp, and squares of the distances (m^2).
+        And that by metre by which a place faces the lamp, and the distances (m).
         """
         ray = lamps[:, None, None] - places
-        square = ray.square().sum(-1)
+        apart = ray.norm(dim=-1)
         reach = (lamps - self.center).square().sum(-1)[:, None, None]
-        bright = reach / square.clamp_min(_NEAREST_M**2) * square.rsqrt()
-        return (ray * normals).sum(-1).clamp_min(0) * bright, bright, square
+        bright = reach / (apart.clamp_min(_NEAREST_M).square() * apart)
+        return (ray * normals).sum(-1).clamp_min(0) * bright, bright, apart
 
     def forward(
         self,
@@ -179,22 +180,23 @@ class _PlainLight(torch.autograd.Function):
         lamps: Float[Tensor, "L 3"],
         lit: Float[Tensor, "L #T N"] | None,
     ) -> Float[Tensor, "T N 3"]:
-        falling, bright, square = shading.falling(lamps, normals, places)
+        falling, bright, apart = shading.falling(lamps, normals, places)
         lights = (falling if lit is None else falling * lit).movedim(0, -1)
         terms = torch.cat([shading.ambient(normals, places), lights], -1)
-        free = 1 + terms @ torch.cat([coefficients.flatten(0, 1), intensities])
+        weights = torch.cat([coefficients.flatten(0, 1), intensities])
+        free = torch.addmm(constant((1.0,), terms), terms.flatten(0, 1), weights).view_as(places)
         factors = free.clamp(_DARKEST, _BRIGHTEST)
         ctx.shading, ctx.sizes = shading, coefficients.shape
         within = factors == free
         ctx.save_for_backward(
-            normals, places, intensities, lamps, lit, falling, bright, square, terms, within
+            normals, places, intensities, lamps, lit, falling, bright, apart, terms, within
         )
         return factors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (normals, places, intensities, lamps, lit, falling, bright, square, terms, within) = (
+        (normals, places, intensities, lamps, lit, falling, bright, apart, terms, within) = (
             ctx.saved_tensors
         )
         above = (upstream[0] * within).flatten(0, 1)
@@ -208,8 +210,8 @@ class _PlainLight(torch.autograd.Function):
         of_each = by_light * falling
         facing = (by_light * bright * (falling > 0)).flatten(1) @ normals.flatten(0, 1)
         # The distance is in the light to the power of -3, and of -1 where it counts as the least.
-        far = 1 + 2 * (square > _NEAREST_M**2)
-        by_ray = of_each * far / square
+        far = torch.add(constant((1.0,), apart), apart > _NEAREST_M, alpha=2)
+        by_ray = of_each * far / apart.square()
         toward = torch.addmm(facing, by_ray.flatten(1), places.flatten(0, 1))
         away = lamps - ctx.shading.center
         share = of_each.sum((1, 2)) / away.square().sum(-1)

@@ -92,7 +92,8 @@ class Views:
         by_ray = self._by_ray(by_local.mT @ seen.rays, by_distance)
         by_points = by_rays.sum(0)
         by_lamps = -by_ray.sum(1) - by_rays.sum((1, 2))
-        by_body = by_points[:, : self.count] + by_ray.sum(0)[:, None] / self.count
+        middle = by_ray.sum(0)[:, None]
+        by_body = torch.add(by_points[:, : self.count], middle, alpha=1 / self.count)
         return by_lamps, by_body, by_points[:, self.count :]
 
     def _by_ray(
@@ -147,5 +148,5 @@ def _across(axis: Float[Tensor, "*T 3"]) -> tuple[Float[Tensor, "*T 2 3"], Float
     identity = constant(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), axis)
     # The identity less (ratio * sign) between.
     rows = torch.addcmul(identity, (ratio * sign)[..., None], between[..., None, :], value=-1)
-    twist = F.pad(torch.stack([ratio[..., 1], -ratio[..., 0]], -1), (0, 1))
+    twist = ratio @ constant(((0.0, -1.0, 0.0), (1.0, 0.0, 0.0)), axis)
     return rows * F.pad(sign, (1, 0), value=1.0)[..., None], twist
