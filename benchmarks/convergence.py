@@ -176,24 +176,25 @@ def draw(curves: dict[str, dict[str, list[dict[str, Any]]]], path: Path) -> None
     panel, margin = (460, 340), 46
     page = Image.new("RGB", (panel[0] * len(curves), panel[1]), "white")
     pen, font = ImageDraw.Draw(page), ImageFont.load_default(12)
-    colours = ["#1b6ca8", "#c0392b", "#2e8b57", "#7d3c98"]
+    colours = dict(zip(METHODS, ["#1b6ca8", "#7d3c98", "#c0392b", "#2e8b57"], strict=True))
     values = [p["crop_psnr_db"] for c in curves.values() for ps in c.values() for p in ps]
-    lengths = [p["steps"] for c in curves.values() for ps in c.values() for p in ps]
+    lengths = sorted({p["steps"] for c in curves.values() for ps in c.values() for p in ps})
     low, high = math.floor(min(values)), math.ceil(max(values))
-    first, last = math.log2(min(lengths)), max(math.log2(max(lengths)), math.log2(min(lengths)) + 1)
+    first, last = math.log2(lengths[0]), math.log2(max(lengths[-1], 2 * lengths[0]))
     for index, (capture, methods) in enumerate(curves.items()):
-        left, right = index * panel[0] + margin, (index + 1) * panel[0] - margin // 2
+        left, right = index * panel[0] + margin, (index + 1) * panel[0] - margin
         top, bottom = margin // 2 + 8, panel[1] - margin
         pen.text((left, 6), f"{capture}: person crop, dB, over steps", "black", font)
         for value in range(low, high + 1, max(1, (high - low) // 6)):
             y = bottom - (value - low) / (high - low) * (bottom - top)
             pen.line([(left, y), (right, y)], "#dddddd")
             pen.text((left - 24, y - 7), str(value), "black", font)
-        for power in range(round(first), round(last) + 1):
-            x = left + (power - first) / (last - first) * (right - left)
-            pen.text((x - 12, bottom + 6), str(round(2**power)), "black", font)
-        for order, (method, points) in enumerate(methods.items()):
-            colour = colours[order % len(colours)]
+        for steps in lengths:
+            x = left + (math.log2(steps) - first) / (last - first) * (right - left)
+            pen.text((x, bottom + 6), f"{steps:,}", "black", font, anchor="ma")
+        at = float(left)
+        for method, points in methods.items():
+            colour = colours[method]
             places = [
                 (
                     left + (math.log2(p["steps"]) - first) / (last - first) * (right - left),
@@ -204,7 +205,8 @@ def draw(curves: dict[str, dict[str, list[dict[str, Any]]]], path: Path) -> None
             pen.line(places, colour, 2)
             for x, y in places:
                 pen.ellipse([x - 3, y - 3, x + 3, y + 3], colour)
-            pen.text((left + 6 + 110 * order, bottom + 24), method, colour, font)
+            pen.text((at, bottom + 24), method, colour, font)
+            at += 24 + pen.textlength(method, font)
     page.save(path)
 
 
