@@ -31,9 +31,10 @@ class _Exponential(torch.autograd.Function):
         cross = torch.linalg.cross(identity.expand(*vectors.shape, 3), vectors[..., None, :])
         twice = cross @ cross
         angle = vectors.norm(dim=-1)[..., None, None]
-        first = torch.sinc(angle / torch.pi)
-        second = 0.5 * torch.sinc(angle / (2 * torch.pi)).square()
-        matrices = torch.addcmul(torch.addcmul(identity, first, cross), second, twice)
+        whole_and_half = constant(((1 / torch.pi, 0.5 / torch.pi),), vectors)
+        first, half = torch.sinc(angle * whole_and_half).split(1, -1)
+        second = half.square()  # twice the factor
+        matrices = torch.addcmul(identity, first, cross).addcmul_(second, twice, value=0.5)
         ctx.save_for_backward(vectors, angle, first, second, matrices)
         return matrices
 
@@ -48,7 +49,7 @@ class _Exponential(torch.autograd.Function):
         third = (1 - first) / angle.square().clamp_min(torch.finfo(angle.dtype).tiny)
         around = torch.linalg.cross(vectors, torque)
         again = torch.linalg.cross(vectors, around)
-        grad = torch.addcmul(torque, second[..., 0], around, value=-1)
+        grad = torch.addcmul(torque, second[..., 0], around, value=-0.5)
         return torch.addcmul(grad, third[..., 0], again)
 
 
