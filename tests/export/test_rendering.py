@@ -184,6 +184,7 @@ def test_out_chooses_video_or_pictures_and_parts_and_camera_are_obeyed(run, tmp_
         ({"slow": -1}, "--slow -1"),
         ({"slow": float("nan")}, "--slow nan"),
         ({"camera": "top"}, "only main, side"),
+        ({"out": "film.avi"}, "--out film.avi: a film is an .mp4, .webp or .gif, or a folder"),
     ],
 )
 def test_impossible_options_name_themselves(run, options, message):

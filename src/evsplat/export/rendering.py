@@ -37,6 +37,8 @@ FILM_HEIGHT = 720
 _NEAREST = 0.6
 """Depth that gets the lightest colour, as a share of the distance to the person."""
 _VIDEO, _ANIMATION = (".mp4",), (".gif", ".webp")
+_OTHERS = (".avi", ".mov", ".mkv", ".webm", ".m4v", ".png", ".jpg", ".jpeg")
+"""Endings of what is asked for as a file and not written."""
 _FULL_SCALE = 3.0
 """Events of a pixel in one picture that get the strongest colour."""
 _PIECE_US = 100_000
@@ -101,6 +103,11 @@ def _is_made_larger(film: Film, out: Path) -> bool:
 def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours: bool) -> None:
     """Refuse before hours of drawing what could not be written after them."""
     suffix = out.suffix.lower()
+    if suffix in _OTHERS:
+        raise ConfigError(
+            f"--out {out}: a film is an .mp4, .webp or .gif, or a folder of PNG files; name one of "
+            "these."
+        )
     if film.transparent and suffix in _VIDEO:
         raise ConfigError(
             "--transparent: mp4 cannot hold it; give --out a name in .webp or .gif or a folder."

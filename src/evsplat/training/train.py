@@ -274,7 +274,9 @@ def _loop(trainer: Trainer, folder: RunFolder) -> None:
         if clock.iteration > 0:
             save(ending=True)  # once more: what was learned is safe whatever this takes
     if clock.iteration == 0:
-        raise DataError(f"{folder.path}: no step was made.")
+        raise DataError(
+            f"{folder.path}: no step was made in the time given; give more by --max-minutes."
+        )
 
 
 def _ended(clock: Clock, capture: Path, run: Path) -> str:
