@@ -12,7 +12,7 @@ from .clouds import covariances, random_cloud
 pytest.importorskip("viser", reason="needs the extra view")
 
 
-def test_the_recording_becomes_one_page(run, monkeypatch):
+def test_the_recording_becomes_one_page(run, monkeypatch, capfd):
     shown = []
     show = clip._show
 
@@ -42,6 +42,7 @@ def test_the_recording_becomes_one_page(run, monkeypatch):
     text = page.read_text(encoding="utf-8")
     (data,) = re.findall(r'__VISER_EMBED_DATA__="([^"]*)"', text)
     assert len(data) > 10_000
+    assert capfd.readouterr().out == ""
 
 
 def test_small_gaussians_keep_their_shape(monkeypatch):

@@ -67,8 +67,13 @@ def test_what_inspect_takes_is_a_capture_a_recording_or_a_bag(tmp_path: Path) ->
     for name in ("capture.json", "metadata.yaml"):
         (tmp_path / name).touch()
         check_capture_or_recording(tmp_path)
-        check_capture_or_recording(tmp_path / name)
         (tmp_path / name).unlink()
+    for name in ("events.csv", "metadata.yaml"):
+        (tmp_path / name).touch()
+        check_capture_or_recording(tmp_path / name)
+    (tmp_path / "capture.json").touch()
+    with pytest.raises(DataError, match=f"Give the folder that it lies in: {tmp_path}\\."):
+        check_capture_or_recording(tmp_path / "capture.json")
 
 
 def test_a_video_is_no_capture_and_what_makes_it_one_is_named(tmp_path: Path) -> None:

@@ -109,6 +109,18 @@ def test_what_is_not_the_training_s_is_not_gone_on_from(
     assert sorted(path for path in run.rglob("*") if path.is_file()) == before
 
 
+def test_a_capture_that_was_moved_is_found_where_the_run_is_told(
+    trained: Path, tmp_path: Path
+) -> None:
+    run = damaged(trained, tmp_path / "run", lambda tensors, state: None)
+    facts = json.loads((run / "versions.json").read_text())
+    (run / "versions.json").write_text(json.dumps(facts | {"capture": str(tmp_path / "gone")}))
+    with pytest.raises(DataError, match="gone: not found, expected the capture that .*put it back"):
+        load_run(run)
+    (run / "versions.json").write_text(json.dumps(facts))
+    assert load_run(run).iteration == 4
+
+
 def test_the_same_run_untouched_goes_on(trained: Path, tmp_path: Path) -> None:
     run = damaged(trained, tmp_path / "run", lambda tensors, state: None)
     assert load_run(run).iteration == 4

@@ -46,7 +46,8 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
     mids = sorted(frame.mid_us for frame in capture.frames)
     count = 1 + int((mids[-1] - mids[0]) * fps / 1e6)
     times = [mids[0] + round(k * 1e6 / fps) for k in range(count)]
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):  # viser's address, at which nobody looks
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         server.gui.configure_theme(control_layout="collapsible", dark_mode=True)
         server.scene.set_up_direction(tuple(up_axis(track).tolist()))

@@ -41,6 +41,8 @@ def no_capture(path: Path) -> tuple[Path, str, str, str] | None:
     """
     if os.path.isfile(path):
         remedy = "Videos and recordings become one by 'evsplat import' (docs/import.md)."
+        if path.name == "capture.json":
+            remedy = f"Give the folder that it lies in: {path.parent}."
         return path, "a file", "a capture folder", remedy
     if not os.path.isdir(path):
         return path, "no such folder", "a capture folder", "Check the path."
@@ -79,7 +81,8 @@ def check_footage(path: Path) -> None:
 
 def check_capture_or_recording(path: Path) -> None:
     """Raise a `DataError` where ``path`` is neither a file nor a folder that holds either."""
-    if not path.is_file() and not (path / "metadata.yaml").is_file():
+    is_recording = path.is_file() and path.name != "capture.json"
+    if not is_recording and not (path / "metadata.yaml").is_file():
         check_capture_folder(path)
 
 

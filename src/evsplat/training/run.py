@@ -239,7 +239,13 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     if loaded is None:
         raise DataError(f"{folder.checkpoints}: no checkpoint; train the run first.")
     path, tensors, progress = loaded
-    capture = load_capture(Path(facts["capture"]))
+    place = Path(facts["capture"])
+    if not place.is_dir():
+        raise DataError(
+            f"{place}: not found, expected the capture that {folder.path} was trained on; put it "
+            f"back, or write its new place under 'capture' in {folder.facts}."
+        )
+    capture = load_capture(place)
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
     shown = seen_by_training(capture, config)
