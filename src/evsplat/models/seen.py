@@ -112,13 +112,13 @@ def shares_in(
     return transposed(image, channels, signs)[0]
 
 
-def transposed(image: Tensor, values: Tensor, weights: Tensor) -> Tensor:
-    """``J^T weights`` of the matrix J by which an image comes from values.
+def transposed(image: Tensor, values: Tensor, weights: Tensor, *, again: bool = False) -> Tensor:
+    """``J^T weights`` of the matrix J by which an image comes from values; ``again`` keeps it.
 
     As the gradient of a sum: PyTorch imports its compiler, which takes a second, for one that is
     begun with weights of its own (``grad_outputs``).
     """
-    return torch.autograd.grad((image * weights).sum(), values)[0]
+    return torch.autograd.grad((image * weights).sum(), values, retain_graph=again)[0]
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
-from typing import Any, Generic, get_args, get_type_hints
+from typing import Annotated, Any, Generic, get_args, get_type_hints
 
 import tyro
 from tyro.constructors import (
@@ -41,7 +41,8 @@ def _options(kind: type[Any]) -> Iterator[StructFieldSpec]:
         if (part := _flat_part(hint)) is not None:
             yield from _options(part)
         else:
-            yield StructFieldSpec(field.name, hint, _default(field), docs.get(field.name))
+            read = _read_type(hint)
+            yield StructFieldSpec(field.name, read, _default(field), docs.get(field.name))
 
 
 def _made(kind: type[Any], /, **values: Any) -> Any:
@@ -56,6 +57,15 @@ def _made(kind: type[Any], /, **values: Any) -> Any:
 def _flat_part(hint: Any) -> type[Any] | None:
     is_flat = any(mark is FLAT for mark in getattr(hint, "__metadata__", ()))
     return get_args(hint)[0] if is_flat else None
+
+
+def _read_type(hint: Any) -> Any:
+    """The hint, or what its option is to be read as in place of it."""
+    marks = getattr(hint, "__metadata__", ())
+    for mark in marks:
+        if (read_as := getattr(mark, "constructor_factory", None)) is not None:
+            return Annotated[(read_as(), *marks)]
+    return hint
 
 
 def _default(field: Field[Any]) -> Any:

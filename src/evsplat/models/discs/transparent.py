@@ -16,7 +16,7 @@ from evsplat.camera import Camera
 from evsplat.gaussians import GaussianSet
 from evsplat.models.discs.shading import NearestSurface
 from evsplat.models.layers import Layers
-from evsplat.models.seen import draw_values
+from evsplat.models.seen import draw_values, transposed
 from evsplat.neighbours import nearest
 
 WRONG, WRONG_FROM = 0.02, 0.1
@@ -96,11 +96,10 @@ def kept_opacity(
             scene = sight.layers.scene.channels[..., :3]
             drawn = draw_values(sight.layers, sight.camera, sight.human, scene, leaf)
             missed = drawn.detach() - sight.picture
-            pull += torch.autograd.grad(drawn, leaf, missed, retain_graph=True)[0]
+            pull += transposed(drawn, leaf, missed, again=True)
             for _ in range(_DRAWS):
                 signs = torch.randint(0, 2, drawn.shape, generator=generator).to(drawn) * 2 - 1
-                slope = torch.autograd.grad(drawn, leaf, signs, retain_graph=True)[0]
-                slopes += slope.square() / _DRAWS
+                slopes += transposed(drawn, leaf, signs, again=True).square() / _DRAWS
         least = torch.finfo(slopes.dtype).tiny
         step = (pull + price / 2) / (_DAMPED * slopes).clamp_min(least)
         kept = torch.where(priced, (kept - step).clamp(0, 1), kept)
