@@ -1,12 +1,20 @@
 """Lens distortion (OpenCV's rational model), removed while keeping the same K."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int32
 from scipy.ndimage import map_coordinates
 
-COEFFICIENT_COUNTS = (4, 5, 8)
+_COUNTS = (4, 5, 8)
+_LARGEST = 1e9
+
+
+def are_coefficients(values: Sequence[object]) -> bool:
+    """Whether a file gives numbers that a `Distortion` takes: as many as OpenCV has, and finite."""
+    numeric = all(isinstance(v, int | float) and abs(v) < _LARGEST for v in values)
+    return numeric and len(values) in _COUNTS
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from evsplat.camera import Camera
-from evsplat.capture.distortion import COEFFICIENT_COUNTS, Distortion
+from evsplat.capture.distortion import Distortion, are_coefficients
 from evsplat.capture.fields import MISSING, RENAME, Fields
 from evsplat.names import NAME_RULE, is_name
 from evsplat.pictures.light import TRANSFERS, Transfer
@@ -124,8 +124,7 @@ def _distortion(entry: Fields) -> tuple[float, ...] | None:
     if inner.valid and inner.text("model") != "opencv":
         inner.fail("model", brief(inner.value.get("model")), "'opencv'", "Undistort first.")
     coefficients = inner.entries("coefficients")
-    numeric = all(isinstance(c, (int, float)) and abs(c) < 1e9 for c in coefficients)
-    if inner.valid and (len(coefficients) not in COEFFICIENT_COUNTS or not numeric):
+    if inner.valid and not are_coefficients(coefficients):
         inner.fail(
             "coefficients",
             brief(coefficients),

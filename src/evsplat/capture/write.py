@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import PoseSource
 from evsplat.capture.body_file import key_poses, save_arrays, write_body
-from evsplat.capture.distortion import COEFFICIENT_COUNTS
+from evsplat.capture.distortion import are_coefficients
 from evsplat.capture.parse import FORMAT, VERSION
 from evsplat.capture.parse_frames import default_split
 from evsplat.capture.points import write_points
@@ -33,7 +33,6 @@ from evsplat.pictures.light import TRANSFERS, Transfer
 from evsplat.untrusted.faults import brief
 from evsplat.untrusted.text import read_json
 
-_LARGEST_COEFFICIENT = 1e9
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -384,10 +383,7 @@ def _coefficients(path: Path, lens: Any) -> list[float] | None:
     if not lens:
         return None
     numbers = values if isinstance(values, list) else []
-    numeric = all(
-        isinstance(value, int | float) and abs(value) < _LARGEST_COEFFICIENT for value in numbers
-    )
-    if not numeric or len(numbers) not in COEFFICIENT_COUNTS:
+    if not are_coefficients(numbers):
         raise DataError(
             f"{path}: distortion: found {brief(values)}, expected 4, 5 or 8 numbers: OpenCV's k1, "
             "k2, p1, p2, k3, k4, k5, k6; give them, or null."

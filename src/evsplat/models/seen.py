@@ -107,9 +107,14 @@ def shares_in(
     count, columns = layers.human.means.shape[1], 1 + draws
     channels = layers.human.means.new_zeros(1, count, columns).requires_grad_()
     image = draw_values(layers, camera, channels)
-    signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+    signs = random_signs(image, generator)
     signs[..., 0] = 1
     return transposed(image, channels, signs)[0]
+
+
+def random_signs(image: Tensor, generator: torch.Generator) -> Tensor:
+    """1 or -1 for each value, with which sums over an image tell sums of squares."""
+    return torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
 
 
 def transposed(image: Tensor, values: Tensor, weights: Tensor, *, again: bool = False) -> Tensor:

@@ -1,6 +1,7 @@
 """Formats of event recordings, one module each, chosen by the first bytes of a file."""
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -54,7 +55,7 @@ def _is_header(head: bytes, line: bytes) -> bool:
 
 
 def _is_text(head: bytes) -> bool:
-    return bool(head) and not set(head) - set(range(32, 127)) - set(b"\t\r\n\xef\xbb\xbf")
+    return bool(head) and not set(head) - set(range(32, 127)) - set(b"\t\r\n" + BOM_UTF8)
 
 
 # Magics first; text is what is left.

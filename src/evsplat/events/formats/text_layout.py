@@ -1,6 +1,7 @@
 """Layout of a text file of events: its header, its delimiter, the names of its columns."""
 
 import re
+from codecs import BOM_UTF8
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,6 @@ from evsplat.errors import DataError
 from evsplat.events.formats.base import ByteReader
 
 MAX_LINE_BYTES = 4096
-_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-"""First bytes of a text that Windows wrote."""
 _MAX_HEADER_LINES = 100
 _SAMPLE_LINES = 2000
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -55,8 +54,8 @@ def inspect_text(path: Path) -> TextFile:
                     empty = np.zeros((0, len(names)))
                     return TextFile("", len(names), start, names, *size, empty, [])
                 raise DataError(f"{path}: holds no events.")
-            if start == 0 and raw.startswith(_BYTE_ORDER_MARK):
-                raw, start = raw[len(_BYTE_ORDER_MARK) :], len(_BYTE_ORDER_MARK)
+            if start == 0 and raw.startswith(BOM_UTF8):  # as Windows begins a text
+                raw, start = raw[len(BOM_UTF8) :], len(BOM_UTF8)
             line = raw.strip()
             delimiter = next((d for d in _DELIMITERS if d in line), b"")
             fields = _split(line.lstrip(b"#% "), delimiter)

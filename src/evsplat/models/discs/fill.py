@@ -100,7 +100,7 @@ def filled(
     off_m = off_the_body(gaussians.means[rows], normals, model.surface)
     pixels = share * seen.weight.mean() * areas(gaussians)
     kept = kept_opacity(pictures.sights(colours), prices(wrong, off_m, pixels))
-    colours = _closest(pictures.thinned(kept), told, squares, strength, behind)
+    colours = _closest(replace(pictures, kept=kept), told, squares, strength, behind)
     with torch.no_grad():
         new.gaussians.get_parameter(gaussians.colour)[rows, :3] = colours.logit()
         opacities = (gaussians.opacities()[rows] * kept).clamp_min(_LEAST_OPACITY)
@@ -203,20 +203,14 @@ class _Pictures:
     layers: Sequence[Layers]
     light: Sequence[Float[Tensor, "1 H 3"]]
     """Factors on the colours."""
+    kept: Float[Tensor, " H"] | None = None
+    """Factors on the opacities."""
 
     @classmethod
     def of(cls, model: DiscModel, views: Sequence[_View], own: Float[Tensor, "H 3"]) -> "_Pictures":
         """``own``: the colours of ``model``, sRGB without light."""
         layers = [_layers(model, view.frame, view.camera) for view in views]
         return cls(views, layers, [each.human.channels[..., :3] / own for each in layers])
-
-    def thinned(self, kept: Float[Tensor, " H"]) -> "_Pictures":
-        """The same with factors on the person's opacities."""
-        layers = [
-            replace(each, human=replace(each.human, opacities=each.human.opacities * kept))
-            for each in self.layers
-        ]
-        return replace(self, layers=layers)
 
     def sights(self, colours: Float[Tensor, "H 3"]) -> list[Sight]:
         """The views as drawn with these colours, and as they shall look."""
@@ -244,7 +238,7 @@ class _Pictures:
         for view, layers, light in zip(self.views, self.layers, self.light, strict=True):
             leaf = values.clone().requires_grad_()
             scene = layers.scene.channels[..., :3]
-            picture = draw_values(layers, view.camera, leaf[None] * light, scene)
+            picture = draw_values(layers, view.camera, leaf[None] * light, scene, self.kept)
             lacks = view.picture - picture.detach()
             total += transposed(picture, leaf, lacks)
         return total
@@ -254,6 +248,6 @@ class _Pictures:
         total = torch.zeros_like(values)
         for view, layers, light in zip(self.views, self.layers, self.light, strict=True):
             leaf = values.clone().requires_grad_()
-            picture = draw_values(layers, view.camera, leaf[None] * light)
+            picture = draw_values(layers, view.camera, leaf[None] * light, kept=self.kept)
             total += transposed(picture, leaf, picture.detach())
         return total

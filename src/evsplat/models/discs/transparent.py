@@ -16,7 +16,7 @@ from evsplat.camera import Camera
 from evsplat.gaussians import GaussianSet
 from evsplat.models.discs.shading import NearestSurface
 from evsplat.models.layers import Layers
-from evsplat.models.seen import draw_values, transposed
+from evsplat.models.seen import draw_values, random_signs, transposed
 from evsplat.neighbours import nearest
 
 WRONG, WRONG_FROM = 0.02, 0.1
@@ -98,7 +98,7 @@ def kept_opacity(
             missed = drawn.detach() - sight.picture
             pull += transposed(drawn, leaf, missed, again=True)
             for _ in range(_DRAWS):
-                signs = torch.randint(0, 2, drawn.shape, generator=generator).to(drawn) * 2 - 1
+                signs = random_signs(drawn, generator)
                 slopes += transposed(drawn, leaf, signs, again=True).square() / _DRAWS
         least = torch.finfo(slopes.dtype).tiny
         step = (pull + price / 2) / (_DAMPED * slopes).clamp_min(least)
