@@ -9,11 +9,12 @@ twice at the two first lengths, with its released rates and with these times the
 15,000 / steps; the better of both is the one whose pictures come closer to the recorded training
 frames, and from the third length on, where both grow alike, the one that was better last is run.
 What was made weaker for quick tables is undone: 50,000 points of a person at the start, HUGS's own
-limit of growth. A length that would take longer than `--hours`, by the one before it, is not
-begun. Every point is kept as a small file in `--points` (the repository's docs/results/convergence)
-and not made again, so the command can be stopped and gone on with; two of them with different
-`--methods` may share the folders. tools/results.py draws what is kept. Printed: a line per cell,
-then the knees; the curves are drawn to OUT/convergence.png. The last line is one JSON object.
+limit of growth. A length that would take longer than `--hours` of the processor, by the one before
+it, is not begun. Every point is kept as a small file in `--points` (the repository's
+docs/results/convergence) and not made again, so the command can be stopped and gone on with; two
+of them with different `--methods` may share the folders. tools/results.py draws what is kept.
+Printed: a line per cell, then the knees; the curves are drawn to OUT/convergence.png. The last
+line is one JSON object.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import evsplat as ev
+from evsplat.benching.cpu_time import cpu_time
 from evsplat.benching.origin import code, machine
 from evsplat.capture import load_capture
 from evsplat.evaluation.run import evaluate_run
@@ -71,18 +73,20 @@ def cell(
         return dict(json.loads(kept.read_text("utf-8")))
     run = options.out / "runs" / name
     settings = METHODS[method] + (scaled_rates(method, steps) if rates == "scaled" else ())
-    if run.exists():
-        ev.train(capture, out=run, resume=True)
-    else:
-        ev.train(
-            capture,
-            method=method,
-            out=run,
-            iterations=steps,
-            overrides=settings,
-            seed=seed,
-            threads=threads,
-        )
+    with cpu_time(run, resume=run.exists()) as cpu_seconds:
+        if run.exists():
+            ev.train(capture, out=run, resume=True)
+        else:
+            ev.train(
+                capture,
+                method=method,
+                out=run,
+                iterations=steps,
+                overrides=settings,
+                seed=seed,
+                threads=threads,
+            )
+    used = cpu_seconds()
     test = evaluate_run(run)
     train = evaluate_run(run, split="train")
     regions = test["protocols"]["standard"]
@@ -97,6 +101,7 @@ def cell(
         "mask_psnr_db": regions["person_mask"]["psnr"],
         "train_recorded_crop_psnr_db": train["blurry_ground_truth"]["person_crop"]["psnr"],
         "train_s": test["train_seconds"],
+        "train_cpu_s": used,
         "gaussians": test["gaussians"],
         "threads": threads,
         "policy": test["policy"],
@@ -128,10 +133,16 @@ def curve(capture: Path, method: str, options: argparse.Namespace) -> list[dict[
         points.append(_better(cells))
         if len(points) > 1 and _gain(points) < options.gain:
             break
-        if 2 * points[-1]["train_s"] > 3600 * options.hours:
+        if 2 * _hours(points[-1]) > options.hours:
             break
         steps *= 2
     return points
+
+
+def _hours(point: dict[str, Any]) -> float:
+    """Time a training took: the processor's where it is known; the clock counts waiting too."""
+    cpu_s = point.get("train_cpu_s")
+    return float(cpu_s / point["threads"] if cpu_s else point["train_s"]) / 3600
 
 
 def _better(cells: Iterable[dict[str, Any]]) -> dict[str, Any]:

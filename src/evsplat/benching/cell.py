@@ -4,8 +4,6 @@ import logging
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 import torch
 
 import evsplat
+from evsplat.benching.cpu_time import cpu_time
 from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.benching.given_pictures import OWN_PICTURE, PICTURES, GivenPictures, OwnPicture
 from evsplat.benching.origin import code, machine
@@ -21,7 +20,7 @@ from evsplat.capture import Capture, Policy, load_capture
 from evsplat.config import override, to_dict
 from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.evaluation.evaluator import evaluate
-from evsplat.files import remove_file, remove_folder, write_json
+from evsplat.files import remove_folder, write_json
 from evsplat.methods import method_config
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
@@ -216,7 +215,7 @@ def _trained(
         max_minutes=cell.max_minutes,
         threads=threads,
     )
-    with _cpu_time(run, resume) as cpu_seconds:
+    with cpu_time(run, resume) as cpu_seconds:
         if resume:
             go(resume=True)
         else:
@@ -231,29 +230,6 @@ def _trained(
         "device": trained.device,
         "threads": torch.get_num_threads(),
     }
-
-
-@contextmanager
-def _cpu_time(run: Path, resume: bool) -> Iterator[Callable[[], float | None]]:
-    """CPU time of the block, s, and of the processes before it that were stopped and saved.
-
-    None where one of them was killed: nobody knows what it had used.
-    """
-    spent = run / "cpu_seconds.json"
-    before: float | None = None if resume else 0.0
-    if resume and spent.exists():
-        before = read_record(spent, {"seconds": float}, "remove the run")["seconds"]
-        remove_file(spent)
-    begun = time.process_time()
-
-    def used() -> float | None:
-        return None if before is None else before + time.process_time() - begun
-
-    try:
-        yield used
-    finally:
-        if used() is not None and run.exists():
-            write_json(spent, {"seconds": used()})
 
 
 def _recorded(bench: BenchFolder, source: CaptureSource) -> Path:
