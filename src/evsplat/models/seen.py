@@ -14,6 +14,7 @@ from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
 from evsplat.neighbours import nearest
+from evsplat.probes import random_signs
 from evsplat.render import Splats, render
 
 LITTLE_PX = 0.3
@@ -110,11 +111,6 @@ def shares_in(
     signs = random_signs(image, generator)
     signs[..., 0] = 1
     return transposed(image, channels, signs)[0]
-
-
-def random_signs(image: Tensor, generator: torch.Generator) -> Tensor:
-    """1 or -1 for each value, with which sums over an image tell sums of squares."""
-    return torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
 
 
 def transposed(image: Tensor, values: Tensor, weights: Tensor, *, again: bool = False) -> Tensor:

@@ -17,6 +17,7 @@ from evsplat.posing.misfit import misfits
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets
 from evsplat.posing.time_limit import TimeLimit
+from evsplat.probes import random_signs
 
 COARSE_PX = 64
 """Least side of the pictures that are compared first."""
@@ -162,7 +163,7 @@ class Descent:
         probes = 0
         for _ in self.limit.steps(PROBES, PROBE_STEPS):
             probes += 1
-            signs = [torch.randint(0, 2, p.shape, generator=generator) * 2.0 - 1 for p in params]
+            signs = [random_signs(p, generator) for p in params]
             up, down = (self._gradient(params, signs, size) for size in (0.05, -0.05))
             for one, a, b, sign in zip(total, up, down, signs, strict=True):
                 one += sign * (a - b) / 0.1

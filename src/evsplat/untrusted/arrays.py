@@ -96,14 +96,14 @@ def read_plain_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_table(
-    source: Path | IO[bytes], *, rows: int | None = None
+    source: Path | IO[bytes] | IO[str], *, rows: int | None = None
 ) -> Float64[np.ndarray, "rows columns"]:
     """Numbers in lines of plain text, the first ``rows`` or all; a `ValueError` where others.
 
     A path that leads to no ordinary text is a `DataError`.
     """
     if isinstance(source, Path):
-        source = io.BytesIO(read_text(source).encode())
+        source = io.StringIO(read_text(source))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # empty lines, no lines

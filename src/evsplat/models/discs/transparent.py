@@ -16,8 +16,9 @@ from evsplat.camera import Camera
 from evsplat.gaussians import GaussianSet
 from evsplat.models.discs.shading import NearestSurface
 from evsplat.models.layers import Layers
-from evsplat.models.seen import draw_values, random_signs, transposed
+from evsplat.models.seen import draw_values, transposed
 from evsplat.neighbours import nearest
+from evsplat.probes import random_signs
 
 WRONG, WRONG_FROM = 0.02, 0.1
 """Price of a pixel of colour that differs by more than the second from what neighbours tell, per
