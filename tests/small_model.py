@@ -41,8 +41,9 @@ _UNREAD = {
 
 def small(method: str, *settings: str) -> tuple[str, ...]:
     """Settings of the small ``method`` with others over them, and none that these leave unread."""
-    unread = {name for one in settings for name in _UNREAD.get(one, ())}
-    return (*(one for one in SMALL[method] if one.partition("=")[0] not in unread), *settings)
+    left_out = {name for one in settings for name in _UNREAD.get(one, ())}
+    left_out |= {one.partition("=")[0] for one in settings}
+    return (*(one for one in SMALL[method] if one.partition("=")[0] not in left_out), *settings)
 
 
 def small_config(method: str, *settings: str) -> Any:

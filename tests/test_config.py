@@ -145,6 +145,11 @@ def test_malformed_overrides_are_refused(text):
         override(to_dict(Outer()), [text])
 
 
+def test_a_key_that_is_set_twice_is_refused():
+    with pytest.raises(ConfigError, match=r"--set flag=true: flag is given twice; leave one out\."):
+        override(to_dict(Outer()), ["flag=false", "inner.rate=1", "flag=true"])
+
+
 def test_unknown_method_names_the_nearest():
     with pytest.raises(ConfigError, match="Did you mean paper"):
         method_config("papr", {}, where="x")

@@ -200,13 +200,20 @@ def load_yaml(path: Path | str) -> dict[str, Any]:
 
 
 def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, Any]:
-    """Apply ``section.key=value`` assignments (values in YAML) to nested dictionaries."""
+    """Apply ``section.key=value`` assignments (values in YAML) to nested dictionaries.
+
+    A `ConfigError` where one is malformed, or a key is given twice.
+    """
+    given: set[str] = set()
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         printable = assignment.isprintable() and len(assignment) <= _LONGEST_NAME
         shown = assignment if printable else brief(assignment)
         if not equals or not key:
             raise ConfigError(f"--set {shown}: expected KEY=VALUE, such as --set event_start=1000.")
+        if key in given:
+            raise ConfigError(f"--set {shown}: {brief(key)[1:-1]} is given twice; leave one out.")
+        given.add(key)
         try:
             value = parse_yaml(text)
         except ValueError:

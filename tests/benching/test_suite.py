@@ -33,6 +33,10 @@ def write(tmp_path, text):
             "name: s\nrows: [{name: a, method: nearest_frame, settings: [width=3]}]",
             "row a: settings are those of a method that is trained",
         ),
+        (
+            "name: s\nrows: [{name: a, method: paper, settings: [iterations=3]}]",
+            "row a: iterations is no setting here",
+        ),
         ("name: s\nrows: [{name: a, method: pictures, pictures: ''}]", "belong together"),
         (f"name: s\ncaptures: [{{name: c, stage: {{fps: 0}}}}]\n{ROW}", "fps is 0"),
     ],

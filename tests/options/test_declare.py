@@ -53,6 +53,30 @@ def test_bad_values_are_one_sentence_with_the_options_name(changes, message, sta
     assert message in str(raised.value) and "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("given_both", "said"),
+    [
+        (
+            {"iterations": 20, "overrides": ("width=8", "iterations=5")},
+            "--iterations 20: --set gives iterations as well; leave one out.",
+        ),
+        (
+            {"use": "everything", "overrides": ("policy.use=training",)},
+            "--use everything: --set gives policy.use as well; leave one out.",
+        ),
+        (
+            {"use": "training", "overrides": ("policy={use: training}",)},
+            "--use training: --set gives policy as well; leave one out.",
+        ),
+    ],
+)
+def test_an_option_and_the_setting_that_it_stands_for_are_refused_together(given_both, said):
+    with pytest.raises(ConfigError) as raised:
+        options.TrainOptions(**given_both)
+    assert str(raised.value) == said
+    options.TrainOptions(iterations=20, overrides=("policy.held_out_events=true", "iteration=3"))
+
+
 def test_changes_are_made_to_what_is_given_or_to_the_defaults():
     assert given(Lamp, None, {"count": 3}) == Lamp(count=3)
     assert given(Lamp, Lamp(watts=60), {"count": 3}) == Lamp(watts=60, count=3)

@@ -143,6 +143,11 @@ def read_suite(suite: Path | str) -> Suite:
                 f"{path}: row {row.name}: settings are those of a method that is trained, and "
                 f"{row.method} is not; leave them out."
             )
+        if any(setting.partition("=")[0] == "iterations" for setting in row.settings):
+            raise ConfigError(
+                f"{path}: row {row.name}: iterations is no setting here; give it as the row's own "
+                "key 'iterations'."
+            )
     if not read.rows:
         raise ConfigError(f"{path}: rows is empty, expected at least one.")
     return replace(read, seeds=tuple(dict.fromkeys(read.seeds)))

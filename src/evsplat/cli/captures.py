@@ -18,6 +18,7 @@ from evsplat.options.declare import (
     Threads,
     Transfer,
     Use,
+    check_twins,
     option,
 )
 from evsplat.options.inputs import Input, check_capture_or_recording, check_file, check_footage
@@ -80,6 +81,8 @@ class Simulate:
         from evsplat.events import SensorSettings, sensor_settings
         from evsplat.footage.simulate import simulate
 
+        twins = dict.fromkeys(("contrast_on", "contrast_off"), "contrast")
+        check_twins(self, self.overrides, twins)
         preset = sensor_settings(self.preset, contrast_on=self.contrast, contrast_off=self.contrast)
         values = override(to_dict(preset), self.overrides)
         count = simulate(

@@ -4,14 +4,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
-from evsplat.options.declare import Flag
+from evsplat.options.declare import LAST, Flag
 from evsplat.pictures.files import read_image
 from evsplat.pictures.light import Transfer
 from evsplat.untrusted.pictures import image_size
@@ -31,7 +31,7 @@ _SHORT_US = 100
 class Importer:
     """Options of one kind of source; `write` turns the source into a capture."""
 
-    no_poses: Flag = False
+    no_poses: Annotated[Flag, LAST] = False
     """Leave out poses that are there: the capture has no body."""
 
     blur_recipe: ClassVar[str | None] = None

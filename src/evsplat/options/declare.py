@@ -1,7 +1,7 @@
 """Declaration of options, their making of what a caller gives, and their check."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -17,6 +17,8 @@ Options = TypeVar("Options")
 
 FLAT = tyro.conf.arg(name="")
 """Marks a parameter of a verb whose fields are the options themselves."""
+LAST = tyro.conf.arg()
+"""Marks a field of a base class that is shown after those of the class."""
 
 
 def option(
@@ -104,6 +106,21 @@ def check_options(options: Any) -> None:
             shown = f"{value:g}" if isinstance(value, float) else value
             wanted = expected(marked[name]).removesuffix(" or null")
             raise ConfigError(f"--{said.replace('_', '-')} {shown}: expected {wanted}.")
+
+
+def check_twins(options: Any, overrides: Sequence[str], twins: Mapping[str, str]) -> None:
+    """Raise a `ConfigError` where an option and the setting that it stands for are both given.
+
+    ``overrides`` are assignments ``KEY=VALUE``; ``twins`` leads from settings to fields.
+    """
+    for assignment in overrides:
+        key = assignment.partition("=")[0]
+        for setting, name in twins.items():
+            value = getattr(options, name)
+            if value is not None and (key == setting or setting.startswith(f"{key}.")):
+                raise ConfigError(
+                    f"--{name.replace('_', '-')} {value}: --set gives {key} as well; leave one out."
+                )
 
 
 def _words(hint: Any) -> tuple[Any, ...]:

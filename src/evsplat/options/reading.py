@@ -13,7 +13,7 @@ from tyro.constructors import (
 )
 
 from evsplat.field_docs import field_docs
-from evsplat.options.declare import FLAT
+from evsplat.options.declare import FLAT, LAST
 
 IN_ORDER = ConstructorRegistry()
 """Context in which a verb's options stand as declared, those of a `FLAT` field in its place.
@@ -36,7 +36,7 @@ def _in_order(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 def _options(kind: type[Any]) -> Iterator[StructFieldSpec]:
     docs, hints = field_docs(kind), get_type_hints(kind, include_extras=True)
-    for field in fields(kind):
+    for field in sorted(fields(kind), key=lambda field: _has(hints[field.name], LAST)):
         hint = hints[field.name]
         if (part := _flat_part(hint)) is not None:
             yield from _options(part)
@@ -55,8 +55,11 @@ def _made(kind: type[Any], /, **values: Any) -> Any:
 
 
 def _flat_part(hint: Any) -> type[Any] | None:
-    is_flat = any(mark is FLAT for mark in getattr(hint, "__metadata__", ()))
-    return get_args(hint)[0] if is_flat else None
+    return get_args(hint)[0] if _has(hint, FLAT) else None
+
+
+def _has(hint: Any, mark: Any) -> bool:
+    return any(one is mark for one in getattr(hint, "__metadata__", ()))
 
 
 def _read_type(hint: Any) -> Any:

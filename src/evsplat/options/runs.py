@@ -15,6 +15,7 @@ from evsplat.options.declare import (
     Threads,
     Use,
     check_options,
+    check_twins,
     option,
 )
 
@@ -54,6 +55,7 @@ class TrainOptions:
 
     def __post_init__(self) -> None:
         check_options(self)
+        check_twins(self, self.overrides, {"iterations": "iterations", "policy.use": "use"})
         if not self.resume:
             return
         if self.out is None:
