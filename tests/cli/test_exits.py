@@ -62,6 +62,25 @@ def test_what_is_expected_needs_no_traceback(capsys, error):
     assert capsys.readouterr().err == "evsplat: a: b.\n"
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("arguments", [["--version"], ["settings"], ["stage", "--list"]])
+def test_standard_output_that_is_full_is_one_sentence(arguments):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "evsplat", *arguments],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    said = "standard output: not written, the disk is full; make room there or write elsewhere."
+    assert (done.returncode, done.stderr) == (2, f"evsplat: {said}\n")
+
+
+def test_without_standard_output_the_work_is_done(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert exit_code(lambda: print("to nobody")) == 0
+
+
 def test_a_fault_of_the_program_is_not_hidden():
     with pytest.raises(RuntimeError, match="shapes"):
         exit_code(raising(RuntimeError("shapes do not match")))

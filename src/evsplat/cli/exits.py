@@ -8,10 +8,17 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
+from typing import Any, TextIO, cast
 
-from evsplat.errors import EvsplatError, MachineError, machine_error
+from evsplat.errors import (
+    EvsplatError,
+    MachineError,
+    OutputError,
+    machine_error,
+    why_not_written,
+)
 from evsplat.files import write_text
 
 _BAD_INPUT = 2
@@ -23,19 +30,21 @@ _AGAIN_S = 0.02
 def exit_code(work: Callable[[], object]) -> int:
     """Do what the command line asks for, with its messages; gives the exit code.
 
-    0: done; 2: the input, the machine or an option is at fault (one message on stderr);
+    0: done; 2: the input, the machine or an option is at fault (one message on stderr), or what is
+    printed cannot be written;
     130: stopped by Ctrl-C or SIGTERM; 141: the reader of a pipe went away. Where memory, disk or
     system fail unforeseen, the message names a file with the traceback.
     """
     logging.basicConfig(format="%(message)s")
     logging.getLogger("evsplat").setLevel(logging.INFO)
     try:
-        with _stopped_by_sigterm(), _dropped_interrupts_again():
+        with _stopped_by_sigterm(), _dropped_interrupts_again(), _output_named():
             try:
                 work()
             finally:
                 # A reader that went away is noticed here, not at the interpreter's end.
-                sys.stdout.flush()
+                if sys.stdout is not None:  # closed by whoever started this
+                    sys.stdout.flush()
     except EvsplatError as error:
         return _said(error)
     except KeyboardInterrupt as stop:
@@ -52,6 +61,33 @@ def exit_code(work: Callable[[], object]) -> int:
         fault.__cause__ = error
         return _said(fault)
     return 0
+
+
+class _Output:
+    """Standard output, whose failures name it, as an `OSError` of a stream does not."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with self._named():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with self._named():
+            self._stream.flush()
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise OutputError(f"standard output: {why_not_written(error)}.") from None
 
 
 def end_quietly() -> None:
@@ -83,6 +119,16 @@ def _kept_traceback(error: EvsplatError) -> str:
                 write_text(folder / name, text)
                 return f" The traceback is in {folder / name}."
     return ""
+
+
+@contextmanager
+def _output_named() -> Iterator[None]:
+    """What fails of standard output is said with its name."""
+    if sys.stdout is None:
+        yield
+        return
+    with redirect_stdout(cast(TextIO, _Output(sys.stdout))):
+        yield
 
 
 @contextmanager

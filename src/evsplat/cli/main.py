@@ -57,9 +57,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # In a file each move of a progress bar is a line; tqdm, not imported yet, reads this.
         os.environ.setdefault("TQDM_MININTERVAL", "30")
     arguments = _gathered(sys.argv[1:] if arguments is None else arguments)
-    if arguments == ["--version"]:
-        print(f"evsplat {evsplat.__version__}")
-        return 0
     verbs = _VERBS
     if not arguments or arguments[0].startswith("-"):
         verbs = {name: _in_a_line(verb) for name, verb in _VERBS.items()}
@@ -67,6 +64,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         verbs = {**_VERBS, "import": import_with_kinds()}
 
     def work() -> None:
+        if arguments == ["--version"]:
+            print(f"evsplat {evsplat.__version__}")
+            return
         if arguments and not arguments[0].startswith("-") and arguments[0] not in _VERBS:
             near = get_close_matches(arguments[0], _VERBS, 1, cutoff=0.0)[0]
             raise ConfigError(
