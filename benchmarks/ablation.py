@@ -66,7 +66,7 @@ def main() -> None:
         figures[row.name] = {
             **{f"{name}_psnr_db": f.mean for name, f in found.items() if f is not None},
             "train_minutes": time.mean,
-            "captures": time.captures,
+            "captures": sum(bool(records.of(one, row.name)) for one in records.captures),
         }
     print(json.dumps(figures))
 

@@ -19,6 +19,7 @@ import argparse
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,12 +53,12 @@ SHOWN = 5
 Figures = dict[str, float]
 
 
-def draws(seed: int, count: int, width: int) -> dict[str, dict[str, object]]:
+def draws(seed: int, count: int, width: int) -> dict[str, dict[str, Any]]:
     """Settings of `evsplat stage` of all captures, by their names."""
     rng = np.random.default_rng(seed)
     lasting = {name: float(np.ptp(load_motion(find_motion(name)).times_us)) for name in motions()}
     lasting = {name: span * 1e-6 for name, span in lasting.items() if span > LEAST_S * 1e6}
-    found: dict[str, dict[str, object]] = {}
+    found: dict[str, dict[str, Any]] = {}
     for number in range(count):
         character, motion = str(rng.choice(list(characters()))), str(rng.choice(list(lasting)))
         exposure_ms = float(rng.uniform(*EXPOSURES_MS))
@@ -78,10 +79,10 @@ def draws(seed: int, count: int, width: int) -> dict[str, dict[str, object]]:
     return found
 
 
-def staged(path: Path, settings: dict[str, object], exposure_ms: float, threads: int) -> Path:
+def staged(path: Path, settings: dict[str, Any], exposure_ms: float, threads: int) -> Path:
     """A draw in another exposure around the same instants."""
     if not path.exists():
-        start_s = (float(str(settings["exposure_ms"])) - exposure_ms) / 2000
+        start_s = (settings["exposure_ms"] - exposure_ms) / 2000
         changes = settings | {"exposure_ms": exposure_ms, "start_s": start_s}
         ev.stage(path, threads=threads, progress=False, **changes)
     return path

@@ -39,6 +39,7 @@ from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.camera import Camera
 from evsplat.film.following import follow
 from evsplat.film.motion import load_motion_of
+from evsplat.models.discs import DiscModel
 from evsplat.neighbours import nearest
 from evsplat.pictures import chroma, to_bytes
 from evsplat.pictures.files import save_png
@@ -138,6 +139,7 @@ def by_page(
 def pulled(run: Run, track: BodyTrack, times: list[int]) -> dict[str, float]:
     """How large Gaussians of the person get in a motion, and how many leave their neighbours."""
     model = run.reconstruction.model
+    assert isinstance(model, DiscModel)
     gaussians, rows = model.gaussians, model.gaussians.human
     means, rest = gaussians.means[rows], gaussians.scales_log[rows].exp().amax(-1)
     normals = model.surface.normals(means)
@@ -147,6 +149,7 @@ def pulled(run: Run, track: BodyTrack, times: list[int]) -> dict[str, float]:
     sizes, torn = [], []
     for time in times:
         person = moving.at([time], means.new_zeros(3), hard_semantics=True).human.with_times()
+        assert person.linear is not None
         axes = quaternion_to_matrix(person.quaternions[0]) * person.scales[0][:, None]
         sizes.append(float((torch.linalg.svdvals(person.linear[0] @ axes)[:, 0] / rest).max()))
         posed = person.means[0]

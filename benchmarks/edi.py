@@ -25,10 +25,17 @@ from evsplat.pictures import to_bytes
 REGIONS = ("full", "person_crop", "person_mask")
 
 
+def rounded(value: float) -> float:
+    """To hundredths of a dB."""
+    return round(float(value), 2)
+
+
 def psnr(picture: torch.Tensor, capture: Capture, frame: Frame) -> list[float]:
     """Full frame, person crop, person mask."""
     error = (torch.from_numpy(to_bytes(picture)) / 255 - capture.sharp(frame)) ** 2
-    mask = capture.mask(frame) > 0.5
+    soft = capture.mask(frame)
+    assert soft is not None
+    mask = soft > 0.5
     box = mask_box(mask)
     assert box is not None
     crop = box.enlarged(CROP_MARGIN, *mask.shape).crop(error)
@@ -66,7 +73,7 @@ def measure(path: Path, every: int, pictures: Path | None) -> dict:
             picture = Image.fromarray(np.concatenate([to_bytes(part) for part in beside], axis=1))
             picture.save(pictures / f"{capture.name}_{frame.name}.png")
     means = {
-        name: dict(zip(REGIONS, np.round(np.mean(values, axis=0), 2).tolist(), strict=True))
+        name: dict(zip(REGIONS, map(rounded, np.mean(values, axis=0)), strict=True))
         for name, values in rows.items()
     }
     return {

@@ -60,7 +60,7 @@ def measure(kind: str, path: Path, repeats: int) -> dict[str, float | int]:
     count = len(read_events(path))
     ours = fastest(lambda: open_recording(path).read(), repeats)
     theirs = fastest(peer(path, count), repeats)
-    row = {f"{kind}_events": count}
+    row: dict[str, float | int] = {f"{kind}_events": count}
     columns = []
     for name, seconds in (("", ours), ("_eventcv", theirs)):
         for clock, value in zip(("", "_cpu"), seconds or (None, None), strict=True):

@@ -87,8 +87,10 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
             )  # fmt: skip
     for low_pass in (None, 0.075, 0.3):
         name = "run.ply" if low_pass is None else f"run-{low_pass}.ply"
-        options = {"frame": frame.name, "low_pass": low_pass, "device": "cpu"}
-        ev.export_run(run.path, "ply", out=site / name, **options)
+        out_file = site / name
+        ev.export_run(
+            run.path, "ply", out=out_file, frame=frame.name, low_pass=low_pass, device="cpu"
+        )
         view = seen_from(camera, file_rotation(source.track, "ply", None))
         for viewer in VIEWERS:
             shots.append(
@@ -105,9 +107,9 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
     )  # fmt: skip
     seen = photograph(arguments, site, shots, out)
 
-    avatar = avatar_of(with_correctives(run, at_rest(run, None), None))
+    person_alone = avatar_of(with_correctives(run, at_rest(run, None), None))
     rotations, bones = source.pose([frame.mid_us])
-    skinned = avatar.gaussians.posed(bones, rotations)
+    skinned = person_alone.gaussians.posed(bones, rotations)
     (alone,) = source.splats(camera, [frame.mid_us], parts="scene")
     avatar = render(skinned, camera, static=alone, low_pass=source.low_pass).image[0, ..., :3]
     save(out / "ours.png", ours)
@@ -118,8 +120,8 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
         "file_to_model_psnr_db": float(psnr(ours.clamp(0, 1), model)),
     }
     for shot in shots:
-        name = shot["picture"].removesuffix(".png")
-        picture = torch.from_numpy(read(out / shot["picture"]))
+        name = str(shot["picture"]).removesuffix(".png")
+        picture = torch.from_numpy(read(out / f"{name}.png"))
         reference = avatar if shot["page"] == "avatar.html" else ours
         figures[f"{name}_psnr_db"] = float(psnr(picture, reference.clamp(0, 1)))
         print(f"{name:20} {figures[f'{name}_psnr_db']:6.2f} dB against our own picture")
@@ -197,7 +199,7 @@ def save(path: Path, image: torch.Tensor) -> None:
 def read(path: Path) -> np.ndarray:
     """An sRGB picture in [0, 1]."""
     with Image.open(io.BytesIO(path.read_bytes())) as image:
-        return np.float32(np.asarray(image.convert("RGB"))) / 255
+        return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
 
 
 if __name__ == "__main__":

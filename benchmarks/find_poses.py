@@ -200,8 +200,8 @@ def calibration(truth: BodyTrack, track: BodyTrack) -> float:
     """
     if truth.body.joint_names != track.body.joint_names or track.errors is None:
         return float("nan")
-    true, _ = truth.at(track.times_us)
-    own, _ = track.at(track.times_us)
+    true, _ = truth.at(track.times_us.tolist())
+    own, _ = track.at(track.times_us.tolist())
     trace = (true.mT @ own).diagonal(dim1=-2, dim2=-1).sum(-1)
     angle = ((trace - 1) / 2).clamp(-1, 1).arccos().numpy()
     skeleton = find_skeleton(truth.body.parents.tolist(), truth.body.joint_names)
@@ -213,7 +213,8 @@ def calibration(truth: BodyTrack, track: BodyTrack) -> float:
 def landmark_errors(capture: Capture, truth: BodyTrack, landmarks: Landmarks) -> dict:
     """Mean distance of twelve landmarks from the joints that they are named after."""
     true = joints(truth, landmarks.times_us.tolist())[:, :12]
-    own = torch.from_numpy(landmarks.places[:, [landmarks.index(n) for n in LANDMARKS]])
+    rows = [row for name in LANDMARKS if (row := landmarks.index(name)) is not None]
+    own = torch.from_numpy(landmarks.places[:, rows])
     frames = [nearest(capture, int(time)) for time in landmarks.times_us]
     pixels = [capture.camera(f).project(place)[0] for f, place in zip(frames, true, strict=True)]
     off = (torch.stack(pixels).double() - own).norm(dim=-1).mean(1)

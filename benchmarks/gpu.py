@@ -21,20 +21,22 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import torch
 from rasterize import Scene, make_scene, person_over_scene, with_gradient
 from step import build_on, draw_one_frame, resized_demo
 from torch import Tensor
 
-from evsplat.capture import Capture
+from evsplat.camera import Camera
+from evsplat.capture import Capture, Frame
 from evsplat.cuda_support import needs, what_is_missing
 from evsplat.render import Splats, cuda, render
 from evsplat.similarity import psnr
 from evsplat.training import load_run, train
+from evsplat.training.reconstruction import GaussianReconstruction
 
 Results = dict[str, float | str]
 BOUNDS = {"image": 1e-4, "gradient": 1e-3, "loss": 1e-3}
@@ -224,12 +226,9 @@ class Bench:
         seconds = time.perf_counter() - start
         return {"frames_per_s": round(len(instants) / seconds, 1)}
 
-    def _camera(self, scene: Scene) -> SimpleNamespace:
-        given = scene.camera
-        pose = given.world_to_camera.to(self.device)
-        return SimpleNamespace(
-            width=given.width, height=given.height, K=given.K, world_to_camera=pose
-        )
+    def _camera(self, scene: Scene) -> Camera:
+        pose = scene.camera.world_to_camera.to(self.device)
+        return replace(scene.camera, world_to_camera=pose)
 
     def _drawn(self, scene: Scene, device: str) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Image, alpha and gradients on the CPU, of a render on ``device``."""
@@ -239,10 +238,7 @@ class Bench:
             if value is not None
         }
         pose = scene.camera.world_to_camera.to(device, copy=True).requires_grad_()
-        camera = SimpleNamespace(
-            width=scene.camera.width, height=scene.camera.height, K=scene.camera.K,
-            world_to_camera=pose,
-        )  # fmt: skip
+        camera = replace(scene.camera, world_to_camera=pose)
         out = render(Splats(**leaves), camera)
         wanted = leaves | {"pose": pose}
         upstream = [scene.image_grad.to(device), scene.alpha_grad.to(device)]
@@ -267,12 +263,13 @@ class Bench:
             torch.cuda.synchronize()
 
 
-def _drawn_frame(model: object, capture: Capture, frame: object) -> Tensor:
-    return model.render(capture.camera(frame), [frame.mid_us]).rgb[0]  # type: ignore[attr-defined]
+def _drawn_frame(model: GaussianReconstruction, capture: Capture, frame: Frame) -> Tensor:
+    return model.render(capture.camera(frame), [frame.mid_us]).rgb[0]
 
 
 def _to(splats: Splats, device: str) -> Splats:
-    return Splats(*(None if value is None else value.to(device) for value in vars(splats).values()))
+    values = vars(splats).items()
+    return replace(splats, **{name: v.to(device) for name, v in values if v is not None})
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ def middles(
             seconds[kind] = min(seconds[kind], time.perf_counter() - start)
             error = np.square(coded(made) - truth / 255).mean(-1)
             errors[kind].append((psnr(error), psnr(error[change > MOVING_LEVELS])))
-    results = {}
+    results: dict[str, float] = {}
     for kind, values in errors.items():
         full, moving = np.mean(values, axis=0)
         print(
@@ -112,8 +112,9 @@ def blur(path: Path, kinds: dict[str, Interpolator]) -> dict[str, float]:
     settings = SynthesisSettings(exposure_us=min(lengths), upsample=FACTOR)
     plan = plan_exposures(times, settings)
     fractions = [step / FACTOR for step in range(1, FACTOR)]
-    pictures = [picture(read_image(frame.sharp).astype(np.float32)) for frame in frames]
-    results = {}
+    sharp_files = [frame.sharp for frame in frames if frame.sharp is not None]
+    pictures = [picture(read_image(file).astype(np.float32)) for file in sharp_files]
+    results: dict[str, float] = {}
     for kind, interpolator in [(None, None), *kinds.items()]:
         mean, values = ExposureMean(plan), []
         for light in subframes(pictures, interpolator, fractions):
@@ -121,7 +122,9 @@ def blur(path: Path, kinds: dict[str, Interpolator]) -> dict[str, float]:
                 truth = read_image(frames[exposure.source].image) / 255
                 sharp = pictures[exposure.source].coded
                 made = sharp if interpolator is None else coded(made)
-                person = capture.mask(frames[exposure.source]).numpy() > 0
+                mask = capture.mask(frames[exposure.source])
+                assert mask is not None
+                person = mask.numpy() > 0
                 error = np.square(made - truth).mean(-1)
                 values.append((psnr(error), psnr(error[person])))
         full, on_person = np.mean(values, axis=0)

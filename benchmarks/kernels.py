@@ -74,7 +74,7 @@ def picture_cases(size: int) -> dict[str, tuple[Call, Call]]:
     masks = packed.masks()
 
     def similarity() -> None:
-        _backward(sum(psnr_ssim.l1_and_ssim(image, truth)), image)
+        _backward(torch.add(*psnr_ssim.l1_and_ssim(image, truth)), image)
 
     def brightness() -> None:
         _backward(light.log_brightness(image).sum(), image)
@@ -150,7 +150,9 @@ def body_cases(points: int) -> dict[str, tuple[Call, Call]]:
         torch.autograd.grad(carried.sum() + blended.sum(), (positions, weights))
 
     def isometric() -> None:
-        terms = isometry.isometry_change(rows, (positions, quaternions, log_scales), tuple(moved))
+        means, turns, scales, linear = moved
+        at_rest, now = (positions, quaternions, log_scales), (means, turns, scales, linear)
+        terms = isometry.isometry_change(rows, at_rest, now)
         torch.autograd.grad(terms[0] + terms[1], (positions, *moved))
 
     light = shading.SurfaceLight(

@@ -17,12 +17,14 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import cast
 
 import pytest
 from step import Stopwatch, draw_one_frame, watch_parts
 
 from evsplat.capture import load_capture
 from evsplat.config import override
+from evsplat.devices import DeviceCache
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.shipped import demo_capture
 from evsplat.training.clock import Clock
@@ -53,7 +55,7 @@ def main() -> None:
             config, capture, 0, device=NAME, purpose="resume"
         )
         trainer = Trainer(composition, capture, Clock(100_000, fraction=0.7))
-        trainer.data = Here()
+        trainer.data = cast(DeviceCache, Here())
         draw_one_frame(trainer)
         trainer.previous_nominal = trainer.clock.nominal  # no densification
         trainer.step()  # what is made once

@@ -171,8 +171,8 @@ def _write_events(path: Path, period_us: int, turns: int, most: int) -> int:
             for turn in range(turns):
                 moved = values + values.dtype.type(turn * period_us) if name == "t" else values
                 stored[turn * count : (turn + 1) * count] = moved
-        turn, within = np.divmod(1000 * ms, period_us)
-        rows = turn * count + np.searchsorted(events["t"], within)
+        before, within = np.divmod(1000 * ms, period_us)
+        rows = before * count + np.searchsorted(events["t"], within)
         file["ms_to_idx"] = np.minimum(rows, count * turns).astype("u8")
         file["t_offset"] = offset
     return count * turns

@@ -83,7 +83,9 @@ def told_limbs(track: BodyTrack, capture: Capture) -> float:
     assert track.errors is not None
     skeleton = find_skeleton(track.body.parents.tolist(), track.body.joint_names)
     limbs = [skeleton.limbs[f"{side}_{part}"] for part in PARTS for side in ("left", "right")]
-    true, own = (one.at(track.times_us)[0] for one in (load_body_track(capture, dense=True), track))
+    true, own = (
+        one.at(track.times_us.tolist())[0] for one in (load_body_track(capture, dense=True), track)
+    )
     trace = (true.mT @ own).diagonal(dim1=-2, dim2=-1).sum(-1)
     angle = ((trace - 1) / 2).clamp(-1, 1).arccos().numpy()[:, limbs]
     return float(np.sqrt(np.mean(angle**2 / 3) / np.mean(track.errors.joint_rad[:, limbs] ** 2)))

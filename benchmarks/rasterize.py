@@ -19,7 +19,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import torch
 
@@ -61,7 +60,7 @@ def make_scene(size_px: int, count: int, channels: int, seed: int = 0) -> Scene:
     ratios = torch.cat([torch.ones(count, 1), 1 / uniform(count, 2, low=1.0, high=5.0)], -1)
     scales = (largest_px * depth / focal_px)[:, None] * ratios
     K = torch.tensor([[focal_px, 0, size_px / 2], [0, focal_px, size_px / 2], [0, 0, 1]])
-    camera = SimpleNamespace(width=size_px, height=size_px, K=K, world_to_camera=torch.eye(4))
+    camera = Camera(width=size_px, height=size_px, K=K, world_to_camera=torch.eye(4))
     splats = Splats(
         means=means[None],
         quaternions=torch.randn(count, 4, generator=generator),
@@ -103,9 +102,7 @@ def measure(scene: Scene, backend: str, repeats: int) -> tuple[Timing, Timing]:
         for name in ("means", "quaternions", "scales", "opacities", "channels")
     }
     pose = scene.camera.world_to_camera.clone().requires_grad_()
-    camera = SimpleNamespace(
-        width=scene.camera.width, height=scene.camera.height, K=scene.camera.K, world_to_camera=pose
-    )
+    camera = replace(scene.camera, world_to_camera=pose)
 
     def forward() -> None:
         with torch.no_grad():
@@ -207,11 +204,13 @@ def limits(scene: Scene, repeats: int) -> dict[str, float]:
 
 def with_gradient(splats: Splats) -> Splats:
     """The same with every field a leaf."""
-    return Splats(
-        *(
-            None if value is None else value.clone().requires_grad_()
-            for value in vars(splats).values()
-        )
+    return replace(
+        splats,
+        **{
+            name: value.clone().requires_grad_()
+            for name, value in vars(splats).items()
+            if value is not None
+        },
     )
 
 

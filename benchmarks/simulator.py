@@ -16,7 +16,8 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 import torch
@@ -63,9 +64,9 @@ def main() -> None:
     for name, settings in (("clean", CLEAN), ("everything", EVERYTHING)):
         light = [to_light(picture) for picture in coded]
         runs = {
-            "evsplat": best(lambda s=settings, x=light: evsplat_events(x, s), arguments.repeats),
+            "evsplat": best(partial(evsplat_events, light, settings), arguments.repeats),
             "evsplat_with_decoding": best(
-                lambda s=settings: evsplat_events(map(to_light, coded), s), arguments.repeats
+                partial(decoded_events, coded, settings), arguments.repeats
             ),
         }
         peer = peer_of(coded, settings)
@@ -120,7 +121,12 @@ def to_light(picture: np.ndarray) -> np.ndarray:
     return table[picture]
 
 
-def evsplat_events(light, settings: SensorSettings) -> int:
+def decoded_events(coded: np.ndarray, settings: SensorSettings) -> int:
+    """The same of coded pictures."""
+    return evsplat_events(map(to_light, coded), settings)
+
+
+def evsplat_events(light: Iterable[np.ndarray], settings: SensorSettings) -> int:
     """Number of events of pictures of linear light."""
     sensor, count = None, 0
     for k, luma in enumerate(light):

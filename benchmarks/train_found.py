@@ -16,6 +16,7 @@ import json
 from pathlib import Path
 
 import evsplat as ev
+from evsplat.options.runs import Split
 
 _EVENTS = ("policy.held_out_events=true", "pose.events_of_held_out=true")
 ROWS: dict[str, tuple[str | None, tuple[str, ...]]] = {
@@ -29,7 +30,8 @@ ROWS: dict[str, tuple[str | None, tuple[str, ...]]] = {
 def trained(capture: Path, run: Path, settings: tuple[str, ...], iterations: int) -> dict:
     """PSNR of the person's pixels by split, dB."""
     found = {}
-    for split, name in (("test", "metrics.json"), ("train", "metrics_train.json")):
+    files: dict[Split, str] = {"test": "metrics.json", "train": "metrics_train.json"}
+    for split, name in files.items():
         if not (run / name).exists():
             if not run.exists():
                 ev.train(capture, out=run, iterations=iterations, overrides=settings)

@@ -19,8 +19,10 @@ import torch
 from evsplat.body import silhouette
 from evsplat.capture import Capture, load_body_track
 from evsplat.evaluation.chroma import chroma_psnr
+from evsplat.models.discs import DiscModel
 from evsplat.models.discs.fill import filled
 from evsplat.models.seen import roughness, seen_by
+from evsplat.options.declare import Parts
 from evsplat.pictures import to_bytes
 from evsplat.pictures.files import save_png
 from evsplat.similarity import psnr
@@ -40,14 +42,14 @@ def figures(run: Run, sheet: list[torch.Tensor]) -> dict[str, float]:
         behind = view.camera == BEHIND
         truth = capture.novel_image(view)
         mask = silhouette(track.vertices(view.time_us), track.body.faces, camera)
-        parts = "human" if behind else "all"
+        parts: Parts = "human" if behind else "all"
         picture = drawn.render(camera, [view.time_us], parts=parts).rgb[0]
         found.setdefault(view.camera, []).append(float(psnr(picture, truth, mask=mask)))
         if behind:
             sheet.append(torch.cat([picture, truth * mask[..., None]]))
     for frame in capture.test_frames:
-        mask = capture.mask(frame)
-        if mask is None or not bool((mask > 0.5).any()):
+        person = capture.mask(frame)
+        if person is None or not bool((person > 0.5).any()):
             continue
         picture = drawn.render(capture.camera(frame), [frame.mid_us]).rgb[0]
         truth = capture.sharp(frame)
@@ -88,6 +90,7 @@ def main() -> None:
         rows[str(path)] = {}
         for name, sheet in sheets.items():
             if name == "after":
+                assert isinstance(model, DiscModel)
                 found = filled(model, training, options.strength, seen)
                 model.load_state_dict({**model.state_dict(), **found})
             values = figures(run, sheet)

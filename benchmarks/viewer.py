@@ -23,6 +23,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -31,6 +32,7 @@ import viser
 import websockets
 import zstandard
 from PIL import Image
+from websockets.typing import Subprotocol
 
 from evsplat.capture import load_capture
 from evsplat.config import override
@@ -55,7 +57,7 @@ def untrained_run(gaussians: int, method: str) -> Run:
     values = override({}, (f"human.count={human}", f"{NETWORK_START[method]}=0"))
     config = method_config(method, values, where="benchmark")
     seen = capture.for_training(config.policy)
-    model = TRAINABLE[method].build(config, seen, 0, purpose="draw").model
+    model: Any = TRAINABLE[method].build(config, seen, 0, purpose="draw").model
     rows = model.gaussians
     more = gaussians - len(rows)
     own = torch.randint(rows.human_count, len(rows), (max(more, 0),))
@@ -267,7 +269,7 @@ async def _watch(seconds: float) -> int:
 def _connected(port: int):
     return websockets.connect(
         f"ws://127.0.0.1:{port}",
-        subprotocols=[f"viser-v{viser.__version__}"],
+        subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
         max_size=None,
         compression=None,
         open_timeout=30,

@@ -95,6 +95,7 @@ def with_passer_by(making: Derivation) -> None:
     """A textured square crosses the pictures, before the person, with the events that it makes."""
     source = making.source
     frames, events = source.frames, source.events
+    assert events is not None
     rng = np.random.default_rng(len(source.name))
     height, width = source.image(frames[0]).shape[:2]
     side = int(_SQUARE * height)
@@ -117,7 +118,7 @@ def with_passer_by(making: Derivation) -> None:
         making.set_picture(frame, "image", encode(blurred))
     still = decode(source.median_background())
     sensor = SensorSimulator(width, height, PRESETS["clean"], 0)
-    passing = [sensor.step(luminance(paint(still, t)), int(t)) for t in np.arange(start, end, 1000)]
+    passing = [sensor.step(luminance(paint(still, t)), t) for t in range(start, end, 1000)]
     recorded = events.between(*events.time_range_us)
     streams = (recorded, EventStream.joined(passing))
     order = np.argsort(np.concatenate([stream.t for stream in streams]), kind="stable")
