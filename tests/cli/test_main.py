@@ -233,3 +233,6 @@ def test_import_without_a_kind_says_where_it_stands(tmp_path, capsys):
     assert f"evsplat import KIND {tmp_path / 'clip.mp4'}" in said and "video" in said
     assert main(["import", "vidoe", "clip.mp4"]) == 2
     assert "vidoe: no such kind of source; did you mean video?" in capsys.readouterr().err
+    assert main(["import"]) == 2
+    said = capsys.readouterr().err
+    assert "import needs a kind of source, such as " in said and said.count("\n") == 1

@@ -134,11 +134,16 @@ class _Poses:
 
 
 def check_kind(arguments: Sequence[str]) -> None:
-    """Raise a `ConfigError` where the word after ``import`` is no kind of source."""
+    """Raise a `ConfigError` where the word after ``import`` is missing or no kind of source."""
     from evsplat.importers import KINDS
 
     kinds = [*KINDS, "poses"]
-    if not arguments or arguments[0].startswith("-") or arguments[0] in kinds:
+    if not arguments:
+        such = command("import", "video", "clip.mp4", "...")
+        raise ConfigError(
+            f"import needs a kind of source, such as {such}; there are {', '.join(kinds)}."
+        )
+    if arguments[0].startswith("-") or arguments[0] in kinds:
         return
     asked = arguments[0]
     if Path(asked).exists():
