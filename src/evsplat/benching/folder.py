@@ -23,24 +23,24 @@ class BenchFolder:
         """Captures that the bench made: staged and restored ones."""
         return self.path / "captures"
 
-    def record_of(self, id: str) -> Path:  # noqa: A002 - the cell's own word
+    def record_of(self, id: str) -> Path:
         """Outcome of a cell, JSON; there when the cell is over."""
         return self.path / "cells" / f"{id}.json"
 
-    def kept_record_of(self, id: str) -> Path | None:  # noqa: A002
+    def kept_record_of(self, id: str) -> Path | None:
         """Record of a cell among the kept ones, there or not; None where nothing is kept."""
         return None if self.kept is None else self.kept / f"{id}.json"
 
-    def record_there(self, id: str) -> Path | None:  # noqa: A002
+    def record_there(self, id: str) -> Path | None:
         """The record of a cell that is over, its own or a kept one."""
         paths = (self.record_of(id), self.kept_record_of(id))
         return next((path for path in paths if path is not None and path.exists()), None)
 
-    def run_of(self, id: str) -> Path:  # noqa: A002
+    def run_of(self, id: str) -> Path:
         """Run folder of a cell: checkpoints and pictures."""
         return self.path / "runs" / id
 
-    def log_of(self, id: str) -> Path:  # noqa: A002
+    def log_of(self, id: str) -> Path:
         """Output of a cell's process."""
         return self.path / "logs" / f"{id}.log"
 

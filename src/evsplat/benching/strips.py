@@ -108,7 +108,7 @@ def _tiles(records: Records, capture: Capture, name: str, folder: BenchFolder) -
             entry = next((e for e in record["per_frame"] if e["frame"] == frame.name), None)
             if entry is None:
                 continue
-            id = f"{name}/{row.name}/seed{record['cell']['seed']}"  # noqa: A001
+            id = f"{name}/{row.name}/seed{record['cell']['seed']}"
             remedy = f"remove {folder.record_of(id)} to measure it again"
             picture = read_rgb(folder.run_of(id) / entry["pictures"]["render"], remedy)
             mask = entry["protocols"]["standard"]["person_mask"]["psnr"]
