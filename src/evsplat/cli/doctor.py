@@ -86,7 +86,9 @@ def _torch() -> Check:
         torch = import_module("torch")
     except ImportError as error:
         return Check("torch", "missing", f"{error}.", "Get it with: pip install 'torch>=2.11'.")
-    return Check("torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads")
+    threads = torch.get_num_threads()
+    plural = "" if threads == 1 else "s"
+    return Check("torch", "ok", f"{torch.__version__}, {threads} thread{plural}")
 
 
 def _native() -> Check:

@@ -80,6 +80,7 @@ def test_named_columns_and_units(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "empty|not a recording|holds no events"),
+        ("\0\0\0 ftypisom", "a video, which 'evsplat import video' reads"),
         ("hello world\n", "holds no events"),
         ("t,x,y,on\n1,2,3,1\n2,3,4\n3,4,5,1\n", "event 1 at byte 17 has another number"),
         ("t x y p\n1 2 3 1\n2 3 4 x\n", "event 1 at byte 16 is not made of numbers"),

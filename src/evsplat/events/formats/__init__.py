@@ -89,6 +89,8 @@ def find_format(path: Path, name: str | None = None) -> Format:
     found = next((entry for entry in FORMATS.values() if entry.matches(head)), None)
     if found is None:
         found_there = f"begins with {head[:16]!r}" if head else "is empty"
+        if head[4:8] == b"ftyp":
+            found_there = "a video, which 'evsplat import video' reads"
         raise DataError(
             f"{path}: not a recording that evsplat reads ({found_there}); expected one of "
             f"{', '.join(FORMATS)}."
