@@ -99,6 +99,53 @@ def test_a_part_of_a_davis_recording_begins_with_its_first_frame(
     assert capture.transfer("000004") == "power"
 
 
+def events_of_the_bar(first_us: int) -> EventStream:
+    """What a sensor sends of `moving_bar`, which goes on by a pixel each half period."""
+    rows = np.arange(HEIGHT)
+    columns = []
+    for step in range(2 * COUNT):
+        time = first_us + step * PERIOD_US // 2
+        columns += [(time, step + 6, 1), (time, step, -1)]
+    t, x, p = (np.repeat(values, HEIGHT) for values in np.array(columns).T)
+    y = np.tile(rows, len(columns))
+    return EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
+
+
+def test_the_offset_of_the_events_clock_is_found(tmp_path: Path) -> None:
+    clip, events = tmp_path / "clip.mp4", tmp_path / "events.h5"
+    write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)
+    write_events(events, events_of_the_bar(3_000_000))
+    options = {"events": events, "exposure_us": 20_000.0, "clock_offset_us": "auto"}
+    capture = run("video", clip, tmp_path / "out", **options)
+    # The bar of a picture stands still for the period about it, and moves in two steps.
+    assert capture.clock_offset_us == pytest.approx(-3_000_000, abs=PERIOD_US / 2)
+    assert any("offset of their clock is found" in note for note in capture.provenance["notes"])
+
+
+@pytest.mark.parametrize(
+    ("events", "said"),
+    [
+        (some_events(0), "agree with the changes of the pictures at no offset of the clocks"),
+        (EventStream(*(np.zeros(0, kind) for kind in ("i8", "u2", "u2", "i1"))), "at no offset"),
+    ],
+)
+def test_an_offset_that_is_not_certain_is_refused(tmp_path: Path, events, said) -> None:
+    clip = tmp_path / "clip.mp4"
+    write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)
+    write_events(tmp_path / "events.h5", events)
+    with pytest.raises(DataError, match="events.h5: .*give --clock-offset-us US") as refusal:
+        import_capture(
+            "video",
+            clip,
+            tmp_path / "out",
+            events=tmp_path / "events.h5",
+            exposure_us=20_000.0,
+            clock_offset_us="auto",
+        )
+    assert said in str(refusal.value) and "\n" not in str(refusal.value)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_video_with_events_beside_it(tmp_path: Path) -> None:
     clip = tmp_path / "clip.mp4"
     write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)

@@ -24,6 +24,7 @@ from evsplat.importers.base import (
 )
 from evsplat.importers.exposures import read_exposures
 from evsplat.importers.option_types import (
+    ClockOffset,
     Contrast,
     Curve,
     Exposure,
@@ -34,9 +35,10 @@ from evsplat.importers.option_types import (
     TimeUs,
 )
 from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_motion
-from evsplat.importers.recorded import add_recorded_events, recorded_camera
+from evsplat.importers.recorded import add_recorded_events, levels_to_compare, recorded_camera
 from evsplat.importers.smpl import chosen_poses
 from evsplat.options.declare import Flag, option
+from evsplat.pictures.files import to_unit_range
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -68,8 +70,8 @@ class Folder(Importer):
     """Exposure time, microseconds; not needed with SOURCE/exposures.txt."""
     start_us: TimeUs = 0
     """Middle of the first exposure."""
-    clock_offset_us: TimeUs = 0
-    """Added to the events' times to get the clock of the pictures."""
+    clock_offset_us: ClockOffset = 0
+    """Added to the events' times to get the clock of the pictures; auto finds it."""
     contrast: Contrast = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
     person: Name = None
@@ -109,14 +111,18 @@ class Folder(Importer):
             )
         views = _camera_poses(motion)
         masks = _Masks(self._masks(source))
+        levels = levels_to_compare(self.clock_offset_us, camera)
         for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
             if index not in seen:
                 continue
+            exposure = int(exposures[index, 0]), int(exposures[index, 1])
+            if levels is not None:
+                levels.add(to_unit_range(timed.pixels), exposure)
             writer.add_frame(
                 timed.name,
                 "main",
                 timed.pixels,
-                (int(exposures[index, 0]), int(exposures[index, 1])),
+                exposure,
                 mask=masks.of(timed),
                 world_to_camera=views.get(index),
             )
@@ -124,6 +130,7 @@ class Folder(Importer):
             writer,
             self.events or next(iter(sorted(source.glob("events.*"))), None),
             size,
+            levels,
             contrast=self.contrast,
             clock_offset_us=self.clock_offset_us,
             repair=self.repair,

@@ -1,7 +1,7 @@
 """Types of the options of several importers: what stands for their values, and their defaults."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from evsplat.options.declare import option
 from evsplat.pictures.light import Transfer
@@ -15,6 +15,8 @@ OwnRate = Annotated[float | None, option("HZ", default="")]
 Focal = Annotated[float | None, option("PX", default="")]
 Exposure = Annotated[float | None, option("US", default="")]
 TimeUs = Annotated[int, option("US")]
+ClockOffset = Annotated[int | Literal["auto"], option("US|auto")]
+"""Microseconds, or to be found (`add_recorded_events`)."""
 Contrast = Annotated[tuple[float, float] | None, option("C+ C-", default="unknown")]
 Curve = Annotated[Transfer | None, option(default="power")]
 Name = Annotated[str | None, option("NAME", default="")]

@@ -3,14 +3,15 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from evsplat.calibration.offset import LEAST_CORRELATION, BlockLevels, TooLong, estimate_offset
 from evsplat.capture.write import CaptureWriter, read_camera
 from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
-from evsplat.events import EventStream, open_recording
+from evsplat.events import EventRecording, EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
 from evsplat.importers.base import check_positive, need
 
@@ -49,16 +50,29 @@ def recorded_camera(
     return {"K": K}, origin, note
 
 
+def levels_to_compare(
+    clock_offset_us: int | Literal["auto"], camera: dict[str, Any]
+) -> BlockLevels | None:
+    """What is to be gathered of the frames where the clock's offset is to be found; else None."""
+    if isinstance(clock_offset_us, str) and clock_offset_us != "auto":
+        raise ConfigError(f"--clock-offset-us {clock_offset_us}: expected microseconds or auto.")
+    return BlockLevels(camera.get("transfer", "power")) if clock_offset_us == "auto" else None
+
+
 def add_recorded_events(
     writer: CaptureWriter,
     path: Path | None,
     size: tuple[int, int],
+    levels: BlockLevels | None,
     *,
     contrast: tuple[float, float] | None,
-    clock_offset_us: int,
+    clock_offset_us: int | Literal["auto"],
     repair: bool,
 ) -> list[str]:
-    """Write the events of a recording of any format; gives notes for the user."""
+    """Write the events of a recording of any format; gives notes for the user.
+
+    ``levels`` are those of the frames where the clock's offset is "auto" (`levels_to_compare`).
+    """
     if path is None:
         of_events = {"contrast": contrast, "clock-offset-us": clock_offset_us, "repair": repair}
         for name, value in of_events.items():
@@ -77,7 +91,11 @@ def add_recorded_events(
     recording = open_recording(path, width=size[0], height=size[1], repair=repair)
     if not recording.has_polarity:
         return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
-    passed = _Passed()
+    passed, notes = _Passed(), []
+    if levels is not None:
+        clock_offset_us, note = _found_offset(levels, recording, path, size)
+        notes.append(note)
+    assert clock_offset_us != "auto"
     writer.set_events(
         passed.watching(recording.chunks()),
         *size,
@@ -85,7 +103,38 @@ def add_recorded_events(
         simulated=False,
         clock_offset_us=clock_offset_us,
     )
-    return [*recording.notes, *passed.notes(path, writer.exposed_us, clock_offset_us)]
+    # Repairs are known once the events have been read.
+    notes += recording.notes
+    return [*notes, *passed.notes(path, writer.exposed_us, clock_offset_us)]
+
+
+def _found_offset(
+    levels: BlockLevels, recording: EventRecording, path: Path, size: tuple[int, int]
+) -> tuple[int, str]:
+    """The offset of the events' clock, us, and a note of it; raises where it is not certain."""
+    try:
+        found = estimate_offset(levels, recording.chunks(), size)
+    except TooLong as error:
+        raise DataError(f"{path}: {error}; cut it, or give --clock-offset-us US.") from None
+    give = "give --clock-offset-us US, or film more that moves"
+    if found is None or found.correlation < LEAST_CORRELATION:
+        best = "" if found is None else f" (correlation {found.correlation:.2f} at best)"
+        raise DataError(
+            f"{path}: its events agree with the changes of the pictures at no offset of the "
+            f"clocks{best}; {give}."
+        )
+    offset_us = 100 * round(found.offset_us / 100)
+    if not found.is_certain:
+        raise DataError(
+            f"{path}: its events agree with the changes of the pictures at {offset_us} us "
+            f"(correlation {found.correlation:.2f}) hardly better than elsewhere "
+            f"({found.rival:.2f}); {give}."
+        )
+    note = (
+        f"events: the offset of their clock is found, {offset_us} us (correlation "
+        f"{found.correlation:.2f}, elsewhere {found.rival:.2f} at most)"
+    )
+    return offset_us, note
 
 
 @dataclass
@@ -119,15 +168,16 @@ class _Passed:
         if last < start or first >= end:
             raise DataError(
                 f"{path}: its events are {times}, expected events while there are pictures; give "
-                f"--clock-offset-us {start - self.first_us} if the events begin with the first "
-                f"picture, or the unit of their times with {SAY_UNIT}."
+                "--clock-offset-us auto, which finds the offset, or the unit of their times with "
+                f"{SAY_UNIT}."
             )
         notes = []
         covered = (min(last, end) - max(first, start)) / (end - start)
         if covered < _COVERED:
             notes.append(
                 f"events: {path.name} covers {covered:.1%} of the pictures' time (it is {times}); "
-                f"check clock, rate of the pictures and unit of the times ({SAY_UNIT})"
+                "check the clock (--clock-offset-us auto finds its offset), the rate of the "
+                f"pictures and the unit of the times ({SAY_UNIT})"
             )
         if self.count >= _MANY and self.brighter in (0, self.count):
             sign = "brighter" if self.brighter else "darker"

@@ -10,6 +10,7 @@ from evsplat.errors import ConfigError
 from evsplat.footage import open_footage
 from evsplat.importers.base import Importer, check_positive, exposure_around, short_exposure
 from evsplat.importers.option_types import (
+    ClockOffset,
     Contrast,
     Curve,
     Exposure,
@@ -18,8 +19,9 @@ from evsplat.importers.option_types import (
     OwnRate,
     TimeUs,
 )
-from evsplat.importers.recorded import add_recorded_events, recorded_camera
+from evsplat.importers.recorded import add_recorded_events, levels_to_compare, recorded_camera
 from evsplat.options.declare import Flag
+from evsplat.pictures.files import to_unit_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +42,8 @@ class Video(Importer):
     """From the values of the pictures to light: power (2.2), srgb or linear."""
     start_us: TimeUs = 0
     """Middle of the first exposure."""
-    clock_offset_us: TimeUs = 0
-    """Added to the events' times to get the clock of the pictures."""
+    clock_offset_us: ClockOffset = 0
+    """Added to the events' times to get the clock of the pictures; auto finds it."""
     contrast: Contrast = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
     repair: Flag = False
@@ -61,14 +63,18 @@ class Video(Importer):
         if self.transfer is not None:
             camera["transfer"] = self.transfer
         writer.add_camera("main", *size, **camera)
+        levels = levels_to_compare(self.clock_offset_us, camera)
         for timed in tqdm(footage, "pictures", len(footage.times_us), leave=False):
             middle = timed.time_us + self.start_us
             exposure = exposure_around(middle, self.exposure_us)
             writer.add_frame(timed.name, "main", timed.pixels, exposure)
+            if levels is not None:
+                levels.add(to_unit_range(timed.pixels), exposure)
         notes = add_recorded_events(
             writer,
             self.events,
             size,
+            levels,
             contrast=self.contrast,
             clock_offset_us=self.clock_offset_us,
             repair=self.repair,

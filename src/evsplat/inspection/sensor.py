@@ -9,7 +9,10 @@ from evsplat.capture.sensor_estimate import looks_linear
 def sensor_lines(estimate: SensorEstimate | None, clock_offset_us: int) -> list[str]:
     """Clock and contrast in words; ``clock_offset_us`` is what was added to the events' times."""
     if estimate is None:
-        return ["clock      not estimated: too little moves, or frames and events do not agree"]
+        return [
+            "clock      not estimated: too little moves, or the clocks differ by more than 0.1 s "
+            "(evsplat import finds that: --clock-offset-us auto)"
+        ]
     clock, contrast = estimate.clock, estimate.thresholds
     text = (
         f"clock      events {_lag_text(clock)} (+-{clock.spread_us / 1000:.1f} ms; correlation "

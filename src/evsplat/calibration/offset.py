@@ -1,0 +1,227 @@
+"""Offset of any length between the clocks of frames and events, from where the picture changes.
+
+`evsplat.calibration.clock` measures a lag that is known to 100 ms; here nothing is known but that
+both recorded the same. Frames and events are compared in a coarse grid of blocks, at all offsets.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+from torch import Tensor
+
+from evsplat.calibration.brightness import exposure, pair_indices
+from evsplat.events import EventStream
+from evsplat.pictures.light import Transfer
+
+LEAST_CORRELATION = 0.5
+"""Frames and events that agree less may be of two recordings."""
+RIVAL = 0.8
+"""Another peak must be lower than this share of the best one's correlation."""
+LONGEST_S = 300
+"""Takes 6 s and 0.4 GB at 25 frames per second; longer recordings are refused."""
+_BLOCKS = 12
+"""Along the longer side of the picture."""
+_MOST_PAIRS = 120
+_STEPS_PER_GAP = 16
+_LEAST_STEP_US = 1_000
+_DARK = math.log(1e-3)
+"""Noise decides how much darker than this a pixel seems, in frames as in events."""
+_LAGS_AT_ONCE = 2_048
+
+
+class TooLong(ValueError):
+    """A recording is longer than `LONGEST_S`; the message follows its path."""
+
+
+@dataclass(frozen=True)
+class OffsetEstimate:
+    """What is added to the events' times to get the clock of the frames."""
+
+    offset_us: float
+    correlation: float
+    """Of the blocks' changes, at ``offset_us``; changes that no event covers count as missed."""
+    rival: float
+    """The largest peak elsewhere."""
+
+    @property
+    def is_certain(self) -> bool:
+        """True where frames and events agree there, and nowhere else nearly as well."""
+        return self.correlation >= LEAST_CORRELATION and self.rival < RIVAL * self.correlation
+
+
+class BlockLevels:
+    """Brightness of frames in blocks, gathered one frame at a time."""
+
+    def __init__(self, transfer: Transfer) -> None:
+        self._transfer = transfer
+        self._levels: list[Float[np.ndarray, " B"]] = []
+        self.spans_us: list[tuple[int, int]] = []
+
+    def add(self, image: Float[Tensor, "..."], span_us: tuple[int, int]) -> None:
+        """A picture (H, W) or (H, W, 3) of coded values in [0, 1] and its exposure."""
+        seen = exposure(image, span_us, transfer=self._transfer)
+        rows, columns, count = _grid(*seen.log_luminance.shape)
+        block = rows[:, None] * count + columns
+        light = np.maximum(seen.log_luminance, _DARK)
+        self._levels.append(np.bincount(block.ravel(), light.ravel()) / np.bincount(block.ravel()))
+        self.spans_us.append(span_us)
+
+    @property
+    def levels(self) -> Float[np.ndarray, "N B"]:
+        """Mean of the logarithm of luminance."""
+        return np.array(self._levels)
+
+
+def estimate_offset(
+    frames: BlockLevels, events: Iterable[EventStream], size: tuple[int, int]
+) -> OffsetEstimate | None:
+    """The offset at which what events add up to correlates best with how frames change.
+
+    Tried are all offsets at which the events cover a change between two frames. ``events`` are the
+    consecutive pieces of the recording, ``size`` is width and height of pictures and sensor. None
+    where nothing changes, or no event is there.
+
+    Raises:
+        TooLong: The recording is longer than `LONGEST_S`.
+    """
+    pairs = pair_indices(frames.spans_us, _MOST_PAIRS)
+    if not pairs:
+        return None
+    spans = np.array(frames.spans_us, dtype=np.int64)
+    gap_us = float(np.median([spans[j].mean() - spans[i].mean() for i, j in pairs]))
+    step_us = max(_LEAST_STEP_US, round(gap_us / _STEPS_PER_GAP))
+    level, first_us = _summed(events, size, step_us)
+    if not len(level):
+        return None
+    changes = frames.levels[[j for _, j in pairs]] - frames.levels[[i for i, _ in pairs]]
+    begin_us = int(spans[pairs[0][0], 0])
+    starts = np.round((spans[:, 0] - begin_us) / step_us).astype(int)[np.array(pairs)]
+    exposed = _exposed(level, float(np.median(spans[:, 1] - spans[:, 0])) / step_us)
+    first_lag = -int(starts[:, 1].max())
+    score = _scores(exposed, changes, starts, first_lag, len(exposed))
+    if not (score > 0).any():
+        return None
+    best = int(np.argmax(score))
+    lag = first_lag + best + _beside(exposed, changes, starts, first_lag + best)
+    return OffsetEstimate(
+        begin_us - first_us - step_us * lag, float(score[best]), _rival(score, best)
+    )
+
+
+def _grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Rows and columns of blocks by those of pixels, and how many columns there are."""
+    side = -(-max(height, width) // _BLOCKS)
+    return np.arange(height) // side, np.arange(width) // side, -(-width // side)
+
+
+def _summed(
+    events: Iterable[EventStream], size: tuple[int, int], step_us: int
+) -> tuple[Float32[np.ndarray, "T B"], int]:
+    """Sum of polarities in each block up to the end of each step, and the first one's start."""
+    rows, columns, count = _grid(size[1], size[0])
+    blocks = (rows[-1] + 1) * count
+    pieces: list[tuple[int, np.ndarray]] = []
+    first_us = 0
+    for piece in events:
+        if not len(piece):
+            continue
+        first_us = first_us if pieces else int(piece.t[0])
+        step = (np.asarray(piece.t) - first_us) // step_us
+        if step[-1] * step_us > LONGEST_S * 1e6:
+            raise TooLong(
+                f"its events last longer than {LONGEST_S} s, in which no offset is searched for"
+            )
+        start = int(step[0])
+        place = (step - start) * blocks + rows[piece.y] * count + columns[piece.x]
+        weights = np.where(np.asarray(piece.p) > 0, 1.0, -1.0)
+        sums = np.bincount(place, weights, minlength=(int(step[-1]) - start + 1) * blocks)
+        pieces.append((start, sums.reshape(-1, blocks).astype(np.float32)))
+    total = np.zeros((max((s + len(a) for s, a in pieces), default=0), blocks), np.float32)
+    for start, sums in pieces:
+        total[start : start + len(sums)] += sums
+    return np.cumsum(total, axis=0, out=total), first_us
+
+
+def _exposed(level: Float32[np.ndarray, "T B"], steps: float) -> Float32[np.ndarray, "S B"]:
+    """Mean level in an exposure of so many steps that begins at each step."""
+    length = max(1, round(steps))
+    whole = np.concatenate([np.zeros((1, level.shape[1])), np.cumsum(level, axis=0, dtype=float)])
+    return ((whole[length:] - whole[:-length]) / length).astype(np.float32)
+
+
+def _scores(
+    exposed: Float32[np.ndarray, "S B"],
+    changes: Float[np.ndarray, "P B"],
+    starts: Int64[np.ndarray, "P 2"],
+    first: int,
+    end: int,
+) -> Float[np.ndarray, " L"]:
+    """Correlation at each lag ``first <= lag < end``, in steps.
+
+    ``starts`` are the first steps of the two exposures of a pair. Of the changes in a block, and of
+    what events say there, the mean over pairs is taken off: light that comes and goes, and noise
+    that is mostly of one sign.
+    """
+    steps, blocks = exposed.shape
+    centred = (changes - changes.mean(0)).astype(np.float32)
+    power = float((centred**2).sum())
+    parts = [np.zeros(0)]
+    for begin in range(first, end, _LAGS_AT_ONCE):
+        lags = min(_LAGS_AT_ONCE, end - begin)
+        told_sum, change_sum = np.zeros((2, lags, blocks), np.float32)
+        squares, products, count = np.zeros((3, lags))
+        for change, (before, after) in zip(centred, starts, strict=True):
+            low, high = max(begin, -before), min(begin + lags, steps - after)
+            if low >= high:
+                continue
+            here = slice(low - begin, high - begin)
+            told = exposed[low + after : high + after] - exposed[low + before : high + before]
+            told_sum[here] += told
+            change_sum[here] += change
+            squares[here] += np.einsum("lb,lb->l", told, told)
+            products[here] += told @ change
+            count[here] += 1
+        count = np.maximum(count, 1)
+        varied = squares - (told_sum**2).sum(1) / count
+        products -= (told_sum * change_sum).sum(1) / count
+        with np.errstate(all="ignore"):
+            score = products / np.sqrt(varied * power)
+        parts.append(np.where(np.isfinite(score), score, 0.0))
+    return np.concatenate(parts)
+
+
+def _beside(
+    exposed: Float32[np.ndarray, "S B"],
+    changes: Float[np.ndarray, "P B"],
+    starts: Int64[np.ndarray, "P 2"],
+    lag: int,
+) -> float:
+    """Steps from a lag to the best one near it, by the pairs that are covered at all of those.
+
+    Of all pairs, one that is covered at the next lag only would outweigh how well the others fit.
+    """
+    first, end = lag - _STEPS_PER_GAP, lag + _STEPS_PER_GAP + 1
+    covered = (starts[:, 0] + first >= 0) & (starts[:, 1] + end <= len(exposed))
+    if covered.sum() < 2:
+        return 0.0
+    score = _scores(exposed, changes[covered], starts[covered], first, end)
+    best = int(np.argmax(score))
+    if best in (0, len(score) - 1):
+        return 0.0
+    before, at, after = score[best - 1 : best + 2]
+    bend = before - 2 * at + after
+    vertex = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return float(best - _STEPS_PER_GAP + vertex)
+
+
+def _rival(score: Float[np.ndarray, " L"], best: int) -> float:
+    """The largest peak outside of the stretch about the best in which the score stays high."""
+    low = np.flatnonzero(score < RIVAL * score[best])
+    before, after = low[low < best], low[low > best]
+    peaks = 1 + np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:]))
+    elsewhere = peaks < (before[-1] if len(before) else 0)
+    elsewhere |= peaks > (after[0] if len(after) else len(score))
+    return float(score[peaks[elsewhere]].max(initial=0.0))

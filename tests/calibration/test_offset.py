@@ -1,0 +1,126 @@
+"""Offsets of any length between two clocks, of a light that wanders through the picture."""
+
+import numpy as np
+import pytest
+import torch
+
+from evsplat.calibration import offset
+from evsplat.calibration.offset import BlockLevels, OffsetEstimate, TooLong, estimate_offset
+from evsplat.events import EventStream
+
+HEIGHT, WIDTH = 24, 36
+STEP_US, PERIOD_US, EXPOSURE_US = 1_000, 40_000, 25_000
+THRESHOLD = 0.1
+Y, X = np.mgrid[:HEIGHT, :WIDTH]
+
+
+def path(seed: int, end_us: int, period_us: int | None = None) -> np.ndarray:
+    """(T, 2) where the light is at each step: never twice alike, or with a period."""
+    rng, times = np.random.default_rng(seed), np.arange(0, end_us, STEP_US)
+    if period_us is not None:
+        hertz, phase = np.array([1e6 / period_us]), np.zeros((2, 1))
+    else:
+        hertz, phase = rng.uniform(0.2, 1.5, 6), rng.uniform(0, 2 * np.pi, (2, 6))
+    turns = 2 * np.pi * hertz * times[:, None] * 1e-6
+    waves = np.stack([np.sin(turns + one).mean(1) for one in phase], axis=1)
+    return np.array([HEIGHT, WIDTH]) * (0.5 + 0.45 * waves / np.abs(waves).max(0))
+
+
+def logarithms(places: np.ndarray) -> np.ndarray:
+    """(T, H, W) logarithm of light."""
+    squares = [(Y - y) ** 2 + (X - x) ** 2 for y, x in places]
+    return np.log(0.08 + 0.7 * np.exp(-np.array(squares) / 18))
+
+
+def seen(light: np.ndarray, first: int, count: int) -> BlockLevels:
+    """The frames from one on, each the mean of the light in its exposure."""
+    levels = BlockLevels("linear")
+    for start in range(first * PERIOD_US, (first + count) * PERIOD_US, PERIOD_US):
+        part = light[start // STEP_US : (start + EXPOSURE_US) // STEP_US]
+        image = torch.from_numpy(np.exp(part).mean(0)).float()
+        levels.add(image, (start, start + EXPOSURE_US))
+    return levels
+
+
+def sent(light: np.ndarray, first_us: int = 0) -> EventStream:
+    """An event at each whole threshold that a pixel passes."""
+    steps = np.diff(np.floor((light - light[0]) / THRESHOLD + 0.5), axis=0).astype(int)
+    time, y, x = np.nonzero(steps)
+    repeats = np.abs(steps[time, y, x])
+    t = np.repeat(first_us + STEP_US * (time + 1), repeats)
+    x, y, p = (np.repeat(values, repeats) for values in (x, y, np.sign(steps[time, y, x])))
+    return EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
+
+
+def found(levels: BlockLevels, *events: EventStream) -> OffsetEstimate:
+    estimate = estimate_offset(levels, events, (WIDTH, HEIGHT))
+    assert estimate is not None
+    return estimate
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("first", "count", "recorded"), [(0, 60, (0, 60)), (17, 20, (0, 60)), (0, 60, (11, 50))]
+)
+def test_an_offset_of_up_to_a_minute_is_found(seed, first, count, recorded) -> None:
+    light = logarithms(path(seed, 60 * PERIOD_US))
+    offset_us = int(np.random.default_rng(seed).integers(-60_000_000, 60_000_000))
+    begin, end = (frame * PERIOD_US // STEP_US for frame in recorded)
+    events = sent(light[begin:end], begin * STEP_US - offset_us)
+    half = len(events) // 2
+    pieces = events.take(slice(0, half)), events.take(slice(half, None))
+    estimate = found(seen(light, first, count), *pieces)
+    assert estimate.is_certain
+    assert estimate.offset_us == pytest.approx(offset_us, abs=3_000)
+
+
+def test_noise_of_one_sign_changes_little() -> None:
+    light = logarithms(path(5, 40 * PERIOD_US))
+    clean, rng = sent(light), np.random.default_rng(5)
+    count = len(clean)
+    extra = EventStream(
+        rng.integers(clean.t[0], clean.t[-1], count),
+        rng.integers(0, WIDTH, count).astype(np.uint16),
+        rng.integers(0, HEIGHT, count).astype(np.uint16),
+        np.ones(count, np.int8),
+    )
+    both = [np.concatenate(pair) for pair in zip(*map(vars_of, (clean, extra)), strict=True)]
+    noisy = EventStream(*both).take(np.argsort(both[0], kind="stable"))
+    levels = seen(light, 0, 40)
+    estimate = found(levels, noisy)
+    assert estimate.is_certain and abs(estimate.offset_us) < 3_000
+    assert estimate.correlation > found(levels, clean).correlation - 0.1
+
+
+def vars_of(events: EventStream) -> tuple[np.ndarray, ...]:
+    return events.t, events.x, events.y, events.p
+
+
+def test_what_repeats_itself_has_no_certain_offset() -> None:
+    light = logarithms(path(0, 60 * PERIOD_US, period_us=500_000))
+    estimate = found(seen(light, 20, 20), sent(light))
+    assert not estimate.is_certain
+    assert estimate.rival == pytest.approx(estimate.correlation, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_events_of_another_recording_have_none(seed) -> None:
+    light, other = (logarithms(path(one, 60 * PERIOD_US)) for one in (seed, seed + 50))
+    assert not found(seen(light, 0, 60), sent(other)).is_certain
+
+
+def test_without_two_frames_events_or_change_nothing_is_found() -> None:
+    light = logarithms(path(0, 10 * PERIOD_US))
+    still, size = np.repeat(light[:1], len(light), axis=0), (WIDTH, HEIGHT)
+    nothing = sent(still)
+    assert len(nothing) == 0
+    assert estimate_offset(seen(light, 0, 10), [nothing], size) is None
+    assert estimate_offset(seen(light, 0, 1), [sent(light)], size) is None
+    assert estimate_offset(seen(still, 0, 10), [sent(light)], size) is None
+
+
+def test_a_recording_too_long_to_be_held_is_refused(monkeypatch) -> None:
+    light = logarithms(path(0, 10 * PERIOD_US))
+    monkeypatch.setattr(offset, "LONGEST_S", 0.3)
+    with pytest.raises(TooLong, match="its events last longer than 0.3 s"):
+        estimate_offset(seen(light, 0, 10), [sent(light)], (WIDTH, HEIGHT))
