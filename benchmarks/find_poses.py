@@ -7,10 +7,13 @@ Per capture and stage the mean distance of 14 joints in pixels (through the fram
 millimetres about the pelvis (MPJPE), and after a similarity per frame (PA-MPJPE), at the times of
 training and of held-out frames apart; the share of the given poses' overlap with the masks that
 the found ones reach; seconds. The stature is taken from the truth, the pose prior leaves the
-capture's motion out. ``--without-events`` takes the events away. With ``--keypoints-px`` the motion
-is fitted to the true joints in the middle of training exposures, off by that many pixels of noise
-per axis, in place of landmarks, as `evsplat poses --keypoints FILE` is. With ``--out`` the poses of
-each stage are written as captures NAME_STAGE. The last line is all of it as JSON.
+capture's motion out. ``px_moving`` is what is left of the pixels where each joint is allowed a
+place of its own on the bone that ends there: skeletons differ in where they have hips and knees,
+and that is no error of a pose. These places are learned at training times. ``--without-events``
+takes the events away. With ``--keypoints-px`` the motion is fitted to the true joints in the middle
+of training exposures, off by that many pixels of noise per axis, in place of landmarks, as
+`evsplat poses --keypoints FILE` is. With ``--out`` the poses of each stage are written as captures
+NAME_STAGE. The last line is all of it as JSON.
 """
 
 import argparse
@@ -25,6 +28,7 @@ import torch
 from evsplat.body import BodyTrack
 from evsplat.body.make import rig_arrays
 from evsplat.body.skeleton import find_skeleton
+from evsplat.camera import Camera
 from evsplat.capture import Capture, Policy, load_body_track, load_capture
 from evsplat.capture.derive import derived_capture
 from evsplat.errors import DataError
@@ -46,6 +50,8 @@ PARTS = [f"{s}_{p}" for p in ("upper_arm", "forearm", "hand", "thigh", "shin", "
 LANDMARKS = [f"{s}_{p}" for p in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
              for s in ("left", "right")]  # fmt: skip
 """Landmarks named after the joints of `PARTS`."""
+PLACE_M = 0.03
+"""How far skeletons differ in where they have a joint."""
 
 
 def main() -> None:
@@ -160,16 +166,25 @@ def write(
 def pose_errors(capture: Capture, truth: BodyTrack, track: BodyTrack) -> dict:
     """Errors at mid-exposures, training and held-out apart, and overlap with the masks."""
     values: dict = {}
+    lasting = torch.zeros(len(PARTS) + 2, 3).double()
     for split, frames in (("train", capture.train_frames), ("test", capture.test_frames)):
         if not frames:
             continue
         times = [frame.mid_us for frame in frames]
         true, found = (joints(one, times) for one in (truth, track))
         cameras = [capture.camera(frame) for frame in frames]
-        off = [
-            c.project(a)[0] - c.project(b)[0] for c, a, b in zip(cameras, true, found, strict=True)
-        ]
-        values[f"{split}_px"] = float(torch.stack(off).norm(dim=-1).mean())
+        off = torch.stack(
+            [
+                c.project(a)[0] - c.project(b)[0]
+                for c, a, b in zip(cameras, true, found, strict=True)
+            ]
+        ).double()
+        values[f"{split}_px"] = float(off.norm(dim=-1).mean())
+        rates = offset_rates(track, times, cameras)
+        if split == "train":
+            lasting = lasting_offsets(off, rates)
+        moving = off - torch.einsum("tjac,jc->tja", rates, lasting)
+        values[f"{split}_px_moving"] = float(moving.norm(dim=-1).mean())
         a, b = true.double().numpy(), found.double().numpy()
         centred = [one - one[:, 6:8].mean(1, keepdims=True) for one in (a, b)]
         values[f"{split}_mpjpe"] = 1000 * float(
@@ -239,11 +254,45 @@ def true_keypoints(capture: Capture, truth: BodyTrack, noise_px: float) -> Landm
     return Landmarks(times_us, places, sigma, seen, None, COCO_17)
 
 
-def joints(track: BodyTrack, times_us: list[int]) -> torch.Tensor:
-    """The 14 joints in the world: those of `PARTS`, neck and head."""
+def lasting_offsets(off: torch.Tensor, rates: torch.Tensor) -> torch.Tensor:
+    """An offset of each joint in the frame of its parent (14, 3), metres, the same at all times.
+
+    What explains best, by least squares, how far pixels are ``off`` (T, 14, 2). `PLACE_M` of it
+    cost as much as an error of one pixel in one picture. ``rates``: `offset_rates`.
+    """
+    square = torch.einsum("tjac,tjad->jcd", rates, rates) + torch.eye(3).double() / PLACE_M**2
+    return torch.linalg.solve(square, torch.einsum("tjac,tja->jc", rates, off))
+
+
+def offset_rates(track: BodyTrack, times_us: list[int], cameras: list[Camera]) -> torch.Tensor:
+    """Derivatives (T, 14, 2, 3) of the joints' pixels by offsets in the frames of their parents."""
+    moved = track.body.joint_transforms(*track.at(times_us))
+    index = joint_index(track)
+    above = track.body.parents[index].clamp_min(0)
+    by_place = torch.stack(
+        [
+            torch.stack([pixel_rate(camera, place) for place in places])
+            for camera, places in zip(cameras, moved[:, index, :3, 3], strict=True)
+        ]
+    )
+    return (by_place @ moved[:, above, :3, :3]).double()
+
+
+def pixel_rate(camera: Camera, place: torch.Tensor) -> torch.Tensor:
+    """Derivative (2, 3) of the pixel of a place in the world."""
+    return torch.autograd.functional.jacobian(lambda p: camera.project(p[None])[0][0], place)
+
+
+def joint_index(track: BodyTrack) -> list[int]:
+    """The 14 joints that are measured: those of `PARTS`, neck and head."""
     skeleton = find_skeleton(track.body.parents.tolist(), track.body.joint_names)
-    index = [skeleton.limbs[part] for part in PARTS] + [skeleton.neck[0], skeleton.neck[-1]]
-    return track.body.joint_transforms(*track.at(times_us))[..., :3, 3][:, index]
+    return [*(skeleton.limbs[part] for part in PARTS), skeleton.neck[0], skeleton.neck[-1]]
+
+
+def joints(track: BodyTrack, times_us: list[int]) -> torch.Tensor:
+    """Places of `joint_index` in the world."""
+    places = track.body.joint_transforms(*track.at(times_us))[..., :3, 3]
+    return places[:, joint_index(track)]
 
 
 def similar(points: np.ndarray, to: np.ndarray) -> np.ndarray:
