@@ -226,6 +226,22 @@ def test_view_of_a_folder_that_is_no_run_is_one_sentence(capsys, tmp_path):
     assert str(tmp_path) in message and "config.yaml" in message
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("train {demo} --iterations 20 --set iterations=5", "iterations"),
+        ("simulate clip.mp4 --out e.h5 --contrast 0.2 --set contrast_on=0.3", "contrast_on"),
+    ],
+)
+def test_an_option_beside_its_setting_is_refused(arguments, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "clip.mp4").touch()
+    assert main([word.format(demo=demo_capture()) for word in arguments.split()]) == 2
+    told = capsys.readouterr().err
+    assert f"--set gives {said} as well; leave one out." in told
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]
+
+
 def test_import_without_a_kind_says_where_it_stands(tmp_path, capsys):
     (tmp_path / "clip.mp4").touch()
     assert main(["import", str(tmp_path / "clip.mp4"), "--out", str(tmp_path / "new")]) == 2
