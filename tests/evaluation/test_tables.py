@@ -1,7 +1,7 @@
 """Markdown and LaTeX tables."""
 
 from evsplat.evaluation.protocols import METRICS, REGIONS
-from evsplat.evaluation.tables import Heading, tables_of, write_tables
+from evsplat.evaluation.tables import Heading, missing_networks, tables_of, write_tables
 
 
 def row(psnr: float, ssim: float, lpips: float | None = None) -> dict:
@@ -49,6 +49,15 @@ def test_markdown_names_protocol_rows_novel_views_and_what_is_missing(tmp_path):
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert len({line.count("|") for line in lines[:6]}) == 1
     assert "| **30.00** |" in text and "| – |" in text
+
+
+def test_what_networks_lack_is_not_told_where_nothing_is_compared():
+    told = metrics()
+    assert missing_networks(told) == ["fetch it"]
+    for row in (told["protocols"]["standard"], told["blurry_input"]):
+        row["full"]["psnr"] = None
+    assert missing_networks(told) == ["fetch it"]  # in novel views
+    assert missing_networks(told | {"novel_views": {}}) == []
 
 
 def test_latex_is_escaped_and_every_row_has_all_cells(tmp_path):

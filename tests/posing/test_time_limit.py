@@ -43,3 +43,13 @@ def test_descents_share_the_time_and_what_one_leaves_goes_to_the_next(clock):
 def test_without_time_one_step_is_taken_of_each(clock):
     limit = TimeLimit(0.0, 10)
     assert [len(places(limit, 5, clock, 1.0)) for _ in range(2)] == [1, 1]
+
+
+def test_the_bar_is_never_fuller_than_full(clock):
+    for count in range(1, 60):
+        limit = TimeLimit(None, 3 * count, progress=True)
+        for _ in range(3):
+            places(limit, count, clock, 1.0)
+        assert limit._bar.n <= limit._bar.total
+        assert limit._bar.n == pytest.approx(limit._bar.total)
+        limit.close()

@@ -29,6 +29,7 @@ from evsplat.evaluation.protocols import (
     without_reasons,
 )
 from evsplat.evaluation.regions import Absent, HumanRegions
+from evsplat.evaluation.tables import missing_networks
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
 from evsplat.names import file_stem
@@ -127,6 +128,8 @@ def evaluate(
         logger.warning("%s", remark)
     result["remarks"] = [remark] if remark else []
     result["weights"] = weights
+    for sentence in missing_networks(result):
+        logger.info("%s", sentence)
     result["protocol_notes"] = {protocol.name: protocol.summary for protocol in protocols}
     return result
 
@@ -377,7 +380,6 @@ def _load_networks(
         try:
             network = load()
         except MissingWeights as error:
-            logger.info("%s", error)
             networks[name] = Absent(f"no weights: see weights.{name}.reason")
             weights[name] = {"sha256": None, "reason": str(error)}
         else:

@@ -187,7 +187,9 @@ def terms(metrics: dict[str, Any]) -> str:
 
 
 def missing_networks(metrics: dict[str, Any]) -> list[str]:
-    """One sentence per network distance without weights."""
+    """One sentence per network distance without weights; none where nothing is to be compared."""
+    if without_truth(metrics) and not metrics.get("novel_views"):
+        return []
     return [entry["reason"] for entry in metrics["weights"].values() if entry["sha256"] is None]
 
 

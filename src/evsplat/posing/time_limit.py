@@ -42,7 +42,9 @@ class TimeLimit:
             done += 1
             taken = (time.monotonic() - begun) / allowed if allowed > 0 else 1.0
             following = min(1.0, max(done / count, taken))
-            self._bar.update(planned * (following - place))
+            # Rounded parts may be more than the whole, of which tqdm warns.
+            left = self._bar.total - self._bar.n
+            self._bar.update(min(planned * (following - place), left))
             place = following
         self._planned -= planned
 
