@@ -116,18 +116,15 @@ def measured(
     model = run.reconstruction.model
     latest = load_latest(run.path / "checkpoints")
     assert latest is not None
-    kept = {name: value.clone() for name, value in model.state_dict().items()}
     tensors, state = load_checkpoint(latest[0])
     shown = back[:: max(1, len(back) // 8)]
     found, rows = {}, []
-    for name in ("learned", "filled"):
+    for name in ("filled", "learned"):
         if name == "learned":
             load_model(model, tensors, state["human_count"])
-        else:
-            model.load_state_dict(kept)
         found[f"front_{name}"] = figures(run, front, lpips)
         found[f"back_{name}"] = figures(run, back, lpips)
-        rows.append(torch.cat([drawn(run, frame) for frame in shown], 1))
+        rows.insert(0, torch.cat([drawn(run, frame) for frame in shown], 1))
     rows.append(torch.cat([run.capture.sharp(frame) for frame in shown], 1))
     save_png(picture, to_bytes(torch.cat(rows).clamp(0, 1)))
     return found

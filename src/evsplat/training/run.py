@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from evsplat.capture import Camera, Capture, Policy, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
@@ -23,19 +22,18 @@ from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.models.beyond import Beyond
 from evsplat.models.model import Model
-from evsplat.models.seen import Seen, roughness
+from evsplat.models.seen import roughness
 from evsplat.options.inputs import check_run_folder
 from evsplat.render import Backdrop, choose_device
 from evsplat.training.checkpoint import (
-    below,
     check_fits,
     counts,
     load_checkpoint,
     load_latest,
-    load_model,
     misfits_of,
 )
 from evsplat.training.reconstruction import GaussianReconstruction
+from evsplat.training.shown import load_shown
 from evsplat.untrusted.faults import brief
 from evsplat.untrusted.records import read_record
 from evsplat.untrusted.text import parse_json, read_text
@@ -255,8 +253,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     )
     check_fits(composition.model, tensors, path)
     with misfits_of(path):
-        load_model(composition.model, tensors, progress["human_count"], filled=True)
-        seen = _seen(tensors, progress)
+        seen = load_shown(composition.model, tensors, progress["human_count"])
     composition.model.requires_grad_(False)
     return Run(
         path=folder.path,
@@ -277,16 +274,10 @@ def reload_run(run: Run, state: Path) -> Run:
     model = run.reconstruction.model
     tensors, progress = load_checkpoint(state)
     with misfits_of(state):
-        load_model(model, tensors, progress["human_count"], filled=True)
-        seen = _seen(tensors, progress)
+        seen = load_shown(model, tensors, progress["human_count"])
     model.requires_grad_(False)
     reconstruction = replace(run.reconstruction, seen=seen)
     return replace(run, reconstruction=reconstruction, **_progress(model, progress))
-
-
-def _seen(tensors: dict[str, Tensor], progress: dict[str, Any]) -> Seen | None:
-    """What training saw, where the checkpoint is that of its end."""
-    return Seen.of(below("seen", tensors), progress["human_count"])
 
 
 def _progress(model: Model, progress: dict[str, Any]) -> dict[str, Any]:
