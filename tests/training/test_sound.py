@@ -127,7 +127,9 @@ def test_events_beside_the_time_of_the_frames_are_said_at_once(tmp_path, capsys)
 def test_a_training_without_a_sound_step_saves_nothing(tmp_path, monkeypatch):
     capture = write_tiny_capture(tmp_path / "tiny")
     never = torch.tensor(False)
-    monkeypatch.setattr("evsplat.training.trainer.Optimiser.finite", lambda optimiser: never)
+    monkeypatch.setattr(
+        "evsplat.training.trainer.Optimiser.finite", lambda optimiser, *others: never
+    )
     said = refused(
         lambda: train(
             capture,

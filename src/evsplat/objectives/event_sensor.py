@@ -59,7 +59,7 @@ class EventSensor(nn.Module):
 
     def apart(self) -> Float[Tensor, ""]:
         """Squared distance of the logarithms from where they started, mean over polarities."""
-        return (self.logs - self.start_logs).square().mean()
+        return nn.functional.mse_loss(self.logs, self.start_logs)
 
     def change(
         self, on: Float[Tensor, "*batch H W"], off: Float[Tensor, "*batch H W"]

@@ -54,10 +54,10 @@ def encode(
     linear: Float[Tensor, "*shape"], transfer: Transfer = "power", *, least: float = 0.0
 ) -> Float[Tensor, "*shape"]:
     """Coded values in [0, 1] of linear light in [0, 1]; values below ``least`` count as that."""
-    linear = linear.clamp_min(least)
     if transfer == "power":
-        coded: Tensor = _PowerEncode.apply(linear)
+        coded: Tensor = _PowerEncode.apply(linear, least)
         return coded
+    linear = linear.clamp_min(least)
     if transfer == "linear":
         return linear
     return torch.where(
@@ -248,7 +248,9 @@ class _LogLuminance(torch.autograd.Function):
     def forward(
         ctx: Any, linear: Float[Tensor, "T 3 H W"], eps: float, keeps_hue: bool
     ) -> Float[Tensor, "T H W"]:
-        light = (linear * constant(REC709, linear)[:, None, None]).sum(1) + eps
+        weights = constant(REC709, linear).expand(len(linear), 1, -1)
+        light = torch.baddbmm(constant((eps,), linear), weights, linear.flatten(2))
+        light = light.unflatten(-1, linear.shape[2:])[:, 0]
         ctx.eps, ctx.keeps_hue = eps, keeps_hue
         ctx.save_for_backward(linear if keeps_hue else light)
         return torch.log(light)
@@ -288,19 +290,21 @@ class _NativeLogLuminance(torch.autograd.Function):
 
 
 class _PowerEncode(torch.autograd.Function):
-    """The inverse of the power curve; its slope, none at 0, is taken from the result."""
+    """The inverse of the power curve; its slope, none up to the least value, is of the result."""
 
     @staticmethod
-    def forward(ctx: Any, linear: Tensor) -> Tensor:
-        coded = linear ** (1 / GAMMA)
+    def forward(ctx: Any, linear: Tensor, least: float) -> Tensor:
+        coded = linear.clamp_min(least) ** (1 / GAMMA)
+        ctx.least = least
         ctx.save_for_backward(linear, coded)
         return coded
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
         linear, coded = ctx.saved_tensors
-        return upstream[0] * (coded / linear.clamp_min(1e-30)) * (1 / GAMMA)
+        slope = upstream[0] * (coded / linear) * (1 / GAMMA)
+        return torch.ops.aten.threshold_backward(slope, linear, ctx.least), None
 
 
 class _PowerLogBrightness(torch.autograd.Function):

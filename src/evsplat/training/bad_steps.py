@@ -32,10 +32,10 @@ class BadSteps:
         self._found = torch.zeros(2, device=device)  # in a row, not settled yet
 
     def refuse(
-        self, sound: Bool[Tensor, ""], culprits: Callable[[], list[str]], iteration: int
+        self, sound: Callable[[], Tensor], culprits: Callable[[], list[str]], iteration: int
     ) -> bool:
-        """Whether the step ends here, its verdict being known and bad."""
-        if not self.at_once or bool(sound):
+        """Whether the step ends here, its verdict being asked for at once and bad."""
+        if not self.at_once or bool(sound()):
             return False
         found = culprits()
         self.skipped += 1

@@ -85,8 +85,8 @@ class Optimiser:
         if not (on_host and bool(unsound)):
             step_together([self.networks], None if on_host else unsound)
 
-    def finite(self) -> Bool[Tensor, ""]:
-        """Whether every gradient is finite, told on the device."""
+    def finite(self, *others: Tensor) -> Bool[Tensor, ""]:
+        """Whether every gradient is finite, and ``others`` are, told on the device."""
         gradients = [
             p.grad
             for _, adam in self._adams()
@@ -95,7 +95,7 @@ class Optimiser:
             if p.grad is not None
         ]
         # A sum is NaN or infinite exactly if an entry is (or it overflows, which is as bad).
-        return (torch.stack(torch._foreach_norm(gradients, 1)) < torch.inf).all()
+        return (torch.stack(torch._foreach_norm([*others, *gradients], 1)) < torch.inf).all()
 
     def state(self) -> dict[str, Tensor]:
         """Moments and step counts, named by group and parameter number."""
@@ -151,4 +151,4 @@ def _clip(gradients: list[Tensor], most: float) -> None:
     """Shrink gradients to a norm together, in as few operations as there can be."""
     if gradients:
         norm = torch.stack(torch._foreach_norm(gradients)).norm()
-        torch._foreach_mul_(gradients, (most / (norm + 1e-6)).clamp(max=1.0))
+        torch._foreach_div_(gradients, (norm / most).clamp_min(1.0))

@@ -121,12 +121,12 @@ class Trainer:
         loss = self._weighted(terms, nominal)
 
         self.optimiser.zero_grad()
-        sound = loss.detach().abs() < torch.inf
-        if self.bad.refuse(sound, lambda: _not_numbers(terms) or ["loss"], self.clock.iteration):
+        iteration = self.clock.iteration
+        if self.bad.refuse(loss.isfinite, lambda: _not_numbers(terms) or ["loss"], iteration):
             return None
         loss.backward()
-        sound = sound & self.optimiser.finite()
-        if self.bad.refuse(sound, lambda: ["gradient"], self.clock.iteration):
+        sound = self.optimiser.finite(loss.detach())
+        if self.bad.refuse(lambda: sound, lambda: ["gradient"], iteration):
             return None
         # None where the host knows that the step is sound; else a GPU will know it.
         unsound = self.bad.count(sound)

@@ -259,9 +259,10 @@ class DiscModel(PosedModel):
         places = world.detach()
         scene = SceneAlone(still.scene, self.low_pass)
         lit, shaded = self._shadows(light, places[lit_at], casters, lit_at, scene, view.shown)
-        rgb = still.rgb[None] * self._light(light, places, transforms, lit)
+        rgb = still.rgb[None]
         if float(self.nominal) >= self.shade_start:
             rgb = rgb * self.shade(means, rotations)
+        rgb = rgb * self._light(light, places, transforms, lit)
         return Layers(
             human_splats(world, *shape, rgb, still.semantics, linear),
             still.scene,

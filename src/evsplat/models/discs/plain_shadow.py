@@ -248,13 +248,13 @@ class _Scene:
     def of(
         cls, bells: Tensor, scale: Tensor, at: Tensor, behind: Tensor, shares: Tensor
     ) -> "_Scene":
-        density = scale * (bells[0] @ bells[1].mT)
-        grid = (at.flip(-1) / REACH_M).flatten(0, 1)[:, None]
+        density = scale * (bells[1] @ bells[0].mT)
+        grid = (at / REACH_M).flatten(0, 1)[:, None]
         sampled = _sample(density.flatten(0, 1)[:, None], grid).view(behind.shape)
         edge = constant((-_BEHIND_M / _BEHIND_EDGE_M,), behind)
         gate = torch.sigmoid(torch.add(edge, behind, alpha=1 / _BEHIND_EDGE_M))
         passed, wide = torch.exp(sampled * gate), shares.detach()[:, None, None]
-        factors = torch.addcmul(1 - wide, wide, passed)
+        factors = torch.lerp(constant((1.0,), passed), passed, wide)
         each = bells, scale, density, grid, wide, sampled, gate, passed
         return cls(*each, factors, factors.prod(0))
 
@@ -269,10 +269,10 @@ class _Scene:
         by_density = by_density.view_as(self.density)
         scaled = self.scale * by_density
         return _Slopes(
-            scaled @ self.bells[1],
-            scaled.mT @ self.bells[0],
+            scaled.mT @ self.bells[1],
+            scaled @ self.bells[0],
             (by_density * self.density).sum((1, 2, 3)),
-            (by_at.flip(-1) / REACH_M).view(*by_gate.shape, 2),
+            (by_at / REACH_M).view(*by_gate.shape, 2),
             by_gate,
             (by_log - by_factor).sum((1, 2)),
         )
@@ -296,9 +296,9 @@ class _Own:
     ) -> tuple["_Own", Float[Tensor, "L T N"]]:
         layers = constant([place / _LAYER_EDGE_M for place in evenly(_LAYERS)], in_front)[:, None]
         nearer = torch.sigmoid(torch.sub(layers, in_front[:, :, None], alpha=1 / _LAYER_EDGE_M))
-        rows = (nearer[:, :, :, None] * bells[0][:, :, None]).flatten(2, 3)
-        density = scale * (rows @ bells[1].mT)
-        where, surface = torch.cat([at.flip(-1), behind[..., None]], -1), -_OWN_SURFACE_M / REACH_M
+        rows = (nearer[:, :, :, None] * bells[1][:, :, None]).flatten(2, 3)
+        density = scale * (rows @ bells[0].mT)
+        where, surface = torch.cat([at, behind[..., None]], -1), -_OWN_SURFACE_M / REACH_M
         grid = torch.add(constant((0.0, 0.0, surface), where), where, alpha=1 / REACH_M)
         grid = grid.flatten(0, 1)[:, None, None]
         depth = _sample(density.flatten(0, 1).unflatten(1, (1, _LAYERS, CELLS)), grid)
@@ -311,14 +311,14 @@ class _Own:
         by_density = by_density.view_as(self.density)
         by_where = by_where.view(*light.shape, 3) / REACH_M
         scaled = self.scale * by_density
-        by_rows = (scaled @ self.bells[1]).unflatten(2, (_LAYERS, CELLS))
-        by_nearer = (by_rows * self.bells[0][:, :, None]).sum(3)
+        by_rows = (scaled @ self.bells[0]).unflatten(2, (_LAYERS, CELLS))
+        by_nearer = (by_rows * self.bells[1][:, :, None]).sum(3)
         by_front = _sigmoid_slope(by_nearer, self.nearer).sum(2) * (-1 / _LAYER_EDGE_M)
         return _Slopes(
-            (by_rows * self.nearer[:, :, :, None]).sum(2),
             scaled.mT @ self.rows,
+            (by_rows * self.nearer[:, :, :, None]).sum(2),
             (by_density * self.density).sum((1, 2, 3)),
-            by_where[..., :2].flip(-1),
+            by_where[..., :2],
             torch.cat([by_front, by_where[..., 2]], 2),
         )
 

@@ -48,22 +48,28 @@ class Relief(nn.Module):
         self.coarse = nn.Parameter(torch.zeros(1, 2, _COARSE, _COARSE))
         self.fine = nn.Parameter(torch.zeros(1, 2, _FINE, _FINE))
         self.register_buffer("stencil", _stencil(), persistent=False)
-        self._kept = Kept()
+        self._kept, self._seen = Kept(), Kept()
 
     def forward(
         self, places: Float[Tensor, "H W 3"]
     ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
         """Where the scene of ``places`` (world, metres) is, and the exponents of its shadows."""
-        to_picture = self.to_picture
-        seen = torch.addmm(to_picture[:, 3], places.flatten(0, 1), to_picture[:, :3].T)
-        at = seen[:, :2] / seen[:, 2:].clamp_min(_NEAREST_M)
-        at = at.view(*places.shape[:2], 2)
+        at, rays = self._seen.of([places], lambda: self._looked_up(places))
         learned = F.grid_sample(
             self._learned(), at[None], padding_mode="border", align_corners=False
         ).squeeze(0)
         units = constant((_LOG_DEPTH, _LOG_STRENGTH), learned)[:, None, None]
         farther, exponents = (units * learned).exp().unbind(0)
-        return self.center + (places - self.center) * farther[..., None], exponents
+        return self.center + rays * farther[..., None], exponents
+
+    def _looked_up(
+        self, places: Float[Tensor, "H W 3"]
+    ) -> tuple[Float[Tensor, "H W 2"], Float[Tensor, "H W 3"]]:
+        """Where in the recorded picture they are, -1 to 1, and the ways there from its camera."""
+        to_picture = self.to_picture
+        seen = torch.addmm(to_picture[:, 3], places.flatten(0, 1), to_picture[:, :3].T)
+        at = seen[:, :2] / seen[:, 2:].clamp_min(_NEAREST_M)
+        return at.view(*places.shape[:2], 2), places - self.center
 
     def price(self) -> Float[Tensor, ""]:
         """Differences of neighbours, squared, and a tenth of the squares; to be kept small.
@@ -134,5 +140,6 @@ class _Power(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, Tensor]:
         factors, exponents, logs, result = ctx.saved_tensors
         slope = upstream[0] * result
-        by_factors = (slope * exponents).div_(factors.clamp_min(_DARKEST)).mul_(factors > _DARKEST)
+        by_factors = (slope * exponents).div_(factors)
+        by_factors = torch.ops.aten.threshold_backward(by_factors, factors, _DARKEST)
         return by_factors, slope.mul_(logs).sum(0)

@@ -1,7 +1,7 @@
 """The person's surface: which of its points Gaussians lie on, and its brightness by its normal."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -58,7 +58,7 @@ class Shading(nn.Module):
         terms = self.ambient(normals, places)
         if lamps is None:
             return nn.functional.pad(terms, (0, len(self.intensities)))
-        each = self.falling(lamps, normals, places)[0]
+        each = self.falling(lamps, normals, places).light
         return torch.cat([terms, (each if lit is None else each * lit).movedim(0, -1)], -1)
 
     def ambient(
@@ -73,16 +73,15 @@ class Shading(nn.Module):
 
     def falling(
         self, lamps: Float[Tensor, "L 3"], normals: Float[Tensor, "T N 3"], places: Tensor
-    ) -> tuple[Float[Tensor, "L T N"], Float[Tensor, "L T N"], Float[Tensor, "L T N"]]:
-        """Light of lamps that hide nowhere, of intensity 1.
-
-        And that by metre by which a place faces the lamp, and the distances (m).
-        """
+    ) -> "_Falling":
+        """Light of lamps that hide nowhere, of intensity 1."""
         ray = lamps[:, None, None] - places
         apart = ray.norm(dim=-1)
-        reach = (lamps - self.center).square().sum(-1)[:, None, None]
-        bright = reach / (apart.clamp_min(_NEAREST_M).square() * apart)
-        return (ray * normals).sum(-1).clamp_min(0) * bright, bright, apart
+        away = lamps - self.center
+        reach = away.square().sum(-1)
+        bright = reach[:, None, None] / (apart.clamp_min(_NEAREST_M).square() * apart)
+        light = (ray * normals).sum(-1).clamp_min(0) * bright
+        return _Falling(light, bright, apart, away, reach)
 
     def forward(
         self,
@@ -98,6 +97,19 @@ class Shading(nn.Module):
         terms = self.terms(normals, places, lamps, lit)
         weights = torch.cat([self.coefficients.flatten(0, 1), self.intensities])
         return (1 + terms @ weights).clamp(_DARKEST, _BRIGHTEST)
+
+
+class _Falling(NamedTuple):
+    light: Float[Tensor, "L T N"]
+    """Of lamps on places."""
+    bright: Float[Tensor, "L T N"]
+    """That by metre by which a place faces the lamp."""
+    apart: Float[Tensor, "L T N"]
+    """Distances, metres."""
+    away: Float[Tensor, "L 3"]
+    """Of the lamps from the middle, metres."""
+    reach: Float[Tensor, "L"]
+    """Its length, squared."""
 
 
 def _quadratic() -> Float[Tensor, "16 9"]:
@@ -180,26 +192,23 @@ class _PlainLight(torch.autograd.Function):
         lamps: Float[Tensor, "L 3"],
         lit: Float[Tensor, "L #T N"] | None,
     ) -> Float[Tensor, "T N 3"]:
-        falling, bright, apart = shading.falling(lamps, normals, places)
-        lights = (falling if lit is None else falling * lit).movedim(0, -1)
+        falling = shading.falling(lamps, normals, places)
+        lights = (falling.light if lit is None else falling.light * lit).movedim(0, -1)
         terms = torch.cat([shading.ambient(normals, places), lights], -1)
         weights = torch.cat([coefficients.flatten(0, 1), intensities])
         free = torch.addmm(constant((1.0,), terms), terms.flatten(0, 1), weights).view_as(places)
         factors = free.clamp(_DARKEST, _BRIGHTEST)
-        ctx.shading, ctx.sizes = shading, coefficients.shape
-        within = factors == free
-        ctx.save_for_backward(
-            normals, places, intensities, lamps, lit, falling, bright, apart, terms, within
-        )
+        ctx.sizes = coefficients.shape
+        ctx.save_for_backward(normals, places, intensities, lamps, lit, terms, free, *falling)
         return factors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (normals, places, intensities, lamps, lit, falling, bright, apart, terms, within) = (
-            ctx.saved_tensors
-        )
-        above = (upstream[0] * within).flatten(0, 1)
+        normals, places, intensities, lamps, lit, terms, free, *each = ctx.saved_tensors
+        falling, bright, apart, away, reach = each
+        above = torch.ops.aten.hardtanh_backward(upstream[0], free, _DARKEST, _BRIGHTEST)
+        above = above.flatten(0, 1)
         by_weights = terms.flatten(0, 1).mT @ above
         by_coefficients = by_weights[: -len(intensities)].view(ctx.sizes)
         by_light = (intensities @ above.mT).view_as(falling)
@@ -208,13 +217,13 @@ class _PlainLight(torch.autograd.Function):
             by_lit = (by_light * falling).sum_to_size(lit.shape)
             by_light = by_light * lit
         of_each = by_light * falling
-        facing = (by_light * bright * (falling > 0)).flatten(1) @ normals.flatten(0, 1)
+        facing = torch.ops.aten.threshold_backward(by_light * bright, falling, 0)
+        facing = facing.flatten(1) @ normals.flatten(0, 1)
         # The distance is in the light to the power of -3, and of -1 where it counts as the least.
         far = torch.add(constant((1.0,), apart), apart > _NEAREST_M, alpha=2)
         by_ray = of_each * far / apart.square()
         toward = torch.addmm(facing, by_ray.flatten(1), places.flatten(0, 1))
-        away = lamps - ctx.shading.center
-        share = of_each.sum((1, 2)) / away.square().sum(-1)
+        share = of_each.sum((1, 2)) / reach
         by_lamps = torch.addcmul(toward, share[:, None], away, value=2)
         by_lamps = torch.addcmul(by_lamps, by_ray.sum((1, 2))[:, None], lamps, value=-1)
         return (None,) * 3 + (by_coefficients, by_weights[-len(intensities) :], by_lamps, by_lit)

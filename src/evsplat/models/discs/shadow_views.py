@@ -9,7 +9,6 @@ from functools import cache
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional as F
 
 from evsplat.devices import constant
 
@@ -84,7 +83,7 @@ class Views:
     ) -> tuple[Float[Tensor, "L 3"], Float[Tensor, "T P 3"], Float[Tensor, "T N 3"]]:
         """Gradients of lamps, body and places from those of what `project` gave."""
         reach = (by_at * seen.at).sum(-1) / self.distance
-        nears = seen.spread * (seen.along > _NEAREST_M)
+        nears = torch.ops.aten.threshold_backward(seen.spread, seen.along, _NEAREST_M)
         by_along = torch.addcmul(by_behind, reach, nears, value=-1)
         by_distance = (reach - by_behind).sum(-1, keepdim=True)
         by_local = torch.cat([by_at * seen.spread[..., None], by_along[..., None]], -1)
@@ -103,11 +102,13 @@ class Views:
         axis = self.frames[..., 2, :]
         turned = by_frame @ self.frames.mT
         about = turned[..., 0, 1] - turned[..., 1, 0]
-        by_axis = by_frame[..., 2, :] - (turned[..., :2, 2:] * self.frames[..., :2, :]).sum(-2)
+        across = turned[..., :2, 2:].mT @ self.frames[..., :2, :]
+        by_axis = by_frame[..., 2, :] - across[..., 0, :]
         by_axis = torch.addcmul(by_axis, about[..., None], self.twist)
         # Only what turns the axis, and what makes the ray longer.
         along = (by_axis * axis).sum(-1, keepdim=True)
-        return torch.addcmul((by_axis - along * axis) / self.distance, by_distance, axis)
+        turning = torch.addcmul(by_axis, along, axis, value=-1) / self.distance
+        return torch.addcmul(turning, by_distance, axis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,15 +139,13 @@ class Bells:
 def _across(axis: Float[Tensor, "*T 3"]) -> tuple[Float[Tensor, "*T 2 3"], Float[Tensor, "*T 3"]]:
     """Two unit vectors at right angles to ``axis`` and each other (Duff et al. 2017, JCGT 6).
 
-    They are the first rows of the reflection that takes the axis to the z axis or its opposite; the
-    second one turns with the sign. And their twist: how far the first one moves along the second
-    for a small move of the axis is the product with it.
+    They are the first rows of the reflection that takes the axis to the z axis or its opposite: as
+    seen in a mirror on one side, which a shadow does not tell. And their twist: how far the first
+    one moves along the second for a small move of the axis is the product with it.
     """
     sign = torch.copysign(constant((1.0,), axis), axis[..., 2:])
-    between = axis + F.pad(sign, (2, 0))
-    ratio = between[..., :2] / between[..., 2:]
+    between = torch.addcmul(axis, sign, constant((0.0, 0.0, 1.0), axis))
+    ratio = sign * between[..., :2] / between[..., 2:]
     identity = constant(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), axis)
-    # The identity less (ratio * sign) between.
-    rows = torch.addcmul(identity, (ratio * sign)[..., None], between[..., None, :], value=-1)
-    twist = ratio @ constant(((0.0, -1.0, 0.0), (1.0, 0.0, 0.0)), axis)
-    return rows * F.pad(sign, (1, 0), value=1.0)[..., None], twist
+    rows = torch.addcmul(identity, ratio[..., None], between[..., None, :], value=-1)
+    return rows, ratio @ constant(((0.0, -1.0, 0.0), (1.0, 0.0, 0.0)), axis)

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.body import Body
 from evsplat.compiled import native, runs_native
-from evsplat.devices import send
+from evsplat.devices import constant, send
 from evsplat.models.networks.body_box import BodyBox
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.networks.pose_encoder import PoseEncoder, normalise_joints
@@ -66,10 +66,11 @@ class _PlainOneBlob(torch.autograd.Function):
         ctx: Any, positions: Tensor, edges: Tensor, between: Tensor, rest: Tensor
     ) -> Float[Tensor, "*batch D"]:
         bins = len(edges) - 1
-        u = (edges - bins * positions.clamp(0, 1)[..., None]).clamp(-1, 1)
+        u = torch.sub(edges, positions.clamp(0, 1)[..., None], alpha=bins).clamp(-1, 1)
         square = u * u
         # The integral from 0 to u of 15/16 (1 - v^2)^2; that from -1 is a half more.
-        upto = u * (square * (0.1875 * square - 0.625) + 0.9375)
+        least, middle = constant((-0.625, 0.9375), u).split(1)
+        upto = u * torch.addcmul(middle, square, torch.add(least, square, alpha=0.1875))
         encoded = torch.nn.functional.linear(upto, between.mT, rest)
         ctx.save_for_backward(positions, square, between)
         return encoded.flatten(-2)
