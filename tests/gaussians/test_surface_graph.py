@@ -1,6 +1,7 @@
 """Neighbours along a surface and what follows from them: chains, plates, dense least squares."""
 
 import numpy as np
+import pytest
 import torch
 from scipy import sparse
 
@@ -38,25 +39,43 @@ def test_what_is_sure_moves_by_no_more_than_its_share():
     assert torch.allclose(found, wanted, atol=1e-5) and float(found[0]) < 0.006
 
 
-def test_conjugate_gradients_find_the_least_squares():
+@pytest.mark.parametrize("tint", [0.0, 3.0])
+def test_conjugate_gradients_find_the_least_squares(tint):
     generator = torch.Generator().manual_seed(0)
     seen = torch.randn(9, 6, generator=generator, dtype=torch.float64)
     pictures = torch.randn(9, 3, generator=generator, dtype=torch.float64)
     prior = torch.rand(6, 3, generator=generator, dtype=torch.float64)
     strength = torch.linspace(0.1, 1, 6, dtype=torch.float64)
+    hue = tint * strength.flip(0)
     pull = seen.T @ (pictures - seen @ prior)
     diagonal = seen.square().sum(0)
-    found = closest(prior, pull, lambda v: seen.T @ (seen @ v), diagonal, strength, 6)
-    squares = seen.T @ seen + strength.diag()
-    wanted = torch.linalg.solve(squares, seen.T @ pictures + strength[:, None] * prior)
-    assert torch.allclose(found, wanted, atol=1e-9)
+
+    def squares(values):
+        return seen.T @ (seen @ values)
+
+    found = closest(prior, pull, squares, diagonal, strength, hue, 18)
+    # All 18 unknowns at once, a row's three colours beside each other.
+    of_hue = torch.eye(3, dtype=torch.float64) - 1 / 3
+    price = torch.kron(strength.diag(), torch.eye(3)) + torch.kron(hue.diag(), of_hue)
+    whole = torch.kron(seen.T @ seen, torch.eye(3)) + price
+    told = (seen.T @ pictures).flatten() + price @ prior.flatten()
+    assert torch.allclose(found.flatten(), torch.linalg.solve(whole, told), atol=1e-9)
+
+
+def test_a_price_on_hue_leaves_brightness_to_the_pictures():
+    prior = torch.tensor([[0.5, 0.4, 0.3]])
+    missing = torch.tensor([[1.0, 2.0, 6.0]])
+    told, hue = torch.tensor([10.0]), torch.tensor([1e9])
+    found = closest(prior, missing, lambda v: told[:, None] * v, told, torch.zeros(1), hue, 2)
+    assert torch.allclose(found, prior + 0.3, atol=1e-6)
 
 
 def test_what_no_picture_tells_of_is_as_the_prior_says():
     prior = torch.tensor([[0.25, 0.5, 0.75], [0.5, 0.5, 0.5]])
     pull = torch.tensor([[0.0, 0, 0], [10, 0, -10]])
     told = torch.tensor([0.0, 100])
-    found = closest(prior, pull, lambda v: told[:, None] * v, told, torch.full((2,), 0.01), 1)
+    held, none = torch.full((2,), 0.01), torch.zeros(2)
+    found = closest(prior, pull, lambda v: told[:, None] * v, told, held, none, 1)
     assert torch.equal(found[0], prior[0])
     assert torch.allclose(found[1], torch.tensor([0.6, 0.5, 0.4]), atol=1e-4)
 

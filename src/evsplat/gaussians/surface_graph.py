@@ -101,27 +101,35 @@ def closest(
     seen: Callable[[Float[Tensor, "N C"]], Float[Tensor, "N C"]],
     diagonal: Float[Tensor, " N"],
     strength: Float[Tensor, " N"],
+    hue: Float[Tensor, " N"],
     steps: int,
 ) -> Float[Tensor, "N C"]:
-    """Values x that minimise ``|J x - b|^2 + sum strength (x - prior)^2``, for each of C columns.
+    """Values x that minimise ``|J x - b|^2 + sum strength d^2 + hue (d - mean of d over C)^2``.
 
-    ``pull``: ``J^T (b - J prior)``; ``seen`` applies ``J^T J``, whose ``diagonal`` is known more or
-    less: ``steps`` of conjugate gradients conditioned by it, one being enough where there is
-    nothing but it.
+    d is ``x - prior``: what all C columns have in common is brightness, the rest hue. ``pull``:
+    ``J^T (b - J prior)``; ``seen`` applies ``J^T J``, whose ``diagonal`` is known more or less:
+    ``steps`` of conjugate gradients conditioned by it, one being enough where there is nothing but
+    it.
     """
-    held = strength.double()[:, None]
+    held, tinted = strength.double()[:, None], hue.double()[:, None]
     scale = diagonal.double()[:, None] + held
     change = torch.zeros_like(prior, dtype=torch.float64)
     left = pull.double()
-    ahead = left / scale
-    direction, size = ahead, (left * ahead).sum(0)
+    ahead = _by_parts(left, 1 / scale, 1 / (scale + tinted))
+    direction, size = ahead, (left * ahead).sum()
     least = torch.finfo(size.dtype).tiny
     for _ in range(steps):
-        image = seen(direction.to(prior)).double() + held * direction
-        way = size / (direction * image).sum(0).clamp_min(least)
+        image = seen(direction.to(prior)).double() + _by_parts(direction, held, held + tinted)
+        way = size / (direction * image).sum().clamp_min(least)
         change = change + way * direction
         left = left - way * image
-        ahead = left / scale
-        before, size = size, (left * ahead).sum(0)
+        ahead = _by_parts(left, 1 / scale, 1 / (scale + tinted))
+        before, size = size, (left * ahead).sum()
         direction = ahead + size / before.clamp_min(least) * direction
     return prior + change.to(prior)
+
+
+def _by_parts(values: Tensor, brightness: Tensor, hue: Tensor) -> Tensor:
+    """Each row's mean times one factor, and what differs from it times the other."""
+    mean = values.mean(1, keepdim=True)
+    return brightness * mean + hue * (values - mean)

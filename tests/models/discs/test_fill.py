@@ -196,3 +196,20 @@ def test_a_run_is_drawn_filled_and_goes_on_unfilled(tiny_capture, tmp_path):
         drawn.model.gaussians.get_parameter(colour), learned.gaussians.get_parameter(colour)
     )
     assert torch.equal(learned.gaussians.get_parameter(colour), model[f"gaussians.{colour}"])
+
+
+def test_hues_that_the_pictures_hardly_tell_are_calm_and_brightness_stays(spoilt, monkeypatch):
+    model, capture, seen = spoilt
+    rows, name = model.gaussians.human, f"gaussians.{model.gaussians.colour}"
+    little = seen.little()
+
+    def parts(price):
+        monkeypatch.setattr("evsplat.models.discs.fill.HUE", price)
+        colours = filled(model, capture, 0.001, seen)[name][rows].sigmoid()
+        bright = colours.mean(-1, keepdim=True)
+        return bright[little], (colours - bright)[little], colours[~little]
+
+    (bright, hues, front), (as_bright, calmer, same_front) = parts(0.0), parts(30.0)
+    assert float(calmer.square().mean()) < 0.5 * float(hues.square().mean())
+    assert float(as_bright.std()) > 0.7 * float(bright.std())
+    assert float((same_front - front).square().mean().sqrt()) < 0.02

@@ -27,6 +27,10 @@ STEPS = 8
 MOST_BEHIND, BARELY_PX = 0.25, 0.01
 """Largest difference to what neighbours say where a surface was seen from behind alone; half of it
 where the squares of its shares sum to the second: what shines through the front has its colour."""
+HUE, FACED_PX = 20.0, 0.01
+"""How much more a difference of hue costs than one of brightness where nothing was seen of a side
+that faced a camera, and the squares of its shares at which it is half of that: speckle is hue, and
+the pictures hardly tell of it there."""
 CALM = 0.000125
 """Weight of the squares of the light's numbers, the constant one apart, against the mean squared
 change of the factors that were seen."""
@@ -69,7 +73,8 @@ def filled(
     colours closest to that with which the training frames look as before (`closest`): what shines
     through the front, or has a small share of its pixels, gives way, and what is well seen stays.
     What turns its back and is still far from what neighbours say, or floats off the body, becomes
-    transparent as far as the frames bear it (`kept_opacity`), and colours are found once more.
+    transparent as far as the frames bear it (`kept_opacity`), and colours are found once more, now
+    with hues that follow the neighbours by what was seen of sides that faced a camera alone.
     ``strength`` is what a difference to the neighbours costs, per training frame, against one of a
     whole pixel.
     """
@@ -89,18 +94,22 @@ def filled(
     own = gaussians.get_parameter(gaussians.colour)[rows, :3].detach().sigmoid()
     rough = laplacian(gaussians.means[rows], normals, bones, mirror_plane(new.track.body))
     facing = (seen.directions * normals).sum(-1) / seen.weight.clamp_min(1e-9)
-    sure = (seen.squares * facing.clamp_min(0).square()).masked_fill(seen.little(), 0)
-    even = harmonic(own, sure, EVEN * rough)
+    faced = seen.squares * facing.clamp_min(0).square()
+    even = harmonic(own, faced.masked_fill(seen.little(), 0), EVEN * rough)
     pictures = _Pictures.of(new, views, own)
-    told = even.lerp(pictures.relit(own), seen.certainty()[:, None])
+    relit = pictures.relit(own)
+    told = even.lerp(relit, seen.certainty()[:, None])
     share, behind = len(views) / len(capture.train_frames), facing < 0
     squares = share * seen.squares
-    colours = _closest(pictures, told, squares, strength, behind)
+    colours = _closest(pictures, told, squares, strength, behind, torch.zeros_like(squares))
     wrong = (colours - even).norm(dim=-1) * behind
     off_m = off_the_body(gaussians.means[rows], normals, model.surface)
     pixels = share * seen.weight.mean() * areas(gaussians)
     kept = kept_opacity(pictures.sights(colours), prices(wrong, off_m, pixels))
-    colours = _closest(replace(pictures, kept=kept), told, squares, strength, behind)
+    sure = faced / (faced + FACED_PX)
+    told = _in_hues_of(told, even.lerp(relit, sure[:, None]))
+    pictures = replace(pictures, kept=kept)
+    colours = _closest(pictures, told, squares, strength, behind, HUE * (1 - sure))
     with torch.no_grad():
         new.gaussians.get_parameter(gaussians.colour)[rows, :3] = colours.logit()
         opacities = (gaussians.opacities()[rows] * kept).clamp_min(_LEAST_OPACITY)
@@ -116,21 +125,30 @@ def _closest(
     squares: Float[Tensor, " H"],
     strength: float,
     behind: Bool[Tensor, " H"],
+    hue: Float[Tensor, " H"],
 ) -> Float[Tensor, "H 3"]:
     """Colours closest to those ``told`` with which the pictures look as before the fill.
 
     ``squares``: of the shares of all pictures' pixels. What was seen from ``behind`` alone must not
-    glare; the front makes up for it.
+    glare; the front makes up for it. ``hue``: what a difference of hue costs besides, in units of
+    ``strength``.
     """
     diagonal = squares * pictures.brightness()
     held = torch.full_like(diagonal, strength * len(pictures.views))
-    colours = closest(told, pictures.missing(told), pictures.twice, diagonal, held, STEPS)
+    tinted = held * hue
+    colours = closest(told, pictures.missing(told), pictures.twice, diagonal, held, tinted, STEPS)
     most = (MOST_BEHIND * squares / (squares + BARELY_PX))[:, None]
     limited = told + (colours - told).clamp(-most, most)
     start = torch.where(behind[:, None], limited, colours).clamp(LEAST, MOST)
     held = held.masked_fill(behind, _FAST)
-    colours = closest(start, pictures.missing(start), pictures.twice, diagonal, held, STEPS)
+    missing = pictures.missing(start)
+    colours = closest(start, missing, pictures.twice, diagonal, held, tinted, STEPS)
     return colours.clamp(LEAST, MOST)
+
+
+def _in_hues_of(bright: Float[Tensor, "H 3"], hues: Float[Tensor, "H 3"]) -> Float[Tensor, "H 3"]:
+    """Colours with the mean over the channels of the first, and the rest of the other."""
+    return hues + (bright - hues).mean(-1, keepdim=True)
 
 
 @torch.no_grad()
