@@ -121,7 +121,7 @@ def parts_of(
             (model.shade, "forward", "shade by the pose"),
             (discs_model, "skin_with_linear", "blend skinning"),
             (model, "_light", "light on the person"),
-            (model, "_lit", "shadow on the person"),
+            (model, "_shadows", "shadow on the person"),
             (model, "_layers", "posing rest"),
         ]
         if model.shadow is not None:
