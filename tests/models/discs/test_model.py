@@ -21,7 +21,8 @@ ERRING = "pose.refine=always"
 def model_of(path, *settings: str):
     """Model, capture, the times of two frames and a camera centre."""
     capture = load_capture(path)
-    model = built("evsplat", capture, "lamps=2", *settings).model
+    lamps = () if any(each.startswith("lamps=") for each in settings) else ("lamps=2",)
+    model = built("evsplat", capture, *lamps, *settings).model
     times = [frame.mid_us for frame in capture.train_frames[:2]]
     return model, capture, times, capture.camera(capture.train_frames[0]).center()
 
