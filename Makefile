@@ -36,7 +36,7 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 
 types: $(STAMP)
-	$(BIN)/mypy src benchmarks
+	$(BIN)/mypy
 
 # Warnings, such as a link that leads nowhere, are errors.
 docs: $(STAMP)

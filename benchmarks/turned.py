@@ -118,7 +118,8 @@ def measured(
     assert latest is not None
     tensors, state = load_checkpoint(latest[0])
     shown = back[:: max(1, len(back) // 8)]
-    found, rows = {}, []
+    found: dict[str, dict[str, float]] = {}
+    rows: list[torch.Tensor] = []
     for name in ("filled", "learned"):
         if name == "learned":
             load_model(model, tensors, state["human_count"])
