@@ -73,8 +73,9 @@ def cell(
         return dict(json.loads(kept.read_text("utf-8")))
     run = options.out / "runs" / name
     settings = METHODS[method] + (scaled_rates(method, steps) if rates == "scaled" else ())
-    with cpu_time(run, resume=run.exists()) as cpu_seconds:
-        if run.exists():
+    begun = (run / "config.yaml").exists()
+    with cpu_time(run, resume=begun) as cpu_seconds:
+        if begun:
             ev.train(capture, out=run, resume=True)
         else:
             ev.train(

@@ -35,6 +35,16 @@ PAGES = ("README.md", "docs/bench.md", "docs/results.md")
 FIGURE = ROOT / "docs" / "images" / "convergence.png"
 COMPARED = ("man_dance_hard_256", "woman_dance_b_256", "real_beam_256")
 """Captures that every method is compared on."""
+FOR_USERS = (
+    "own_picture",
+    "avatar3dgs_semantic",
+    "hugs",
+    "edi_avatar3dgs_semantic",
+    "paper",
+    "evsplat",
+    "evsplat_video",
+)
+"""Rows of the short table."""
 FOUND = {
     "_found_poses": "poses found by `evsplat poses`",
     "_found_poses_by_events": "poses found by `evsplat poses --held-out-events`",
@@ -77,14 +87,16 @@ def trio(records: Records, row: str, capture: str) -> str:
     return text + (f" (± {max(spreads):.2f})" if spreads else "")
 
 
-def methods(records: Records) -> str:
-    """Every row on the captures that all methods are compared on."""
+def methods(records: Records, names: Sequence[str] = ()) -> str:
+    """Every row, or the named ones, on the captures that all methods are compared on."""
     lines = [
         f"| method | steps | {' | '.join(COMPARED)} | CPU minutes |",
         f"|---|---:|{'---|' * len(COMPARED)}---:|",
     ]
     missing = []
     for row, title, captures in _rows(records):
+        if names and row.name not in names:
+            continue
         figures = [trio(records, row.name, capture) for capture in captures]
         gaps = [name for name, figure in zip(COMPARED, figures, strict=True) if figure == "–"]
         if gaps:
@@ -227,6 +239,7 @@ def texts() -> dict[str, str]:
     stage, drawn = kept_records("stage"), kept_records("grid")
     return {
         "methods": methods(stage),
+        "for-users": methods(stage, FOR_USERS),
         "captures": captures(stage),
         "grid": grid(drawn),
         "grid-summary": grid_summary(drawn),

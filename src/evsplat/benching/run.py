@@ -32,6 +32,7 @@ from evsplat.options.declare import given
 from evsplat.render import choose_device
 from evsplat.untrusted.faults import MISFITS, broken_as
 from evsplat.untrusted.text import read_json
+from evsplat.wording import counted
 
 Executor = LocalPool | RayCluster
 """Processes that cells run in."""
@@ -146,9 +147,10 @@ class Progress:
         self._started = time.monotonic()
         suite, done = plan.suite, len(plan.cells) - len(todo)
         _print(
-            f"suite {suite.name}: {_count(len(plan.sources), 'capture')} x "
-            f"{_count(len(suite.rows), 'row')} x {_count(len(suite.seeds), 'seed')}; "
-            f"{_count(len(todo), 'cell')} to do, {done} done before; logs in {folder.path / 'logs'}"
+            f"suite {suite.name}: {counted(len(plan.sources), 'capture')} x "
+            f"{counted(len(suite.rows), 'row')} x {counted(len(suite.seeds), 'seed')}; "
+            f"{counted(len(todo), 'cell')} to do, {done} done before; "
+            f"logs in {folder.path / 'logs'}"
         )
         for sentence in plan.missing.values():
             _print(sentence)
@@ -199,10 +201,6 @@ class Progress:
     def _refresh(self) -> None:
         while not self._over.wait(_REFRESH_S):
             self._bar.refresh()
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("s" if number != 1 else "")
 
 
 def _print(text: str) -> None:

@@ -13,6 +13,7 @@ from evsplat.capture.policy import STRICT_TERMS, policy_of
 from evsplat.evaluation.protocols import PROTOCOLS
 from evsplat.evaluation.tables import METRIC_TITLES, REGION_TITLES, Figure, Heading, Row, Table
 from evsplat.methods import NOMINAL_ITERATIONS
+from evsplat.wording import counted
 
 Column = tuple[Heading, Callable[[SuiteRow], Figure | None]]
 """Its head, and the figure of a row."""
@@ -244,8 +245,7 @@ def _trained(records: Records) -> Iterator[tuple[SuiteRow, Record]]:
 
 
 def _threads(record: Record) -> str:
-    threads = record.get("threads") or 1
-    return f"{threads} thread{'s' if threads > 1 else ''}"
+    return counted(record.get("threads") or 1, "thread")
 
 
 def _footnotes(records: Records) -> list[str]:

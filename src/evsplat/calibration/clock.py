@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from evsplat.calibration.brightness import EventSource, FramePair, PairEvents
+from evsplat.calibration.peak import top_of
 
 SEARCH_US = 100_000
 """Lags up to here, either way, are tried."""
@@ -113,19 +114,9 @@ def _best(correlations: Float[np.ndarray, "L"]) -> int | None:
 
 
 def _vertex(lags_us: Float[np.ndarray, "L"], correlations: Float[np.ndarray, "L"]) -> float | None:
-    """Lag at the top of a parabola through the five values about the largest."""
-    best = _best(correlations)
-    if best is None:
-        return None
-    first = min(max(best - 2, 0), len(lags_us) - 5)
-    near, values = lags_us[first : first + 5], correlations[first : first + 5]
-    if np.isnan(values).any():
-        return float(lags_us[best])
-    scale = near[1] - near[0]
-    a, b, _ = np.polyfit((near - lags_us[best]) / scale, values, 2)
-    if a >= 0:
-        return float(lags_us[best])
-    return float(lags_us[best] + np.clip(-b / (2 * a), -2, 2) * scale)
+    """Lag at the top of the correlations."""
+    top = top_of(correlations)
+    return None if top is None else float(lags_us[0] + top * (lags_us[1] - lags_us[0]))
 
 
 def _jackknife(lags_us: Float[np.ndarray, "L"], sums: Float[np.ndarray, "P L 6"]) -> float:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from evsplat.calibration.brightness import exposure, pair_indices
+from evsplat.calibration.peak import top_of
 from evsplat.events import EventStream
 from evsplat.pictures.light import Transfer
 
@@ -208,13 +209,10 @@ def _beside(
     if covered.sum() < 2:
         return 0.0
     score = _scores(exposed, changes[covered], starts[covered], first, end)
-    best = int(np.argmax(score))
-    if best in (0, len(score) - 1):
+    top = top_of(score)
+    if top is None or int(np.argmax(score)) in (0, len(score) - 1):
         return 0.0
-    before, at, after = score[best - 1 : best + 2]
-    bend = before - 2 * at + after
-    vertex = 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return float(best - _STEPS_PER_GAP + vertex)
+    return top - _STEPS_PER_GAP
 
 
 def _rival(score: Float[np.ndarray, " L"], best: int) -> float:

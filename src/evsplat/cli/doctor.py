@@ -16,6 +16,7 @@ from evsplat.cuda_support import Need, needs
 from evsplat.errors import DataError, WeightsError
 from evsplat.options.declare import Flag
 from evsplat.shipped import demo_capture
+from evsplat.wording import counted
 
 _RESTORERS_WITH_WEIGHTS = ("nafnet", "mprnet", "efnet", "d2net", "e2vid")
 _TITLES = {"missing": "missing", "ok": "there", "optional": "optional, not there"}
@@ -86,9 +87,8 @@ def _torch() -> Check:
         torch = import_module("torch")
     except ImportError as error:
         return Check("torch", "missing", f"{error}.", "Get it with: pip install 'torch>=2.11'.")
-    threads = torch.get_num_threads()
-    plural = "" if threads == 1 else "s"
-    return Check("torch", "ok", f"{torch.__version__}, {threads} thread{plural}")
+    threads = counted(torch.get_num_threads(), "thread")
+    return Check("torch", "ok", f"{torch.__version__}, {threads}")
 
 
 def _native() -> Check:

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence
+from evsplat.calibration.offset import BlockLevels
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
 from evsplat.footage import Footage, TimedPicture, open_footage
@@ -35,7 +36,7 @@ from evsplat.importers.option_types import (
     TimeUs,
 )
 from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_motion
-from evsplat.importers.recorded import add_recorded_events, levels_to_compare, recorded_camera
+from evsplat.importers.recorded import add_recorded_events, offset_or_levels, recorded_camera
 from evsplat.importers.smpl import chosen_poses
 from evsplat.options.declare import Flag, option
 from evsplat.pictures.files import to_unit_range
@@ -111,13 +112,13 @@ class Folder(Importer):
             )
         views = _camera_poses(motion)
         masks = _Masks(self._masks(source))
-        levels = levels_to_compare(self.clock_offset_us, camera)
+        clock_offset = offset_or_levels(self.clock_offset_us, camera)
         for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
             if index not in seen:
                 continue
             exposure = int(exposures[index, 0]), int(exposures[index, 1])
-            if levels is not None:
-                levels.add(to_unit_range(timed.pixels), exposure)
+            if isinstance(clock_offset, BlockLevels):
+                clock_offset.add(to_unit_range(timed.pixels), exposure)
             writer.add_frame(
                 timed.name,
                 "main",
@@ -130,9 +131,8 @@ class Folder(Importer):
             writer,
             self.events or next(iter(sorted(source.glob("events.*"))), None),
             size,
-            levels,
+            clock_offset,
             contrast=self.contrast,
-            clock_offset_us=self.clock_offset_us,
             repair=self.repair,
         )
         notes += [*short_exposure(self.exposure_us), *([note] if note else [])]

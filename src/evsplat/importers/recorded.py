@@ -50,31 +50,32 @@ def recorded_camera(
     return {"K": K}, origin, note
 
 
-def levels_to_compare(
+def offset_or_levels(
     clock_offset_us: int | Literal["auto"], camera: dict[str, Any]
-) -> BlockLevels | None:
-    """What is to be gathered of the frames where the clock's offset is to be found; else None."""
-    if isinstance(clock_offset_us, str) and clock_offset_us != "auto":
+) -> int | BlockLevels:
+    """The clock's offset; where it is to be found, what is to be gathered of the frames for it."""
+    if not isinstance(clock_offset_us, str):
+        return clock_offset_us
+    if clock_offset_us != "auto":
         raise ConfigError(f"--clock-offset-us {clock_offset_us}: expected microseconds or auto.")
-    return BlockLevels(camera.get("transfer", "power")) if clock_offset_us == "auto" else None
+    return BlockLevels(camera.get("transfer", "power"))
 
 
 def add_recorded_events(
     writer: CaptureWriter,
     path: Path | None,
     size: tuple[int, int],
-    levels: BlockLevels | None,
+    clock_offset: int | BlockLevels,
     *,
     contrast: tuple[float, float] | None,
-    clock_offset_us: int | Literal["auto"],
     repair: bool,
 ) -> list[str]:
     """Write the events of a recording of any format; gives notes for the user.
 
-    ``levels`` are those of the frames where the clock's offset is "auto" (`levels_to_compare`).
+    ``clock_offset`` is in us, or the levels of the frames by which it is found.
     """
     if path is None:
-        of_events = {"contrast": contrast, "clock-offset-us": clock_offset_us, "repair": repair}
+        of_events = {"contrast": contrast, "clock-offset-us": clock_offset, "repair": repair}
         for name, value in of_events.items():
             if value:
                 raise ConfigError(f"--{name}: there are no events; give --events, or leave it out.")
@@ -92,20 +93,19 @@ def add_recorded_events(
     if not recording.has_polarity:
         return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
     passed, notes = _Passed(), []
-    if levels is not None:
-        clock_offset_us, note = _found_offset(levels, recording, path, size)
+    if isinstance(clock_offset, BlockLevels):
+        clock_offset, note = _found_offset(clock_offset, recording, path, size)
         notes.append(note)
-    assert clock_offset_us != "auto"
     writer.set_events(
         passed.watching(recording.chunks()),
         *size,
         contrast_threshold=contrast,
         simulated=False,
-        clock_offset_us=clock_offset_us,
+        clock_offset_us=clock_offset,
     )
     # Repairs are known once the events have been read.
     notes += recording.notes
-    return [*notes, *passed.notes(path, writer.exposed_us, clock_offset_us)]
+    return [*notes, *passed.notes(path, writer.exposed_us, clock_offset)]
 
 
 def _found_offset(

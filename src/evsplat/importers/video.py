@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from evsplat.calibration.offset import BlockLevels
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
 from evsplat.footage import open_footage
@@ -19,7 +20,7 @@ from evsplat.importers.option_types import (
     OwnRate,
     TimeUs,
 )
-from evsplat.importers.recorded import add_recorded_events, levels_to_compare, recorded_camera
+from evsplat.importers.recorded import add_recorded_events, offset_or_levels, recorded_camera
 from evsplat.options.declare import Flag
 from evsplat.pictures.files import to_unit_range
 
@@ -63,20 +64,19 @@ class Video(Importer):
         if self.transfer is not None:
             camera["transfer"] = self.transfer
         writer.add_camera("main", *size, **camera)
-        levels = levels_to_compare(self.clock_offset_us, camera)
+        clock_offset = offset_or_levels(self.clock_offset_us, camera)
         for timed in tqdm(footage, "pictures", len(footage.times_us), leave=False):
             middle = timed.time_us + self.start_us
             exposure = exposure_around(middle, self.exposure_us)
             writer.add_frame(timed.name, "main", timed.pixels, exposure)
-            if levels is not None:
-                levels.add(to_unit_range(timed.pixels), exposure)
+            if isinstance(clock_offset, BlockLevels):
+                clock_offset.add(to_unit_range(timed.pixels), exposure)
         notes = add_recorded_events(
             writer,
             self.events,
             size,
-            levels,
+            clock_offset,
             contrast=self.contrast,
-            clock_offset_us=self.clock_offset_us,
             repair=self.repair,
         )
         notes += [*short_exposure(self.exposure_us), *([note] if note else [])]

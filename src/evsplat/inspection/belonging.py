@@ -18,6 +18,7 @@ from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.inspection.figure import Coarse, Figure, grown, outlines
 from evsplat.inspection.movement import looked_at, movement, spread, stands
 from evsplat.inspection.search import DELAYS, NOW, REACH_PX, BestPlace, drawn, in_picture
+from evsplat.wording import counted
 
 Verdict = Literal["belongs", "off", "another", "unknown"]
 
@@ -145,9 +146,8 @@ class Belonging:
             sides = (("left of", right), ("right of", -right), ("above", down), ("below", -down))
             said = [f"{px:.0f} px {side}" for side, px in sides if px >= self.tolerance_px / 2]
         if abs(self.delay_frames) >= _OFF_FRAMES:
-            count = abs(self.delay_frames)
             side = "behind" if self.delay_frames > 0 else "ahead of"
-            said.append(f"{count:g} frame{'s' if count != 1 else ''} {side}")
+            said.append(f"{counted(abs(self.delay_frames), 'frame')} {side}")
         return " and ".join(said)
 
     @property
