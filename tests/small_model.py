@@ -1,11 +1,14 @@
 """Every method so small that a training step takes milliseconds."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from evsplat.capture import Capture, load_capture
 from evsplat.config import override
-from evsplat.methods import TRAINABLE, Composition, Purpose, method_config
+from evsplat.methods import TRAINABLE, Composition, Purpose, method_config, poses
 
 _PERSON = ("human.count=120", "densify.max_human=150")
 _NETWORKS = (
@@ -49,6 +52,12 @@ def small(method: str, *settings: str) -> tuple[str, ...]:
 def small_config(method: str, *settings: str) -> Any:
     """The configuration of the small ``method``."""
     return method_config(method, override({}, small(method, *settings)), where="test")
+
+
+def few_descent_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before training poses are drawn a little; tests/posing/test_refine.py asks how well."""
+    for how in ("refine", "judge"):
+        monkeypatch.setattr(poses, how, partial(getattr(poses, how), steps=(4, 4), discs=100))
 
 
 def built(

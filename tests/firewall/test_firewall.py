@@ -29,7 +29,7 @@ from evsplat.training.trainer import Trainer
 
 from ..masks.test_rvm import Counting, save_network
 from ..restore.test_networks import CHECKPOINTS
-from ..small_model import small_config
+from ..small_model import few_descent_steps, small_config
 from .scrambled import Recorded, recordings, scrambled, write_recorded
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")
@@ -90,7 +90,8 @@ def same(ours: dict[str, Tensor], others: dict[str, Tensor]) -> bool:
 @pytest.mark.parametrize("name", METHODS)
 @given(recorded=recordings(), noise=st.integers(0, 1_000))
 @few(max_examples=3)
-def test_two_training_steps_know_nothing_of_what_is_held_out(name, recorded, noise):
+def test_two_training_steps_know_nothing_of_what_is_held_out(name, recorded, noise, monkeypatch):
+    few_descent_steps(monkeypatch)
     method, assignments = METHODS[name]
     given_masks = method in ("avatar3dgs", "hugs") and "policy.masks=estimated" not in assignments
     with both(recorded, noise, masks=given_masks) as (path, noisy):

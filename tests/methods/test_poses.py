@@ -3,7 +3,6 @@
 import json
 import logging
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,7 +25,7 @@ from evsplat.training.trainer import Trainer
 
 from ..firewall.scrambled import scrambled
 from ..seen import seen
-from ..small_model import built, small_config
+from ..small_model import built, few_descent_steps, small_config
 
 SETTINGS = ("lamps=0", "most_renders=3", "event_start=0", "pose.start=0")
 
@@ -45,10 +44,7 @@ def with_errors(path: Path, **fields) -> None:
 
 @pytest.fixture(autouse=True)
 def _few_steps(monkeypatch):
-    """What is found before training is another test's (tests/posing/test_refine.py)."""
-    for how in ("refine", "judge"):
-        few = partial(getattr(poses, how), steps=(4, 4), discs=100)
-        monkeypatch.setattr(poses, how, few)
+    few_descent_steps(monkeypatch)
 
 
 @pytest.fixture
