@@ -49,7 +49,7 @@ def outputs(found: NetworkOutput) -> dict[str, np.ndarray]:
 
 
 def test_outputs_are_those_that_litert_gave(network):
-    found = outputs(network(demo_crop()[None]))
+    found = outputs(network(demo_crop()[None], mask=True))
     with np.load(REFERENCE) as expected:
         assert expected["flag"] > 0.9
         for name, largest in LARGEST.items():
@@ -75,7 +75,7 @@ def test_outputs_are_those_of_litert_on_people_and_on_noise(network):
             np.moveaxis(heat, -1, 1),
             world.reshape(1, 39, 3),
         )
-        found = outputs(network(picture[None]))
+        found = outputs(network(picture[None], mask=True))
         for name, values in expected.items():
             largest = max(1.0, np.abs(values).max())
             np.testing.assert_allclose(found[name], values, atol=1e-3 * largest)
@@ -83,10 +83,18 @@ def test_outputs_are_those_of_litert_on_people_and_on_noise(network):
 
 def test_pictures_in_a_batch_do_not_meet(network):
     person = demo_crop()
-    both = outputs(network(torch.stack((person, person.flip(1)))))
-    one = outputs(network(person.flip(1)[None]))
+    both = outputs(network(torch.stack((person, person.flip(1))), mask=True))
+    one = outputs(network(person.flip(1)[None], mask=True))
     for name, largest in LARGEST.items():
         np.testing.assert_allclose(both[name][1:], one[name], atol=1e-4 * largest)
+
+
+def test_what_is_found_does_not_depend_on_the_mask_being_asked_for(network):
+    picture = demo_crop()[None]
+    whole, without = network(picture, mask=True), network(picture)
+    assert without.mask is None
+    for name in LARGEST.keys() - {"mask"}:
+        assert torch.equal(getattr(without, name), getattr(whole, name))
 
 
 def test_same_padding_is_tensorflows():
@@ -100,13 +108,13 @@ def test_same_padding_is_tensorflows():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_outputs_are_the_same_on_cuda(network):
     picture = demo_crop()[None]
-    found, expected = outputs_of_cuda(picture), outputs(network(picture))
+    found, expected = outputs_of_cuda(picture), outputs(network(picture, mask=True))
     for name, largest in LARGEST.items():
         np.testing.assert_allclose(found[name], expected[name], atol=2e-3 * largest)
 
 
 def outputs_of_cuda(picture) -> dict[str, np.ndarray]:
-    found = LandmarkNetwork(device="cuda")(picture)
+    found = LandmarkNetwork(device="cuda")(picture, mask=True)
     return thinned(*(getattr(found, name).cpu() for name in LARGEST))
 
 
