@@ -102,6 +102,73 @@ def test_points_of_somebody_hardly_recognised_count_alike(middles, carried, beli
     np.testing.assert_allclose(_sigma(picture, found), expected)
 
 
+def somebody(flag: float, doubt: float = 0.0) -> Found:
+    """A person in a region of 100 pixels."""
+    nowhere = np.zeros((33, 3))
+    region = Region(np.zeros(2), 100.0)
+    return Found(nowhere[:, :2], np.full(33, 100 * doubt), np.ones(33), nowhere, flag, region)
+
+
+class Scripted(_Tracker):
+    """A tracker that finds what it is told, and notes where it looks."""
+
+    def __init__(self, followed: Found, searched: Found):
+        super().__init__(None, None)
+        self._followed, self._found = followed, searched
+        self.settled, self.searches = [], []
+
+    def settle(self, image, region):
+        self.settled.append(region)
+        return self._followed
+
+    def search_anew(self, picture):
+        self.searches.append(picture)
+        return self._found
+
+
+def test_one_picture_of_an_exposure_is_searched_for_somebody_lost(middles):
+    first, second = (
+        [replace(picture, time_us=picture.time_us + k) for k in range(3)] for picture in middles[:2]
+    )
+    weak, strong = somebody(0.6), somebody(0.8)
+    tracker = Scripted(weak, strong)
+    found = [tracker.find(picture) for picture in (*first, *second)]
+    assert tracker.searches == [first[0], second[0]]
+    assert found == [strong, weak, weak, strong, weak, weak]
+    # what was found with some belief is followed from picture to picture
+    follows = [region is strong.region for region in tracker.settled]
+    assert follows == [True, False, False, True, False]
+
+
+def test_somebody_seen_clearly_is_not_searched_for(middles):
+    tracker = Scripted(somebody(0.95, 0.012), somebody(0.99))
+    found = [tracker.find(picture) for picture in middles[:4]]
+    assert tracker.searches == middles[:1]
+    assert [person.flag for person in found] == [0.99, 0.95, 0.95, 0.95]
+
+
+def test_a_region_is_kept_where_nobody_is_believed_to_be(middles):
+    lost, seen = somebody(0.2), somebody(0.99)
+    tracker = Scripted(lost, seen)
+    tracker.find(middles[0])
+    tracker._found = lost
+    for picture in middles[1:4]:
+        assert tracker.find(picture) is lost
+    assert all(region is seen.region for region in tracker.settled)
+
+
+def test_doubtful_pictures_follow_from_better_ones_after_them(middles):
+    better, worse = somebody(0.97, 0.002), somebody(0.3)
+    for followed, expected in ((better, better), (worse, None)):
+        tracker = Scripted(followed, worse)
+        found = [somebody(0.9, 0.03), somebody(0.8), somebody(1.0, 0.01), somebody(0.7)]
+        before = list(found)
+        tracker.look_back(middles[:4], found)
+        # nothing comes after the last, and what comes after the third is worse than it
+        assert found[2:] == before[2:]
+        assert found[:2] == (before[:2] if expected is None else [expected, expected])
+
+
 def test_names_change_sides_in_a_mirror():
     for index, name in enumerate(BLAZEPOSE_33):
         other = BLAZEPOSE_33[MIRRORED[index]]

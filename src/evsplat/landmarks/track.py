@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.capture import TrainingCapture, coded
+from evsplat.capture import Frame, TrainingCapture, coded
 from evsplat.errors import DataError
-from evsplat.landmarks.detect import COPIES, Found, Region, find_in
+from evsplat.landmarks.detect import COPIES, LEAST_FLAG, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33, Landmarks
 from evsplat.landmarks.motion import Motion
 from evsplat.landmarks.network import LandmarkNetwork
@@ -26,7 +26,7 @@ from evsplat.landmarks.refusals import (
 logger = logging.getLogger(__name__)
 
 SURE = 0.9
-"""The person is tracked on from pictures with at least this flag, and searched for below it."""
+"""Below this flag the person is searched for; from it on, pictures before may follow."""
 HARDLY, _HARDLY_SIGMA = 0.5, 2.0
 """Belief in all points of somebody who is hardly recognised, and factor of their expected error: in
 kicks and flips most of them are near where they belong."""
@@ -35,7 +35,7 @@ _CARRIED, _CARRIED_SIGMA = 0.1, 4.0
 _TURNS = (0.0, np.pi / 2, -np.pi / 2, np.pi)
 """Uprights of a search: cartwheels and handstands are found by the last three."""
 _CLEAR = 0.008
-"""Beyond this doubt other uprights are tried."""
+"""Up to this doubt no other upright is tried."""
 _LOOKS = 2
 _FIRST_LOOKS = 6
 """Pictures in which somebody is searched for before all are read."""
@@ -112,17 +112,20 @@ class _Tracker:
     def __init__(self, network: LandmarkNetwork, motion: Motion) -> None:
         self._network, self._motion = network, motion
         self._last: Region | None = None
+        self._searched: Frame | None = None
 
     def find(self, picture: SharpPicture) -> Found:
-        """From the last region, turned otherwise where that is doubtful, or by a search."""
+        """From the last region, or by a search where that is doubtful.
+
+        Of an exposure one picture is searched: the others are near enough to follow from it.
+        """
         best = None if self._last is None else self.settle(picture.image, self._last)
-        if best is not None and best.is_person and not _is_clear(best):
-            around = Region(best.region.centre, best.region.side)
-            best = min(best, self.search(picture.image, [around]), key=_badness)
-        if best is None or best.flag < SURE:
+        if best is None or best.flag < SURE and picture.frame is not self._searched:
+            self._searched = picture.frame
             searched = self.search_anew(picture)
             best = searched if best is None else min(best, searched, key=_badness)
-        self._last = best.region if best.flag >= SURE else None
+        if self._last is None or best.flag >= LEAST_FLAG:
+            self._last = best.region
         return best
 
     def search_anew(self, picture: SharpPicture) -> Found:
@@ -130,36 +133,52 @@ class _Tracker:
         return self.search(picture.image, list(starts_of(self._motion, picture)))
 
     def look_back(self, pictures: Sequence[SharpPicture], found: list[Found]) -> None:
-        """Read doubtful pictures again in the regions of clear ones after them."""
+        """Read doubtful pictures again in the regions of better ones after them."""
         for index in range(len(found) - 2, -1, -1):
-            following = found[index + 1]
-            if _is_clear(following) and not _is_clear(found[index]):
+            here, following = found[index], found[index + 1]
+            if _is_clear(here) or following.flag < SURE:
+                continue
+            if _badness(following) < _badness(here):
                 again = self.settle(pictures[index].image, following.region)
-                found[index] = min(found[index], again, key=_badness)
+                found[index] = min(here, again, key=_badness)
 
     def search(self, image: Float[Tensor, "H W 3"], starts: Sequence[Region]) -> Found:
-        """The clearest person in any of the starts, upright, turned or upside down."""
+        """The clearest person in the first start that shows one; upright, turned or upside down."""
         best: Found | None = None
         for start in starts:
             for turn in _TURNS:
-                found = self.settle(image, start.turned(turn))
+                region, flag = self._approach(image, start.turned(turn))
+                if best is not None and flag < _LEAST_FOLLOWED:
+                    continue
+                found = find_in(self._network, image, region)
                 best = found if best is None else min(best, found, key=_badness)
                 if _is_clear(best):
                     return best
+            if best is not None and best.is_person:
+                return best
         assert best is not None
         return best
 
     def settle(self, image: Float[Tensor, "H W 3"], region: Region) -> Found:
-        """Read the region that follows from a first look, or from a second one where it is far."""
+        """The person in the region that follows from one that is near."""
+        return find_in(self._network, image, self._approach(image, region)[0])
+
+    def _approach(self, image: Float[Tensor, "H W 3"], region: Region) -> tuple[Region, float]:
+        """The region that follows from a first look, or from a second one where it is far.
+
+        And the belief of the last look that there is a person.
+        """
+        flag = 0.0
         for _ in range(_LOOKS):
             look = find_in(self._network, image, region, copies=COPIES[:1])
-            if look.flag < _LEAST_FOLLOWED or not 0.4 < look.region.side / region.side < 2.5:
+            flag = look.flag
+            if flag < _LEAST_FOLLOWED or not 0.4 < look.region.side / region.side < 2.5:
                 break
             near = _alike(region, look.region)
             region = look.region
             if near:
                 break
-        return find_in(self._network, image, region)
+        return region, flag
 
 
 def _is_clear(found: Found) -> bool:
