@@ -297,8 +297,8 @@ Vec shade(const Light& light, const ShadowMap& shadow, Vec albedo, Vec place, Ve
     float facing = dot(normal, to_eye);
     if (facing < 0) normal = -1.f * normal, facing = -facing;  // the inside of a garment
     const Vec away = vec(light.position.data()) - place;
-    const Vec to_light = unit(away);
-    float lamp = std::max((dot(normal, to_light) + light.wrap) / (1 + light.wrap), 0.f) * std::max(to_light.z, 0.f) /
+    const Vec to_light = unit(away), back = -1.f * vec(light.facing.data());
+    float lamp = std::max((dot(normal, to_light) + light.wrap) / (1 + light.wrap), 0.f) * std::max(dot(to_light, back), 0.f) /
                  (dot(away, away) + 1e-20f) * light.power;
     if (lamp > 0) lamp *= shadow.lit(place);
     const float gloss = light.specular * lamp * std::pow(std::max(dot(normal, unit(to_light + to_eye)), 0.f), light.shininess);

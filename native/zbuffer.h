@@ -44,9 +44,10 @@ struct Person {
     const uint8_t* alpha = nullptr;     // (height, width) of the atlas
 };
 
-// A lamp in the ceiling that shines down, light from all around, and how skin and cloth answer.
+// A flat lamp, light from all around, and how skin and cloth answer.
 struct Light {
     std::array<float, 3> position = {};
+    std::array<float, 3> facing = {0, 0, -1};  // the way it shines, of length 1
     float power = 0;
     std::array<float, 12> world_to_light = {};  // (3, 4), z away from the lamp
     float shadow_focal = 0, shadow_radius = 0;  // texels

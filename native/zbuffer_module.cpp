@@ -130,6 +130,7 @@ void evsplat::bind_zbuffer(nb::module_& m) {
     nb::class_<Light>(m, "Light", "A lamp, light from all around, and how surfaces answer; metres and texels.")
         .def(nb::init<>())
         .def_rw("position", &Light::position)
+        .def_rw("facing", &Light::facing)
         .def_rw("power", &Light::power)
         .def_rw("world_to_light", &Light::world_to_light)
         .def_rw("shadow_focal", &Light::shadow_focal)

@@ -217,7 +217,8 @@ def shade_person(light, shadow, albedo, place, normal, eye):
     power = 4 * light.lamp[3] * light.lamp[4] / np.pi * light.lamp_strength
     cosine = (normal * to_light).sum(-1)
     lamp = np.maximum((cosine + light.wrap) / (1 + light.wrap), 0)
-    lamp = lamp * np.maximum(to_light[:, 2], 0) / (away**2).sum(-1) * power * shadow.lit(place)
+    lamp *= np.maximum(-to_light @ light.facing, 0) / (away**2).sum(-1)
+    lamp *= power * shadow.lit(place)
     half = np.maximum((normal * unit(to_light + to_eye)).sum(-1), 0)
     gloss = light.specular * lamp * half**light.shininess
     above = (0.5 + 0.5 * normal[:, 2])[:, None]

@@ -10,6 +10,17 @@ from evsplat.staging.room import Lighting, Room
 
 WHITE = np.full((1, 16, 16, 3), 255, np.uint8)
 LAMP = (0.0, 0.0, 2.6, 0.5, 0.5)
+_PLACE, _AIM = np.array([1.1, -0.8, 2.3]), np.array([0.0, 0.0, 1.0])
+_WAY = (_AIM - _PLACE) / np.linalg.norm(_AIM - _PLACE)
+LIGHTS = {
+    "from above": Lighting(lamp=LAMP),
+    "aslant": Lighting(
+        lamp=(*_PLACE.tolist(), 0.5, 0.5),
+        facing=tuple(_WAY.tolist()),
+        shadow_way=tuple(_WAY.tolist()),
+    ),
+}
+"""A lamp in the ceiling and one that shines from the side."""
 AMBIENT_ONLY = Lighting(
     lamp=LAMP,
     lamp_strength=0.0,

@@ -151,6 +151,18 @@ class StageSettings:
     """Arc of an orbiting camera over the whole capture."""
     shadows: Annotated[Flag, option(name="shadow")] = True
     """Leave out the person's shadow on the room."""
+    lamp_azimuth_deg: Annotated[
+        float | None,
+        Within(-360, 360),
+        option("DEG", default="the ceiling lamp's, 22", name="lamp-azimuth"),
+    ] = None
+    """Where the lamp hangs, from the camera: 90 is at the right of the picture, 180 behind."""
+    lamp_elevation_deg: Annotated[
+        float | None,
+        Within(5, 90),
+        option("DEG", default="the ceiling lamp's, 56", name="lamp-elevation"),
+    ] = None
+    """Height of the lamp above the level of the person's middle."""
     brightness: Annotated[float, Within(0.01, 100), option("X")] = 1.0
     """Factor of all light."""
     events: Annotated[Sensor, option("SENSOR")] = "clean"

@@ -37,6 +37,7 @@ from evsplat.staging.camera import (
 )
 from evsplat.staging.character import Character, load_character
 from evsplat.staging.cloth import Cloth
+from evsplat.staging.lamp import in_light_of, lamp_at
 from evsplat.staging.motion import (
     cut_motion,
     height_m,
@@ -138,7 +139,7 @@ class _Film:
                 settings.camera, duration_s, orbit_deg=settings.orbit_deg, seed=settings.seed
             ),
             make_camera(MAIN, *settings.size),
-            StageRenderer(load_room(), character, threads=threads),
+            _renderer(settings, character, threads),
             cloth,
             times,
         )
@@ -273,6 +274,14 @@ class _Film:
             shadows=self.settings.shadows,
         )
         return pictures * np.float32(self.settings.brightness), masks
+
+
+def _renderer(settings: StageSettings, character: Character, threads: int | None) -> StageRenderer:
+    room, place = load_room(), (settings.lamp_azimuth_deg, settings.lamp_elevation_deg)
+    if place == (None, None):
+        return StageRenderer(room, character, threads=threads)
+    light = lamp_at(room, *place)
+    return StageRenderer(in_light_of(room, light), character, light, threads=threads)
 
 
 def _frame_count(settings: StageSettings, motion: SkeletonMotion) -> int:

@@ -13,7 +13,7 @@ from evsplat.untrusted.arrays import read_plain_npz
 
 _SHADOW_TEXELS = 640
 _SHADOW_FOCAL = 1 / 2.9
-"""Focal length of the shadow map over its side: 55 degrees to either side of straight down."""
+"""Focal length of the shadow map over its side: 55 degrees to either side of its middle."""
 _SHADOW_SOFTNESS = 0.016
 """Radius of the soft edge over the side of the shadow map."""
 _LEAN = (-0.12, 0.22, -1.0)
@@ -25,8 +25,13 @@ class Lighting:
     """Radiances relative to the room's baked light."""
 
     lamp: tuple[float, float, float, float, float]
-    """Centre of a lamp that shines down (metres) and half its extent along x and y."""
+    """Centre of a flat lamp (metres) and half its extent along its sides, which are x and y where
+    it shines down."""
     lamp_strength: float = 3.0
+    facing: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    """The way that the lamp shines, of length 1."""
+    shadow_way: tuple[float, float, float] = _LEAN
+    """The way that the shadow map looks; it sees 55 degrees to either side."""
     ambient_below: tuple[float, float, float] = (0.17, 0.15, 0.135)
     """Light from all around on what faces down."""
     ambient_above: tuple[float, float, float] = (0.24, 0.245, 0.25)
@@ -42,13 +47,18 @@ class Lighting:
     def shadow_view(self) -> Float[np.ndarray, "3 4"]:
         """World to the lamp's eye: x and y across, z away from the lamp."""
         eye = np.array(self.lamp[:3])
-        return look_at(eye, eye + np.array(_LEAN), up=(0, 1, 0))[:3]
+        return look_at(eye, eye + np.array(self.shadow_way), up=(0, 1, 0))[:3]
+
+    @property
+    def power(self) -> float:
+        """Light at 1 m straight before the lamp, on what faces it."""
+        return 4 * self.lamp[3] * self.lamp[4] / np.pi * self.lamp_strength
 
     def to_native(self) -> "native.Light":
         """Light as the renderer takes it."""
         light = native.Light()
-        light.position = self.lamp[:3]
-        light.power = 4 * self.lamp[3] * self.lamp[4] / np.pi * self.lamp_strength
+        light.position, light.facing = self.lamp[:3], self.facing
+        light.power = self.power
         light.world_to_light = self.shadow_view().ravel().tolist()
         light.shadow_size = _SHADOW_TEXELS
         light.shadow_focal = _SHADOW_TEXELS * _SHADOW_FOCAL
