@@ -53,8 +53,9 @@ def figures(run: Run, sheet: list[torch.Tensor]) -> dict[str, float]:
             continue
         picture = drawn.render(capture.camera(frame), [frame.mid_us]).rgb[0]
         truth = capture.sharp(frame)
-        values = {"mask": float(psnr(picture, truth, mask=mask > 0.5))}
-        for name, value in (values | chroma_psnr(picture, truth, mask > 0.5)).items():
+        person = person > 0.5
+        values = {"mask": float(psnr(picture, truth, mask=person))}
+        for name, value in (values | chroma_psnr(picture, truth, person)).items():
             found.setdefault(name, []).append(value)
     return {name: sum(values) / len(values) for name, values in found.items()}
 
