@@ -1,6 +1,7 @@
 """What the end of training decides where little was seen; pictures and learned values stay."""
 
 import copy
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from evsplat.capture import Policy, load_capture
 from evsplat.errors import DataError
 from evsplat.film.looks import Look
-from evsplat.models.discs.fill import _Pictures, _shade, _views, filled
+from evsplat.models.discs.fill import _beyond_shade, _Pictures, _shade, _views, filled
 from evsplat.models.discs.transparent import OFF_FROM_M, off_the_body
 from evsplat.models.drawing import draw
 from evsplat.models.seen import Seen, seen_by
@@ -122,6 +123,80 @@ def test_the_shade_is_the_darkest_fifth_in_the_mean_light_s_hue():
     tint = torch.tensor([1.2, 1.0, 0.8], dtype=torch.float64)
     shade = _shade(factors * tint, torch.ones(11, dtype=torch.float64))
     assert torch.allclose(shade, 0.7 * tint)
+
+
+def hang_lamp(model, way, share, distance_m=150.0):
+    """The first lamp in a direction, its shadow taking a share; no shadow of the others."""
+    with torch.no_grad():
+        model.lamps.directions[0] = way
+        model.lamps.distances_log.fill_(math.log(distance_m))
+        model.shadow.share_logits.fill_(-4.0)
+        model.shadow.share_logits[0] = torch.tensor(share).logit()
+
+
+def test_a_lamp_brightens_what_faces_it_as_its_shadow_darkens_the_floor(spoilt):
+    model = spoilt[0]
+    up = model.lamps.up
+    side = torch.linalg.cross(up, torch.tensor([0.3, 0.5, 0.8]))
+    side = side / side.norm()
+    hang_lamp(model, 0.8 * side + 0.6 * up, 0.3)
+    normals = torch.stack([up, side, -side, 0.8 * side + 0.6 * up])[None]
+    places = model.lamps.center.expand(1, 4, 3)
+    terms = model.surface_light().shading.terms(normals, places, model.lamps.places())[0]
+    behind = model.lamps.center - side
+    brighter = _beyond_shade(model, terms, 0.0, behind)
+    # the floor is 1 / (1 - 0.3) times as bright in the light as in the shade; linear light adds up
+    lit = 0.7**-2.2 - 1
+    expected = [1 + lit, 1 + lit * 0.8 / 0.6, 1, 1 + lit / 0.6]
+    assert brighter.tolist() == pytest.approx([value ** (1 / 2.2) for value in expected], rel=1e-3)
+    beside = model.lamps.center + side  # a camera that sees what that lamp does
+    assert torch.equal(_beyond_shade(model, terms, 0.0, beside), torch.ones(4))
+    hang_lamp(model, 0.8 * side + 0.6 * up, 0.1)
+    assert torch.equal(_beyond_shade(model, terms, 0.0, behind), torch.ones(4))
+
+
+def test_a_lamp_nearby_gives_the_person_more_than_the_floor_behind(spoilt):
+    model = spoilt[0]
+    lamps, up = model.lamps, model.lamps.up
+    side = torch.linalg.cross(up, torch.tensor([0.3, 0.5, 0.8]))
+    way = 0.6 * side / side.norm() + 0.8 * up
+    hang_lamp(model, way, 0.2, distance_m=2.0)
+    terms = model.surface_light().shading.terms(
+        way[None, None], lamps.center[None, None], lamps.places()
+    )[0]
+    # light over the floor 1 m below, where the lamp's ray through the middle meets it
+    floor = lamps.center - way / 0.8
+    apart = lamps.places()[0] - floor
+    on_floor = float((apart @ up / apart.norm() ** 3).detach())
+    lit = (0.8**-2.2 - 1) * (1 / 2.0**2) / on_floor
+    found = float(_beyond_shade(model, terms, 1.0, lamps.center - way).detach())
+    assert found == pytest.approx((1 + lit) ** (1 / 2.2), rel=1e-4)
+
+
+def test_a_lamp_behind_the_person_lights_the_back_that_nobody_saw(spoilt):
+    model, capture, seen = spoilt
+    camera = capture.camera(capture.train_frames[0])
+    to_camera = camera.center() - model.lamps.center
+    level = to_camera - (to_camera @ model.lamps.up) * model.lamps.up
+    level = level / level.norm()
+    with torch.no_grad():
+        model.shading.coefficients.zero_()
+    (layers, _), *_ = frames_of(model, capture)
+    mid = capture.train_frames[0].mid_us
+    normals = model.surface.normals(model.gaussians.means[model.gaussians.human])
+    turned = (layers.transforms[0, :, :3, :3] @ normals[..., None])[..., 0]
+    behind = turned @ level < -0.7
+    bright = {}
+    for name, way in (("before", level), ("behind", -level)):
+        hang_lamp(model, way + model.lamps.up, 0.4)
+        new = copy.deepcopy(model)
+        new.load_state_dict({**model.state_dict(), **filled(model, capture, 0.005, seen)})
+        with torch.no_grad():
+            bright[name] = new.light_terms(layers, mid)[1][0][behind].mean()
+    assert bool(behind.any())
+    assert bright["before"] == pytest.approx(1, abs=0.1)
+    # as far as what shines through the front, in the light of the front, lets it
+    assert bright["behind"] > bright["before"] + 0.02
 
 
 def test_nothing_is_decided_where_nobody_was_seen(spoilt):

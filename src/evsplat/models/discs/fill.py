@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
@@ -35,8 +36,19 @@ CALM = 0.000125
 """Weight of the squares of the light's numbers, the constant one apart, against the mean squared
 change of the factors that were seen."""
 SHADE, SHADE_WEIGHT = 0.2, 0.02
-"""What turns its back to a camera is lit like the darkest of what is seen, at this quantile: the
-side that is filmed is mostly the one in the light. The weight is against all that is seen."""
+"""What turns its back to a camera is lit like the darkest of what is seen, at this quantile, and
+besides by lamps that it faces (`_beyond_shade`). The weight is against all that is seen."""
+LEAST_SHARE = 0.12
+"""Of the scene's brightness that a lamp's shadow takes, as every lamp starts: those that no shadow
+tells of end below."""
+LEAST_HEIGHT = 0.35
+"""Sine of a lamp's height over the level, as what it gives the floor tells what it gives a wall."""
+BESIDE = 0.5
+"""Cosine between the ways to a lamp and to the camera from which on what the camera sees tells all
+that it does; one across the view or behind counts in full."""
+MOST_LIT = 2.0
+"""Times as bright as the shade, at most."""
+_GAMMA = 2.2
 _BACK = -0.1
 """Cosine to the camera under which a surface turns its back."""
 _FAST = 1e6
@@ -181,28 +193,67 @@ def _dim(model: DiscModel, views: Sequence[_View]) -> None:
     Linear in the light's numbers (`Shading.terms`), all colours at once.
     """
     assert model.shading is not None
-    terms, factors = [], []
+    terms, factors, lowest_m = [], [], 0.0
     for view in views:
         layers = _layers(model, view.frame, view.camera)
+        lowest_m = min(lowest_m, _lowest_m(model, layers))
         found = model.light_terms(layers, view.frame.mid_us)
         terms.append(found[0][0].double())
         factors.append(found[1][0].double())
     weights = torch.cat([view.weight for view in views]).double()
     total, away = weights.sum(), [view.away for view in views]
     rows = SHADE_WEIGHT * total / torch.stack(away).sum().clamp_min(1)
-    shade = _shade(torch.cat(factors), weights) - 1
+    shade = _shade(torch.cat(factors), weights)
     width = terms[0].shape[1]
     ridge = torch.full((width,), CALM, dtype=weights.dtype, device=weights.device) * total
     ridge[0] = 0.0  # the same light from everywhere
     squares, told = ridge.diag(), weights.new_zeros(width, 3)
     for view, term, factor, back in zip(views, terms, factors, away, strict=True):
         weighed = term * view.weight.double()[:, None]
-        squares += weighed.T @ term + rows * term[back].T @ term[back]
-        told += weighed.T @ (factor - 1) + rows * term[back].sum(0)[:, None] * shade
+        eye = view.camera.center()
+        brighter = _beyond_shade(model, term[back], -lowest_m, eye)[:, None]
+        # a brighter place may err by as much more
+        behind = rows * term[back] / brighter.square()
+        squares += weighed.T @ term + behind.T @ term[back]
+        told += weighed.T @ (factor - 1) + behind.T @ (brighter * shade - 1)
     numbers = torch.linalg.solve(squares, told).to(model.shading.coefficients)
     bent = model.shading.coefficients.flatten(0, 1)
     model.shading.coefficients.copy_(numbers[: len(bent)].view_as(model.shading.coefficients))
     model.shading.intensities.copy_(numbers[len(bent) :])
+
+
+def _lowest_m(model: DiscModel, layers: Layers) -> float:
+    """How high the person's lowest parts are over the middle of where they go, metres."""
+    if model.lamps is None:
+        return 0.0
+    heights = (layers.human.means[0] - model.lamps.center) @ model.lamps.up
+    return float(heights.sort().values[len(heights) // 100])
+
+
+def _beyond_shade(
+    model: DiscModel, terms: Float[Tensor, "N K"], floor_m: float, eye: Float[Tensor, "3"]
+) -> Float[Tensor, " N"]:
+    """How much brighter than in the shade places are by the lamps that they face, 1 and up.
+
+    A shadow on the floor tells what its lamp gives there against the light from all around, and so
+    what it gives nearer by, to places that nobody saw as well. ``terms`` are those of
+    `Shading.terms`, the lamps' the last; ``floor_m``: how far the floor lies below the person's
+    middle; ``eye``: the camera's place, for what lamps on its side do, it sees.
+    """
+    light, shadow, lamps = model.surface_light(), model.shadow, model.lamps
+    if light is None or light.lamps is None or shadow is None or lamps is None:
+        return terms.new_ones(len(terms))
+    shares = shadow.share_logits.sigmoid()
+    lit = ((1 - shares).pow(-_GAMMA) - 1) * (shares > LEAST_SHARE)
+    away = lamps.distances()
+    ways = (lamps.places() - lamps.center) / away[:, None]
+    beside = normalize(eye - lamps.center, dim=0)
+    lit = lit * (1 - ways @ beside / BESIDE).clamp(0, 1)
+    height = (ways @ lamps.up).clamp_min(LEAST_HEIGHT)
+    # from the lamp through the person's middle on to the floor, against to the middle
+    farther = 1 + floor_m / (away * height)
+    each = (lit * farther.square() / height).to(terms)
+    return (1 + terms[:, -len(each) :] @ each).pow(1 / _GAMMA).clamp(max=MOST_LIT)
 
 
 def _shade(factors: Float[Tensor, "N 3"], weights: Float[Tensor, " N"]) -> Float[Tensor, "3"]:

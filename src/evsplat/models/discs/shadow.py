@@ -23,6 +23,7 @@ class Lamps(nn.Module):
     """
 
     center: Tensor
+    up: Tensor
 
     def __init__(self, center: Float[Tensor, "3"], up: Float[Tensor, "3"], count: int) -> None:
         """They start around the zenith, 35 degrees from it, but the first which is there.
@@ -31,6 +32,7 @@ class Lamps(nn.Module):
         """
         super().__init__()
         self.register_buffer("center", center.clone())
+        self.register_buffer("up", up.clone(), persistent=False)
         side = torch.linalg.cross(up, torch.eye(3)[int(up.abs().argmin())])
         side = nn.functional.normalize(side, dim=0)
         other = torch.linalg.cross(up, side)
