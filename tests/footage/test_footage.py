@@ -10,6 +10,7 @@ from PIL import Image
 
 from evsplat.errors import ConfigError, DataError
 from evsplat.footage import open_footage
+from evsplat.untrusted.pictures import image_size
 
 
 def write_video(path: Path, pictures: np.ndarray, stamps: list[int], rate: int = 1000) -> None:
@@ -93,6 +94,16 @@ def test_a_picture_is_turned_as_its_camera_was_held(tmp_path, orientation, suffi
     expected = UPRIGHT[orientation](stored)
     assert (footage.height, footage.width) == expected.shape[:2] == read.shape[:2]
     assert np.abs(read.astype(int) - expected).max() <= (0 if suffix == ".webp" else 3)
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".jpg"])
+def test_the_size_of_a_picture_that_is_upright_needs_no_pixels(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(np.kron(some_pictures(1)[0], np.ones((8, 8, 1), np.uint8))).save(path)
+    height, width = np.asarray(Image.open(path)).shape[:2]
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-200] + bytes(200))
+    assert image_size(path) == (width, height)
 
 
 def test_given_rate_replaces_the_times_of_a_slow_motion_file(tmp_path):

@@ -7,7 +7,7 @@ from typing import TypeVar
 import av
 import numpy as np
 from jaxtyping import UInt16
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from evsplat.errors import DataError
 from evsplat.untrusted.faults import BROKEN, ordinary_file, reason
@@ -50,7 +50,8 @@ def read_picture(
 
 
 def _upright(image: Image.Image) -> Image.Image:
-    if image.format in _OF_CAMERAS:
+    # Turning decodes the pixels, even where nothing is to be turned.
+    if image.format in _OF_CAMERAS and image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
         ImageOps.exif_transpose(image, in_place=True)
     return image
 
