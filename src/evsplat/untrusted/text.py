@@ -55,8 +55,7 @@ def parse_json(text: str) -> Any:
 def parse_yaml(text: str) -> Any:
     """The value that a YAML text stands for; all that can be wrong with it is a `ValueError`."""
     try:
-        _check_yaml(text)
-        return yaml.load(text, Loader=_EachKeyOnce)
+        return yaml.load(text, Loader=_Guarded)
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from None
     except RecursionError:
@@ -67,8 +66,41 @@ def parse_yaml(text: str) -> Any:
         raise ValueError("a tag that its value does not fit") from None
 
 
-class _EachKeyOnce(yaml.SafeLoader):
-    """Values and nothing run; of a key that is there twice neither is taken silently."""
+class _Guarded(yaml.SafeLoader):
+    """Values and nothing run; of a key that is there twice neither is taken silently.
+
+    What is nested too deeply, or grows without end through aliases, is refused on the way: nodes
+    come one by one, so that a text of brackets costs no more than its first few.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        super().__init__(stream)
+        self._nodes = self._deep = 0
+        self._sizes: dict[str, int | None] = {}
+        """Of the collections with an anchor; None while one is open."""
+
+    def compose_node(self, parent: Any, index: Any) -> yaml.Node | None:
+        event, start = self.peek_event(), self._nodes
+        self._nodes += 1
+        if isinstance(event, yaml.AliasEvent):
+            size = self._sizes.get(event.anchor or "", 0)
+            if size is None:
+                raise ValueError(f"*{event.anchor} is a part of itself")
+            self._nodes += size
+        if self._nodes > _MOST_NODES:
+            raise ValueError(f"more than {_MOST_NODES} values")
+        if not isinstance(event, yaml.CollectionStartEvent):
+            return super().compose_node(parent, index)
+        if self._deep == _DEEPEST:
+            raise ValueError(f"nested more than {_DEEPEST} deep")
+        if event.anchor:
+            self._sizes[event.anchor] = None
+        self._deep += 1
+        node = super().compose_node(parent, index)
+        self._deep -= 1
+        if event.anchor:
+            self._sizes[event.anchor] = self._nodes - start
+        return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
@@ -81,30 +113,3 @@ class _EachKeyOnce(yaml.SafeLoader):
                 raise yaml.YAMLError(f"line {line}: the key {brief(key.value)} for the second time")
             found.add(key.value)
         return node
-
-
-def _check_yaml(text: str) -> None:
-    """Refuse what is nested too deeply, or grows without end through aliases.
-
-    Its events come one by one, so that a text of brackets costs no more than its first few.
-    """
-    nodes, open_nodes, sizes = 0, list[tuple[str | None, int]](), dict[str, int | None]()
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        if isinstance(event, yaml.CollectionEndEvent):
-            anchor, start = open_nodes.pop()
-            sizes |= {anchor: nodes - start} if anchor else {}
-        elif isinstance(event, yaml.AliasEvent):
-            size = sizes.get(event.anchor or "", 0)
-            if size is None:
-                raise ValueError(f"*{event.anchor} is a part of itself")
-            nodes += size + 1
-        elif isinstance(event, yaml.CollectionStartEvent):
-            open_nodes.append((event.anchor, nodes))
-            sizes |= {event.anchor: None} if event.anchor else {}
-            nodes += 1
-        else:
-            nodes += 1
-        if len(open_nodes) > _DEEPEST:
-            raise ValueError(f"nested more than {_DEEPEST} deep")
-        if nodes > _MOST_NODES:
-            raise ValueError(f"more than {_MOST_NODES} values")
