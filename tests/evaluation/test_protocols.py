@@ -19,6 +19,7 @@ from evsplat.evaluation.protocols import (
     all_absent,
 )
 from evsplat.evaluation.regions import Absent, Box, mask_box
+from evsplat.similarity.psnr_ssim import ssim_map
 
 NO_NETWORKS = dict.fromkeys(METRICS[2:], Absent("no weights"))
 
@@ -111,6 +112,31 @@ def test_without_a_mask_the_mask_region_says_so(protocol):
     measured = measure(protocol, truth, render, None, box)
     assert "no person mask" in measured["person_mask"]["psnr"].reason
     assert isinstance(measured["person_crop"]["psnr"], float)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS, ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "place", [(10, 34, 5, 25), (0, 18, 0, 60), (28, 40, 44, 60)], ids=["inside", "top", "corner"]
+)
+def test_similarity_of_parts_is_bit_for_bit_that_of_their_pixels_alone(protocol, place):
+    """The person's windows are taken out of the picture's, and black ones are not computed."""
+    top, bottom, left, right = place
+    truth, render, _, _ = scene(5)
+    mask = np.zeros((40, 60), dtype=bool)
+    mask[top:bottom, left:right] = (
+        np.random.default_rng(6).random((bottom - top, right - left)) > 0.4
+    )
+    box = mask_box(torch.from_numpy(mask))
+    measured = measure(protocol, truth, render, mask, box)
+    tight = protocol.crop == "tight"
+    box = box.without_last() if tight else box.enlarged(0.1, 40, 60)
+    seen = np.round(render.clip(0, 1) * 255) / 255 if protocol.eight_bit else render
+    alone = {"person_crop": (box.crop(seen), box.crop(truth))}
+    if protocol.mask == "blackened":
+        alone["person_mask"] = seen * mask[..., None], truth * mask[..., None]
+    for region, pictures in alone.items():
+        windows = ssim_map(*map(torch.from_numpy, pictures), protocol.ssim)
+        assert measured[region]["ssim"] == float(windows.mean())
 
 
 def test_a_crop_smaller_than_the_window_has_psnr_only():

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from evsplat.evaluation.regions import CROP_MARGIN, Absent, Box
+from evsplat.evaluation.regions import CROP_MARGIN, Absent, Box, mask_box
 from evsplat.similarity.perceptual import Features, PerceptualMetric
 from evsplat.similarity.psnr_ssim import (
     GAUSSIAN_SSIM,
@@ -22,6 +22,7 @@ from evsplat.similarity.psnr_ssim import (
     SsimReference,
     psnr,
     psnr_channel_mean,
+    ssim_map,
 )
 
 REGIONS = ("full", "person_crop", "person_mask")
@@ -132,13 +133,14 @@ class Truth:
     def measure(self, image: Float[Tensor, "H W 3"]) -> Measured:
         """Every metric of every region; ``image`` is sRGB in [0, 1]."""
         image = self._prepared(image)
+        whole = self._full.similarity(image)
         result: Measured = {}
         for region in REGIONS:
             part = self._regions[region]
             result[region] = (
                 dict.fromkeys(METRICS, part)
                 if isinstance(part, Absent)
-                else part.measure(part.cut(image))
+                else part.measure(part.cut(image), whole)
             )
         return result
 
@@ -148,9 +150,12 @@ class Truth:
         return eight_bit(image) if self.protocol.eight_bit else image
 
     @cached_property
+    def _full(self) -> "_Region":
+        return _Region(self.protocol, self._prepared(self.image), self.networks)
+
+    @cached_property
     def _regions(self) -> dict[str, "_Region | Absent"]:
-        truth = self._prepared(self.image)
-        full = _Region(self.protocol, truth, self.networks)
+        full, truth = self._full, self._full.truth
         return {"full": full, "person_crop": self._crop(truth), "person_mask": self._masked(truth)}
 
     def _crop(self, truth: Float[Tensor, "H W 3"]) -> "_Region | Absent":
@@ -192,19 +197,58 @@ class _Region:
             return image * self.blacken[..., None]
         return image if self.box is None else self.box.crop(image)
 
-    def measure(self, image: Float[Tensor, "h w 3"]) -> dict[str, Value]:
+    def measure(
+        self, image: Float[Tensor, "h w 3"], whole: Float[Tensor, "3 H W"] | Absent
+    ) -> dict[str, Value]:
+        """Every metric of the region; ``whole`` is the `similarity` of the whole pictures."""
         values: dict[str, Value] = {"psnr": self._psnr(image)}
         if self.pixels is not None:
             reason = Absent("only PSNR is defined for single pixels; see person_crop")
             return values | dict.fromkeys(METRICS[1:], reason)
-        try:
-            values["ssim"] = float(self._ssim_truth.map(image).mean())
-        except ValueError as error:
-            values["ssim"] = Absent(str(error))
+        windows = self._windows(image, whole)
+        values["ssim"] = windows if isinstance(windows, Absent) else float(windows.mean())
         seen = image.clamp(max=1.0) if self.protocol.perceptual_clip else image
         for name in METRICS[2:]:
             values[name] = self._distance(name, seen)
         return values
+
+    def similarity(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 y x"] | Absent:
+        """Structural similarity in each window; Absent where none fits into the region."""
+        try:
+            return self._ssim_truth.map(image)
+        except ValueError as error:
+            return Absent(str(error))
+
+    def _windows(
+        self, image: Float[Tensor, "h w 3"], whole: Float[Tensor, "3 H W"] | Absent
+    ) -> Float[Tensor, "3 y x"] | Absent:
+        """As `similarity`, out of that of the whole pictures where it is the same there."""
+        settings = self.protocol.ssim
+        if self.blacken is not None and settings.padding == "zero":
+            return self._around(image, self.blacken)
+        if self.box is None and self.blacken is None:
+            return whole
+        inside = settings.padding == "valid" and min(image.shape[:2]) >= settings.size
+        if self.box is None or isinstance(whole, Absent) or not inside:
+            return self.similarity(image)
+        # Windows inside the box are windows of the picture; in one piece, as sums depend on that.
+        box, last = self.box, settings.size - 1
+        return whole[:, box.top : box.bottom - last, box.left : box.right - last].contiguous()
+
+    def _around(
+        self, image: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]
+    ) -> Float[Tensor, "3 h w"]:
+        """As `similarity` of pictures that are black elsewhere: black windows are alike."""
+        settings, (height, width) = self.protocol.ssim, seen.shape
+        box = mask_box(seen)
+        assert box is not None  # regions without a pixel are absent
+        reach = settings.size // 2
+        box = box.wider(reach, reach, height, width)
+        windows = image.new_ones(image.shape[2], height, width)
+        windows[:, box.top : box.bottom, box.left : box.right] = ssim_map(
+            box.crop(image), box.crop(self.truth), settings
+        )
+        return windows
 
     def _psnr(self, image: Float[Tensor, "h w 3"]) -> float:
         if self.pixels is not None:

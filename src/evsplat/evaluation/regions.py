@@ -42,6 +42,10 @@ class Box:
         """Wider by ``margin`` of its extent on each side, whole pixels, clipped to the picture."""
         rows = int(margin * (self.bottom - self.top))
         columns = int(margin * (self.right - self.left))
+        return self.wider(rows, columns, height, width)
+
+    def wider(self, rows: int, columns: int, height: int, width: int) -> "Box":
+        """Wider by so many rows and columns on each side, clipped to the picture."""
         return Box(
             max(self.top - rows, 0),
             min(self.bottom + rows, height),

@@ -106,22 +106,27 @@ class SsimReference:
             raise ValueError(f"the {settings.size}-pixel window is larger than the image")
         x, y = image.movedim(-1, 0), self.picture.movedim(-1, 0)
         mean_x, mean_xx, mean_xy = self._means(x, x * x, x * y)
-        mean_y, mean_yy = self._moments
-        count = settings.size**2
-        unbias = count / (count - 1) if settings.sample_covariance else 1.0
-        variance_x = unbias * (mean_xx - mean_x**2)
-        variance_y = unbias * (mean_yy - mean_y**2)
-        covariance = unbias * (mean_xy - mean_x * mean_y)
+        mean_y, square_y, variance_y = self._moments
+        square_x = mean_x**2
+        variance_x = self._unbiased(mean_xx - square_x)
+        covariance = self._unbiased(mean_xy - mean_x * mean_y)
         c1, c2 = settings.stabilisers
-        luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+        luminance = (2 * mean_x * mean_y + c1) / (square_x + square_y + c1)
         structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
         return luminance * structure
 
     @cached_property
     def _moments(self) -> tuple[Float[Tensor, "C h w"], ...]:
-        """Means of the picture and of its square in each window."""
+        """The picture's mean, its square, and the picture's variance in each window."""
         y = self.picture.movedim(-1, 0)
-        return self._means(y, y * y)
+        mean, mean_yy = self._means(y, y * y)
+        square = mean**2
+        return mean, square, self._unbiased(mean_yy - square)
+
+    def _unbiased(self, moments: Float[Tensor, "C h w"]) -> Float[Tensor, "C h w"]:
+        """Of a sample where the settings ask for it."""
+        count = self.settings.size**2
+        return count / (count - 1) * moments if self.settings.sample_covariance else moments
 
     def _means(self, *values: Float[Tensor, "C H W"]) -> tuple[Float[Tensor, "C h w"], ...]:
         """Weighted means in each window."""
@@ -142,18 +147,27 @@ def _smooth(planes: Float[Tensor, "C H W"], settings: Ssim, pad: int) -> Float[T
 
 
 def _shifted_sums(
-    planes: Float[Tensor, "C H W"], settings: Ssim, pad: int
-) -> Float[Tensor, "C h w"]:
+    plane: Float[Tensor, "1 H W"], settings: Ssim, pad: int
+) -> Float[Tensor, "1 h w"]:
+    """Weighted means in each window of one plane.
+
+    Its rows are taken as one line, on which sums are fastest; what reaches over the end of a row is
+    left out.
+    """
     size, kernel = settings.size, _window(settings)
-    padded = F.pad(planes, (pad, pad, pad, pad)) if pad else planes
-    rows, columns = padded.shape[1] - size + 1, padded.shape[2] - size + 1
-    down = kernel[0] * padded[:, :rows]
+    padded = F.pad(plane, (pad, pad, pad, pad)) if pad else plane
+    _, height, width = padded.shape
+    line = padded.reshape(-1)
+    count = (height - size + 1) * width
+    down = kernel[0] * line[:count]
     for k in range(1, size):
-        down.add_(padded[:, k : k + rows], alpha=kernel[k])
-    across = kernel[0] * down[:, :, :columns]
+        down.add_(line[k * width : k * width + count], alpha=kernel[k])
+    whole = count - size + 1
+    across = kernel[0] * down[:whole]
     for k in range(1, size):
-        across.add_(down[:, :, k : k + columns], alpha=kernel[k])
-    return across
+        across.add_(down[k : k + whole], alpha=kernel[k])
+    rows, columns = height - size + 1, width - size + 1
+    return across.as_strided((1, rows, columns), (whole, width, 1))
 
 
 def ssim(
