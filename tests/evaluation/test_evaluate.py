@@ -162,6 +162,18 @@ def test_the_true_motion_explains_the_events_and_a_still_picture_does_not(tiny_c
     assert all(pair["similarity"] is None for pair in pairs)
 
 
+def test_frames_of_event_pairs_are_drawn_once(tiny_capture, tmp_path):
+    capture = load_capture(tiny_capture(frames=20, width=48, height=40))
+    source, drawn = TruthWithNoise(capture), []
+    picture = source._picture
+    source._picture = lambda camera, time: drawn.append((camera, time)) or picture(camera, time)
+    pairs = evaluate(capture, source, out_dir=tmp_path)["events"]["pairs"]
+    frames = {name for pair in pairs for name in pair["frames"]}
+    frames |= {frame.name for frame in capture.test_frames}
+    assert len(frames) < 2 * len(pairs)
+    assert len(drawn) == len(frames) + len(capture.novel_views)
+
+
 def test_event_pairs_hold_every_test_frame_and_some_of_training_only(tiny_capture):
     capture = load_capture(tiny_capture(frames=30))
     pairs = chosen_pairs(capture)

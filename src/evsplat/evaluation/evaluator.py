@@ -15,7 +15,7 @@ from tqdm import tqdm
 from evsplat.capture import Capture, Frame, Policy, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.evaluation.chroma import chroma_psnr
-from evsplat.evaluation.event_maps import drawn, evaluate_event_maps
+from evsplat.evaluation.event_maps import DrawnFrames, drawn, evaluate_event_maps
 from evsplat.evaluation.protocols import (
     METRICS,
     PROTOCOLS,
@@ -92,9 +92,11 @@ def evaluate(
     networks, weights = _load_networks(lpips_weights, device)
     protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
     human_regions = HumanRegions(capture)
+    drawn_frames = DrawnFrames(capture, reconstruction)
     measured = _MeasuredFrames(
         capture,
         reconstruction,
+        drawn_frames,
         protocols,
         networks,
         human_regions,
@@ -119,7 +121,7 @@ def evaluate(
         )
         events: dict[str, Any] | Absent = Absent("they are measured with the test frames")
         if split == "test":
-            events = evaluate_event_maps(capture, reconstruction, out_dir=out_dir)
+            events = evaluate_event_maps(capture, drawn_frames, out_dir=out_dir)
         result["events"] = None if isinstance(events, Absent) else events
         if isinstance(events, Absent):
             reasons["events"] = events.reason
@@ -157,6 +159,8 @@ class _MeasuredFrames:
 
     capture: Capture
     reconstruction: Reconstruction
+    drawn: DrawnFrames
+    """Those of the reconstruction."""
     protocols: Sequence[Protocol]
     """`STANDARD` comes first; the report shows its figures of every frame and row."""
     networks: Networks
@@ -188,7 +192,7 @@ class _MeasuredFrames:
 
     def measure(self, frame: Frame) -> None:
         """Measure one frame and write its pictures."""
-        ours = _render(self.capture, self.reconstruction, frame)
+        ours = self.drawn(frame)
         mask, human = self.human_regions.in_frame(frame)
         self._seen |= not isinstance(human, Absent)
         truth = None if frame.sharp is None else self.capture.sharp(frame)

@@ -13,26 +13,44 @@ from evsplat.events import count_map
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.names import file_stem
 from evsplat.pictures import signed_map
-from evsplat.pictures.files import save_png
+from evsplat.pictures.files import ImageCache, save_png
 from evsplat.pictures.light import log_brightness_change
 
 _TRAIN_PAIRS_SHOWN = 3
+_KEPT_BYTES = 64 << 20
+"""Of drawn frames: a frame is measured, and drawn in up to two pairs."""
+
+
+class DrawnFrames:
+    """Frames as a reconstruction draws their mid-exposures, sRGB; the last ones are kept."""
+
+    def __init__(self, capture: Capture, reconstruction: Reconstruction) -> None:
+        self._capture, self._reconstruction = capture, reconstruction
+        self._kept = ImageCache(_KEPT_BYTES)
+
+    def __call__(self, frame: Frame) -> Float[Tensor, "H W 3"]:
+        """One frame; not to be written to."""
+        return torch.from_numpy(self._kept.get(frame.name, lambda: self._drawn(frame).numpy()))
+
+    def _drawn(self, frame: Frame) -> Float[Tensor, "H W 3"]:
+        return drawn(self._reconstruction, self._capture.camera(frame), frame.mid_us)
 
 
 def evaluate_event_maps(
-    capture: Capture, reconstruction: Reconstruction, *, out_dir: Path
+    capture: Capture, frames: DrawnFrames, *, out_dir: Path
 ) -> dict[str, Any] | Absent:
     """Similarity and pictures of frame pairs: one per test frame and a few training pairs.
 
     Events between training frames are input of the training, those around test frames only where
-    the policy shows them; the rendered maps show whether the reconstruction explains them.
+    the policy shows them; the rendered maps show whether the reconstruction, as it draws
+    ``frames``, explains them.
     """
     absent = _missing_input(capture)
     if absent is not None:
         return absent
     pairs: list[dict[str, Any]] = []
     for before, after in chosen_pairs(capture):
-        given, rendered = _maps(capture, reconstruction, before, after)
+        given, rendered = _maps(capture, frames, before, after)
         stem = file_stem("events", before.name, after.name)
         # The brightest percent would make the rest invisible; both maps get the same scale.
         busy = given[given != 0].abs()
@@ -74,7 +92,7 @@ def _missing_input(capture: Capture) -> Absent | None:
 
 
 def _maps(
-    capture: Capture, reconstruction: Reconstruction, before: Frame, after: Frame
+    capture: Capture, frames: DrawnFrames, before: Frame, after: Frame
 ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
     """Events per pixel, with their sign, between two mid-exposures: recorded and rendered.
 
@@ -83,12 +101,8 @@ def _maps(
     assert capture.events is not None
     stream = capture.events.between(before.mid_us, after.mid_us)
     given = count_map(stream, capture.events.height, capture.events.width)
-    first, second = (
-        drawn(reconstruction, capture.camera(frame), frame.mid_us) for frame in (before, after)
-    )
-    change = log_brightness_change(
-        first.clamp(0, 1), second.clamp(0, 1), transfer=capture.transfer(before)
-    ).float()
+    first, second = (frames(frame).clamp(0, 1) for frame in (before, after))
+    change = log_brightness_change(first, second, transfer=capture.transfer(before)).float()
     return given, change / _threshold(capture, given, change)
 
 
