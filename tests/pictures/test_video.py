@@ -40,6 +40,28 @@ def test_video_has_the_pictures_rate_and_even_size(tmp_path, fps, height, width)
         assert np.abs(decoded.astype(int).mean((0, 1)) - picture[0, 0]).max() < 4
 
 
+@pytest.mark.parametrize("enlarged", [2, 3, 4])
+def test_enlarged_pixels_are_squares_of_their_colour(tmp_path, enlarged):
+    """Every pixel another colour, which yuv420p would mix with its neighbours'."""
+    rng = np.random.default_rng(enlarged)
+    picture = rng.integers(30, 226, size=(8, 12, 3), dtype=np.uint8)
+    path = tmp_path / "out.mp4"
+    assert write_video(path, [picture] * 2, fps=25, crf=1, enlarged=enlarged) == 2
+    with av.open(str(path)) as container:
+        planes = next(container.decode(video=0)).to_ndarray()
+    frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
+        format="yuv444p", dst_colorspace="ITU709", dst_color_range=1
+    )
+    y, *colours = frame.to_ndarray().astype(int)
+    height = 8 * enlarged
+    assert np.abs(planes[:height] - np.kron(y, np.ones((enlarged, enlarged)))).max() <= 3
+    # Of an odd factor every other Cb and Cr stands for two pixels.
+    for colour, plane in zip(colours, np.split(planes[height:].ravel(), 2), strict=True):
+        each = np.kron(colour, np.ones((enlarged, enlarged)))[::2, ::2]
+        apart = np.abs(plane.reshape(each.shape) - each)
+        assert np.quantile(apart, 1 if enlarged % 2 == 0 else 0.25) <= 3
+
+
 def test_frame_rate_1000_over_1001_is_kept_exactly(tmp_path):
     write_video(tmp_path / "out.mp4", _flat_pictures(2, 16, 16), fps=30000 / 1001)
     with av.open(str(tmp_path / "out.mp4")) as container:

@@ -25,12 +25,14 @@ def write_video(
     fps: float,
     crf: int = 16,
     preset: str = "medium",
+    enlarged: int = 1,
 ) -> int:
     """Encode sRGB pictures as an mp4 (H.264, yuv420p, BT.709) and return how many there were.
 
     Odd sizes are made even by repeating the last row or column, as yuv420p asks for. ``fps`` is
     the playing speed in pictures per second; ``crf`` is x264's quality, lower is better (16 is
-    hard to tell from the original), ``preset`` its effort.
+    hard to tell from the original), ``preset`` its effort. Each pixel is shown ``enlarged`` times
+    as wide and as high, so that small pictures stay sharp and keep their colours.
     """
     import av
 
@@ -44,12 +46,12 @@ def write_video(
         )
     with atomic_path(path) as temporary:
         container = av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"})
-        even = map(_even, pictures)
+        even = pictures if enlarged % 2 == 0 else map(_even, pictures)
         options = {"crf": str(crf), "preset": preset}
         if torch.backends.cpu.get_cpu_capability() == "AVX512":
             # With AVX-512 the macroblock tree of PyAV's x264 differs from run to run.
             options["x264-params"] = "asm=avx2"
-        count = _encode(container, "libx264", even, fps, "ITU709", **options)
+        count = _encode(container, "libx264", even, fps, "ITU709", enlarged, **options)
         if not count:
             raise DataError(f"{path}: there is no picture to write.")
     return count
@@ -61,6 +63,7 @@ def _encode(
     pictures: Iterable[UInt8[np.ndarray, "H W C"]],
     fps: float,
     colours: str,
+    enlarged: int = 1,
     **options: str,
 ) -> int:
     """Encode RGB or RGBA pictures into an open container and close it; gives their number."""
@@ -72,7 +75,7 @@ def _encode(
             opaque = picture.shape[2] == 3
             if stream is None:
                 stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
-                stream.height, stream.width = picture.shape[:2]
+                stream.height, stream.width = (enlarged * side for side in picture.shape[:2])
                 stream.pix_fmt = "yuv420p" if opaque else "yuva420p"
                 stream.options = options
                 if colours == "ITU709":
@@ -80,9 +83,16 @@ def _encode(
                     context.colorspace = context.color_primaries = context.color_trc = _BT709
                     context.color_range = _LIMITED_RANGE
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24" if opaque else "rgba")
+            # Enlarged when each pixel has its own Cb and Cr: a fraction of the values to convert.
             frame = frame.reformat(
-                format=stream.pix_fmt, dst_colorspace=colours, dst_color_range=_LIMITED_RANGE
+                format=stream.pix_fmt if enlarged == 1 else "yuv444p",
+                dst_colorspace=colours,
+                dst_color_range=_LIMITED_RANGE,
             )
+            if enlarged > 1:
+                frame = frame.reformat(
+                    stream.width, stream.height, stream.pix_fmt, interpolation="POINT"
+                )
             frame.pts = count
             container.mux(stream.encode(frame))
             count += 1

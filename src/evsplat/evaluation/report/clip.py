@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ _LONGEST_SECONDS = 8.0
 _TIMES_AT_ONCE = 8
 _WIDE = 640
 """Small pictures are enlarged by whole factors up to this width, so that pixels stay pixels."""
+_LINE = 4
+"""Width of the white line between the halves in the video, where whole pixels give it."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,16 @@ def make_clip(capture: Capture, reconstruction: Reconstruction) -> Clip | None:
     else:
         count = round(min(shown_us / 1e6 * _SLOWER, _LONGEST_SECONDS) * _PLAYED_HZ)
         times = [round(float(t)) for t in np.linspace(first, last, max(2, count))]
+    camera = capture.cameras[camera_name]
+    factor = max(1, _WIDE // camera.width)
+    # Of an odd factor an even number of columns, as the video's width has to be even.
+    line_px = max(2 if factor % 2 else 1, _LINE // factor)
+    line = np.full((camera.height, line_px, 3), 255, np.uint8)
     played_hz = min(_PLAYED_HZ, max(2.0, len(times) / (shown_us / 1e6 * _SLOWER)))
+
+    @lru_cache(maxsize=1)
+    def recorded(name: str) -> UInt8[np.ndarray, "H W 3"]:
+        return to_bytes(capture.shown(capture.image(name)))
 
     def pictures() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
         at_once = 1 if moves else _TIMES_AT_ONCE
@@ -66,22 +78,14 @@ def make_clip(capture: Capture, reconstruction: Reconstruction) -> Clip | None:
             with torch.no_grad():
                 rgb = reconstruction.render(capture.camera(nearest[0]), batch).rgb
             for frame, image in zip(nearest, rgb, strict=True):
-                halves = capture.image(frame), image.cpu()
-                yield _beside(*(to_bytes(capture.shown(half)) for half in halves))
+                halves = recorded(frame.name), to_bytes(capture.shown(image.cpu()))
+                yield np.concatenate([halves[0], line, halves[1]], axis=1)
 
     with scratch_folder() as folder:
         path = folder / "clip.mp4"
         # Half the time of the encoder's usual effort, and no more bytes.
-        written = write_video(path, pictures(), fps=played_hz, crf=20, preset="veryfast")
+        written = write_video(
+            path, pictures(), fps=played_hz, crf=20, preset="veryfast", enlarged=factor
+        )
         mp4 = path.read_bytes()
     return Clip(mp4, written / played_hz / (shown_us / 1e6), first, last, written)
-
-
-def _beside(
-    left: UInt8[np.ndarray, "H W 3"], right: UInt8[np.ndarray, "H W 3"]
-) -> UInt8[np.ndarray, "H2 W2 3"]:
-    """Two pictures with a thin white line between them, enlarged by a whole factor."""
-    factor = max(1, _WIDE // left.shape[1])
-    halves = [picture.repeat(factor, axis=0).repeat(factor, axis=1) for picture in (left, right)]
-    line = np.full((halves[0].shape[0], 4, 3), 255, dtype=np.uint8)
-    return np.concatenate([halves[0], line, halves[1]], axis=1)
