@@ -97,9 +97,10 @@ class Embedder:
     def image(self, picture: UInt8[np.ndarray, "H W 3"], alt: str) -> str:
         """An image element with the picture inside."""
         buffer = io.BytesIO()
-        # Without loss quality is effort: more of it takes seven times as long for 13 % fewer bytes.
+        # Without loss the least effort takes a third to a quarter of the time of method 2 for 8 %
+        # more bytes.
         if self.lossless:
-            Image.fromarray(picture).save(buffer, "WEBP", lossless=True, quality=20, method=2)
+            Image.fromarray(picture).save(buffer, "WEBP", lossless=True, quality=0, method=0)
         else:
             # Method 4, Pillow's default, takes twice as long for as many bytes.
             Image.fromarray(picture).save(buffer, "WEBP", quality=92, method=2)
