@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from evsplat.cli.captures import Poses
+from evsplat.cli.importing import kept_objects
 from evsplat.commands import command
 from evsplat.options import BenchOptions, ExportOptions, Film, PoseSearch, TrainOptions
 from evsplat.options.declare import (
@@ -88,7 +89,9 @@ class Train:
 
     def __call__(self) -> None:
         from evsplat.cli.viewer_process import ViewerProcess
-        from evsplat.training import Stopped, train
+
+        with kept_objects():
+            from evsplat.training import Stopped, train
 
         viewer = ViewerProcess(self.port) if self.view else None
         try:
@@ -124,7 +127,8 @@ class _Demo(Train):
     """Training that is filmed before its report is written, which shows the films."""
 
     def _finish(self, run: Path) -> None:
-        from evsplat.export import export_run, render_run
+        with kept_objects():
+            from evsplat.export import export_run, render_run
 
         device, threads = self.options.device, self.options.threads
         for film in _DEMO_FILMS:
@@ -153,7 +157,8 @@ class Evaluate:
     """Device that draws and compares."""
 
     def __call__(self) -> None:
-        from evsplat.evaluation.run import evaluate_and_report
+        with kept_objects():
+            from evsplat.evaluation.run import evaluate_and_report
 
         metrics, report = evaluate_and_report(
             self.run, lpips_weights=self.lpips_weights, device=self.device, split=self.split
@@ -171,7 +176,8 @@ class Report:
     """Frames whose figures it shows: test, or train ('evsplat evaluate --split train')."""
 
     def __call__(self) -> None:
-        from evsplat.evaluation.run import write_report
+        with kept_objects():
+            from evsplat.evaluation.run import write_report
 
         print(f"report: {write_report(self.run, split=self.split)}")
 
@@ -194,7 +200,8 @@ class Render:
     threads: Threads = None
 
     def __call__(self) -> None:
-        from evsplat.export import render_run
+        with kept_objects():
+            from evsplat.export import render_run
 
         written = render_run(
             self.run,
@@ -226,7 +233,8 @@ class View:
     threads: Threads = None
 
     def __call__(self) -> None:
-        from evsplat.view import view_run
+        with kept_objects():
+            from evsplat.view import view_run
 
         view_run(
             self.run,
@@ -257,7 +265,8 @@ class Export:
     options: Annotated[ExportOptions, FLAT]
 
     def __call__(self) -> None:
-        from evsplat.export import export_run
+        with kept_objects():
+            from evsplat.export import export_run
 
         print(f"written: {export_run(self.run, self.kind, self.options)}")
 
@@ -274,7 +283,8 @@ class Bench:
     options: Annotated[BenchOptions, FLAT]
 
     def __call__(self) -> None:
-        from evsplat.benching.run import Stopped, bench
+        with kept_objects():
+            from evsplat.benching.run import Stopped, bench
 
         try:
             folder = bench(self.suite, self.options)
