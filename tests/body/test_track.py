@@ -49,6 +49,25 @@ def test_keys_are_hit_exactly_and_held_beyond_the_ends(keys):
     assert torch.equal(outside[0], ends[0]) and torch.equal(outside[1], ends[1])
 
 
+def test_rates_that_were_found_once_are_those_of_the_poses_and_times_given(monkeypatch):
+    """A motion is read several times; what was found of it is nobody's to change."""
+    track, poses, places = make_track(3, keys=7)
+    faster = track.times_us[0] + (track.times_us - track.times_us[0]) // 2
+    first = BodyTrack(track.body, track.times_us, poses, places)
+    first._rates.zero_()
+    others = [
+        (track.times_us, poses),
+        (faster, poses),
+        (track.times_us, poses[::-1].copy()),
+        (track.times_us[:4], poses[:4]),
+    ]
+    found = [BodyTrack(track.body, t, p, places[: len(t)])._rates for t, p in others]
+    monkeypatch.setattr("evsplat.body.track._KEPT_KEYS", 0)
+    for (times_us, given), rates in zip(others, found, strict=True):
+        afresh = BodyTrack(track.body, times_us, given, places[: len(times_us)])._rates
+        assert torch.equal(rates, afresh) and bool(rates.any())
+
+
 def test_a_long_recording_is_posed_as_a_short_one(monkeypatch):
     """Whose polynomials are not kept."""
     short, _, _ = make_track(3, keys=40)

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -188,6 +189,23 @@ def _rates(
     seconds: Float[np.ndarray, "P"], poses: Float[np.ndarray, "P M 3"]
 ) -> Float[np.ndarray, "P M 3"]:
     """Angular rates at the keys, radians per second about each joint's own axes, float32."""
+    if len(poses) > _KEPT_KEYS:
+        return _found_rates(seconds, poses)
+    return _known_rates(seconds.tobytes(), poses.tobytes(), poses.shape).copy()
+
+
+@lru_cache(maxsize=4)
+def _known_rates(
+    seconds: bytes, poses: bytes, shape: tuple[int, int, int]
+) -> Float[np.ndarray, "P M 3"]:
+    """As `_rates` of float64: a capture's motion is read several times in one command."""
+    # Copied, since scipy takes no array that is read-only.
+    return _found_rates(np.frombuffer(seconds).copy(), np.frombuffer(poses).reshape(shape).copy())
+
+
+def _found_rates(
+    seconds: Float[np.ndarray, "P"], poses: Float[np.ndarray, "P M 3"]
+) -> Float[np.ndarray, "P M 3"]:
     rates = np.zeros(poses.shape, np.float32)
     if len(poses) == 1:
         return rates
