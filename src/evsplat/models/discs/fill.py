@@ -212,8 +212,7 @@ def _dim(model: DiscModel, views: Sequence[_View]) -> None:
         weighed = term * view.weight.double()[:, None]
         eye = view.camera.center()
         brighter = _beyond_shade(model, term[back], -lowest_m, eye)[:, None]
-        # a brighter place may err by as much more
-        behind = rows * term[back] / brighter.square()
+        behind = rows * term[back]
         squares += weighed.T @ term + behind.T @ term[back]
         told += weighed.T @ (factor - 1) + behind.T @ (brighter * shade - 1)
     numbers = torch.linalg.solve(squares, told).to(model.shading.coefficients)
