@@ -148,21 +148,21 @@ class StageSettings:
     camera: Annotated[CameraMotion, option("HOW")] = "static"
     """Tripod (static), arc round the person (orbit) or handheld."""
     orbit_deg: Annotated[float, Within(-360, 360), option("DEG", name="orbit")] = 30.0
-    """Arc of an orbiting camera over the whole capture."""
+    """Arc of an orbiting camera in all."""
     shadows: Annotated[Flag, option(name="shadow")] = True
     """Leave out the person's shadow on the room."""
     lamp_azimuth_deg: Annotated[
         float | None,
         Within(-360, 360),
-        option("DEG", default="the ceiling lamp's, 22", name="lamp-azimuth"),
+        option("DEG", default="22", name="lamp-azimuth"),
     ] = None
-    """Where the lamp hangs, from the camera: 90 is at the right of the picture, 180 behind."""
+    """Lamp round the person from the camera: 90 is right, 180 behind."""
     lamp_elevation_deg: Annotated[
         float | None,
         Within(5, 90),
-        option("DEG", default="the ceiling lamp's, 56", name="lamp-elevation"),
+        option("DEG", default="56", name="lamp-elevation"),
     ] = None
-    """Height of the lamp above the level of the person's middle."""
+    """Lamp above the person's middle."""
     brightness: Annotated[float, Within(0.01, 100), option("X")] = 1.0
     """Factor of all light."""
     events: Annotated[Sensor, option("SENSOR")] = "clean"
@@ -170,7 +170,7 @@ class StageSettings:
     pose_noise: Annotated[PoseNoise, option("P")] = "none"
     """Errors of the poses: none, mocap, estimated or estimated-blurry."""
     cloth_mm: Annotated[float, Within(0, 50), option("MM")] = 0.0
-    """Wrinkles that garments throw, root mean square."""
+    """Wrinkles of garments, root mean square."""
     novel_views: Annotated[NovelViews, option("V")] = "test"
     """Frames with sharp pictures of two more cameras: test, all or none."""
     subframe_hz: Annotated[float, Within(1000, 100_000), option("HZ")] = 1000.0
