@@ -1,8 +1,10 @@
 """Records that are kept: a bench starts from them, and what is published says where it is from."""
 
 import json
+import shutil
 import subprocess
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 
@@ -18,35 +20,47 @@ from evsplat.errors import ConfigError
 from evsplat.evaluation.tables import markdown
 from evsplat.pages import read_rgb
 
+from ..conftest import write_tiny_capture
 from .helpers import MEDIAN, PAPER, records, write_suite
 
 OWN = {"name": "own", "method": "own_picture"}
 
 
+@dataclass(frozen=True)
+class Made:
+    suite: Path
+    folder: Path
+    kept: Path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Made:
+    """A bench that all tests look at, and none writes to."""
+    place = tmp_path_factory.mktemp("made")
+    capture = write_tiny_capture(place / "one")
+    suite = write_suite(place / "suite.yaml", {"one": capture}, MEDIAN, PAPER)
+    folder = ev.bench(suite, out=place / "out", records=place / "kept", jobs=1)
+    return Made(suite, folder, place / "kept")
+
+
 @pytest.fixture
-def bench_of(tiny_capture, tmp_path):
-    suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, MEDIAN, PAPER)
-
-    def run(out: str, **options):
-        return ev.bench(suite, out=tmp_path / out, records=tmp_path / "kept", jobs=1, **options)
-
-    run.suite = suite
-    return run
+def kept(made, tmp_path) -> Path:
+    """A copy of its records."""
+    return Path(shutil.copytree(made.kept, tmp_path / "kept"))
 
 
-def test_what_is_kept_is_not_made_again_and_gives_the_same_tables(bench_of, tmp_path):
-    first = bench_of("first")
-    second = bench_of("second")
+def test_what_is_kept_is_not_made_again_and_gives_the_same_tables(made, kept, tmp_path):
+    first = made.folder
+    second = ev.bench(made.suite, out=tmp_path / "second", records=kept, jobs=1)
     assert not (second / "cells").exists() and not (second / "runs").exists()
     assert (first / "tables.md").read_text() == (second / "tables.md").read_text()
     assert "pictures not kept" not in (second / "tables.md").read_text()
     assert not list((second / "strips").glob("*")) if (second / "strips").exists() else True
 
 
-def test_a_kept_record_has_the_figures_of_every_frame_in_a_few_kb(bench_of, tmp_path):
-    folder = bench_of("out")
-    whole = records(folder)["one/paper/seed0.json"]
-    path = tmp_path / "kept" / "one" / "paper" / "seed0.json"
+def test_a_kept_record_has_the_figures_of_every_frame_in_a_few_kb(made):
+    whole = records(made.folder)["one/paper/seed0.json"]
+    path = made.kept / "one" / "paper" / "seed0.json"
     kept = json.loads(path.read_text())
     assert path.stat().st_size < 9_000
     assert kept["cell"] == whole["cell"] and kept["train_cpu_seconds"] > 0
@@ -59,35 +73,32 @@ def test_a_kept_record_has_the_figures_of_every_frame_in_a_few_kb(bench_of, tmp_
     assert compact(kept) == kept
 
 
-def test_a_kept_record_that_was_asked_for_otherwise_is_an_error_not_a_mixture(bench_of):
-    bench_of("out")
+def test_a_kept_record_that_was_asked_for_otherwise_is_an_error_not_a_mixture(made, kept, tmp_path):
     with pytest.raises(ConfigError, match=r"kept.*iterations 12.*choose another --records"):
-        bench_of("other", iterations=13)
+        ev.bench(made.suite, out=tmp_path / "other", records=kept, jobs=1, iterations=13)
 
 
-def test_tables_are_made_of_kept_records_alone(bench_of, tmp_path):
-    folder = bench_of("out")
-    suite = read_suite(bench_of.suite)
-    from_bench = Records.read(make_plan(suite, BenchFolder(folder)), BenchFolder(folder))
-    kept = BenchFolder(tmp_path / "nowhere", tmp_path / "kept")
-    alone = Records.read(plan_of_kept(suite, suite.name, tmp_path / "kept"), kept)
+def test_tables_are_made_of_kept_records_alone(made, tmp_path):
+    suite, folder = read_suite(made.suite), BenchFolder(made.folder)
+    from_bench = Records.read(make_plan(suite, folder), folder)
+    nowhere = BenchFolder(tmp_path / "nowhere", made.kept)
+    alone = Records.read(plan_of_kept(suite, suite.name, made.kept), nowhere)
     # Kept figures have seven digits, printed ones fewer.
     printed = [markdown("", "", make_tables(read)) for read in (alone, from_bench)]
     assert printed[0] == printed[1]
 
 
-def test_rows_of_other_commits_are_told_apart(bench_of, tmp_path):
-    bench_of("out")
-    path = tmp_path / "kept" / "one" / "paper" / "seed0.json"
+def test_rows_of_other_commits_are_told_apart(made, kept, tmp_path):
+    path = kept / "one" / "paper" / "seed0.json"
     record = json.loads(path.read_text()) | {"code": {"commit": "abc1234", "date": "2026-01-02"}}
     path.write_text(json.dumps(record))
     newer = path.with_name("seed1.json")
     cell = record["cell"] | {"seed": 1}
     code = {"commit": "def5678", "date": "2026-02-03"}
     newer.write_text(json.dumps(record | {"cell": cell, "code": code}))
-    suite = replace(read_suite(bench_of.suite), seeds=(0, 1))
-    kept = BenchFolder(tmp_path / "nowhere", tmp_path / "kept")
-    found = Records.read(plan_of_kept(suite, suite.name, tmp_path / "kept"), kept)
+    suite = replace(read_suite(made.suite), seeds=(0, 1))
+    nowhere = BenchFolder(tmp_path / "nowhere", kept)
+    found = Records.read(plan_of_kept(suite, suite.name, kept), nowhere)
     assert origins(found)[0] == (
         "Code: abc1234 of 2026-01-02 (paper), def5678 of 2026-02-03 (paper)."
     )
