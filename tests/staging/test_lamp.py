@@ -52,6 +52,10 @@ def test_azimuth_counts_from_the_camera_to_the_right_of_its_picture():
     assert azimuth_and_elevation((1.0, 0.0, TARGET[2] + 1.0))[1] == pytest.approx(45)
 
 
+def test_the_ceiling_lamp_hangs_where_the_options_say(room):
+    assert azimuth_and_elevation(tuple(room.lamp.tolist())) == pytest.approx((22, 56), abs=0.5)
+
+
 def test_open_floor_gets_the_light_of_a_small_lamp():
     corners = FLOOR[TWO_TRIANGLES]
     light = Lighting(lamp=(1.0, -0.5, 2.0, 0.01, 0.01), facing=(-0.96, 0.0, -0.28))

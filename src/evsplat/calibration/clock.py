@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from evsplat.calibration.brightness import EventSource, FramePair, PairEvents
-from evsplat.calibration.peak import top_of
+from evsplat.calibration.peak import top_near
 
 SEARCH_US = 100_000
 """Lags up to here, either way, are tried."""
@@ -62,8 +62,8 @@ def estimate_clock(
         return None
     fine = coarse[best] + np.linspace(-1, 1, 13) * step
     fine_sums = _moments(pairs, events, fine)
-    vertex = _vertex(fine, _correlation(fine_sums.sum(0)))
     correlations = _correlation(fine_sums.sum(0))
+    vertex = _vertex(fine, correlations)
     if vertex is None or np.nanmax(correlations) < LEAST_CORRELATION:
         return None
     beyond = (coarse < fine[0]) | (coarse > fine[-1])
@@ -115,8 +115,10 @@ def _best(correlations: Float[np.ndarray, "L"]) -> int | None:
 
 def _vertex(lags_us: Float[np.ndarray, "L"], correlations: Float[np.ndarray, "L"]) -> float | None:
     """Lag at the top of the correlations."""
-    top = top_of(correlations)
-    return None if top is None else float(lags_us[0] + top * (lags_us[1] - lags_us[0]))
+    best = _best(correlations)
+    if best is None:
+        return None
+    return float(lags_us[0] + top_near(correlations, best) * (lags_us[1] - lags_us[0]))
 
 
 def _jackknife(lags_us: Float[np.ndarray, "L"], sums: Float[np.ndarray, "P L 6"]) -> float:

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from evsplat.calibration.brightness import exposure, pair_indices
-from evsplat.calibration.peak import top_of
+from evsplat.calibration.peak import top_near
 from evsplat.events import EventStream
 from evsplat.pictures.light import Transfer
 
@@ -209,10 +209,10 @@ def _beside(
     if covered.sum() < 2:
         return 0.0
     score = _scores(exposed, changes[covered], starts[covered], first, end)
-    top = top_of(score)
-    if top is None or int(np.argmax(score)) in (0, len(score) - 1):
+    best = int(np.argmax(score))
+    if best in (0, len(score) - 1):
         return 0.0
-    return top - _STEPS_PER_GAP
+    return top_near(score, best) - _STEPS_PER_GAP
 
 
 def _rival(score: Float[np.ndarray, " L"], best: int) -> float:

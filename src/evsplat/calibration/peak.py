@@ -6,15 +6,12 @@ from jaxtyping import Float
 _NEAR = 5
 
 
-def top_of(values: Float[np.ndarray, "N"]) -> float | None:
+def top_near(values: Float[np.ndarray, "N"], best: int) -> float:
     """Place of the top, in samples, by a parabola through the five values about the largest.
 
-    The largest sample's own place where the parabola has no top or a value is NaN. Of at least five
-    ``values`` at even steps; None where all are NaN.
+    ``best``, the place of the largest, where the parabola has no top or a value is NaN. Of at least
+    five ``values`` at even steps.
     """
-    if np.isnan(values).all():
-        return None
-    best = int(np.nanargmax(values))
     first = min(max(best - _NEAR // 2, 0), len(values) - _NEAR)
     near = values[first : first + _NEAR]
     if np.isnan(near).any():

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from evsplat.capture import Capture, Frame, Policy, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.evaluation.chroma import chroma_psnr
-from evsplat.evaluation.event_maps import DrawnFrames, drawn, evaluate_event_maps
+from evsplat.evaluation.event_maps import DrawnFrames, drawn, drawn_frame, evaluate_event_maps
 from evsplat.evaluation.protocols import (
     METRICS,
     PROTOCOLS,
@@ -355,15 +355,11 @@ def _novel_views(
     return result
 
 
-def _render(capture: Capture, source: Reconstruction, frame: Frame) -> Float[Tensor, "H W 3"]:
-    return drawn(source, capture.camera(frame), frame.mid_us)
-
-
 def _picture_of(
     kind: Callable[[TrainingCapture], Reconstruction], capture: Capture
 ) -> Picture | Absent:
     try:
-        return partial(_render, capture, kind(capture.for_training(_TRIVIAL_SEES)))
+        return partial(drawn_frame, capture, kind(capture.for_training(_TRIVIAL_SEES)))
     except DataError as error:
         return Absent(str(error))
 

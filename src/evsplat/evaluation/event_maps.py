@@ -30,10 +30,12 @@ class DrawnFrames:
 
     def __call__(self, frame: Frame) -> Float[Tensor, "H W 3"]:
         """One frame; not to be written to."""
-        return torch.from_numpy(self._kept.get(frame.name, lambda: self._drawn(frame).numpy()))
-
-    def _drawn(self, frame: Frame) -> Float[Tensor, "H W 3"]:
-        return drawn(self._reconstruction, self._capture.camera(frame), frame.mid_us)
+        return torch.from_numpy(
+            self._kept.get(
+                frame.name,
+                lambda: drawn_frame(self._capture, self._reconstruction, frame).numpy(),
+            )
+        )
 
 
 def evaluate_event_maps(
@@ -110,6 +112,11 @@ def _maps(
 def drawn(source: Reconstruction, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
     """One instant as a camera sees it, sRGB."""
     return source.render(camera, [time_us]).rgb[0].cpu()
+
+
+def drawn_frame(capture: Capture, source: Reconstruction, frame: Frame) -> Float[Tensor, "H W 3"]:
+    """A frame's mid-exposure, sRGB."""
+    return drawn(source, capture.camera(frame), frame.mid_us)
 
 
 def chosen_pairs(capture: Capture) -> list[tuple[Frame, Frame]]:

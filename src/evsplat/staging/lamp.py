@@ -19,6 +19,8 @@ _MAP_TEXELS = 256
 """Along a side of the map of what furniture hides, 4.7 cm at 3 m: wider than the spacing of the
 points that it is made of, so that it has no holes."""
 _BIAS_M = 0.04
+_CAMERA = float(np.arctan2(MAIN[1] - TARGET[1], MAIN[0] - TARGET[0]))
+"""Where the recording camera is about the person, radians from x."""
 
 
 def azimuth_and_elevation(place: tuple[float, ...]) -> tuple[float, float]:
@@ -28,8 +30,7 @@ def azimuth_and_elevation(place: tuple[float, ...]) -> tuple[float, float]:
     picture, 180 behind the person. Both are of the middle of a person who stands in the middle.
     """
     x, y, z = np.subtract(place[:3], TARGET)
-    camera = np.subtract(MAIN, TARGET)
-    turn = np.degrees(np.arctan2(y, x) - np.arctan2(camera[1], camera[0]))
+    turn = np.degrees(np.arctan2(y, x) - _CAMERA)
     return float((turn + 180) % 360 - 180), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
@@ -45,8 +46,7 @@ def lamp_at(room: Room, azimuth_deg: float | None, elevation_deg: float | None) 
     azimuth, elevation = azimuth_and_elevation((x, y, z))
     azimuth = azimuth if azimuth_deg is None else azimuth_deg
     elevation = elevation if elevation_deg is None else elevation_deg
-    camera = np.subtract(MAIN, TARGET)
-    turn = np.radians(azimuth) + np.arctan2(camera[1], camera[0])
+    turn = np.radians(azimuth) + _CAMERA
     level, up = np.cos(np.radians(elevation)), np.sin(np.radians(elevation))
     way = np.array([level * np.cos(turn), level * np.sin(turn), up])
     px, py, pz = (TARGET + distance * way).tolist()

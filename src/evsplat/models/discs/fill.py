@@ -22,6 +22,7 @@ from evsplat.models.discs.model import DiscModel
 from evsplat.models.discs.transparent import Sight, areas, kept_opacity, off_the_body, prices
 from evsplat.models.layers import Layers
 from evsplat.models.seen import Seen, draw_values, facing, shares_in, transposed
+from evsplat.pictures.light import GAMMA
 
 STEPS = 8
 """Of conjugate gradients, twice."""
@@ -48,7 +49,6 @@ BESIDE = 0.5
 that it does; one across the view or behind counts in full."""
 MOST_LIT = 2.0
 """Times as bright as the shade, at most."""
-_GAMMA = 2.2
 _BACK = -0.1
 """Cosine to the camera under which a surface turns its back."""
 _FAST = 1e6
@@ -243,7 +243,7 @@ def _beyond_shade(
     if light is None or light.lamps is None or shadow is None or lamps is None:
         return terms.new_ones(len(terms))
     shares = shadow.share_logits.sigmoid()
-    lit = ((1 - shares).pow(-_GAMMA) - 1) * (shares > LEAST_SHARE)
+    lit = ((1 - shares).pow(-GAMMA) - 1) * (shares > LEAST_SHARE)
     away = lamps.distances()
     ways = (lamps.places() - lamps.center) / away[:, None]
     beside = normalize(eye - lamps.center, dim=0)
@@ -252,7 +252,7 @@ def _beyond_shade(
     # from the lamp through the person's middle on to the floor, against to the middle
     farther = 1 + floor_m / (away * height)
     each = (lit * farther.square() / height).to(terms)
-    return (1 + terms[:, -len(each) :] @ each).pow(1 / _GAMMA).clamp(max=MOST_LIT)
+    return (1 + terms[:, -len(each) :] @ each).pow(1 / GAMMA).clamp(max=MOST_LIT)
 
 
 def _shade(factors: Float[Tensor, "N 3"], weights: Float[Tensor, " N"]) -> Float[Tensor, "3"]:
