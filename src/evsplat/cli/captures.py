@@ -6,7 +6,6 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from evsplat.cli.importing import kept_objects
 from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.options import PoseSearch, ReadOptions, StageSettings, SynthesisSettings
@@ -45,8 +44,7 @@ class Convert:
     reading: Annotated[ReadOptions, FLAT]
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.events.convert import convert_recording
+        from evsplat.events.convert import convert_recording
 
         conversion = convert_recording(
             self.recording, self.out, self.reading, from_zero=self.from_zero, to=self.to
@@ -79,10 +77,9 @@ class Simulate:
     """Seed of everything random in the sensor."""
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.config import from_dict, override, to_dict
-            from evsplat.events import SensorSettings, sensor_settings
-            from evsplat.footage.simulate import simulate
+        from evsplat.config import from_dict, override, to_dict
+        from evsplat.events import SensorSettings, sensor_settings
+        from evsplat.footage.simulate import simulate
 
         twins = dict.fromkeys(("contrast_on", "contrast_off"), "contrast")
         check_twins(self, self.overrides, twins)
@@ -124,8 +121,7 @@ class Synthesize:
     """Replace a capture at CAPTURE."""
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.synthesis import synthesize
+        from evsplat.synthesis import synthesize
 
         path = synthesize(
             self.source,
@@ -156,8 +152,7 @@ class Stage:
     threads: Threads = None
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat import staging
+        from evsplat import staging
 
         if self.list:
             print(f"characters: {', '.join(staging.characters())}")
@@ -183,8 +178,7 @@ class Inspect:
     """Read on where an event file is damaged."""
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.inspection import inspect
+        from evsplat.inspection import inspect
 
         out = self.out or Path("inspect") / self.capture.resolve().name
         report = inspect(self.capture, out, repair=self.repair)
@@ -219,9 +213,8 @@ class Masks:
     """Source of the masks of training frames; everything looks at held-out ones too."""
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.capture import Policy
-            from evsplat.masks import mask_capture
+        from evsplat.capture import Policy
+        from evsplat.masks import mask_capture
 
         options: dict[str, Any] = {}
         for name, keyword, owner in (
@@ -263,9 +256,8 @@ class Poses:
     threads: Threads = None
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.devices import use_threads
-            from evsplat.posing import find_poses
+        from evsplat.devices import use_threads
+        from evsplat.posing import find_poses
 
         use_threads(self.threads)
         found = find_poses(self.capture, self.out, self.search, keypoints=self.keypoints)
@@ -300,9 +292,8 @@ class Restore:
     """Source of restored training frames; everything looks at held-out frames too."""
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.capture import Policy
-            from evsplat.restore import restore_capture
+        from evsplat.capture import Policy
+        from evsplat.restore import restore_capture
 
         is_network = self.method != "edi"
         options: dict[str, Any] = {}

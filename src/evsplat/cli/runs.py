@@ -9,7 +9,6 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from evsplat.cli.captures import Poses
-from evsplat.cli.importing import kept_objects
 from evsplat.commands import command
 from evsplat.options import BenchOptions, ExportOptions, Film, PoseSearch, TrainOptions
 from evsplat.options.declare import (
@@ -89,9 +88,7 @@ class Train:
 
     def __call__(self) -> None:
         from evsplat.cli.viewer_process import ViewerProcess
-
-        with kept_objects():
-            from evsplat.training import Stopped, train
+        from evsplat.training import Stopped, train
 
         viewer = ViewerProcess(self.port) if self.view else None
         try:
@@ -127,8 +124,7 @@ class _Demo(Train):
     """Training that is filmed before its report is written, which shows the films."""
 
     def _finish(self, run: Path) -> None:
-        with kept_objects():
-            from evsplat.export import export_run, render_run
+        from evsplat.export import export_run, render_run
 
         device, threads = self.options.device, self.options.threads
         for film in _DEMO_FILMS:
@@ -157,8 +153,7 @@ class Evaluate:
     """Device that draws and compares."""
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.evaluation.run import evaluate_and_report
+        from evsplat.evaluation.run import evaluate_and_report
 
         metrics, report = evaluate_and_report(
             self.run, lpips_weights=self.lpips_weights, device=self.device, split=self.split
@@ -176,8 +171,7 @@ class Report:
     """Frames whose figures it shows: test, or train ('evsplat evaluate --split train')."""
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.evaluation.run import write_report
+        from evsplat.evaluation.run import write_report
 
         print(f"report: {write_report(self.run, split=self.split)}")
 
@@ -200,8 +194,7 @@ class Render:
     threads: Threads = None
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.export import render_run
+        from evsplat.export import render_run
 
         written = render_run(
             self.run,
@@ -233,8 +226,7 @@ class View:
     threads: Threads = None
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.view import view_run
+        from evsplat.view import view_run
 
         view_run(
             self.run,
@@ -265,8 +257,7 @@ class Export:
     options: Annotated[ExportOptions, FLAT]
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.export import export_run
+        from evsplat.export import export_run
 
         print(f"written: {export_run(self.run, self.kind, self.options)}")
 
@@ -283,8 +274,7 @@ class Bench:
     options: Annotated[BenchOptions, FLAT]
 
     def __call__(self) -> None:
-        with kept_objects():
-            from evsplat.benching.run import Stopped, bench
+        from evsplat.benching.run import Stopped, bench
 
         try:
             folder = bench(self.suite, self.options)

@@ -15,7 +15,8 @@ from tqdm import tqdm
 from evsplat.capture import Capture, Frame, Policy, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.evaluation.chroma import chroma_psnr
-from evsplat.evaluation.event_maps import DrawnFrames, drawn, drawn_frame, evaluate_event_maps
+from evsplat.evaluation.drawn import DrawnFrames, drawn, drawn_frame
+from evsplat.evaluation.event_maps import evaluate_event_maps
 from evsplat.evaluation.protocols import (
     METRICS,
     PROTOCOLS,

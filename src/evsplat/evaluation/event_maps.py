@@ -3,39 +3,19 @@
 from pathlib import Path
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Camera, Capture, Frame
+from evsplat.capture import Capture, Frame
+from evsplat.evaluation.drawn import DrawnFrames
 from evsplat.evaluation.regions import Absent
 from evsplat.events import count_map
-from evsplat.methods.reconstruction import Reconstruction
 from evsplat.names import file_stem
 from evsplat.pictures import signed_map
-from evsplat.pictures.files import ImageCache, save_png
+from evsplat.pictures.files import save_png
 from evsplat.pictures.light import log_brightness_change
 
 _TRAIN_PAIRS_SHOWN = 3
-_KEPT_BYTES = 64 << 20
-"""Of drawn frames: a frame is measured, and drawn in up to two pairs."""
-
-
-class DrawnFrames:
-    """Frames as a reconstruction draws their mid-exposures, sRGB; the last ones are kept."""
-
-    def __init__(self, capture: Capture, reconstruction: Reconstruction) -> None:
-        self._capture, self._reconstruction = capture, reconstruction
-        self._kept = ImageCache(_KEPT_BYTES)
-
-    def __call__(self, frame: Frame) -> Float[Tensor, "H W 3"]:
-        """One frame; not to be written to."""
-        return torch.from_numpy(
-            self._kept.get(
-                frame.name,
-                lambda: drawn_frame(self._capture, self._reconstruction, frame).numpy(),
-            )
-        )
 
 
 def evaluate_event_maps(
@@ -106,17 +86,6 @@ def _maps(
     first, second = (frames(frame).clamp(0, 1) for frame in (before, after))
     change = log_brightness_change(first, second, transfer=capture.transfer(before)).float()
     return given, change / _threshold(capture, given, change)
-
-
-@torch.no_grad()
-def drawn(source: Reconstruction, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
-    """One instant as a camera sees it, sRGB."""
-    return source.render(camera, [time_us]).rgb[0].cpu()
-
-
-def drawn_frame(capture: Capture, source: Reconstruction, frame: Frame) -> Float[Tensor, "H W 3"]:
-    """A frame's mid-exposure, sRGB."""
-    return drawn(source, capture.camera(frame), frame.mid_us)
 
 
 def chosen_pairs(capture: Capture) -> list[tuple[Frame, Frame]]:
