@@ -273,18 +273,41 @@ def test_a_run_is_drawn_filled_and_goes_on_unfilled(tiny_capture, tmp_path):
     assert torch.equal(learned.gaussians.get_parameter(colour), model[f"gaussians.{colour}"])
 
 
-def test_hues_that_the_pictures_hardly_tell_are_calm_and_brightness_stays(spoilt, monkeypatch):
+@pytest.fixture
+def parts_at(spoilt, monkeypatch):
+    """Brightness and hue of the little seen, and colours of the rest, after a fill at prices."""
     model, capture, seen = spoilt
     rows, name = model.gaussians.human, f"gaussians.{model.gaussians.colour}"
     little = seen.little()
 
-    def parts(price):
-        monkeypatch.setattr("evsplat.models.discs.fill.HUE", price)
+    def parts(**prices):
+        for price, value in prices.items():
+            monkeypatch.setattr(f"evsplat.models.discs.fill.{price}", value)
         colours = filled(model, capture, 0.001, seen)[name][rows].sigmoid()
         bright = colours.mean(-1, keepdim=True)
         return bright[little], (colours - bright)[little], colours[~little]
 
-    (bright, hues, front), (as_bright, calmer, same_front) = parts(0.0), parts(30.0)
+    return parts
+
+
+def test_hues_that_the_pictures_hardly_tell_are_calm_and_brightness_stays(parts_at):
+    bright, hues, front = parts_at(HUE=0.0, BRIGHT=0.0)
+    as_bright, calmer, same_front = parts_at(HUE=30.0, BRIGHT=0.0)
     assert float(calmer.square().mean()) < 0.5 * float(hues.square().mean())
     assert float(as_bright.std()) > 0.7 * float(bright.std())
+    assert float((same_front - front).square().mean().sqrt()) < 0.02
+
+
+def test_brightness_that_the_pictures_hardly_tell_is_calm_and_hues_stay(parts_at):
+    bright, hues, front = parts_at(HUE=0.0, BRIGHT=0.0)
+    calmer, as_hued, same_front = parts_at(HUE=0.0, BRIGHT=30.0)
+    print(
+        float(calmer.std()),
+        float(bright.std()),
+        float(as_hued.square().mean()),
+        float(hues.square().mean()),
+        float((same_front - front).square().mean().sqrt()),
+    )
+    assert float(calmer.std()) < 0.7 * float(bright.std())
+    assert float(as_hued.square().mean()) > 0.7 * float(hues.square().mean())
     assert float((same_front - front).square().mean().sqrt()) < 0.02

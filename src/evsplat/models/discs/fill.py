@@ -29,10 +29,10 @@ STEPS = 8
 MOST_BEHIND, BARELY_PX = 0.25, 0.01
 """Largest difference to what neighbours say where a surface was seen from behind alone; half of it
 where the squares of its shares sum to the second: what shines through the front has its colour."""
-HUE, FACED_PX = 20.0, 0.01
-"""How much more a difference of hue costs than one of brightness where nothing was seen of a side
+HUE, BRIGHT, FACED_PX = 20.0, 2.0, 0.01
+"""How much more a difference of hue costs, and one of brightness, where nothing was seen of a side
 that faced a camera, and the squares of its shares at which it is half of that: speckle is hue, and
-the pictures hardly tell of it there."""
+the pictures hardly tell of it there. A higher price of brightness is missed in recorded frames."""
 CALM = 0.000125
 """Weight of the squares of the light's numbers, the constant one apart, against the mean squared
 change of the factors that were seen."""
@@ -86,7 +86,8 @@ def filled(
     through the front, or has a small share of its pixels, gives way, and what is well seen stays.
     What turns its back and is still far from what neighbours say, or floats off the body, becomes
     transparent as far as the frames bear it (`kept_opacity`), and colours are found once more, now
-    with hues that follow the neighbours by what was seen of sides that faced a camera alone.
+    with hues that follow the neighbours by what was seen of sides that faced a camera alone; the
+    less that was, the more differing from them costs, in hue and in brightness.
     ``strength`` is what a difference to the neighbours costs, per training frame, against one of a
     whole pixel.
     """
@@ -113,15 +114,17 @@ def filled(
     told = even.lerp(relit, seen.certainty()[:, None])
     share, behind = len(views) / len(capture.train_frames), facing < 0
     squares = share * seen.squares
-    colours = _closest(pictures, told, squares, strength, behind, torch.zeros_like(squares))
+    price = torch.full_like(squares, strength * len(views))
+    colours = _closest(pictures, told, squares, behind, price, torch.zeros_like(price))
     wrong = (colours - even).norm(dim=-1) * behind
     off_m = off_the_body(gaussians.means[rows], normals, model.surface)
     pixels = share * seen.weight.mean() * areas(gaussians)
     kept = kept_opacity(pictures.sights(colours), prices(wrong, off_m, pixels))
     sure = faced / (faced + FACED_PX)
     told = _in_hues_of(told, even.lerp(relit, sure[:, None]))
-    pictures = replace(pictures, kept=kept)
-    colours = _closest(pictures, told, squares, strength, behind, HUE * (1 - sure))
+    pictures, unsure = replace(pictures, kept=kept), price * (1 - sure)
+    held, tinted = price + BRIGHT * unsure, (HUE - BRIGHT) * unsure
+    colours = _closest(pictures, told, squares, behind, held, tinted)
     with torch.no_grad():
         new.gaussians.get_parameter(gaussians.colour)[rows, :3] = colours.logit()
         opacities = (gaussians.opacities()[rows] * kept).clamp_min(_LEAST_OPACITY)
@@ -135,19 +138,17 @@ def _closest(
     pictures: "_Pictures",
     told: Float[Tensor, "H 3"],
     squares: Float[Tensor, " H"],
-    strength: float,
     behind: Bool[Tensor, " H"],
-    hue: Float[Tensor, " H"],
+    held: Float[Tensor, " H"],
+    tinted: Float[Tensor, " H"],
 ) -> Float[Tensor, "H 3"]:
     """Colours closest to those ``told`` with which the pictures look as before the fill.
 
     ``squares``: of the shares of all pictures' pixels. What was seen from ``behind`` alone must not
-    glare; the front makes up for it. ``hue``: what a difference of hue costs besides, in units of
-    ``strength``.
+    glare; the front makes up for it. ``held``: what a squared difference to those told costs,
+    ``tinted``: what one of hue costs besides.
     """
     diagonal = squares * pictures.brightness()
-    held = torch.full_like(diagonal, strength * len(pictures.views))
-    tinted = held * hue
     colours = closest(told, pictures.missing(told), pictures.twice, diagonal, held, tinted, STEPS)
     most = (MOST_BEHIND * squares / (squares + BARELY_PX))[:, None]
     limited = told + (colours - told).clamp(-most, most)
