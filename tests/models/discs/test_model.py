@@ -1,5 +1,7 @@
 """The disc model put together: who carries a disc, what lights it, and where gradients reach."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -122,6 +124,21 @@ def test_shape_that_times_give_belongs_to_no_other_motion(tiny_capture):
     )
     assert torch.allclose(other.at(times, center).human.means, expected, atol=1e-5)
     assert not torch.allclose(model.at(times, center).human.means, expected, atol=1e-3)
+
+
+def test_what_reaches_off_the_body_does_so_in_recorded_poses_alone(tiny_capture):
+    model, _, times, center = model_of(tiny_capture())
+    rows = model.gaussians.human
+    with torch.no_grad():
+        model.gaussians.scales_log[rows] = math.log(0.001)
+        model.gaussians.scales_log[rows][3] = math.log(0.3)
+    moving = model.following(model.track)
+    moving.stay_together()
+    recorded, new = (each.at(times, center).human.scales[0].detach() for each in (model, moving))
+    assert torch.allclose(recorded[3], torch.tensor(0.3))
+    assert float(new[3].max()) < 0.5 * 0.3
+    others = torch.arange(len(new)) != 3
+    assert torch.equal(new[others], recorded[others])
 
 
 def test_times_do_not_see_each_other(tiny_capture):

@@ -19,6 +19,7 @@ from evsplat.capture import Camera, Frame
 from evsplat.gaussians import GaussianSet
 from evsplat.models.discs.deformation import Deformation
 from evsplat.models.discs.pose_shade import PoseShade
+from evsplat.models.discs.reach import within_reach
 from evsplat.models.discs.relief import Relief
 from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.models.discs.shadow import BodyShadow, Lamps
@@ -220,8 +221,14 @@ class DiscModel(PosedModel):
         return model
 
     def stay_together(self) -> None:
-        """Weights of the bones without jumps from disc to disc, for poses beyond the recorded."""
-        self.surface.even_out(self.gaussians.means[self.gaussians.human])
+        """For poses beyond the recorded: bones' weights without jumps, no disc far off the body."""
+        gaussians, rows = self.gaussians, self.gaussians.human
+        means = gaussians.means[rows].detach()
+        self.surface.even_out(means)
+        with torch.no_grad():
+            sizes, turned = gaussians.scales_log[rows], gaussians.quaternions[rows]
+            less = within_reach(means, turned, sizes.exp(), self.surface.surface)
+            sizes += less.log()[:, None]
 
     def _offsets(self, times_us: Sequence[int]) -> Float[Tensor, "T H 3"] | None:
         """What times do to the person's shape; None where it does not change, or not yet."""
