@@ -17,7 +17,6 @@ constexpr float kMinTransmittance = 1e-4f;
 constexpr float kMaxExtent = 3.33f;         // standard deviations
 constexpr float kHalfLog2e = 0.72134752f;   // exp(-s/2) = exp2(-kHalfLog2e s)
 constexpr float kMaxPixel = 1e6f;           // farther than this from the image is not drawn
-constexpr uint32_t kChunk = 32;             // entries of a tile handled together
 
 // ------------------------------------------------------------------ projection
 
@@ -211,6 +210,9 @@ INLINE Tile tile_of(const View& view, uint32_t index) {
     return t;
 }
 
+// Vectors of fewer than 16 lanes composite by narrow.h, which counts pixels from the tile's corner.
+constexpr bool kFromCorner = W < 16;
+
 // Pixel centres of each patch, and whether they are in the image.
 struct Pixels {
     F x[kPatches], y[kPatches];
@@ -222,7 +224,7 @@ INLINE void fill_pixels(const Tile& t, Pixels& pixels) {
     for (int l = 0; l < W; ++l) lane_x[l] = float(l % kPatchW) + 0.5f, lane_y[l] = float(l / kPatchW) + 0.5f;
     for (int p = 0; p < kPatches; ++p) {
         const F x = lane_x + float(p % kPatchesX * kPatchW), y = lane_y + float(p / kPatchesX * kPatchH);
-        pixels.x[p] = x + float(t.x0), pixels.y[p] = y + float(t.y0);
+        pixels.x[p] = kFromCorner ? x : x + float(t.x0), pixels.y[p] = kFromCorner ? y : y + float(t.y0);
         pixels.inside[p] = (x < float(t.columns)) & (y < float(t.rows));
     }
 }
@@ -301,14 +303,6 @@ INLINE void load_plane(const Tile& t, F* patches, int step, const float* plane, 
     }
 }
 
-// A run of entries with what compositing reads, copied close together.
-struct Chunk {
-    Projected projected[kChunk];
-    const float* values[kChunk];
-    bool still[kChunk];
-    uint32_t count;
-};
-
 struct Found {
     const Projected* projected;
     const float* values;
@@ -319,6 +313,34 @@ INLINE Found find(const ForwardJob& job, uint32_t gaussian) {
     const size_t i = gaussian - (still ? job.split : 0);
     return {job.projected[still] + i, job.values[still] + i * job.value_stride};
 }
+
+INLINE void prefetch_entries(const ForwardJob& job, const Entry* entries, uint32_t from, uint32_t to) {
+    for (uint32_t i = from; i < to; ++i) {
+        const Found found = find(job, entries[i].gaussian);
+        __builtin_prefetch(found.projected);
+        __builtin_prefetch(found.values);
+    }
+}
+
+INLINE uint32_t least(uint32_t a, uint32_t b) { return a < b ? a : b; }
+
+struct Alpha {
+    F u, v, raw, value;  // value: 0 below 1/255, at most 0.999
+};
+
+#if EVSPLAT_LANES < 16
+#include "narrow.h"
+#else
+
+constexpr uint32_t kChunk = 32;  // entries of a tile handled together
+
+// A run of entries with what compositing reads, copied close together.
+struct Chunk {
+    Projected projected[kChunk];
+    const float* values[kChunk];
+    bool still[kChunk];
+    uint32_t count;
+};
 
 // Copies entries [from, to) of a tile and asks for the memory of the chunk that comes next: behind it,
 // or, going back, before it.
@@ -331,18 +353,8 @@ INLINE void fill_chunk(const ForwardJob& job, const Entry* entries, uint32_t fro
         chunk.values[j] = found.values;
         chunk.still[j] = entries[from + j].gaussian >= job.split;
     }
-    for (uint32_t i = next; i < next_end; ++i) {
-        const Found found = find(job, entries[i].gaussian);
-        __builtin_prefetch(found.projected);
-        __builtin_prefetch(found.values);
-    }
+    prefetch_entries(job, entries, next, next_end);
 }
-
-INLINE uint32_t least(uint32_t a, uint32_t b) { return a < b ? a : b; }
-
-struct Alpha {
-    F u, v, raw, value;  // value: 0 below 1/255, at most 0.999
-};
 
 INLINE Alpha alpha_at(const Projected& g, F x, F y) {
     Alpha a;
@@ -356,7 +368,6 @@ INLINE Alpha alpha_at(const Projected& g, F x, F y) {
 
 // words[p] bit j: entry j of the chunk reaches patch p.
 INLINE void transpose_masks(const Entry* entries, uint32_t count, uint32_t* words) {
-#if EVSPLAT_LANES >= 8
     U lane, word[kPatches / W] = {};
     for (int l = 0; l < W; ++l) lane[l] = l;
     for (uint32_t j = 0; j < count; ++j) {
@@ -364,12 +375,9 @@ INLINE void transpose_masks(const Entry* entries, uint32_t count, uint32_t* word
         for (int k = 0; k < kPatches / W; ++k) word[k] |= ((mask >> (lane + uint32_t(k * W))) & 1u) << j;
     }
     __builtin_memcpy(words, word, sizeof word);
-#else
-    for (int p = 0; p < kPatches; ++p) words[p] = 0;
-    for (uint32_t j = 0; j < count; ++j)
-        for (uint64_t mask = entries[j].patches; mask; mask &= mask - 1) words[__builtin_ctzll(mask)] |= 1u << j;
-#endif
 }
+
+#endif
 
 // C > 0: that many channels, kept in registers; C = 0: up to kMaxChannels, kept in memory. Lit: there is a light.
 template <int C, bool Lit>
@@ -391,6 +399,9 @@ void forward_tile(const ForwardJob& job, const TileWork& work) {
     F light[Lit ? kPatches : 1];
     if (Lit) load_plane(tile, light, 1, job.light, 1, view.width);
 
+#if EVSPLAT_LANES < 16
+    composite<C, Lit>(job, work, tile, pixels, light, live, final, last, colour);
+#else
     uint64_t open = 0;
     for (int p = 0; p < kPatches; ++p) {
         work.patch_end[p] = work.count;
@@ -437,6 +448,7 @@ void forward_tile(const ForwardJob& job, const TileWork& work) {
             }
         }
     }
+#endif
 
     __builtin_memcpy(work.final_t, final, sizeof final);
     __builtin_memcpy(work.last, last, sizeof last);
@@ -480,6 +492,9 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
     const int channels = C ? C : job.channels;
     const int stride = slot_stride(channels);
     const Tile tile = tile_of(view, work.index);
+#if EVSPLAT_LANES < 16
+    prefetch_tile(back, work, tile, stride);
+#endif
     Pixels pixels;
     fill_pixels(tile, pixels);
     F transmittance[kPatches], behind[kPatches], value[kPatches];
@@ -528,6 +543,10 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
         }
     }
 
+#if EVSPLAT_LANES < 16
+    composite_backward<C, Lit>(back, work, tile, pixels, stride, add,
+                               {last, grad, light, transmittance, behind, light_grad});
+#else
     Chunk chunk;
     for (uint32_t stop = work.count; stop > 0;) {
         const uint32_t first = (stop - 1) / kChunk * kChunk;
@@ -580,6 +599,7 @@ void backward_tile(const BackwardJob& back, const TileWork& work, bool add) {
                  add && entry.gaussian >= job.split);
         }
     }
+#endif
     if (Lit && back.light_grad) store_plane(tile, light_grad, 1, back.light_grad, view.width);
 }
 

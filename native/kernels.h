@@ -89,7 +89,7 @@ struct TileWork {
     bool bare;                    // nothing moving is among the entries
     // What the backward pass starts from, by patch, not by row:
     float* final_t;               // (256) transmittance behind the last entry
-    int32_t* last;                // (256) last entry before compositing stopped
+    int32_t* last;                // (256) last entry before compositing stopped; where it did not, that or a later one
     uint32_t* patch_end;          // (patches) entries after which a patch is opaque
 };
 
