@@ -8,6 +8,7 @@
 // with their values, since the end of a patch's run is guessed wrong and memory far away is waited for.
 
 constexpr uint32_t kRun = 64;  // entries of a tile handled together, at most the bits of a word
+constexpr uint32_t kLook = 16;  // entries after which the backward pass looks anew at which patches are open
 constexpr float kLog2MinAlpha = -7.9943534f;
 
 template <int C>
@@ -134,6 +135,7 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
         prefetch_rows<1>(job.alpha + work.times[0] * job.alpha_t + corner, view.width);
     }
     const I never = I{} + INT32_MAX;
+    constexpr uint32_t everyone = (uint32_t(1) << W) - 1;
     uint64_t open = 0;
     uint32_t stopped[kPatches];  // a bit per lane
     for (int p = 0; p < kPatches; ++p) {
@@ -169,6 +171,12 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
                     last[p] = stops ? I{} + (int32_t(first) + j - 1) : last[p];
                     weight = select(stops, F{}, weight), next = select(stops, F{}, next);
                     out_of = uint32_t(bits(next <= 0.f));
+                    if (out_of == everyone) {
+                        t = next;
+                        open &= ~(uint64_t(1) << p);
+                        work.patch_end[p] = first + j;
+                        break;
+                    }
                 }
                 t = next;
                 const F lit = Lit ? weight * select(I{} + run.still[j], light[p], splat(1.f)) : weight;
@@ -181,10 +189,6 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
             }
             for (int k = 0; k < C; ++k) out[k] = c[k];
             live[p] = t, stopped[p] = out_of;
-            if (out_of == (uint32_t(1) << W) - 1) {
-                open &= ~(uint64_t(1) << p);
-                work.patch_end[p] = first + run.count;
-            }
         }
     }
     for (int p = 0; p < kPatches; ++p) final[p] = select(live[p] > 0.f, live[p], final[p]);
@@ -212,6 +216,17 @@ INLINE void prefetch_tile(const BackwardJob& back, const TileWork& work, const T
                          back.alpha_grad_y);
 }
 
+// A bit per patch that is not opaque before entry `index`.
+INLINE uint64_t open_at(const uint32_t* patch_end, uint32_t index) {
+    uint64_t open = 0;
+    for (int p = 0; p < kPatches; p += W) {
+        I end;
+        __builtin_memcpy(&end, patch_end + p, sizeof end);
+        open |= bits(end > I{} + int32_t(index)) << p;
+    }
+    return open;
+}
+
 // By patch, of a tile's backward pass.
 struct Behind {
     const I* last;
@@ -228,12 +243,12 @@ INLINE void composite_backward(const BackwardJob& back, const TileWork& work, co
     Run<C> run;
     for (uint32_t stop = work.count; stop > 0;) {
         const uint32_t first = (stop - 1) / kRun * kRun;
-        uint64_t open = 0;
-        for (int p = 0; p < kPatches; ++p) open |= uint64_t(first < work.patch_end[p]) << p;
         fill_run<C>(job, tile, work.entries, first, stop, run);
         prefetch_backward(back, work.entries, stride, first ? first - kRun : 0, first);
         stop = first;
+        uint64_t open = 0;
         for (uint32_t j = run.count; j-- > 0;) {
+            if (j + 1 == run.count || j % kLook == kLook - 1) open = open_at(work.patch_end, first + j / kLook * kLook);
             const Entry& entry = work.entries[first + j];
             const Projected g = run.projected[j];
             const float* colour = run.values + j * Run<C>::stride;

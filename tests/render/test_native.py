@@ -253,11 +253,14 @@ def test_two_threads_give_the_same_bits_as_one(random_scene, all_gradients):
             assert torch.equal(gradients[name], other[name]), name
 
 
+@pytest.mark.parametrize("count", [200, 900])  # of 900 a tile has more than are handled together
 @pytest.mark.parametrize("level", ["avx512", "avx2", "portable"])
-def test_simd_levels_agree_within_rounding(level, monkeypatch, random_scene, all_gradients):
+def test_simd_levels_agree_within_rounding(level, count, monkeypatch, random_scene, all_gradients):
     if level not in _native.levels():
         pytest.skip(f"this CPU has no {level}")
-    splats, camera = random_scene(7, times=2, width=53, height=50, linear=True, channels=4)
+    splats, camera = random_scene(
+        7, count=count, times=2, width=53, height=50, linear=True, channels=4
+    )
     monkeypatch.setenv("EVSPLAT_ISA", level)
     assert _native.level() == level
     out, gradients = all_gradients(splats, camera, backend="native", dtype=torch.float32)
