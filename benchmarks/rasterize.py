@@ -28,8 +28,8 @@ from evsplat.render import LOW_PASS, Splats, render
 from evsplat.render.splats import join
 
 # Floating-point operations per lane of a patch step, a multiply-add as two: constant, per channel.
-# Counted in native/kernels.cpp; comparisons, selections and integer operations are left out. With fewer
-# than 16 lanes (native/narrow.h) a step has three operations less, which shares of the peak leave in.
+# Counted in native/kernels.cpp; comparisons, selections and integer operations are left out. With
+# fewer than 16 lanes (native/narrow.h) a step has three less, which shares of the peak leave in.
 FLOP_PER_LANE = {"forward": (26, 2), "backward": (41, 4)}
 
 
