@@ -49,8 +49,8 @@ INLINE void prefetch_rows(const float* first, ptrdiff_t sy) {
 }
 
 #if defined(__AVX2__) && EVSPLAT_LANES == 8
-// words[step * p] bit j: bit p of masks[j], of 32.
-INLINE void transpose_bits(const uint32_t* masks, uint32_t* words, int step) {
+// halves[2 * p] bit j: bit p of masks[j], of 32.
+INLINE void transpose_bits(const uint32_t* masks, uint32_t* halves) {
     const __m256i order = _mm256_setr_epi8(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15,  //
                                            0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
     __m256i rows[4];
@@ -66,23 +66,24 @@ INLINE void transpose_bits(const uint32_t* masks, uint32_t* words, int step) {
                         _mm256_unpacklo_epi64(ab2, cd2), _mm256_unpackhi_epi64(ab2, cd2)};
     for (int bit = 7; bit >= 0; --bit)
         for (int b = 0; b < 4; ++b) {
-            words[(8 * b + bit) * step] = uint32_t(_mm256_movemask_epi8(bytes[b]));
+            halves[2 * (8 * b + bit)] = uint32_t(_mm256_movemask_epi8(bytes[b]));
             bytes[b] = _mm256_add_epi8(bytes[b], bytes[b]);
         }
 }
 #endif
 
-// words[p] bit j: entry j of the run reaches patch p.
-INLINE void transpose_run(const Entry* entries, uint32_t count, uint64_t* words) {
+// Bit j of halves[2 * p], and of the one behind it for later entries: entry j of the run reaches patch p.
+INLINE void transpose_run(const Entry* entries, uint32_t count, uint32_t* halves) {
 #if defined(__AVX2__) && EVSPLAT_LANES == 8
     uint32_t masks[kRun];
     for (uint32_t j = 0; j < kRun; ++j) masks[j] = j < count ? uint32_t(entries[j].patches) : 0u;
-    transpose_bits(masks, (uint32_t*)words, 2);
-    transpose_bits(masks + kRun / 2, (uint32_t*)words + 1, 2);
+    transpose_bits(masks, halves);
+    transpose_bits(masks + 32, halves + 1);
 #else
-    for (int p = 0; p < kPatches; ++p) words[p] = 0;
+    for (int i = 0; i < 2 * kPatches; ++i) halves[i] = 0;
     for (uint32_t j = 0; j < count; ++j)
-        for (uint64_t mask = entries[j].patches; mask; mask &= mask - 1) words[__builtin_ctzll(mask)] |= uint64_t(1) << j;
+        for (uint64_t mask = entries[j].patches; mask; mask &= mask - 1)
+            halves[2 * __builtin_ctzll(mask) + j / 32] |= uint32_t(1) << j % 32;
 #endif
 }
 
@@ -149,11 +150,11 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
         const uint32_t stop = least(first + kRun, work.count);
         fill_run<C>(job, tile, work.entries, first, stop, run);
         prefetch_entries(job, work.entries, stop, least(stop + kRun, work.count));
-        uint64_t words[kPatches];
-        transpose_run(work.entries + first, run.count, words);
+        uint32_t halves[2 * kPatches];
+        transpose_run(work.entries + first, run.count, halves);
         for (uint64_t left = open; left; left &= left - 1) {
             const int p = __builtin_ctzll(left);
-            uint64_t word = words[p];
+            uint64_t word = halves[2 * p] | uint64_t(halves[2 * p + 1]) << 32;
             if (!word) continue;
             const F x = pixels.x[p], y = pixels.y[p];
             F t = live[p];
