@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -156,18 +157,24 @@ def test_a_body_of_few_joints_keeps_its_weights(reconstruction, joints):
     gaussians = _skinned(load_body_track(reconstruction[0]), 50, 0)
     weights = torch.rand(50, joints, generator=torch.Generator().manual_seed(0))
     weights /= weights.sum(1, keepdim=True)
-    avatar = avatar_of(replace(gaussians, weights=weights), weights.flip(1))
+    sizes = torch.linspace(0.05, 1, 50)
+    avatar = avatar_of(replace(gaussians, weights=weights), (weights.flip(1), sizes))
     assert (avatar.gaussians.weights - weights).abs().max() < 1 / 255
-    assert (avatar.elsewhere.dense(joints) - weights.flip(1)).abs().max() < 1 / 255
+    assert (avatar.elsewhere.skin.dense(joints) - weights.flip(1)).abs().max() < 1 / 255
+    assert np.abs(avatar.elsewhere.sizes / 255 - sizes.numpy()).max() <= 0.501 / 255
 
 
-def test_the_document_has_the_weights_of_poses_that_were_not_recorded(run):
+def test_the_document_has_weights_and_sizes_of_poses_that_were_not_recorded(run):
     """Those with which films draw other motions, where they are others."""
+    source = run.reconstruction
+    rows = source.model.gaussians.human
+    with torch.no_grad():
+        source.model.gaussians.scales_log[rows][3] = math.log(0.3)
     page = export_run(run.path, "avatar", out=run.path / "dancer")
     document = json.loads((page.parent / "avatar.json").read_text(encoding="utf-8"))
-    source = run.reconstruction
-    means = source.model.gaussians.means[source.model.gaussians.human]
-    even = source.in_new_motion(source.track).model.skinning_weights(means)
+    means = source.model.gaussians.means[rows]
+    moving = source.in_new_motion(source.track).model
+    even = moving.skinning_weights(means)
     assert (even - source.model.skinning_weights(means)).abs().max() > 0.01
     elsewhere = document["skin"]["elsewhere"]
     bones, weights = (
@@ -176,6 +183,10 @@ def test_the_document_has_the_weights_of_poses_that_were_not_recorded(run):
     )
     kept = FourBones(bones.copy(), weights.copy()).dense(even.shape[1])
     assert (kept - four_bones(even).dense(even.shape[1])).abs().max() == 0
+    sizes = np.frombuffer(base64.b64decode(elsewhere["sizes"]), "u1") / 255
+    drawn, learned = (m.gaussians.scales_log[rows].exp().detach() for m in (moving, source.model))
+    assert sizes[3] < 0.5
+    np.testing.assert_allclose(sizes[:, None] * learned.numpy(), drawn.numpy(), rtol=0.05)
 
 
 def test_a_body_of_too_many_joints_is_told(reconstruction):

@@ -30,7 +30,7 @@ from evsplat.training.reconstruction import GaussianReconstruction
 BONES_EACH = 4
 _MOST_JOINTS = 256
 KEYS_PER_SECOND = 60.0
-FORMAT, VERSION = "evsplat-avatar", 3
+FORMAT, VERSION = "evsplat-avatar", 4
 _PLAYER = files("evsplat") / "data" / "player"
 _SCRIPTS = ("splats.js", "skeleton.js", "orbit.js", "player.js")
 _README = """An avatar made by evsplat.
@@ -72,8 +72,18 @@ class Avatar:
     """Gaussians at rest; their weights are those of ``skin``."""
     skin: FourBones
     """In recorded poses."""
-    elsewhere: FourBones | None
-    """In all other poses, where neighbours stay together; None: the same."""
+    elsewhere: "Elsewhere | None"
+    """In all other poses; None: as in recorded ones."""
+
+
+@dataclass(frozen=True, eq=False)
+class Elsewhere:
+    """What differs in poses that were not recorded."""
+
+    skin: FourBones
+    """With which neighbours stay together."""
+    sizes: UInt8[np.ndarray, " H"]
+    """Factors on the standard deviations, in 255ths: less where a Gaussian reaches off the body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +98,20 @@ class Clip:
     """Root joint's shift from its rest place, metres."""
 
 
-def avatar_of(gaussians: SkinnedGaussians, elsewhere: Float[Tensor, "H J"] | None = None) -> Avatar:
-    """Keep four bones of each Gaussian; ``elsewhere``: weights in poses that were not recorded."""
+def avatar_of(
+    gaussians: SkinnedGaussians,
+    elsewhere: tuple[Float[Tensor, "H J"], Float[Tensor, " H"]] | None = None,
+) -> Avatar:
+    """Keep four bones of each Gaussian.
+
+    ``elsewhere``: weights, and factors (0..1) on the sizes, in poses that were not recorded.
+    """
     skin = four_bones(gaussians.weights)
     weights = skin.dense(gaussians.weights.shape[1])
-    other = None if elsewhere is None else four_bones(elsewhere)
+    other = None
+    if elsewhere is not None:
+        even, sizes = elsewhere
+        other = Elsewhere(four_bones(even), (255 * sizes).round().to(torch.uint8).numpy())
     return Avatar(replace(gaussians, weights=weights), skin, other)
 
 
@@ -214,7 +233,7 @@ def avatar_document(
         "skin": {
             "count": len(avatar.skin),
             **_skin(avatar.skin),
-            "elsewhere": None if avatar.elsewhere is None else _skin(avatar.elsewhere),
+            "elsewhere": None if avatar.elsewhere is None else _elsewhere(avatar.elsewhere),
         },
         "light": None if light is None else _light(light),
         "correctives": None if correctives is None else _correctives(correctives),
@@ -266,6 +285,10 @@ def _cloud(cloud: SplatCloud) -> dict[str, Any]:
 
 def _skin(skin: FourBones) -> dict[str, Any]:
     return {"bones": _base64(skin.bones, "u1"), "weights": _base64(skin.weights, "u1")}
+
+
+def _elsewhere(elsewhere: Elsewhere) -> dict[str, Any]:
+    return {**_skin(elsewhere.skin), "sizes": _base64(elsewhere.sizes, "u1")}
 
 
 def _light(light: SurfaceLight) -> dict[str, Any]:

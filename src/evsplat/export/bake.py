@@ -63,7 +63,7 @@ def export_avatar(
     if motion is not None:
         clips.append(clip_of(Path(motion).stem, load_motion_of(motion, track)))
     gaussians = with_correctives(run, at_rest(run, camera), camera)
-    avatar = avatar_of(gaussians, _weights_elsewhere(source, gaussians))
+    avatar = avatar_of(gaussians, _elsewhere(source, gaussians))
     mids = [frame.mid_us for frame in capture.frames]
     clips.insert(0, recorded_clip(source, (min(mids), max(mids))))
     loss = measure_loss(source, avatar, capture)
@@ -85,13 +85,22 @@ def export_avatar(
 
 
 @torch.no_grad()
-def _weights_elsewhere(
+def _elsewhere(
     source: GaussianReconstruction, gaussians: SkinnedGaussians
-) -> Float[Tensor, "H J"] | None:
-    """Weights of the bones in motions that were not recorded; None: the same."""
+) -> tuple[Float[Tensor, "H J"], Float[Tensor, " H"]] | None:
+    """Bones' weights and factors on sizes in motions that were not recorded; None: the same."""
     model = source.in_new_motion(source.track).model
     weights = model.skinning_weights(gaussians.means.to(source.model.device)).cpu()
-    return None if torch.allclose(weights, gaussians.weights, atol=1e-6) else weights
+    if torch.allclose(weights, gaussians.weights, atol=1e-6):
+        return None
+    time_us = int(source.track.times_us[0])
+    center = torch.zeros(3, device=source.model.device)
+    new, recorded = (
+        each.at([time_us], center, hard_semantics=True).human.scales[0]
+        for each in (model, source.model)
+    )
+    # Gaussians are only ever made smaller, along all axes alike.
+    return weights, (new / recorded).amax(-1).clamp(0, 1).cpu()
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,14 @@ const joints = skeleton.names.length;
 const state = { clip: 0, time: 0, playing: true, speed: 1, rest: false, scene: true, exact: null, preset: null };
 
 const canvas = find("picture");
-// Of recorded poses, and of all others, where neighbours on the skin stay together.
+// Of recorded poses, and of all others, where neighbours on the skin stay together and nothing
+// reaches far off the body.
 const skins = [avatar.skin, avatar.skin.elsewhere ?? avatar.skin].map((skin) => {
-  const bones = bytes(skin.bones), weights = bytes(skin.weights);
-  return { bones: (row, k) => bones[4 * row + k], weights: (row, k) => weights[4 * row + k] / 255 };
+  const bones = bytes(skin.bones), weights = bytes(skin.weights), sizes = skin.sizes && bytes(skin.sizes);
+  return {
+    bones: (row, k) => bones[4 * row + k], weights: (row, k) => weights[4 * row + k] / 255,
+    size: (row) => (sizes ? sizes[row] / 255 : 1),
+  };
 });
 const clouds = [{
   count: avatar.person.count, values: floats(avatar.person.values), skins,
@@ -26,7 +30,7 @@ const clouds = [{
 if (avatar.scene) {
   clouds.push({
     count: avatar.scene.count, values: floats(avatar.scene.values),
-    skins: skins.map(() => ({ bones: () => joints, weights: (_, k) => (k ? 0 : 1) })),
+    skins: skins.map(() => ({ bones: () => joints, weights: (_, k) => (k ? 0 : 1), size: () => 1 })),
   });
 }
 

@@ -126,8 +126,8 @@ out vec4 result;
 void main() { result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1); }`;
 
 class SplatRenderer {
-  // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with skins (bones and
-  // weights, as many of each cloud) and, where light falls on them, normals. lowPass: px². light: center, radius_m,
+  // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with skins (bones, weights and
+  // factors on the scales, as many of each cloud) and, where light falls on them, normals. lowPass: px². light: center, radius_m,
   // coefficients (4 x 9 x 3), lamps and their intensities (L x 3), or null. correctives: count of
   // fields, steps and values (count x Gaussians x 4) for the first cloud, or null.
   constructor(canvas, clouds, boneCount, lowPass, light, correctives) {
@@ -168,10 +168,10 @@ class SplatRenderer {
     const skin = { bones: new Uint16Array(4 * this.count), weights: new Float32Array(4 * this.count) };
     let k = 0;
     for (const { count, values, skins, normals } of clouds) {
-      const { bones, weights } = skins[number];
+      const { bones, weights, size } = skins[number];
       for (let row = 0; row < count; row++, k++) {
         const v = values.subarray(14 * row, 14 * row + 14), at = 4 * TEXELS * k;
-        const c = covarianceOf(v.subarray(3, 7), v.subarray(7, 10));
+        const c = covarianceOf(v.subarray(3, 7), v.subarray(7, 10).map((scale) => scale * size(row)));
         const n = normals ? normals.subarray(3 * row, 3 * row + 3) : [0, 0, 0];
         texels.set([v[0], v[1], v[2], v[10], ...c, n[0], n[1], v[11], v[12], v[13], n[2]], at);
         for (let j = 0; j < 4; j++) {
