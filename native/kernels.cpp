@@ -328,6 +328,12 @@ struct Alpha {
     F u, v, raw, value;  // value: 0 below 1/255, at most 0.999
 };
 
+// Adds a Gaussian's values to a patch's; the first are lit.
+template <int C, bool Lit>
+INLINE void add_values(F* colour, int channels, F weight, F lit, const float* value) {
+    for (int k = 0; k < (C ? C : channels); ++k) colour[k] += (Lit && k < kLitChannels ? lit : weight) * value[k];
+}
+
 #if EVSPLAT_LANES < 16
 #include "narrow.h"
 #else
@@ -434,11 +440,7 @@ void forward_tile(const ForwardJob& job, const TileWork& work) {
                 t = select(go, next, F{});
                 const F lit = Lit && chunk.still[j] ? weight * light[p] : weight;
                 const float* value = chunk.values[j];
-                if (C) {
-                    for (int k = 0; k < C; ++k) c[k] += (Lit && k < kLitChannels ? lit : weight) * value[k];
-                } else {
-                    for (int k = 0; k < channels; ++k) out[k] += (Lit && k < kLitChannels ? lit : weight) * value[k];
-                }
+                add_values<C, Lit>(C ? c : out, channels, weight, lit, value);
             }
             for (int k = 0; k < C; ++k) out[k] = c[k];
             live[p] = t, final[p] = t_final, last[p] = t_last;

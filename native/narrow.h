@@ -99,8 +99,8 @@ INLINE void nearest(F e, F& whole, I& exponent) {
 #endif
 }
 
-// At pixel centres x, y from the tile's corner; `raw` means nothing where alpha is below 1/255. The polynomial
-// is that of exp2 in simd.h, whose bound -60 the test of e replaces.
+// At pixel centres x, y from the tile's corner; `raw` means nothing where alpha is below 1/255. In place
+// of exp2's bound there is the test of e.
 INLINE Alpha alpha_in_tile(const Projected& g, F x, F y) {
     Alpha a;
     a.v = g.l22 * y + g.y;
@@ -109,14 +109,7 @@ INLINE Alpha alpha_in_tile(const Projected& g, F x, F y) {
     F whole;
     I exponent;
     nearest(e, whole, exponent);
-    const F f = e - whole;
-    F p = splat(0.0013264727f);
-    p = p * f + 0.009671513f;
-    p = p * f + 0.055507336f;
-    p = p * f + 0.24022242f;
-    p = p * f + 0.693147f;
-    p = p * f + 1.f;
-    a.raw = (F)((I)p + exponent);
+    a.raw = (F)((I)exp2_fraction(e - whole) + exponent);
     a.value = select(e >= kLog2MinAlpha, min(a.raw, splat(kMaxAlpha)), F{});
     return a;
 }
@@ -182,11 +175,7 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
                 t = next;
                 const F lit = Lit ? weight * select(I{} + run.still[j], light[p], splat(1.f)) : weight;
                 const float* value = run.values + j * Run<C>::stride;
-                if (C) {
-                    for (int k = 0; k < C; ++k) c[k] += (Lit && k < kLitChannels ? lit : weight) * value[k];
-                } else {
-                    for (int k = 0; k < channels; ++k) out[k] += (Lit && k < kLitChannels ? lit : weight) * value[k];
-                }
+                add_values<C, Lit>(C ? c : out, channels, weight, lit, value);
             }
             for (int k = 0; k < C; ++k) out[k] = c[k];
             live[p] = t, stopped[p] = out_of;

@@ -125,20 +125,24 @@ INLINE F reciprocal(F v) {
 #endif
 }
 
-// 2^e for e <= 1, 1.5e-7 relative, but exact at 0, since 1 - 2^e matters there; below -60 it gives
-// 2^-60. The magic number rounds to nearest, which -ffast-math would break.
-INLINE F exp2(F e) {
-    e = max(e, splat(-60.f));
-    const F magic = splat(12582912.f);
-    const F shifted = e + magic;
-    const F f = e - (shifted - magic);
+// 2^f for f in [-1/2, 1/2], 1.5e-7 relative, but exact at 0, since 1 - 2^f matters there.
+INLINE F exp2_fraction(F f) {
     F p = splat(0.0013264727f);
     p = p * f + 0.009671513f;
     p = p * f + 0.055507336f;
     p = p * f + 0.24022242f;
     p = p * f + 0.693147f;
     p = p * f + 1.f;
-    return (F)((I)p + ((I)shifted << 23));
+    return p;
+}
+
+// 2^e for e <= 1, as exact as `exp2_fraction`; below -60 it gives 2^-60. The magic number rounds to
+// nearest, which -ffast-math would break.
+INLINE F exp2(F e) {
+    e = max(e, splat(-60.f));
+    const F magic = splat(12582912.f);
+    const F shifted = e + magic;
+    return (F)((I)exp2_fraction(e - (shifted - magic)) + ((I)shifted << 23));
 }
 
 // Base-2 logarithm of normal positive numbers, 1e-7 absolute: the exponent, and of the mantissa m in

@@ -37,6 +37,13 @@ def nearest(
     return distance.to(points), index
 
 
+def median_around(
+    points: Float[Tensor, "N 3"], values: Float[Tensor, " N"], k: int
+) -> Float[Tensor, " N"]:
+    """Median of the values of each point's k nearest others, or of all where there are fewer."""
+    return values[nearest(points, min(k, len(points) - 1))[1]].median(1).values
+
+
 def _by_all_distances(
     points: Float[Tensor, "N 3"], k: int, queries: Float[Tensor, "M 3"] | None
 ) -> tuple[Float[Tensor, "M k"], Int[Tensor, "M k"]]:

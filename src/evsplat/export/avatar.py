@@ -65,18 +65,6 @@ class FourBones:
 
 
 @dataclass(frozen=True, eq=False)
-class Avatar:
-    """A person whose every Gaussian follows at most four bones."""
-
-    gaussians: SkinnedGaussians
-    """Gaussians at rest; their weights are those of ``skin``."""
-    skin: FourBones
-    """In recorded poses."""
-    elsewhere: "Elsewhere | None"
-    """In all other poses; None: as in recorded ones."""
-
-
-@dataclass(frozen=True, eq=False)
 class Elsewhere:
     """What differs in poses that were not recorded."""
 
@@ -84,6 +72,18 @@ class Elsewhere:
     """With which neighbours stay together."""
     sizes: UInt8[np.ndarray, " H"]
     """Factors on the standard deviations, in 255ths: less where a Gaussian reaches off the body."""
+
+
+@dataclass(frozen=True, eq=False)
+class Avatar:
+    """A person whose every Gaussian follows at most four bones."""
+
+    gaussians: SkinnedGaussians
+    """Gaussians at rest; their weights are those of ``skin``."""
+    skin: FourBones
+    """In recorded poses."""
+    elsewhere: Elsewhere | None
+    """In all other poses; None: as in recorded ones."""
 
 
 @dataclass(frozen=True, eq=False)

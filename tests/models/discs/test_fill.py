@@ -301,13 +301,6 @@ def test_hues_that_the_pictures_hardly_tell_are_calm_and_brightness_stays(parts_
 def test_brightness_that_the_pictures_hardly_tell_is_calm_and_hues_stay(parts_at):
     bright, hues, front = parts_at(HUE=0.0, BRIGHT=0.0)
     calmer, as_hued, same_front = parts_at(HUE=0.0, BRIGHT=30.0)
-    print(
-        float(calmer.std()),
-        float(bright.std()),
-        float(as_hued.square().mean()),
-        float(hues.square().mean()),
-        float((same_front - front).square().mean().sqrt()),
-    )
     assert float(calmer.std()) < 0.7 * float(bright.std())
     assert float(as_hued.square().mean()) > 0.7 * float(hues.square().mean())
     assert float((same_front - front).square().mean().sqrt()) < 0.02

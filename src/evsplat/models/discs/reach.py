@@ -10,7 +10,7 @@ from torch import Tensor
 
 from evsplat.body import SurfaceSamples
 from evsplat.body.rotations import quaternion_to_matrix
-from evsplat.neighbours import nearest
+from evsplat.neighbours import median_around, nearest
 
 SIGMAS = 2.0
 """Standard deviations along its axes at which a disc is taken to end."""
@@ -35,7 +35,7 @@ def within_reach(
     if len(means) < 2:
         return torch.ones_like(means[:, 0])
     heights = _heights(means, surface)
-    usual = heights[nearest(means, min(_NEIGHBOURS, len(means) - 1))[1]].median(1).values
+    usual = median_around(means, heights, _NEIGHBOURS)
     axes = SIGMAS * quaternion_to_matrix(quaternions) * scales[:, None]
     ends = [_heights(means + way * axis, surface) for axis in axes.unbind(-1) for way in (1, -1)]
     stands, reaches = heights - usual, torch.stack(ends).amax(0) - usual

@@ -17,7 +17,7 @@ from evsplat.gaussians import GaussianSet
 from evsplat.models.discs.shading import NearestSurface
 from evsplat.models.layers import Layers
 from evsplat.models.seen import draw_values, transposed
-from evsplat.neighbours import nearest
+from evsplat.neighbours import median_around
 from evsplat.probes import random_signs
 
 WRONG, WRONG_FROM = 0.02, 0.1
@@ -54,8 +54,7 @@ def off_the_body(
     """
     means = means.detach()
     heights = ((means - surface.surface.points[surface.at(means)]) * normals).sum(-1)
-    index = nearest(means, min(_NEIGHBOURS, len(means) - 1))[1]
-    return heights - heights[index].median(1).values
+    return heights - median_around(means, heights, _NEIGHBOURS)
 
 
 def prices(
