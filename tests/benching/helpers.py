@@ -1,9 +1,17 @@
 """Suites small enough for tests, and what their records say apart from times."""
 
+import importlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+import torch
 import yaml
+
+from evsplat.benching.cell import run_cell
+from evsplat.benching.local import LocalPool
 
 from ..small_model import SMALL
 
@@ -32,3 +40,23 @@ def records(folder: Path) -> dict[str, dict]:
             key: value for key, value in record.items() if key not in timed
         }
     return found
+
+
+class _InThisProcess(LocalPool):
+    """Cells one after another without the seconds in which a process of their own starts."""
+
+    def run(self, cells):
+        for cell in cells:
+            run_cell(self.folder, cell, threads=self.threads, device=self.device)
+            yield cell, None
+
+
+@contextmanager
+def cells_in_this_process() -> Iterator[None]:
+    """Benches within ask what becomes of cells; test_bench.py asks about their processes."""
+    threads = torch.get_num_threads()
+    with pytest.MonkeyPatch.context() as patch:
+        # The package has a function of the module's name.
+        patch.setattr(importlib.import_module("evsplat.benching.run"), "LocalPool", _InThisProcess)
+        yield
+    torch.set_num_threads(threads)

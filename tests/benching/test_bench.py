@@ -26,7 +26,7 @@ from evsplat.training.trainer import Trainer
 from evsplat.untrusted.text import read_json
 
 from ..small_model import SMALL
-from .helpers import MEDIAN, PAPER, records, write_suite
+from .helpers import MEDIAN, PAPER, cells_in_this_process, records, write_suite
 
 training = importlib.import_module("evsplat.training.train")
 
@@ -52,7 +52,8 @@ def test_killed_at_random_moments_and_started_again_it_ends_with_the_same_record
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-    subprocess.run(command(suite, tmp_path / "killed", "--jobs", "1"), check=True)
+    with cells_in_this_process():
+        ev.bench(suite, out=tmp_path / "killed", jobs=1)
     assert records(tmp_path / "killed") == records(tmp_path / "whole"), f"seed {seed}"
     hidden = [path.name for path in (tmp_path / "killed" / "captures").iterdir()]
     assert hidden == ["one-edi"]
@@ -91,7 +92,12 @@ def test_failures_are_recorded_kept_and_tried_again_only_when_asked(tiny_capture
     rows = (MEDIAN, {"name": "new", "method": "of_tomorrow"})
     suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, *rows)
     out = tmp_path / "out"
-    assert main(["bench", str(suite), "--out", str(out), "--jobs", "1"]) == 0
+
+    def bench(*options: str) -> int:
+        with cells_in_this_process():
+            return main(["bench", str(suite), "--out", str(out), *options])
+
+    assert bench("--jobs", "1") == 0
     assert "0 done before" in capsys.readouterr().err
     first = records(out)
     assert first["one/median/seed0.json"]["status"] == "done"
@@ -100,14 +106,14 @@ def test_failures_are_recorded_kept_and_tried_again_only_when_asked(tiny_capture
     for name in ("tables.md", "tables.tex", "index.html"):
         assert "unknown; methods are" in (out / name).read_text()
 
-    assert main(["bench", str(suite), "--out", str(out)]) == 0
+    assert bench() == 0
     assert "0 cells to do, 2 done before" in capsys.readouterr().err
-    assert main(["bench", str(suite), "--out", str(out), "--retry"]) == 0
+    assert bench("--retry") == 0
     assert "1 cell to do, 1 done before" in capsys.readouterr().err
     assert records(out) == first
 
     write_suite(suite, {"one": tiny_capture("two")}, MEDIAN | {"method": "nearest_frame"})
-    assert main(["bench", str(suite), "--out", str(out)]) == 2
+    assert bench() == 2
     message = capsys.readouterr().err
     assert "was made with method 'median_background', and 'nearest_frame' is asked for" in message
     assert records(out) == first

@@ -8,7 +8,7 @@ from evsplat.capture import load_capture
 from evsplat.cli.main import main
 from evsplat.untrusted.text import read_json
 
-from .helpers import MEDIAN, write_suite
+from .helpers import MEDIAN, cells_in_this_process, write_suite
 
 
 @pytest.fixture
@@ -25,7 +25,8 @@ def bench(tiny_capture, tmp_path):
         record = tmp_path / "out" / "cells" / "one" / "them" / "seed0.json"
         return read_json(record) if code == 0 else None
 
-    return capture, theirs, run
+    with cells_in_this_process():
+        yield capture, theirs, run
 
 
 def write_pictures(capture, folder, change: int) -> float:

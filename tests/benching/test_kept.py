@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from evsplat.evaluation.tables import markdown
 from evsplat.pages import read_rgb
 
 from ..conftest import write_tiny_capture
-from .helpers import MEDIAN, PAPER, records, write_suite
+from .helpers import MEDIAN, PAPER, cells_in_this_process, records, write_suite
 
 OWN = {"name": "own", "method": "own_picture"}
 
@@ -31,6 +32,12 @@ class Made:
     suite: Path
     folder: Path
     kept: Path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cells() -> Iterator[None]:
+    with cells_in_this_process():
+        yield
 
 
 @pytest.fixture(scope="module")
