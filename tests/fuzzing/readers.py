@@ -49,6 +49,7 @@ from evsplat.untrusted.pictures import image_size
 from evsplat.untrusted.text import read_json, read_text
 from evsplat.weights import read_state
 
+from ..benching.helpers import cells_in_this_process
 from ..body.motion.test_motion_files import (
     acclaim_files,
     bvh_text,
@@ -86,6 +87,8 @@ class Reader:
     """Reads the folder, or the damaged file in it."""
     share: int
     """Inputs of it beside those of others; about as many take a second."""
+    whole: bool = False
+    """Whether it reads the folder alike, whichever file in it is damaged."""
 
 
 def write_capture(root: Path) -> None:
@@ -278,7 +281,7 @@ def read_tool(root: Path, damaged: Path) -> None:
     tool = damaged.relative_to(root).parts[0]
     if tool == "models":
         read_model_file(damaged)
-    elif damaged.suffix != ".where":
+    else:
         path = root / (root / f"{tool}.where").read_text()
         finite(read_poses(path, body_models=root / "models"))
 
@@ -365,8 +368,6 @@ def write_started(root: Path) -> None:
 
 def read_resumed(root: Path, damaged: Path) -> None:
     """The training gone on with, in a copy: what it saves is sound, or nothing is saved."""
-    if damaged.suffix == ".where":
-        return
     out = root.with_name(f"{root.name}-out")
     shutil.rmtree(out, ignore_errors=True)
     shutil.copytree(root / "run", out, symlinks=True)
@@ -407,7 +408,8 @@ def write_bench(root: Path) -> None:
         "rows": [{"name": name, "method": name} for name in ("median_background", "nearest_frame")],
     }
     (root / "suite.yaml").write_text(yaml.safe_dump(suite))
-    bench(root / "suite.yaml", out=root / "bench", jobs=1)
+    with cells_in_this_process():
+        bench(root / "suite.yaml", out=root / "bench", jobs=1)
 
 
 def read_bench(root: Path, damaged: Path) -> None:
@@ -425,7 +427,8 @@ def write_kept(root: Path) -> None:
     write_bench(beside)
     (beside / "suite.yaml").rename(root / "suite.yaml")
     shutil.rmtree(beside / "bench")
-    bench(root / "suite.yaml", out=beside / "bench", records=root / "records", jobs=1)
+    with cells_in_this_process():
+        bench(root / "suite.yaml", out=beside / "bench", records=root / "records", jobs=1)
     shutil.copytree(root.with_name(f"{beside.name} capture") / "sharp", root / "theirs" / "tiny")
 
 
@@ -490,7 +493,7 @@ def tree(kind: str) -> Reader:
         place = source.relative_to(root).as_posix()
         (root / "how.where").write_text(json.dumps([name, place, options, {}]))
 
-    return Reader(write_data, read_import, 3)
+    return Reader(write_data, read_import, 3, whole=True)
 
 
 def own(kind: str, write: Callable[[Path], Source], share: int) -> Reader:
@@ -499,13 +502,11 @@ def own(kind: str, write: Callable[[Path], Source], share: int) -> Reader:
     def write_data(root: Path) -> None:
         (root / "how.where").write_text(json.dumps([kind, *write(root)]))
 
-    return Reader(write_data, read_import, share)
+    return Reader(write_data, read_import, share, whole=True)
 
 
 def read_import(root: Path, damaged: Path) -> None:
     """The import that how.where tells of: a capture that is sound, or none."""
-    if damaged.suffix == ".where":
-        return
     name, place, options, files = json.loads((root / "how.where").read_text())
     out = root.with_name(f"{root.name}-out")
     shutil.rmtree(out, ignore_errors=True)
@@ -578,14 +579,14 @@ READERS = {
     "checkpoints": Reader(_write_checkpoint, lambda root, file: load_checkpoint(file), 500),
     "event files": Reader(write_store, read_events, 100),
     "recordings": Reader(write_recordings, read_recording, 250),
-    "captures": Reader(write_capture, read_capture, 25),
-    "runs": Reader(write_run, read_run, 3),
-    "reports": Reader(write_evaluated, read_report, 1),
-    "resumed runs": Reader(write_started, read_resumed, 2),
-    "benches": Reader(write_bench, read_bench, 10),
-    "kept records": Reader(write_kept, read_kept, 10),
-    "found poses": Reader(write_unposed, read_found, 2),
-    "training": Reader(write_capture, read_training, 1),
+    "captures": Reader(write_capture, read_capture, 25, whole=True),
+    "runs": Reader(write_run, read_run, 3, whole=True),
+    "reports": Reader(write_evaluated, read_report, 1, whole=True),
+    "resumed runs": Reader(write_started, read_resumed, 2, whole=True),
+    "benches": Reader(write_bench, read_bench, 10, whole=True),
+    "kept records": Reader(write_kept, read_kept, 10, whole=True),
+    "found poses": Reader(write_unposed, read_found, 2, whole=True),
+    "training": Reader(write_capture, read_training, 1, whole=True),
     **{
         f"import {kind}": tree(kind)
         for kind in (
