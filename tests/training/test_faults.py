@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import resource
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -15,14 +16,14 @@ import torch
 from evsplat.cli import main
 from evsplat.disk import held
 from evsplat.errors import ConfigError, DataError, MachineError, OutputError
-from evsplat.training import load_run, train
+from evsplat.training import Stopped, load_run, train
 from evsplat.training.checkpoint import checkpoints
 from evsplat.training.trainer import Trainer
 from evsplat.training.watching import is_training
 from evsplat.view.viewed_run import load_newest
 
 from ..small_model import small
-from .test_train import final_tensors, start, wait_for_step
+from .test_train import final_tensors
 
 # The package has a function of the module's name.
 MODULE = sys.modules["evsplat.training.train"]
@@ -55,15 +56,21 @@ def test_a_refused_training_leaves_no_folder(tiny_capture, tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-def test_sigterm_saves_as_ctrl_c_does(tiny_capture, tmp_path):
-    out = tmp_path / "run"
-    process = start(tiny_capture(), out, 5_000)
-    wait_for_step(out, 2, process)
-    assert is_training(out)
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=60)
-    assert f"--out {out} --resume" in errors and process.returncode == 1  # it raised Stopped
-    assert load_run(out).iteration >= 2 and not is_training(out)
+def test_sigterm_saves_as_ctrl_c_does(tiny_capture, tmp_path, monkeypatch):
+    out, before = tmp_path / "run", signal.getsignal(signal.SIGTERM)
+    step = Trainer.step
+
+    def ended_in_a_step(trainer: Trainer) -> object:
+        if trainer.clock.iteration == 2:
+            assert is_training(out)
+            os.kill(os.getpid(), signal.SIGTERM)
+        return step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", ended_in_a_step)
+    with pytest.raises(Stopped, match=f"--out {out} --resume"):
+        train(tiny_capture(), out=out, iterations=5_000, overrides=small("evsplat"))
+    assert load_run(out).iteration == 3 and not is_training(out)
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_the_viewer_of_a_training_that_was_killed_before_its_first_checkpoint_ends(
@@ -79,14 +86,14 @@ def test_the_viewer_of_a_training_that_was_killed_before_its_first_checkpoint_en
 
 def test_a_run_without_a_checkpoint_is_begun_anew_with_an_empty_log(tiny_capture, tmp_path):
     capture = tiny_capture()
-    whole = train(capture, out=tmp_path / "whole", iterations=10, overrides=small("evsplat"))
-    out = train(capture, out=tmp_path / "run", iterations=10, overrides=small("evsplat"))
+    whole = trained(capture, tmp_path / "whole")
+    out = Path(shutil.copytree(whole, tmp_path / "run"))
     config = (out / "config.yaml").read_bytes()
     for path in checkpoints(out / "checkpoints"):
         path.unlink()
-    train(capture, out=out, iterations=10, resume=True)
+    train(capture, out=out, iterations=2, resume=True)
     lines = (out / "log.jsonl").read_text().splitlines()
-    assert [json.loads(line)["iteration"] for line in lines] == [10]
+    assert [json.loads(line)["iteration"] for line in lines] == [2]
     expected, found = final_tensors(whole), final_tensors(out)
     assert all(torch.equal(expected[name], found[name]) for name in expected)
     assert (out / "config.yaml").read_bytes() == config
@@ -99,7 +106,7 @@ def test_a_run_goes_on_from_before_a_damaged_checkpoint(
     capture = tiny_capture()
     options = {"iterations": 6, "overrides": small("evsplat")}
     whole = train(capture, out=tmp_path / "whole", **options)
-    out = train(capture, out=tmp_path / "run", **options)
+    out = Path(shutil.copytree(whole, tmp_path / "run"))
     newest = checkpoints(out / "checkpoints")[-1]
     newest.write_bytes(b"")
     with caplog.at_level(logging.WARNING):

@@ -11,8 +11,10 @@ from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.outlook import FIRST, PARTS, REST, SPAN, Outlook
 from evsplat.training.trainer import Trainer
 
-from ..small_model import small
+from ..small_model import few_descent_steps, small
 
+STEPS = 2 * PARTS
+"""Of a whole training."""
 WEIGHTS = {"l1": 2.0, "dssim": ((0.0, 1.0), (7_500.0, 3.0))}
 
 
@@ -65,36 +67,37 @@ def test_a_method_that_names_no_terms_is_never_told_anything():
 
 
 def test_a_run_without_a_number_of_steps_ends_earlier_and_says_so(tiny_capture, tmp_path, caplog):
-    capture, settings = tiny_capture(frames=10), small("evsplat", "iterations=80")
+    capture, settings = tiny_capture(frames=10), small("evsplat", f"iterations={STEPS}")
     with caplog.at_level(logging.INFO):
         out = train(capture, out=tmp_path / "run", overrides=settings)
     _, state = load_checkpoint(latest_checkpoint(out / "checkpoints"))
     clock = state["clock"]
-    assert clock["fraction"] == 1.0 and clock["ends_at"] == clock["iteration"] < 80
+    assert clock["fraction"] == 1.0 and clock["ends_at"] == clock["iteration"] < STEPS
     assert "of the schedule: what is left of it ends with step" in caplog.text
     assert "whose end was brought forward" in caplog.text
     train(capture, out=out, resume=True)
     assert load_run(out).iteration == clock["iteration"]
     # Adding shares of what is left may take one step more within minutes.
     small_model = small("evsplat")
-    steps = train(capture, out=tmp_path / "steps", overrides=small_model, iterations=80)
+    steps = train(capture, out=tmp_path / "steps", overrides=small_model, iterations=STEPS)
     minutes = train(capture, out=tmp_path / "minutes", overrides=settings, max_minutes=30.0)
-    assert load_run(steps).iteration == 80 and load_run(minutes).iteration in {80, 81}
+    assert load_run(steps).iteration == STEPS and load_run(minutes).iteration in {STEPS, STEPS + 1}
 
 
-def test_a_run_on_poses_that_err_makes_all_its_steps(tiny_capture, tmp_path):
-    settings = small("evsplat", "iterations=80", "pose.refine=always")
+def test_a_run_on_poses_that_err_makes_all_its_steps(tiny_capture, tmp_path, monkeypatch):
+    few_descent_steps(monkeypatch)
+    settings = small("evsplat", f"iterations={STEPS}", "pose.refine=always")
     out = train(tiny_capture(frames=10), out=tmp_path / "run", overrides=settings)
-    assert load_run(out).iteration == 80
+    assert load_run(out).iteration == STEPS
 
 
 def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(tiny_capture, tmp_path, monkeypatch):
     module = sys.modules["evsplat.training.train"]  # its name in the package is the function
     monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
-    capture, settings = tiny_capture(frames=10), small("evsplat", "iterations=80")
+    capture, settings = tiny_capture(frames=10), small("evsplat", f"iterations={STEPS}")
     whole = train(capture, out=tmp_path / "whole", overrides=settings)
 
-    step, turn = Trainer.step, load_run(whole).iteration - round(80 * REST)
+    step, turn = Trainer.step, load_run(whole).iteration - round(STEPS * REST)
     for kill_at in (turn - 1, turn + 3):
 
         def killed(self: Trainer, kill_at: int = kill_at):

@@ -18,7 +18,7 @@ def test_a_short_training_beats_both_trivial_answers_in_full_frame_and_on_the_pe
     train(
         demo_capture_path,
         out=tmp_path / "run",
-        iterations=80,
+        iterations=20,
         overrides=("human.count=4000", "densify.max_human=4000", "scene.prefit_steps=100"),
     )
     capture = load_capture(demo_capture_path)

@@ -1,5 +1,7 @@
 """What a finished training made transparent is in its checkpoint, and in nothing made of it."""
 
+import shutil
+
 import pytest
 import torch
 
@@ -9,6 +11,7 @@ from evsplat.training.checkpoint import load_checkpoint, load_latest, load_model
 from evsplat.training.run import load_run, reload_run
 from evsplat.training.train import train
 
+from ..conftest import write_tiny_capture
 from ..small_model import small
 
 GONE = (0, 3, 7)
@@ -16,15 +19,24 @@ GONE = (0, 3, 7)
 OPACITIES = "filled.gaussians.opacity_logits"
 
 
-@pytest.fixture
-def thinned(tiny_capture, tmp_path):
-    """A run whose end made some Gaussians transparent, and its checkpoint."""
-    run = train(tiny_capture(), out=tmp_path / "run", iterations=3, overrides=small("evsplat"))
+@pytest.fixture(scope="module")
+def thinned_once(tmp_path_factory):
+    """A run whose end made some Gaussians transparent."""
+    place = tmp_path_factory.mktemp("thinned")
+    capture = write_tiny_capture(place / "tiny")
+    run = train(capture, out=place / "run", iterations=3, overrides=small("evsplat"))
     path, tensors, state = load_latest(run / "checkpoints")
     tensors[OPACITIES].clamp_(min=-2.0)
     tensors[OPACITIES][list(GONE)] = -14.0
     write_state(path, tensors, state)
-    return run, path
+    return run
+
+
+@pytest.fixture
+def thinned(thinned_once, tmp_path):
+    """A copy of it that may be spoilt, and its checkpoint."""
+    run = shutil.copytree(thinned_once, tmp_path / "run")
+    return run, load_latest(run / "checkpoints")[0]
 
 
 def test_pictures_without_transparent_rows_are_the_same_to_the_bit(thinned):

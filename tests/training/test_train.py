@@ -1,9 +1,11 @@
 """A training run as a user meets it: reproducible, resumable, honest when it fails."""
 
+import importlib
 import json
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -29,24 +31,23 @@ from evsplat.training.train import _ended
 from evsplat.training.trainer import Trainer
 from evsplat.untrusted.text import read_json
 
+from ..conftest import write_tiny_capture
 from ..seen import seen
 from ..small_model import built, small
 
+training = importlib.import_module("evsplat.training.train")
 # The same call in a process of its own that saves after every step.
 SCRIPT = """
 import importlib, sys
 module = importlib.import_module("evsplat.training.train")
 module.CHECKPOINT_SECONDS = 0.0
-module.train(sys.argv[1], out=sys.argv[2], iterations=int(sys.argv[3]), resume=sys.argv[4] == "1",
-             method=sys.argv[5], overrides=sys.argv[6:], threads=1)
+module.train(sys.argv[1], out=sys.argv[2], iterations=int(sys.argv[3]), method=sys.argv[4],
+             overrides=sys.argv[5:], threads=1)
 """
 
 
-def start(
-    capture: Path, out: Path, iterations: int, *, resume: bool = False, method: str = "paper"
-) -> subprocess.Popen:
-    settings = (method,) if resume else (method, *small(method))
-    command = [sys.executable, "-c", SCRIPT, capture, out, iterations, int(resume), *settings]
+def start(capture: Path, out: Path, iterations: int, *, method: str = "paper") -> subprocess.Popen:
+    command = [sys.executable, "-c", SCRIPT, capture, out, iterations, method, *small(method)]
     return subprocess.Popen(
         [str(part) for part in command],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -66,6 +67,21 @@ def wait_for_step(out: Path, step: int, process: subprocess.Popen) -> None:
     raise AssertionError("no checkpoint in time")
 
 
+@pytest.fixture(scope="module")
+def trained_once(tmp_path_factory) -> Path:
+    """A folder with a capture and two steps on it, for tests that ask what becomes of a run."""
+    place = tmp_path_factory.mktemp("trained")
+    capture = write_tiny_capture(place / "tiny")
+    train(capture, out=place / "run", iterations=2, overrides=small("evsplat"))
+    return place
+
+
+@pytest.fixture
+def trained(trained_once, tmp_path) -> tuple[Path, Path]:
+    """Its capture, and a run that the test may spoil."""
+    return trained_once / "tiny", shutil.copytree(trained_once / "run", tmp_path / "my run")
+
+
 def final_tensors(out: Path) -> dict[str, torch.Tensor]:
     path = latest_checkpoint(out / "checkpoints")
     assert path is not None
@@ -79,20 +95,19 @@ def log_without_times(out: Path) -> list[dict]:
 
 @pytest.mark.parametrize("method", ["paper", "evsplat"])
 def test_killed_and_resumed_run_equals_the_uninterrupted_one_bit_for_bit(
-    method, tiny_capture, tmp_path
+    method, tiny_capture, tmp_path, monkeypatch
 ):
     capture = tiny_capture(frames=10)
-    iterations = 24
-    whole = start(capture, tmp_path / "whole", iterations, method=method)
-    assert whole.wait(240) == 0, whole.stderr.read()
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    asked = {"iterations": 24, "threads": 1}
+    train(capture, out=tmp_path / "whole", method=method, overrides=small(method), **asked)
     for kill_at in (3, 13):
         broken = tmp_path / f"broken{kill_at}"
-        process = start(capture, broken, iterations, method=method)
+        process = start(capture, broken, asked["iterations"], method=method)
         wait_for_step(broken, kill_at, process)
         process.kill()  # SIGKILL: nothing can be tidied up
         process.wait()
-        resumed = start(capture, broken, iterations, resume=True)
-        assert resumed.wait(240) == 0, resumed.stderr.read()
+        train(capture, out=broken, resume=True, **asked)
         expected, found = final_tensors(tmp_path / "whole"), final_tensors(broken)
         assert expected.keys() == found.keys()
         different = [name for name in expected if not torch.equal(expected[name], found[name])]
@@ -180,7 +195,7 @@ def test_a_training_brings_no_compiler_along(tiny_capture, tmp_path):
     """PyTorch imports it, which takes a second, for gradients of more than plain sums."""
     last = 'assert not {"sympy", "torch._dynamo"} & set(sys.modules)'
     command = [sys.executable, "-c", SCRIPT + last, tiny_capture(frames=10), tmp_path / "run"]
-    command += [3, 0, "evsplat", *small("evsplat")]
+    command += [3, "evsplat", *small("evsplat")]
     subprocess.run([str(part) for part in command], check=True)
 
 
@@ -233,9 +248,8 @@ def test_the_folder_above_a_run_names_the_run(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["lacks", "holds the unknown"])
-def test_a_checkpoint_of_another_version_is_named(tiny_capture, tmp_path, change):
-    capture = tiny_capture(frames=10)
-    out = train(capture, out=tmp_path / "run", iterations=2, overrides=small("evsplat"))
+def test_a_checkpoint_of_another_version_is_named(trained, change):
+    capture, out = trained
     path = latest_checkpoint(RunFolder(out).checkpoints)
     tensors, state = load_checkpoint(path)
     if change == "lacks":
@@ -253,10 +267,8 @@ def test_a_checkpoint_of_another_version_is_named(tiny_capture, tmp_path, change
     assert RunFolder(out).log.read_text() == log
 
 
-def test_a_damaged_checkpoint_is_named(tiny_capture, tmp_path):
-    out = train(
-        tiny_capture(frames=10), out=tmp_path / "run", iterations=2, overrides=small("evsplat")
-    )
+def test_a_damaged_checkpoint_is_named(trained):
+    out = trained[1]
     path = latest_checkpoint(RunFolder(out).checkpoints)
     assert path is not None
     path.write_bytes(path.read_bytes()[:1000])
@@ -286,9 +298,8 @@ def test_the_method_is_the_one_asked_for_or_that_of_the_config(
     assert read_config(RunFolder(out))[0] == expected
 
 
-def test_a_run_folder_holds_what_it_was_made_with(tiny_capture, tmp_path):
-    capture = tiny_capture(frames=10)
-    out = train(capture, out=tmp_path / "run", iterations=2, overrides=small("evsplat"))
+def test_a_run_folder_holds_what_it_was_made_with(trained, tmp_path):
+    capture, out = trained
     facts = json.loads((out / "versions.json").read_text())
     assert facts["packages"]["torch"] == torch.__version__
     assert facts["seed"] == 0 and facts["threads"] >= 1
@@ -319,10 +330,8 @@ def test_everything_trains_where_it_is_asked_for_and_no_figure_is_made(
     assert "--use" in capsys.readouterr().err
 
 
-def test_a_run_of_the_version_before_says_what_became_of_its_settings(tiny_capture, tmp_path):
-    overrides = small("evsplat")
-    capture, out = tiny_capture(frames=10), tmp_path / "run"
-    train(capture, out=out, iterations=2, overrides=overrides)
+def test_a_run_of_the_version_before_says_what_became_of_its_settings(trained):
+    capture, out = trained
     config = load_yaml(out / "config.yaml")
     config["deform"] = {"width": config.pop("width"), "shadow_lights": config.pop("lamps")}
     config["optimisation"] = {"iterations": config.pop("iterations")}
@@ -350,9 +359,8 @@ def test_settings_read_back_have_the_digest_of_those_that_were_written(tmp_path,
     assert _settings_of(load_yaml(tmp_path / "config.yaml")) == written
 
 
-def test_settings_edited_after_the_start_are_refused(tiny_capture, tmp_path, capsys):
-    capture, out = tiny_capture(frames=10), tmp_path / "my run"
-    train(capture, out=out, iterations=2, overrides=small("evsplat"))
+def test_settings_edited_after_the_start_are_refused(trained, capsys):
+    capture, out = trained
     path = out / "config.yaml"
     written = path.read_text()
     path.write_text("# a comment changes nothing\n" + written)
