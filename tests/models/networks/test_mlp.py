@@ -1,9 +1,5 @@
 """The split MLP against one on concatenated inputs, and the compiled one against float64."""
 
-import os
-import subprocess
-import sys
-
 import pytest
 import torch
 from torch import nn
@@ -114,6 +110,10 @@ def sized(inputs_of, width, depth, out, points):
 @pytest.mark.parametrize(("inputs_of", "width", "depth", "out"), SIZES)
 @pytest.mark.parametrize("points", [1, 95, 96, 97, 1000])
 def test_native_values_and_gradients_equal_those_in_float64(inputs_of, width, depth, out, points):
+    assert_near_float64(inputs_of, width, depth, out, points)
+
+
+def assert_near_float64(inputs_of, width, depth, out, points):
     network, arguments, exact, doubles = sized(inputs_of, width, depth, out, points)
     counted = off_the_kink(exact, doubles)
     assert counted.double().mean() > 0.95
@@ -140,28 +140,11 @@ def test_native_results_do_not_depend_on_the_number_of_threads():
 
 
 @pytest.mark.parametrize("level", ["avx512", "avx2", "portable"])
-def test_every_simd_level_agrees(level):
+def test_every_simd_level_gives_what_float64_gives(level, monkeypatch):
     if level not in native_levels():
         pytest.skip(f"this processor has no {level}")
-    code = (
-        "import evsplat, torch; from evsplat.models.networks.mlp import PointMLP;"
-        "torch.manual_seed(0);"
-        "n = PointMLP(9, 4, 5, width=23, depth=2, out=6); p = torch.randn(130, 9).requires_grad_();"
-        "o = n(p, torch.randn(2, 4), torch.randn(2, 130, 5)); o.square().sum().backward();"
-        "print(float(o.double().norm()), float(p.grad.double().norm()))"
-    )
-    printed = []
-    for isa in (level, native_levels()[0]):
-        environment = {**os.environ, "EVSPLAT_ISA": isa}
-        run = subprocess.run(
-            [sys.executable, "-c", code],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        printed.append([float(word) for word in run.stdout.split()])
-    assert printed[0] == pytest.approx(printed[1], rel=1e-5)
+    monkeypatch.setenv("EVSPLAT_ISA", level)
+    assert_near_float64((9, 4, 5), 23, 2, 6, points=130)
 
 
 def test_transposed_inputs_give_the_same():
