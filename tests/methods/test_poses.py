@@ -115,7 +115,8 @@ def test_poses_that_were_corrected_when_found_are_not_drawn_again(captures, monk
 @pytest.mark.parametrize("source", ["exact", "markers", "estimated"])
 def test_what_a_capture_says_of_its_poses_counts_whatever_their_curve(seed, source, tiny_capture):
     """Fast exact motions stay as they are, smooth ones that are estimated are corrected."""
-    path, rng = tiny_capture(frames=40), np.random.default_rng(seed)
+    frames = 40 if source == "exact" else 20  # fast ones need the keys
+    path, rng = tiny_capture(frames=frames), np.random.default_rng(seed)
     count, *joints = load_capture(path).body_file.poses.shape
     cycles, jitter = (8.0, 0.01) if source == "exact" else (0.5, 0.0)
     phase = 2 * np.pi * (np.linspace(0, cycles, count)[:, None, None] + rng.random(joints))

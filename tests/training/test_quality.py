@@ -19,7 +19,13 @@ def test_a_short_training_beats_both_trivial_answers_in_full_frame_and_on_the_pe
         demo_capture_path,
         out=tmp_path / "run",
         iterations=20,
-        overrides=("human.count=4000", "densify.max_human=4000", "scene.prefit_steps=100"),
+        # What no picture shows is filled in tests/models/discs/test_fill.py.
+        overrides=(
+            "human.count=4000",
+            "densify.max_human=4000",
+            "scene.prefit_steps=100",
+            "fill=0",
+        ),
     )
     capture = load_capture(demo_capture_path)
     sources = {

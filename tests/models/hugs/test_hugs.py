@@ -197,7 +197,7 @@ def test_a_resumed_run_goes_on_as_the_uninterrupted_one(tiny_capture):
 def test_a_run_is_drawn_after_loading_and_its_sets_densify(tiny_capture, tmp_path):
     path = tiny_capture(frames=10)
     settings = small("hugs", "fit_steps=5", "densify.gradient=1e-7")
-    out = train(path, method="hugs", out=tmp_path / "run", iterations=30, overrides=settings)
+    out = train(path, method="hugs", out=tmp_path / "run", iterations=12, overrides=settings)
     run = load_run(out)
     assert run.gaussians["human"] > 80
     tensors, _ = load_checkpoint(latest_checkpoint(out / "checkpoints"))

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from evsplat._native import levels as native_levels
+from evsplat import _native
 from evsplat.models.networks.mlp import PointMLP
 
 
@@ -141,9 +141,10 @@ def test_native_results_do_not_depend_on_the_number_of_threads():
 
 @pytest.mark.parametrize("level", ["avx512", "avx2", "portable"])
 def test_every_simd_level_gives_what_float64_gives(level, monkeypatch):
-    if level not in native_levels():
+    if level not in _native.levels():
         pytest.skip(f"this processor has no {level}")
     monkeypatch.setenv("EVSPLAT_ISA", level)
+    assert _native.level() == level
     assert_near_float64((9, 4, 5), 23, 2, 6, points=130)
 
 
