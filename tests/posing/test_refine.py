@@ -15,18 +15,19 @@ from evsplat.pictures import decode, encode, luminance
 from evsplat.posing import refine as refining
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import Descent
+from evsplat.posing.pieces import between
 from evsplat.posing.refine import (
     JUDGED_FRAMES,
     LEAST_GAIN,
-    _between,
     _descended,
     _gain,
     _given_errors,
+    _mean_gain,
     expected_errors,
     judge,
 )
 from evsplat.posing.surface_discs import SurfaceDiscs
-from evsplat.posing.targets import Targets, find_targets
+from evsplat.posing.targets import Targets, find_targets, halved
 from evsplat.posing.time_limit import TimeLimit
 
 from ..seen import seen
@@ -256,7 +257,8 @@ def test_pictures_of_another_motion_correct_it_and_are_explained_better(body):
     stage = descent.run(1, 60, first=True)
     assert joint_px(descent, truth) < 0.5 * before
     assert stage.after < 0.5 * stage.before
-    gain, gain_error = _gain(descent, descent.targets.rows(range(0, len(TIMES), 3)))
+    aside = descent.targets.rows(range(0, len(TIMES), 3))
+    gain, gain_error = _mean_gain(_gain(descent, aside))
     assert gain - 2 * gain_error > 0.3
     errors = descent.errors()
     errors.check(len(descent.correction.key_times), len(body.parents), "test")
@@ -334,7 +336,7 @@ def test_larger_pictures_are_asked_where_the_smallest_leave_it_open(body, wrong)
     limit, steps = TimeLimit(None, 1), (60, 10)
     track = still_track(body)
     found = _descended(track, descent.targets, limit, steps, 500, 0, least_gain=LEAST_GAIN)
-    gain, gain_error = found.gain
+    gain, gain_error = _mean_gain(found.better)
     assert len(found.stages) == (2 if wrong else 1)
     assert (gain - 2 * gain_error > LEAST_GAIN) == wrong
 
@@ -346,7 +348,7 @@ def test_a_piece_of_a_motion_moves_as_the_whole(body):
     poses = 0.3 * rng.normal(size=(60, len(body.parents), 3))
     whole = BodyTrack(body, times, poses, rng.normal(size=(60, 3)))
     inside = np.linspace(times[20], times[39], 50).astype(np.int64).tolist()
-    piece = _between(whole, inside[0], inside[-1])
+    piece = between(whole, inside[0], inside[-1])
     assert len(piece.times_us) < 40
     for found, wanted in zip(piece.at(inside), whole.at(inside), strict=True):
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
@@ -376,7 +378,8 @@ def test_larger_pictures_are_made_smaller_for_a_verdict(tiny_capture):
     """Halved while both sides keep the least, as the camera is."""
     capture = seen(tiny_capture(width=64, height=48))
     track = load_body_track(capture)
-    whole, small = find_targets(track, capture), find_targets(track, capture, least_px=12)
+    shrink = halved(capture.camera(capture.frames[0]), 12)
+    whole, small = find_targets(track, capture), find_targets(track, capture, shrink=shrink)
     assert (small.camera.width, small.camera.height) == (16, 12)
     assert small.image.shape[1:3] == (12, 16) == small.behind.shape[1:3]
     means = torch.nn.functional.avg_pool2d(whole.image.permute(0, 3, 1, 2), 4)

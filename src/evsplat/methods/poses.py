@@ -15,7 +15,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.landmarks.pictures import FRACTIONS
 from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, Weight
 from evsplat.models.pose_correction import SHARES, PoseCorrection
-from evsplat.posing.refine import Refined, Verdict, judge, refine
+from evsplat.posing.refine import Gain, Refined, Verdict, judge, refine
 
 logger = logging.getLogger(__name__)
 
@@ -28,9 +28,8 @@ SMOOTHED = 0.5
 """Noise that is believed of a curve alone, over what is expected to be new in every key: fast
 motion looks like noise as well, and with all of it up to 15 % was added to errors of joints."""
 
-MOST_PIXELS = 40_000_000
-"""Of the pictures by which poses are corrected before training: they are there at once, with all
-that is computed of them 140 B a pixel."""
+MOST_PIXELS = 100_000_000
+"""Of the pictures by which poses are corrected before training: some ten minutes of one core."""
 
 _NOT_ALWAYS = ReadIf("pose.refine", "auto or never", lambda refine: refine != "always")
 _REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "never")
@@ -98,14 +97,14 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
         track = _smoothed(track, joint_rad, root_m)
     # Poses that were corrected when they were found need not wait for the same again.
     tried = source is not None and capture.poses_refined
-    found: Verdict | None = None
+    found: Gain | None = None
     if fit and exact is not True and not tried:
         found = _corrected(track, capture) if told else _compared(judge, track, capture)
     decided = exact if exact is not None else found is None or not found.disproves
     if exact is not False and decided and fit:
         _refuse_unread(config, capture)
     given = track
-    if found is not None and found.better and not decided and not told:
+    if isinstance(found, Verdict) and found.better and not decided:
         track = _as_far_off(track, found.given_errors, smooth=config.smooth == "auto")
         found = _corrected(track, capture)
         joint_rad, root_m = _expected(config, track)
@@ -154,7 +153,7 @@ def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTr
     return _smoothed(told, errors.joint_rad, errors.root_m) if smooth else told
 
 
-def _corrected(track: BodyTrack, capture: TrainingCapture) -> Verdict | None:
+def _corrected(track: BodyTrack, capture: TrainingCapture) -> Gain | None:
     """Poses corrected by the whole recording; None where that is ruled out, which is logged."""
     frames = capture.train_frames
     camera = capture.camera(frames[0])
@@ -162,17 +161,15 @@ def _corrected(track: BodyTrack, capture: TrainingCapture) -> Verdict | None:
     if len(frames) > most:
         logger.warning(
             "%s: has %d training frames, more than the %d of this size whose poses are corrected "
-            "before training; what they err by is learned in training alone, which is less "
-            "exact. Cut the recording into shorter ones where that matters.",
+            "before training, since that would take long; what they err by is learned in training "
+            "alone, which is less exact. Cut the recording into shorter ones where that matters.",
             capture.path, len(frames), most,
         )  # fmt: skip
         return None
     return _compared(refine, track, capture)
 
 
-def _compared(
-    how: Callable[..., Verdict], track: BodyTrack, capture: TrainingCapture
-) -> Verdict | None:
+def _compared(how: Callable[..., Gain], track: BodyTrack, capture: TrainingCapture) -> Gain | None:
     """Other poses, found without any Gaussian; None where a moving camera rules them out."""
     try:
         found = how(track, capture, progress=True)

@@ -6,11 +6,13 @@ what is unknown of motion and look is moved downhill until the drawings are like
 
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from evsplat.body import Body, BodyTrack, PoseErrors
 from evsplat.body.pose_noise import PoseNoise, joint_angles
@@ -19,6 +21,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import COARSE_PX, LOOK_STEPS, PROBE_STEPS, PROBES, Descent, Stage
+from evsplat.posing.pieces import between, cut_in_pieces, joined
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import Targets, find_targets, halved
 from evsplat.posing.time_limit import TimeLimit
@@ -44,21 +47,16 @@ _NEARER = 0.6
 JUDGED_PX, JUDGED_FRAMES = 128, 24
 """Least side of the pictures, and training frames, that tell whether given poses are exact. More
 of either takes the longer and tells no more: `LEAST_GAIN` was chosen on recordings of this size."""
-_AROUND = 8
-"""Keys beside those frames: a spline forgets three quarters of a value from one to the next."""
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class Gain:
     """Whether a corrected motion is better than the given one."""
 
     gain: float
     """Share by which it explains pictures better that neither motion was fitted to."""
     gain_error: float
     """Standard error of the gain over the frames."""
-    given_errors: PoseErrors
-    """Errors of the given motion, by how far the corrected one lies from it: for motions that don't
-    say how far they err."""
     seconds: float
 
     @property
@@ -73,7 +71,15 @@ class Verdict:
 
 
 @dataclass(frozen=True, eq=False)
-class Refined(Verdict):
+class Verdict(Gain):
+    """Of a motion that doesn't say how far it errs."""
+
+    given_errors: PoseErrors
+    """Errors of the given motion, by how far the corrected one lies from it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined(Gain):
     """A corrected motion, and whether it is better than the given one."""
 
     track: BodyTrack
@@ -81,6 +87,7 @@ class Refined(Verdict):
     dressed: Body
     """The body with its surface where pictures show the person's: clothes, hair and shoes too."""
     stages: tuple[Stage, ...]
+    """Of each piece of the recording, one after the other."""
 
 
 def judge(
@@ -105,13 +112,14 @@ def judge(
     began = time.monotonic()
     frames = _middle(capture)
     times = [time_us for frame in frames for time_us in frame.exposure_us]
-    targets = find_targets(track, capture, frames, least_px=JUDGED_PX)
+    shrink = halved(capture.camera(frames[0]), JUDGED_PX)
+    targets = find_targets(track, capture, frames, shrink=shrink)
     limit = TimeLimit(None, 5 * LOOK_STEPS + sum(steps), progress=progress)
-    piece = _between(track, min(times), max(times))
+    piece = between(track, min(times), max(times))
     found = _descended(piece, targets, limit, steps, discs, seed, least_gain=LEAST_GAIN)
     limit.close()
     errors = _given_errors(found.descent.correction, len(track.times_us))
-    return Verdict(*found.gain, errors, time.monotonic() - began)
+    return Verdict(*_mean_gain(found.better), time.monotonic() - began, errors)
 
 
 def refine(
@@ -134,23 +142,59 @@ def refine(
         DataError: the camera moves, or the posed body is in no picture.
     """
     began = time.monotonic()
+    pieces = cut_in_pieces(track, capture)
     planned = 3 * LOOK_STEPS + sum(steps) + _LAST_STEPS + PROBES * PROBE_STEPS
-    limit = TimeLimit(seconds, planned, progress=progress)
-    targets = find_targets(track, capture)
+    limit = TimeLimit(seconds, len(pieces) * planned, progress=progress)
+    found = []
+    for piece in pieces:
+        whole = len(pieces) == 1
+        given = track if whole else between(track, piece.start_us, piece.end_us)
+        targets = find_targets(given, capture, piece.frames, shrink=piece.shrink)
+        found.append(_refined(given, targets, limit, steps, discs, seed))
+    limit.close()
+    return Refined(
+        *_mean_gain(torch.cat([one.better for one in found])),
+        time.monotonic() - began,
+        joined(pieces, [one.track for one in found]),
+        _mean_body([one.dressed for one in found]),
+        tuple(stage for one in found for stage in one.stages),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """What pictures make of one piece of a motion."""
+
+    better: Float[Tensor, "A"]
+    """See `_gain`."""
+    track: BodyTrack
+    dressed: Body
+    stages: list[Stage]
+
+
+def _refined(
+    track: BodyTrack,
+    targets: Targets,
+    limit: TimeLimit,
+    steps: tuple[int, int],
+    discs: int,
+    seed: int,
+) -> _Piece:
     found = _descended(track, targets, limit, steps, discs, seed)
     descent = found.descent
     descent.targets = found.nearer
     last = descent.run(1, _LAST_STEPS, first=False)
-    errors = descent.errors()
-    limit.close()
-    return Refined(
-        *found.gain,
-        _given_errors(descent.correction, len(track.times_us)),
-        time.monotonic() - began,
-        descent.correction.corrected(errors),
-        descent.look.dressed(),
-        (*found.stages, last),
-    )
+    corrected = descent.correction.corrected(descent.errors())
+    return _Piece(found.better, corrected, descent.look.dressed(), [*found.stages, last])
+
+
+def _mean_body(bodies: Sequence[Body]) -> Body:
+    """The mean surface of bodies with the same joints."""
+    first, *others = bodies
+    if not others:
+        return first
+    vertices = torch.stack([body.rest_vertices for body in bodies]).mean(0)
+    return replace(first, rest_vertices=vertices)
 
 
 def _middle(capture: TrainingCapture) -> list[Frame]:
@@ -161,14 +205,6 @@ def _middle(capture: TrainingCapture) -> list[Frame]:
     return [frame for frame in capture.frames if kept[0] <= frame.mid_us <= kept[-1]]
 
 
-def _between(track: BodyTrack, start_us: int, end_us: int) -> BodyTrack:
-    """The motion between two times, without what it says of its errors."""
-    first, last = np.searchsorted(track.times_us, [start_us, end_us])
-    keys = slice(max(0, first - _AROUND), last + _AROUND)
-    values = track.times_us[keys], track.poses[keys], track.transl[keys]
-    return BodyTrack(track.body, *values, camera_up=track.camera_up)
-
-
 @dataclass(frozen=True, eq=False)
 class _Descended:
     """A motion as pictures correct it, those in the middle of exposures kept aside."""
@@ -177,8 +213,8 @@ class _Descended:
     nearer: Targets
     """All pictures, and what is behind the person by the motion found in the smallest ones."""
     stages: list[Stage]
-    gain: tuple[float, float]
-    """With its standard error."""
+    better: Float[Tensor, "A"]
+    """See `_gain`."""
 
 
 def _descended(
@@ -204,9 +240,10 @@ def _descended(
         if len(stages) > 1:
             continue
         if least_gain is not None:
-            gain, gain_error = _gain(descent, targets.rows(aside), shrink)
+            better = _gain(descent, targets.rows(aside), shrink)
+            gain, gain_error = _mean_gain(better)
             if gain + 2 * gain_error < least_gain:
-                return _Descended(descent, nearer, stages, (gain, gain_error))
+                return _Descended(descent, nearer, stages, better)
         nearer = targets.around(correction.corrected(), _NEARER)
         descent.targets = nearer.rows(fitted)
     return _Descended(descent, nearer, stages, _gain(descent, targets.rows(aside)))
@@ -268,8 +305,10 @@ def _middles(targets: Targets) -> list[int]:
     return [number for _, number in best.values()]
 
 
-def _gain(descent: Descent, aside: Targets, shrink: int = 1) -> tuple[float, float]:
-    """How much better the corrected motion explains pictures kept aside, and the standard error.
+def _gain(descent: Descent, aside: Targets, shrink: int = 1) -> Float[Tensor, "A"]:
+    """How much better the corrected motion explains each of the pictures kept aside.
+
+    As logarithms of the ratio of both misfits.
 
     Both motions get their look learned for as many steps from where the corrected one's was, in
     pictures smaller by a factor.
@@ -292,6 +331,10 @@ def _gain(descent: Descent, aside: Targets, shrink: int = 1) -> tuple[float, flo
         for param, value in zip(params, found, strict=True):
             param.copy_(value)
     descent.look.load_state_dict(state)
-    better = (misfits[1] / misfits[0]).log()
+    return (misfits[1] / misfits[0]).log()
+
+
+def _mean_gain(better: Float[Tensor, "A"]) -> tuple[float, float]:
+    """Of values of `_gain`, the share that they are in the mean, and its standard error."""
     spread = float(better.std()) if len(better) > 1 else math.inf
     return 1 - math.exp(-float(better.mean())), spread / math.sqrt(len(better))

@@ -164,12 +164,12 @@ def find_targets(
     capture: TrainingCapture,
     frames: Sequence[Frame] | None = None,
     *,
-    least_px: int | None = None,
+    shrink: int = 1,
 ) -> Targets:
     """Sharp pictures of all times that the policy shows, with what is behind the person.
 
-    ``frames``: those in whose exposures they lie, None for all. With ``least_px`` they are made
-    smaller, see `halved`.
+    ``frames``: those in whose exposures they lie, None for all. ``shrink``: pixels along each side
+    of the square that becomes one.
 
     Raises:
         DataError: the camera moves, or the posed body is in no picture.
@@ -195,7 +195,6 @@ def find_targets(
         capture.camera(pictures[0].frame),
         transfer,
     )
-    shrink = 1 if least_px is None else halved(found.camera, least_px)
     found = found if shrink == 1 else found.smaller(shrink)
     try:
         return found.around(track)
