@@ -27,7 +27,7 @@ from evsplat.export.avatar import (
     four_bones,
     recorded_clip,
 )
-from evsplat.export.bake import measure_loss
+from evsplat.export.bake import _elsewhere, measure_loss
 from evsplat.export.cloud import cloud_of
 from evsplat.models.at_rest import SkinnedGaussians, mean_at_rest
 from evsplat.render import Splats
@@ -187,6 +187,31 @@ def test_the_document_has_weights_and_sizes_of_poses_that_were_not_recorded(run)
     drawn, learned = (m.gaussians.scales_log[rows].exp().detach() for m in (moving, source.model))
     assert sizes[3] < 0.5
     np.testing.assert_allclose(sizes[:, None] * learned.numpy(), drawn.numpy(), rtol=0.05)
+
+
+@pytest.mark.parametrize("smaller", [True, False])
+def test_sizes_of_other_motions_are_kept_where_weights_are_the_same(smaller):
+    means, weights = torch.zeros(3, 3), torch.ones(3, 1)
+
+    def model(*sizes):
+        scales = torch.tensor(sizes)[None, :, None].expand(1, 3, 3)
+        human = SimpleNamespace(scales=scales)
+        return SimpleNamespace(
+            device="cpu",
+            skinning_weights=lambda _: weights,
+            at=lambda *_, **__: SimpleNamespace(human=human),
+        )
+
+    track = SimpleNamespace(times_us=[0])
+    new = SimpleNamespace(model=model(0.1, 0.05 if smaller else 0.1, 0.2))
+    recorded = model(0.1, 0.1, 0.2)
+    source = SimpleNamespace(model=recorded, track=track, in_new_motion=lambda _: new)
+    found = _elsewhere(source, SimpleNamespace(means=means, weights=weights))
+    if not smaller:
+        assert found is None
+    else:
+        assert torch.equal(found[0], weights)
+        torch.testing.assert_close(found[1], torch.tensor([1, 0.5, 1]))
 
 
 def test_a_body_of_too_many_joints_is_told(reconstruction):

@@ -91,8 +91,6 @@ def _elsewhere(
     """Bones' weights and factors on sizes in motions that were not recorded; None: the same."""
     model = source.in_new_motion(source.track).model
     weights = model.skinning_weights(gaussians.means.to(source.model.device)).cpu()
-    if torch.allclose(weights, gaussians.weights, atol=1e-6):
-        return None
     time_us = int(source.track.times_us[0])
     center = torch.zeros(3, device=source.model.device)
     new, recorded = (
@@ -100,7 +98,9 @@ def _elsewhere(
         for each in (model, source.model)
     )
     # Gaussians are only ever made smaller, along all axes alike.
-    return weights, (new / recorded).amax(-1).clamp(0, 1).cpu()
+    sizes = (new / recorded).amax(-1).clamp(0, 1).cpu()
+    same = torch.allclose(weights, gaussians.weights, atol=1e-6) and bool((sizes > 1 - 1e-6).all())
+    return None if same else (weights, sizes)
 
 
 @dataclass(frozen=True)
