@@ -7,6 +7,7 @@ import torch
 
 from evsplat.capture import Policy, load_capture
 from evsplat.landmarks import BLAZEPOSE_33, COCO_17, OPENPOSE_25, WHOLEBODY_133, sharp_pictures
+from evsplat.landmarks import pictures as making
 from evsplat.landmarks.pictures import BLURRY_SIGMA, CARRIED_SIGMA, _blend
 from evsplat.pictures import decode, luminance
 
@@ -72,3 +73,27 @@ def test_without_events_they_are_the_blurry_ones_and_the_log_says_so(tiny_captur
     assert "has no events" in caplog.text
     assert {picture.sigma for picture in pictures} == {BLURRY_SIGMA}
     assert torch.equal(pictures[0].image, capture.image(capture.train_frames[0]))
+
+
+def test_pictures_are_made_when_they_are_looked_at_and_those_of_few_frames_kept(
+    tiny_capture, monkeypatch
+):
+    """In order of time each exposure is sharpened once; looked at again they are the same."""
+    made = []
+    original = making.deblur
+
+    def counted(image, events, exposure_us, times, *rest, **options):
+        made.append(exposure_us)
+        return original(image, events, exposure_us, times, *rest, **options)
+
+    monkeypatch.setattr(making, "deblur", counted)
+    capture = load_capture(tiny_capture(frames=40)).for_training(Policy())
+    found = sharp_pictures(capture)
+    assert not made
+    first = [picture.image for picture in found]
+    frames = len(capture.train_frames)
+    assert len(found) == 3 * frames and len(made) == len(set(made)) == frames
+    assert frames > making._KEPT_FRAMES
+    again = found[-1].image
+    assert len(made) == frames and again is first[-1]
+    assert torch.equal(found[0].image, first[0]) and len(made) == frames + 1

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -65,7 +66,14 @@ def middles(training):
 
 def blurry(capture, every: int) -> list[SharpPicture]:
     frames = capture.train_frames[::every]
-    return [SharpPicture(frame.mid_us, capture.image(frame), frame, 2.0) for frame in frames]
+    return [
+        SharpPicture(frame.mid_us, frame, 2.0, partial(as_recorded, capture, frame))
+        for frame in frames
+    ]
+
+
+def as_recorded(capture, frame):
+    return capture.image(frame), None
 
 
 def test_the_person_of_the_demo_capture_is_found(demo, training, middles, network):
@@ -245,7 +253,7 @@ def test_a_person_cut_at_the_hips_is_one_sentence(training, middles, network):
 
     capture = Changed(training, upper)
     capture.events = None
-    pictures = [replace(picture, image=upper(picture.image)) for picture in middles[:1]]
+    pictures = [picture.showing(upper(picture.image)) for picture in middles[:1]]
     with pytest.raises(DataError, match="partly out of view in 1 of 1 pictures"):
         find_landmarks(capture, pictures, network=network, progress=False)
 

@@ -136,7 +136,7 @@ def test_poses_that_say_nothing_are_corrected_once_they_are_disproved(
     capture = seen(path)
     keys, joints = load_body_track(capture).poses.shape[:2]
     told = PoseErrors("estimated", np.full((keys, joints), 0.07), np.full((keys, 3), 0.03))
-    monkeypatch.setattr(poses, "judge", lambda *_, **__: Verdict(gain, 0.01, told, 1.0))
+    monkeypatch.setattr(poses, "judge", lambda *_, **__: Verdict(gain, 0.01, 1.0, told))
     corrected, real = [], poses.refine
 
     def noted(track, *args, **options):

@@ -7,8 +7,10 @@ before and from the one after, which are blended by how many events each has pas
 
 import logging
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -17,7 +19,7 @@ from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import HeldOutError
-from evsplat.events import EventStream, deblur, polarity_counts
+from evsplat.events import EventStore, deblur, polarity_counts
 from evsplat.pictures import shown
 from evsplat.pictures.light import Transfer, decode, encode, luminance, transfer_shown
 
@@ -28,23 +30,42 @@ FRACTIONS = (0.05, 0.5, 0.95)
 CARRIED_SIGMA, BLURRY_SIGMA = 1.6, 2.0
 _SMOOTHING_PX = 1.0
 """Counts of events are smoothed before they become weights: single ones are noise."""
+_KEPT_FRAMES = 8
+"""Frames whose pictures are kept: most are looked at in order of time."""
+
+
+Made = tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"] | None]
+"""A picture and its doubt, see `SharpPicture`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SharpPicture:
-    """What the camera would have seen at an instant."""
+    """What the camera would have seen at an instant, made when it is looked at."""
 
     time_us: int
-    image: Float[Tensor, "H W 3"]
-    """sRGB-coded, float32 in [0, 1]."""
     frame: Frame
     """The frame in whose exposure the instant lies; held out where the picture was carried."""
     sigma: float
     """Factor on the expected error of landmarks: 1 within an exposure, `CARRIED_SIGMA` where there
     is no picture of that time, `BLURRY_SIGMA` where the picture is as blurry as it was recorded."""
-    doubt: Float[Tensor, "H W"] | None = None
-    """Expected squared error of coded luminance where two exposures were carried there: what they
-    differ by, weighted as in their blend."""
+    make: Callable[[], Made]
+    """Gives `image` and `doubt`: those of a long recording are too many to be kept."""
+
+    @property
+    def image(self) -> Float[Tensor, "H W 3"]:
+        """sRGB-coded, float32 in [0, 1]."""
+        return self.make()[0]
+
+    @property
+    def doubt(self) -> Float[Tensor, "H W"] | None:
+        """Expected squared error of coded luminance where two exposures were carried there: what
+        they differ by, weighted as in their blend.
+        """
+        return self.make()[1]
+
+    def showing(self, image: Float[Tensor, "H W 3"]) -> "SharpPicture":
+        """The same instant in another picture."""
+        return replace(self, make=lambda: (image, self.doubt))
 
 
 def sharp_pictures(
@@ -62,28 +83,9 @@ def sharp_pictures(
     contrast thresholds and none can be estimated, they are the blurry training pictures at their
     mid-exposures; the log says so.
     """
-    frames = capture.frames if frames is None else frames
-    thresholds = _thresholds(capture)
-    if thresholds is None:
-        blurry = [frame for frame in frames if frame.split == "train"]
-        return [
-            SharpPicture(
-                frame.mid_us,
-                shown(capture.image(frame), capture.transfer(frame)),
-                frame,
-                BLURRY_SIGMA,
-            )
-            for frame in sorted(blurry, key=lambda frame: frame.mid_us)
-        ]
-    pictures = [
-        picture
-        for frame in frames
-        for picture in (
-            _in_exposure(capture, frame, fractions, thresholds)
-            if frame.split == "train"
-            else _carried(capture, frame, fractions, thresholds)
-        )
-    ]
+    frames = sorted(capture.frames if frames is None else frames, key=lambda frame: frame.mid_us)
+    sharpener = _Sharpener(capture, fractions, _thresholds(capture))
+    pictures = [picture for frame in frames for picture in sharpener.pictures(frame)]
     return sorted(pictures, key=lambda picture: picture.time_us)
 
 
@@ -109,44 +111,95 @@ def _instants(frame: Frame, fractions: Sequence[float]) -> list[int]:
     return [start + int(fraction * (end - start)) for fraction in fractions]
 
 
-def _in_exposure(
-    capture: TrainingCapture,
-    frame: Frame,
-    fractions: Sequence[float],
-    thresholds: tuple[float, float],
-) -> Iterator[SharpPicture]:
-    """The pictures of a training frame's own exposure."""
-    assert capture.events is not None
-    times = _instants(frame, fractions)
-    events = capture.events.between(*frame.exposure_us)
-    images = deblur(
-        capture.image(frame),
-        events,
-        frame.exposure_us,
-        times,
-        thresholds,
-        transfer=capture.transfer(frame),
-    )
-    for time, image in zip(times, images, strict=True):
-        yield SharpPicture(time, shown(image, capture.transfer(frame)), frame, 1.0)
+class _Sharpener:
+    """Pictures of a capture's exposures, of which those looked at last are kept."""
 
+    def __init__(
+        self,
+        capture: TrainingCapture,
+        fractions: Sequence[float],
+        thresholds: tuple[float, float] | None,
+    ) -> None:
+        """``thresholds``: C+ and C-; without them nothing is sharpened."""
+        self._capture, self._fractions, self._thresholds = capture, fractions, thresholds
+        self._kept: OrderedDict[str, list[Made]] = OrderedDict()
 
-def _carried(
-    capture: TrainingCapture,
-    frame: Frame,
-    fractions: Sequence[float],
-    thresholds: tuple[float, float],
-) -> Iterator[SharpPicture]:
-    """Pictures within the exposure of a held-out frame, from training exposures beside it."""
-    for time in _instants(frame, fractions):
-        sources = [
-            source
-            for side in _beside(capture, frame, time)
-            if (source := _carry(capture, side, time, thresholds)) is not None
+    def pictures(self, frame: Frame) -> list[SharpPicture]:
+        """Of one frame, those that can be made of what the policy shows."""
+        if self._thresholds is None:
+            times, sigma = [frame.mid_us] if frame.split == "train" else [], BLURRY_SIGMA
+        elif frame.split == "train":
+            times, sigma = _instants(frame, self._fractions), 1.0
+        else:
+            times, sigma = _instants(frame, self._fractions), CARRIED_SIGMA
+            times = [time for time in times if self._sources(frame, time)]
+        return [
+            SharpPicture(time, frame, sigma, partial(self._made, frame, times, number))
+            for number, time in enumerate(times)
         ]
-        if sources:
-            image, doubt = _blend(sources, capture.transfer(frame))
-            yield SharpPicture(time, image, frame, CARRIED_SIGMA, doubt)
+
+    def _made(self, frame: Frame, times: list[int], number: int) -> Made:
+        found = self._kept.pop(frame.name, None)
+        if found is None:
+            make = self._in_exposure if frame.split == "train" else self._carried
+            found = make(frame, times)
+        self._kept[frame.name] = found
+        if len(self._kept) > _KEPT_FRAMES:
+            self._kept.popitem(last=False)
+        return found[number]
+
+    def _in_exposure(self, frame: Frame, times: list[int]) -> list[Made]:
+        """The pictures of a training frame's own exposure."""
+        capture = self._capture
+        image, transfer = capture.image(frame), capture.transfer(frame)
+        if self._thresholds is None:
+            return [(shown(image, transfer), None)]
+        assert capture.events is not None
+        images = deblur(
+            image,
+            capture.events.between(*frame.exposure_us),
+            frame.exposure_us,
+            times,
+            self._thresholds,
+            transfer=transfer,
+        )
+        return [(shown(image, transfer), None) for image in images]
+
+    def _carried(self, frame: Frame, times: list[int]) -> list[Made]:
+        """Pictures within the exposure of a held-out frame, from training exposures beside it."""
+        capture, thresholds = self._capture, self._thresholds
+        assert thresholds is not None
+        return [
+            _blend(
+                [_carry(capture, side, time, thresholds) for side in self._sources(frame, time)],
+                capture.transfer(frame),
+            )
+            for time in times
+        ]
+
+    def _sources(self, frame: Frame, time_us: int) -> list[Frame]:
+        """The frames of `_beside` from which the policy shows all events to an instant."""
+        events = self._capture.events
+        assert events is not None
+        return [
+            side
+            for side in _beside(self._capture, frame, time_us)
+            if _reads(events, *_passed(side, time_us))
+        ]
+
+
+def _passed(frame: Frame, time_us: int) -> tuple[int, int]:
+    """The stretch from a frame's exposure to an instant, with both."""
+    start, end = frame.exposure_us
+    return min(start, time_us), max(end, time_us)
+
+
+def _reads(events: EventStore, start_us: int, end_us: int) -> bool:
+    """Whether the policy shows all events of a stretch."""
+    try:
+        return end_us <= events.readable_around(start_us)[1]
+    except HeldOutError:
+        return False
 
 
 def _beside(capture: TrainingCapture, frame: Frame, time_us: int) -> list[Frame]:
@@ -162,17 +215,10 @@ _Source = tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]
 
 def _carry(
     capture: TrainingCapture, frame: Frame, time_us: int, thresholds: tuple[float, float]
-) -> _Source | None:
-    """A training picture carried to an instant, and events per pixel that it passed through.
-
-    None where the policy hides some of these events.
-    """
+) -> _Source:
+    """A training picture carried to an instant, and events per pixel that it passed through."""
     assert capture.events is not None
-    start, end = frame.exposure_us
-    try:
-        events: EventStream = capture.events.between(min(start, time_us), max(end, time_us))
-    except HeldOutError:
-        return None
+    events = capture.events.between(*_passed(frame, time_us))
     image = capture.image(frame)
     (carried,) = deblur(
         image,

@@ -60,7 +60,7 @@ class FoundPoses:
     """The motion behind them."""
     landmarks: Landmarks
     seconds: dict[str, float]
-    """By stage: pictures, landmarks, fit, refinement."""
+    """By stage: landmarks, with the pictures that they are in, fit, refinement."""
     summary: str
     """Some lines of text."""
 
@@ -118,10 +118,9 @@ def find_poses(
     seen = _seen(capture, policy, focal_px)
     limit_s = _refinement_s(seen, search)
     stages = _Stages()
-    with tqdm(total=3 + (limit_s > 0), desc="poses", unit="stage") as bar:
-        with stages(bar, "pictures"):
-            pictures = sharp_pictures(seen)
+    with tqdm(total=2 + (limit_s > 0), desc="poses", unit="stage") as bar:
         with stages(bar, "landmarks"):
+            pictures = sharp_pictures(seen)
             landmarks = _landmarks(seen, pictures, keypoints)
         with stages(bar, "fit"):
             fitted = _fit(seen, landmarks, rig, search)
