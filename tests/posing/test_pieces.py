@@ -11,6 +11,7 @@ from evsplat.posing import pieces as cutting
 from evsplat.posing import refine as refining
 from evsplat.posing.pieces import Piece, _spans, between, cut_in_pieces, joined
 from evsplat.posing.refine import refine
+from evsplat.posing.targets import NobodyInViewError
 
 from ..seen import seen
 
@@ -111,17 +112,17 @@ def test_pictures_of_one_piece_are_there_at_once_and_all_of_them_count(tiny_capt
     asked = []
     original = refining.find_targets
 
-    def noted(motion, of, frames, **options):
-        asked.append((motion, frames))
-        return original(motion, of, frames, **options)
+    def noted(motion, of, pictures, **options):
+        asked.append((motion, {picture.frame.name for picture in pictures}))
+        return original(motion, of, pictures, **options)
 
     monkeypatch.setattr(refining, "find_targets", noted)
     found = refine(track, capture, steps=(2, 2), discs=100)
     assert len(asked) > 1
-    names = {frame.name for _, frames in asked for frame in frames}
-    assert names == {frame.name for frame in capture.frames}
-    for motion, frames in asked:
-        assert sum(frame.split == "train" for frame in frames) <= 24
+    trained = {frame.name for frame in capture.train_frames}
+    assert set().union(*(names for _, names in asked)) == trained, "the policy shows no others"
+    for motion, names in asked:
+        assert len(names) <= 24
         assert len(motion.times_us) < len(track.times_us)
     assert set(track.times_us.tolist()) <= set(found.track.times_us.tolist())
     assert found.track.errors.joint_rad.shape == (
@@ -129,3 +130,33 @@ def test_pictures_of_one_piece_are_there_at_once_and_all_of_them_count(tiny_capt
         len(track.body.parents),
     )
     assert len(found.stages) % len(asked) == 0
+
+
+def test_where_nobody_is_in_view_the_motion_stays_and_the_rest_is_corrected(
+    tiny_capture, monkeypatch
+):
+    capture = seen(tiny_capture(frames=60))
+    track = load_body_track(capture)
+    camera = capture.camera(capture.frames[0])
+    monkeypatch.setattr(cutting, "_MOST_PIXELS", 24 * 3 * camera.width * camera.height)
+    pieces = cut_in_pieces(track, capture)
+    original = refining.find_targets
+
+    def left(motion, of, pictures, **options):
+        """Nobody in the last piece."""
+        if pictures[-1].frame.name == capture.train_frames[-1].name:
+            raise NobodyInViewError("nobody")
+        return original(motion, of, pictures, **options)
+
+    monkeypatch.setattr(refining, "find_targets", left)
+    found = refine(track, capture, steps=(2, 2), discs=100)
+    alone = [key for key in track.times_us.tolist() if key > pieces[-2].end_us]
+    assert alone
+    for ours, given in zip(found.track.at(alone), track.at(alone), strict=True):
+        torch.testing.assert_close(ours, given, rtol=0, atol=2e-5)
+    corrected = [key for key in track.times_us.tolist() if key < pieces[-1].start_us]
+    moved = (found.track.at(corrected)[1] - track.at(corrected)[1]).norm(dim=1)
+    assert float(moved.max()) > 1e-4
+    monkeypatch.setattr(cutting, "_MOST_PIXELS", 1 << 40)
+    with pytest.raises(NobodyInViewError, match="nobody"):
+        refine(track, capture, steps=(2, 2), discs=100)

@@ -358,17 +358,17 @@ def test_a_verdict_takes_no_longer_for_a_longer_recording(tiny_capture, monkeypa
     """Pictures of so many training frames, and of what is held out between them."""
     asked = []
 
-    def noted(track, capture, frames, **options):
-        asked.append(frames)
-        return find_targets(track, capture, frames, **options)
+    def noted(track, capture, pictures, **options):
+        asked.append(list(dict.fromkeys(picture.frame.index for picture in pictures)))
+        return find_targets(track, capture, pictures, **options)
 
     monkeypatch.setattr(refining, "find_targets", noted)
     capture = seen(tiny_capture(frames=60))
     assert len(capture.train_frames) > JUDGED_FRAMES
     track = load_body_track(capture)
     verdict = judge(track, capture, steps=(2, 2), discs=100)
-    (frames,) = asked
-    assert sum(frame.split == "train" for frame in frames) == JUDGED_FRAMES
+    frames = [capture.frames[index] for index in asked[0]]
+    assert len(asked) == 1 and sum(frame.split == "train" for frame in frames) == JUDGED_FRAMES
     before, after = frames[0].mid_us, capture.frames[-1].mid_us - frames[-1].mid_us
     assert abs(before - after) <= 3 * (frames[1].mid_us - frames[0].mid_us)
     assert len(verdict.given_errors.joint_rad) == len(track.times_us)

@@ -123,6 +123,9 @@ class _Sharpener:
         """``thresholds``: C+ and C-; without them nothing is sharpened."""
         self._capture, self._fractions, self._thresholds = capture, fractions, thresholds
         self._kept: OrderedDict[str, list[Made]] = OrderedDict()
+        self._trained: dict[str, list[Frame]] = {}
+        for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us):
+            self._trained.setdefault(frame.camera, []).append(frame)
 
     def pictures(self, frame: Frame) -> list[SharpPicture]:
         """Of one frame, those that can be made of what the policy shows."""
@@ -181,11 +184,8 @@ class _Sharpener:
         """The frames of `_beside` from which the policy shows all events to an instant."""
         events = self._capture.events
         assert events is not None
-        return [
-            side
-            for side in _beside(self._capture, frame, time_us)
-            if _reads(events, *_passed(side, time_us))
-        ]
+        beside = _beside(self._trained.get(frame.camera, []), time_us)
+        return [side for side in beside if _reads(events, *_passed(side, time_us))]
 
 
 def _passed(frame: Frame, time_us: int) -> tuple[int, int]:
@@ -202,12 +202,10 @@ def _reads(events: EventStore, start_us: int, end_us: int) -> bool:
         return False
 
 
-def _beside(capture: TrainingCapture, frame: Frame, time_us: int) -> list[Frame]:
-    """The last training frame of the same camera before an instant and the first one after it."""
-    own = [other for other in capture.train_frames if other.camera == frame.camera]
-    own.sort(key=lambda other: other.mid_us)
-    after = bisect_right([other.mid_us for other in own], time_us)
-    return own[max(0, after - 1) : after + 1]
+def _beside(frames: Sequence[Frame], time_us: int) -> Sequence[Frame]:
+    """The last of frames in order of time before an instant and the first one after it."""
+    after = bisect_right(frames, time_us, key=lambda frame: frame.mid_us)
+    return frames[max(0, after - 1) : after + 1]
 
 
 _Source = tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]

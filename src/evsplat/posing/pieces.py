@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from evsplat.body import BodyTrack, PoseErrors
 from evsplat.body.rotations import nearest_axis_angle
 from evsplat.capture import Frame, TrainingCapture
-from evsplat.landmarks.pictures import FRACTIONS
+from evsplat.landmarks.pictures import FRACTIONS, SharpPicture
 
 _MOST_PIXELS = 24_000_000
 """Of the pictures of one piece: with all that is computed of them 140 B a pixel."""
@@ -32,6 +32,11 @@ class Piece:
     """The exposures' first and last time; at the ends of the recording those of the motion."""
     shrink: int
     """By how much the pictures are made smaller along each side, so that enough fit."""
+
+    def pictures(self, all_of: Sequence[SharpPicture]) -> list[SharpPicture]:
+        """Those in the exposures of its frames."""
+        names = {frame.name for frame in self.frames}
+        return [picture for picture in all_of if picture.frame.name in names]
 
 
 def cut_in_pieces(track: BodyTrack, capture: TrainingCapture) -> list[Piece]:

@@ -19,11 +19,12 @@ from evsplat.body.pose_noise import PoseNoise, joint_angles
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
+from evsplat.landmarks.pictures import sharp_pictures
 from evsplat.posing.correction import Correction
 from evsplat.posing.descent import COARSE_PX, LOOK_STEPS, PROBE_STEPS, PROBES, Descent, Stage
 from evsplat.posing.pieces import between, cut_in_pieces, joined
 from evsplat.posing.surface_discs import SurfaceDiscs
-from evsplat.posing.targets import Targets, find_targets, halved
+from evsplat.posing.targets import NobodyInViewError, Targets, find_targets, halved
 from evsplat.posing.time_limit import TimeLimit
 
 DISCS, _JUDGED_DISCS = 4_000, 3_000
@@ -113,7 +114,8 @@ def judge(
     frames = _middle(capture)
     times = [time_us for frame in frames for time_us in frame.exposure_us]
     shrink = halved(capture.camera(frames[0]), JUDGED_PX)
-    targets = find_targets(track, capture, frames, shrink=shrink)
+    pictures = sharp_pictures(capture, frames=frames)
+    targets = find_targets(track, capture, pictures, shrink=shrink)
     limit = TimeLimit(None, 5 * LOOK_STEPS + sum(steps), progress=progress)
     piece = between(track, min(times), max(times))
     found = _descended(piece, targets, limit, steps, discs, seed, least_gain=LEAST_GAIN)
@@ -138,6 +140,8 @@ def refine(
     of held-out frames, pictures carried there by events count as well. ``steps``: of the coarse
     and of the fine part, fewer where they would take more than ``seconds``.
 
+    Of a long recording each piece is corrected by itself, but for those without the person.
+
     Raises:
         DataError: the camera moves, or the posed body is in no picture.
     """
@@ -145,18 +149,28 @@ def refine(
     pieces = cut_in_pieces(track, capture)
     planned = 3 * LOOK_STEPS + sum(steps) + _LAST_STEPS + PROBES * PROBE_STEPS
     limit = TimeLimit(seconds, len(pieces) * planned, progress=progress)
-    found = []
+    pictures = sharp_pictures(capture)
+    found, missed = [], None
     for piece in pieces:
         whole = len(pieces) == 1
         given = track if whole else between(track, piece.start_us, piece.end_us)
-        targets = find_targets(given, capture, piece.frames, shrink=piece.shrink)
+        own = pictures if whole else piece.pictures(pictures)
+        try:
+            targets = find_targets(given, capture, own, shrink=piece.shrink)
+        except NobodyInViewError as error:
+            missed = error
+            found.append(_Piece(torch.empty(0), _with_errors(given), None, []))
+            continue
         found.append(_refined(given, targets, limit, steps, discs, seed))
     limit.close()
+    bodies = [one.dressed for one in found if one.dressed is not None]
+    if missed is not None and not bodies:
+        raise missed
     return Refined(
         *_mean_gain(torch.cat([one.better for one in found])),
         time.monotonic() - began,
         joined(pieces, [one.track for one in found]),
-        _mean_body([one.dressed for one in found]),
+        _mean_body(bodies),
         tuple(stage for one in found for stage in one.stages),
     )
 
@@ -168,7 +182,8 @@ class _Piece:
     better: Float[Tensor, "A"]
     """See `_gain`."""
     track: BodyTrack
-    dressed: Body
+    dressed: Body | None
+    """None where the person is out of view, and the motion stays as it is given."""
     stages: list[Stage]
 
 
@@ -186,6 +201,16 @@ def _refined(
     last = descent.run(1, _LAST_STEPS, first=False)
     corrected = descent.correction.corrected(descent.errors())
     return _Piece(found.better, corrected, descent.look.dressed(), [*found.stages, last])
+
+
+def _with_errors(track: BodyTrack) -> BodyTrack:
+    """A motion that is left as it is; what it errs by as expected, where it does not say."""
+    if track.errors is not None:
+        return track
+    joint_rad, root_m = (np.tile(each, (len(track.times_us), 1)) for each in expected_errors(track))
+    errors = PoseErrors("estimated", joint_rad, root_m)
+    keys = track.times_us, track.poses, track.transl
+    return BodyTrack(track.body, *keys, errors=errors, camera_up=track.camera_up)
 
 
 def _mean_body(bodies: Sequence[Body]) -> Body:

@@ -31,6 +31,10 @@ _DOUBTFUL = 0.06
 """Expected error of coded colours from which on a carried pixel counts little."""
 
 
+class NobodyInViewError(DataError):
+    """The posed body is in too few pictures to tell anything."""
+
+
 @dataclass(frozen=True, eq=False)
 class Looked:
     """The N pixels of P pictures that count, picture by picture: the others tell nothing."""
@@ -162,24 +166,26 @@ def halved(camera: Camera, least_px: int) -> int:
 def find_targets(
     track: BodyTrack,
     capture: TrainingCapture,
-    frames: Sequence[Frame] | None = None,
+    pictures: Sequence[SharpPicture] | None = None,
     *,
     shrink: int = 1,
 ) -> Targets:
     """Sharp pictures of all times that the policy shows, with what is behind the person.
 
-    ``frames``: those in whose exposures they lie, None for all. ``shrink``: pixels along each side
-    of the square that becomes one.
+    ``pictures``: some of `sharp_pictures`, None for all. ``shrink``: pixels along each side of the
+    square that becomes one.
 
     Raises:
-        DataError: the camera moves, or the posed body is in no picture.
+        DataError: the camera moves.
+        NobodyInViewError: the posed body is in few of the pictures or in none.
     """
     if not capture.is_static_camera:
         raise DataError(
             f"{capture.path}: has a moving camera or several, and a motion is corrected by what "
             "differs from a static background; leave the poses as they are."
         )
-    pictures = sharp_pictures(capture, frames=frames)
+    if pictures is None:
+        pictures = sharp_pictures(capture)
     image = torch.stack([picture.image for picture in pictures]).float()
     transfer = transfer_shown(capture.transfer(pictures[0].frame))
     coloured = torch.tensor([picture.frame.split == "train" for picture in pictures])
@@ -198,8 +204,8 @@ def find_targets(
     found = found if shrink == 1 else found.smaller(shrink)
     try:
         return found.around(track)
-    except DataError as error:
-        raise DataError(f"{capture.path}: {error}") from None
+    except NobodyInViewError as error:
+        raise NobodyInViewError(f"{capture.path}: {error}") from None
 
 
 def _grey(coded: Float[Tensor, "*size 3"], transfer: Transfer) -> Float[Tensor, "*size 3"]:
@@ -227,7 +233,7 @@ def _distances(
         found.append(distance_transform_edt(~inside) if len(rows) else far)
     tall = float(np.median(heights))
     if tall == 0:
-        raise DataError(
+        raise NobodyInViewError(
             "the posed body is in few of the pictures or in none, so that they tell nothing of "
             "its motion; check camera and poses."
         )
