@@ -95,6 +95,13 @@ class BodyTrack:
         other.body = body
         return other
 
+    def with_errors(self, errors: PoseErrors) -> "BodyTrack":
+        """The same motion, whose key poses err so."""
+        errors.check(len(self.times_us), len(self.body.parents), "body track")
+        other = copy.copy(self)
+        other.errors = errors
+        return other
+
     @property
     def device(self) -> torch.device:
         """Of the body, and of the poses that `at` gives."""

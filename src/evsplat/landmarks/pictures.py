@@ -7,10 +7,9 @@ before and from the one after, which are blended by how many events each has pas
 
 import logging
 from bisect import bisect_right
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 
 import torch
 from jaxtyping import Float
@@ -63,10 +62,6 @@ class SharpPicture:
         """
         return self.make()[1]
 
-    def showing(self, image: Float[Tensor, "H W 3"]) -> "SharpPicture":
-        """The same instant in another picture."""
-        return replace(self, make=lambda: (image, self.doubt))
-
 
 def sharp_pictures(
     capture: TrainingCapture,
@@ -83,7 +78,7 @@ def sharp_pictures(
     contrast thresholds and none can be estimated, they are the blurry training pictures at their
     mid-exposures; the log says so.
     """
-    frames = sorted(capture.frames if frames is None else frames, key=lambda frame: frame.mid_us)
+    frames = capture.frames if frames is None else frames
     sharpener = _Sharpener(capture, fractions, _thresholds(capture))
     pictures = [picture for frame in frames for picture in sharpener.pictures(frame)]
     return sorted(pictures, key=lambda picture: picture.time_us)
@@ -122,7 +117,7 @@ class _Sharpener:
     ) -> None:
         """``thresholds``: C+ and C-; without them nothing is sharpened."""
         self._capture, self._fractions, self._thresholds = capture, fractions, thresholds
-        self._kept: OrderedDict[str, list[Made]] = OrderedDict()
+        self._made = lru_cache(_KEPT_FRAMES)(self._make)
         self._trained: dict[str, list[Frame]] = {}
         for frame in sorted(capture.train_frames, key=lambda frame: frame.mid_us):
             self._trained.setdefault(frame.camera, []).append(frame)
@@ -137,21 +132,18 @@ class _Sharpener:
             times, sigma = _instants(frame, self._fractions), CARRIED_SIGMA
             times = [time for time in times if self._sources(frame, time)]
         return [
-            SharpPicture(time, frame, sigma, partial(self._made, frame, times, number))
+            SharpPicture(time, frame, sigma, partial(self._one, frame, tuple(times), number))
             for number, time in enumerate(times)
         ]
 
-    def _made(self, frame: Frame, times: list[int], number: int) -> Made:
-        found = self._kept.pop(frame.name, None)
-        if found is None:
-            make = self._in_exposure if frame.split == "train" else self._carried
-            found = make(frame, times)
-        self._kept[frame.name] = found
-        if len(self._kept) > _KEPT_FRAMES:
-            self._kept.popitem(last=False)
-        return found[number]
+    def _one(self, frame: Frame, times: tuple[int, ...], number: int) -> Made:
+        return self._made(frame, times)[number]
 
-    def _in_exposure(self, frame: Frame, times: list[int]) -> list[Made]:
+    def _make(self, frame: Frame, times: tuple[int, ...]) -> list[Made]:
+        make = self._in_exposure if frame.split == "train" else self._carried
+        return make(frame, times)
+
+    def _in_exposure(self, frame: Frame, times: Sequence[int]) -> list[Made]:
         """The pictures of a training frame's own exposure."""
         capture = self._capture
         image, transfer = capture.image(frame), capture.transfer(frame)
@@ -168,7 +160,7 @@ class _Sharpener:
         )
         return [(shown(image, transfer), None) for image in images]
 
-    def _carried(self, frame: Frame, times: list[int]) -> list[Made]:
+    def _carried(self, frame: Frame, times: Sequence[int]) -> list[Made]:
         """Pictures within the exposure of a held-out frame, from training exposures beside it."""
         capture, thresholds = self._capture, self._thresholds
         assert thresholds is not None

@@ -142,14 +142,7 @@ def _smoothed(track: BodyTrack, joint_rad: np.ndarray, root_m: np.ndarray) -> Bo
 
 def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTrack:
     """The motion as one that says how far it errs, and smoothed accordingly."""
-    told = BodyTrack(
-        track.body,
-        track.times_us,
-        track.poses,
-        track.transl,
-        errors=errors,
-        camera_up=track.camera_up,
-    )
+    told = track.with_errors(errors)
     return _smoothed(told, errors.joint_rad, errors.root_m) if smooth else told
 
 

@@ -152,16 +152,14 @@ def refine(
     pictures = sharp_pictures(capture)
     found, missed = [], None
     for piece in pieces:
-        whole = len(pieces) == 1
-        given = track if whole else between(track, piece.start_us, piece.end_us)
-        own = pictures if whole else piece.pictures(pictures)
+        given = between(track, piece.start_us, piece.end_us)
         try:
-            targets = find_targets(given, capture, own, shrink=piece.shrink)
+            targets = find_targets(given, capture, piece.pictures(pictures), shrink=piece.shrink)
         except NobodyInViewError as error:
             missed = error
             found.append(_Piece(torch.empty(0), _with_errors(given), None, []))
             continue
-        found.append(_refined(given, targets, limit, steps, discs, seed))
+        found.append(_finished(_descended(given, targets, limit, steps, discs, seed)))
     limit.close()
     bodies = [one.dressed for one in found if one.dressed is not None]
     if missed is not None and not bodies:
@@ -187,15 +185,8 @@ class _Piece:
     stages: list[Stage]
 
 
-def _refined(
-    track: BodyTrack,
-    targets: Targets,
-    limit: TimeLimit,
-    steps: tuple[int, int],
-    discs: int,
-    seed: int,
-) -> _Piece:
-    found = _descended(track, targets, limit, steps, discs, seed)
+def _finished(found: "_Descended") -> _Piece:
+    """With the last steps, in which pictures kept aside are explained as well."""
     descent = found.descent
     descent.targets = found.nearer
     last = descent.run(1, _LAST_STEPS, first=False)
@@ -208,9 +199,7 @@ def _with_errors(track: BodyTrack) -> BodyTrack:
     if track.errors is not None:
         return track
     joint_rad, root_m = (np.tile(each, (len(track.times_us), 1)) for each in expected_errors(track))
-    errors = PoseErrors("estimated", joint_rad, root_m)
-    keys = track.times_us, track.poses, track.transl
-    return BodyTrack(track.body, *keys, errors=errors, camera_up=track.camera_up)
+    return track.with_errors(PoseErrors("estimated", joint_rad, root_m))
 
 
 def _mean_body(bodies: Sequence[Body]) -> Body:
