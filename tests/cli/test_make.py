@@ -1,9 +1,11 @@
 """Set-up through the Makefile: what it runs, what it reuses, what it refuses in one sentence."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -34,28 +36,60 @@ def _make_venv(target, **environment):
     return done.returncode, done.stderr
 
 
-@pytest.mark.parametrize(("target", "command"), [("demo", "evsplat demo"), ("test", "-m pytest")])
-def test_first_call_sets_up_and_a_second_one_reuses(tmp_path, target, command):
+def _touch(venv, *stamps):
+    """Stamps made one after the other, each by itself newer than the one before."""
+    venv.mkdir(exist_ok=True)
+    for seconds, stamp in enumerate(stamps, start=int(time.time())):
+        (venv / stamp).touch()
+        os.utime(venv / stamp, (seconds, seconds))
+
+
+@pytest.mark.parametrize(
+    ("target", "command", "extra"),
+    [
+        ("demo", "evsplat demo", None),
+        ("view", "evsplat view", "view"),
+        ("test", "-m pytest", "dev"),
+        ("lint", "ruff check", "dev"),
+        ("types", "mypy", "dev"),
+        ("docs", "mkdocs build", "dev"),
+        ("fuzz", "fuzz.py", "dev"),
+        ("kill", "kill.py", "dev"),
+    ],
+)
+def test_a_target_installs_what_it_needs_and_a_second_call_reuses(tmp_path, target, command, extra):
     first = _plan(target, tmp_path / "venv")
     assert "make_venv.sh" in first
-    assert "--constraint constraints.txt" in first
+    installs = [line for line in first.splitlines() if "pip install" in line]
+    assert all("--constraint constraints.txt" in line for line in installs)
+    assert installs[0].endswith("--editable .")
+    assert re.findall(r"evsplat\[(\w+)\]", first) == ([extra] if extra else [])
     assert command in first
-    (tmp_path / "venv").mkdir()
-    (tmp_path / "venv" / ".installed").touch()
+    stamps = [".installed", f".installed-{extra}"] if extra else [".installed"]
+    _touch(tmp_path / "venv", *stamps)
     second = _plan(target, tmp_path / "venv")
     assert "pip install" not in second
     assert command in second
+
+
+def test_after_the_demo_the_tests_build_nothing_again(tmp_path):
+    _touch(tmp_path, ".installed")
+    plan = _plan("test", tmp_path)
+    assert "--editable" not in plan
+    assert '"evsplat[dev]"' in plan
 
 
 @pytest.mark.parametrize(
     "name", ["pyproject.toml", "constraints.txt", "CMakeLists.txt", "native/module.cpp"]
 )
 def test_a_newer_input_sets_up_again(tmp_path, name):
-    stamp = tmp_path / ".installed"
-    stamp.touch()
-    before = (ROOT / name).stat().st_mtime - 10
-    os.utime(stamp, (before, before))
-    assert "pip install" in _plan("test", tmp_path)
+    before = int((ROOT / name).stat().st_mtime) - 10
+    for stamp in (".installed", ".installed-dev"):
+        (tmp_path / stamp).touch()
+        os.utime(tmp_path / stamp, (before, before))
+    plan = _plan("test", tmp_path)
+    assert "--editable" in plan
+    assert '"evsplat[dev]"' in plan
 
 
 def test_wrong_python_and_missing_tools_are_one_sentence(tmp_path):
