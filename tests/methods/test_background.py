@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import distance_transform_edt
 
-from evsplat.body import BodyTrack, default_body
+from evsplat.body import BodyTrack, default_body, silhouette
 from evsplat.camera import Camera
-from evsplat.methods.background import background_without
+from evsplat.methods.background import background_without, gone_on
 
 SIDE, FRAMES, SKIN = 64, 9, 230 / 255
 
@@ -64,11 +65,58 @@ def test_somebody_who_leaves_for_a_few_frames_is_not_in_it(away):
     assert torch.allclose(background_without(capture, track, 12.0), wall, atol=1e-6)
 
 
-def test_where_somebody_always_is_all_frames_count():
-    capture, wall, track = capture_of([0.0] * FRAMES)
-    found = background_without(capture, track, 12.0)
-    first = capture.image(capture.train_frames[0])
-    assert torch.allclose(found, first, atol=1e-6) and not torch.allclose(found, wall)
+def test_where_somebody_always_is_the_wall_goes_on():
+    """A median shows them there, and so do the frames in which they are farthest."""
+    capture, _, track = capture_of([0.0] * FRAMES)
+    capture._wall = torch.tensor([0.2, 0.3, 0.4]).expand(SIDE, SIDE, 3)
+    shown = capture.image(capture.train_frames[0])
+    found = background_without(capture, track, 120.0)
+    assert ((shown - capture._wall).abs().amax(-1) > 0.1).sum() > 100
+    assert torch.allclose(found, capture._wall, atol=1e-2)
+
+
+def test_a_place_beside_the_body_in_one_frame_alone_is_taken_from_that_frame():
+    """Nearer than the band in all frames, and farthest in one of them."""
+    capture, wall, track = capture_of([0.0] * (FRAMES - 1) + [0.5])
+    found = background_without(capture, track, 60.0)
+    hidden = [
+        silhouette(track.vertices(t), track.body.faces, capture.camera(None)).numpy()
+        for t in track.times_us.tolist()
+    ]
+    once = torch.from_numpy(hidden[0] & (distance_transform_edt(~hidden[-1]) > 4))
+    assert once.sum() > 10
+    assert torch.allclose(found[once], wall[once], atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_was_seen_stays_and_the_rest_lies_within_its_range(seed):
+    generator = torch.Generator().manual_seed(seed)
+    height, width = torch.randint(1, 90, (2,), generator=generator).tolist()
+    picture = torch.rand(height, width, 3, generator=generator)
+    seen = torch.rand(height, width, generator=generator) < 0.02
+    seen[-1, -1] = True
+    found = gone_on(picture, seen)
+    assert torch.equal(found[seen], picture[seen])
+    known = picture[seen]
+    assert (found >= known.amin(0) - 1e-5).all() and (found <= known.amax(0) + 1e-5).all()
+    # Colours at places that were not seen count nothing.
+    other = torch.where(seen[..., None], picture, 1 - picture)
+    assert torch.equal(gone_on(other, seen), found)
+
+
+def test_an_even_slope_goes_on_through_a_hole():
+    """Laplace's equation, which continues a slope exactly, is the reference."""
+    y, x = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
+    picture = torch.stack([x / 128, y / 96, (x + y) / 224], -1)
+    hole = ((x - 60) / 22).square() + ((y - 50) / 30).square() < 1
+    found = gone_on(torch.where(hole[..., None], torch.nan, picture).nan_to_num(5.0), ~hole)
+    assert (found - picture)[hole].abs().max() < 0.13
+    assert (found - picture)[hole].square().mean().sqrt() < 0.05
+
+
+def test_a_picture_of_which_nothing_was_seen_stays():
+    picture = torch.rand(5, 7, 3)
+    assert torch.equal(gone_on(picture, torch.zeros(5, 7, dtype=torch.bool)), picture)
 
 
 def test_nobody_in_the_picture_leaves_the_median():

@@ -1,16 +1,21 @@
-"""What a still camera sees behind the person: the median of the frames where they are elsewhere."""
+"""What a still camera sees behind the person: the median of the frames where they are elsewhere.
+
+Where they never are, what lies around goes on.
+"""
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from evsplat.body import BodyTrack, silhouette
 from evsplat.capture import Frame, TrainingCapture
 
-LEAST = 0.5
-"""Share of the band that the body must be away at some time for frames to be chosen by that."""
+LEAST = 1 / 9
+"""Share of the band, but a pixel at least, by which the body must have been away for a place to
+count as seen: an outline's own pixels show the person in part."""
 MOST_FRAMES = 48
 """Training frames that are looked at, spread evenly: the body's outlines take the time."""
 
@@ -22,8 +27,9 @@ def background_without(
 
     Somebody who hardly moves is before a pixel in most of the frames, and would be in a median of
     all. The band, for a picture 256 pixels high, is how far clothes, hair and errors of the poses
-    reach beyond the body. Where it is in every frame those count in which the body is farthest, and
-    all of them where it is hardly away in any.
+    reach beyond the body. Where it is in every frame those count in which the body is farthest.
+    What it hides or touches in all of them nobody saw: there the colours around go on evenly, where
+    a median would show the person.
     """
     frames = capture.train_frames
     frames = frames[:: -(-len(frames) // MOST_FRAMES)]
@@ -33,9 +39,34 @@ def background_without(
     near = [np.minimum(_apart(capture, track, frame), band).astype(np.float16) for frame in frames]
     pictures, apart = np.stack(coded), np.stack(near)
     farthest = apart.max(0)
-    counts = (apart == farthest) | (farthest < LEAST * band)
+    counts = apart == farthest
     rows = [_median_of(pictures[:, row], counts[:, row]) for row in range(pictures.shape[1])]
-    return torch.from_numpy(np.stack(rows) / np.float32(255))
+    picture = torch.from_numpy(np.stack(rows) / np.float32(255))
+    return gone_on(picture, torch.from_numpy(farthest > max(1.0, LEAST * band)))
+
+
+def gone_on(picture: Float[Tensor, "H W 3"], seen: Bool[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+    """The picture, and where it was not seen the colours around it, as evenly as they go.
+
+    Means over squares of pixels that were seen, twice as large from level to level until all are
+    known, are carried back down and interpolated (pull and push: Gortler et al., The Lumigraph,
+    SIGGRAPH 1996, section 3.4). A picture of which nothing was seen stays.
+    """
+    if not seen.any():
+        return picture
+    known = seen.to(picture)[None, None]
+    return _filled(picture.movedim(-1, 0)[None] * known, known)[0].movedim(0, -1)
+
+
+def _filled(sums: Float[Tensor, "1 3 H W"], known: Float[Tensor, "1 1 H W"]) -> Tensor:
+    """Colours of every pixel from those of which ``known`` is 1; the others are 0."""
+    if known.all():
+        return sums
+    height, width = known.shape[-2:]
+    colours, shares = (avg_pool2d(each, 2, ceil_mode=True) for each in (sums, known))
+    coarse = _filled(colours / shares.clamp_min(1e-6), (shares > 0).to(shares))
+    fine = interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False)
+    return torch.where(known > 0, sums, fine[..., :height, :width])
 
 
 def _median_of(
