@@ -4,8 +4,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#if defined(__x86_64__) || defined(__i386__)
-#include <immintrin.h>
+#if defined(EVSPLAT_LANES) && (defined(__x86_64__) || defined(__i386__))
+#include <immintrin.h>  // for kernels alone: it takes most of a second to read
 #endif
 
 #include "event_windows.h"
