@@ -26,6 +26,7 @@ constexpr int kTilePixels = kTile * kTile;
 constexpr uint32_t kBlock = 512;       // Gaussians per unit of projection work; fixes the order of sums
 constexpr int kMoments = 6;            // gradient slot: sums of h, hu, hv, huu, huv, hvv, then channels
 constexpr int kMaxChannels = 32;       // drawn in one go; more are drawn in blocks
+constexpr float kMinAlpha = 1.f / 255.f;  // below it a Gaussian is not drawn
 
 constexpr int kLitChannels = 3;
 
@@ -117,6 +118,10 @@ struct GaussianGrads {
 
 // Kernels outside of kernels.cpp: KERNEL(result, name, arguments) of each.
 #define EVSPLAT_KERNELS(KERNEL) \
+    /* Projects [begin, end), appends its slots; first_slot[i] is relative to the list's start. */ \
+    KERNEL(void, project, (const View&, const Gaussians&, uint32_t begin, uint32_t end, Projected*, int32_t* radii, uint32_t* first_slot, List<Slot>&)) \
+    /* Sums the slots of each Gaussian of [begin, end) and goes back through the projection. */ \
+    KERNEL(void, project_backward, (const View&, const Gaussians&, uint32_t begin, uint32_t end, const Projected*, const uint32_t* first_slot, const float* slots, int channels, const GaussianGrads&)) \
     KERNEL(void, mlp_forward, (const MlpShape&, const MlpForward&, size_t block, float* scratch)) \
     KERNEL(void, mlp_backward, (const MlpShape&, const MlpBackward&, size_t block, const MlpSums&, float* scratch)) \
     /* Sums over a band, and the gradient of the similarity. */ \
@@ -155,16 +160,9 @@ struct GaussianGrads {
 struct Kernels {
     const char* name;
     int lanes, patches;
-    // Projects [begin, end), appends its slots; first_slot[i] is relative to the list's start.
-    void (*project)(const View&, const Gaussians&, uint32_t begin, uint32_t end, Projected*,
-                    int32_t* radii, uint32_t* first_slot, List<Slot>&);
     void (*forward)(const ForwardJob&, const TileWork&);
     // Writes the entries' slots; with `add` those of Gaussians that stand still are added to.
     void (*backward)(const BackwardJob&, const TileWork&, bool add);
-    // Sums the slots of each Gaussian of [begin, end) and goes back through the projection.
-    void (*project_backward)(const View&, const Gaussians&, uint32_t begin, uint32_t end,
-                             const Projected*, const uint32_t* first_slot, const float* slots,
-                             int channels, const GaussianGrads&);
     // Independent multiply-adds for `rounds`; returns the floating-point operations done.
     double (*multiply_add)(int64_t rounds, float* sink);
 #define EVSPLAT_POINTER(result, name, arguments) result(*name) arguments;

@@ -114,11 +114,11 @@ INLINE Alpha alpha_in_tile(const Projected& g, F x, F y) {
     return a;
 }
 
-// A tile's pixels front to back. `live`: transmittance, 0 once stopped and outside the image; `final`: what
-// it was when it stopped, 1 outside; `last`: an entry behind which it stopped, or one that comes after all.
+// A tile's pixels front to back. `live` begins as 0 outside the image, `final` as 1; `last` becomes an entry behind
+// which a pixel stopped, or one that comes after all.
 template <int C, bool Lit>
-INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& tile, const Pixels& pixels,
-                      const F* light, F* live, F* final, I* last, F* colour) {
+APART void composite(const ForwardJob& job, const TileWork& work, const Tile& tile, const Pixels& pixels,
+                     Front at) {
     const View& view = job.view;
     const int channels = C ? C : job.channels;
     prefetch_entries(job, work.entries, 0, least(kRun, work.count));
@@ -135,7 +135,7 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
     for (int p = 0; p < kPatches; ++p) {
         work.patch_end[p] = work.count;
         stopped[p] = uint32_t(bits(~pixels.inside[p]));
-        last[p] = pixels.inside[p] ? never : last[p];
+        at.last[p] = pixels.inside[p] ? never : at.last[p];
         open |= uint64_t(bits(pixels.inside[p]) != 0) << p;
     }
     Run<C> run;
@@ -150,9 +150,9 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
             uint64_t word = halves[2 * p] | uint64_t(halves[2 * p + 1]) << 32;
             if (!word) continue;
             const F x = pixels.x[p], y = pixels.y[p];
-            F t = live[p];
+            F t = at.live[p];
             uint32_t out_of = stopped[p];
-            F* out = colour + p * channels;
+            F* out = at.colour + p * channels;
             F c[C ? C : 1];
             for (int k = 0; k < C; ++k) c[k] = out[k];
             for (; word; word &= word - 1) {
@@ -161,8 +161,8 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
                 F weight = t * alpha, next = t - weight;
                 if (__builtin_expect(bits(next <= kMinTransmittance) != out_of, 0)) {
                     const I stops = (next <= kMinTransmittance) & (t > 0.f);
-                    final[p] = select(stops, t, final[p]);
-                    last[p] = stops ? I{} + (int32_t(first) + j - 1) : last[p];
+                    at.final[p] = select(stops, t, at.final[p]);
+                    at.last[p] = stops ? I{} + (int32_t(first) + j - 1) : at.last[p];
                     weight = select(stops, F{}, weight), next = select(stops, F{}, next);
                     out_of = uint32_t(bits(next <= 0.f));
                     if (out_of == everyone) {
@@ -173,15 +173,15 @@ INLINE void composite(const ForwardJob& job, const TileWork& work, const Tile& t
                     }
                 }
                 t = next;
-                const F lit = Lit ? weight * select(I{} + run.still[j], light[p], splat(1.f)) : weight;
+                const F lit = Lit ? weight * select(I{} + run.still[j], at.light[p], splat(1.f)) : weight;
                 const float* value = run.values + j * Run<C>::stride;
                 add_values<C, Lit>(C ? c : out, channels, weight, lit, value);
             }
             for (int k = 0; k < C; ++k) out[k] = c[k];
-            live[p] = t, stopped[p] = out_of;
+            at.live[p] = t, stopped[p] = out_of;
         }
     }
-    for (int p = 0; p < kPatches; ++p) final[p] = select(live[p] > 0.f, live[p], final[p]);
+    for (int p = 0; p < kPatches; ++p) at.final[p] = select(at.live[p] > 0.f, at.live[p], at.final[p]);
 }
 
 // Entries [from, to) with the slots of their gradients.
@@ -217,17 +217,10 @@ INLINE uint64_t open_at(const uint32_t* patch_end, uint32_t index) {
     return open;
 }
 
-// By patch, of a tile's backward pass.
-struct Behind {
-    const I* last;
-    const F *grad, *light;
-    F *transmittance, *behind, *light_grad;
-};
-
 // All entries of a tile back to front, each one's sums into its slot.
 template <int C, bool Lit>
-INLINE void composite_backward(const BackwardJob& back, const TileWork& work, const Tile& tile, const Pixels& pixels,
-                               int stride, bool add, const Behind& at) {
+APART void composite_backward(const BackwardJob& back, const TileWork& work, const Tile& tile, const Pixels& pixels,
+                              int stride, bool add, Behind at) {
     const ForwardJob& job = back.forward;
     const int channels = C ? C : job.channels;
     Run<C> run;

@@ -16,7 +16,7 @@ struct ViewDirections {
     float* directions;        // (points, 3)
 };
 
-// Gaussians of any rotation and opacity whose footprint, as kernels.cpp finds it, may reach into a picture.
+// Gaussians of any rotation and opacity whose footprint, as projection_kernels.cpp finds it, may reach into a picture.
 struct InView {
     size_t points;
     const float *means, *scales;  // (points, 3), (points, 3)
