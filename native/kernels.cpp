@@ -170,6 +170,39 @@ struct Behind {
     F *transmittance, *behind, *light_grad;
 };
 
+// One Gaussian in a patch, back to front; its sums are added to `slot`. `alpha`: that of `a` where it was drawn, else 0.
+template <int C, bool Lit>
+INLINE void add_gradient(const Behind& at, int p, int channels, const Alpha& a, F alpha, bool still,
+                         const float* colour, F* slot) {
+    F* hc = slot + kMoments;
+    const F t = at.transmittance[p] * reciprocal(1.f - alpha);
+    const F weight = t * alpha;
+    at.transmittance[p] = t;
+    const F* v = at.grad + p * channels;
+    F shade = F{};
+    if (Lit) {
+        const F lit = still ? weight * at.light[p] : weight;
+        for (int k = 0; k < kLitChannels; ++k) {
+            shade += colour[k] * v[k];
+            hc[k] += lit * v[k];
+        }
+        if (still) {
+            at.light_grad[p] += weight * shade;
+            shade *= at.light[p];
+        }
+    }
+    for (int k = Lit ? kLitChannels : 0; k < channels; ++k) {
+        shade += colour[k] * v[k];
+        hc[k] += weight * v[k];
+    }
+    const F differs = shade - at.behind[p];
+    at.behind[p] += alpha * differs;
+    const F h = select(a.raw <= kMaxAlpha, weight * differs, F{});
+    const F h_u = h * a.u, h_v = h * a.v;
+    slot[0] += h, slot[1] += h_u, slot[2] += h_v;
+    slot[3] += h_u * a.u, slot[4] += h_u * a.v, slot[5] += h_v * a.v;
+}
+
 #if EVSPLAT_LANES < 16
 #include "narrow.h"
 #else

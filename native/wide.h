@@ -120,37 +120,11 @@ APART void composite_backward(const BackwardJob& back, const TileWork& work, con
             const int32_t index_in_tile = int32_t(first + j);
             F slot[kMoments + (C ? C : kMaxChannels)];
             for (int k = 0; k < kMoments + channels; ++k) slot[k] = F{};
-            F* hc = slot + kMoments;
             for (uint64_t left = entry.patches & open; left; left &= left - 1) {
                 const int p = __builtin_ctzll(left);
                 const Alpha a = alpha_at(g, pixels.x[p], pixels.y[p]);
                 const F alpha = select(at.last[p] >= index_in_tile, a.value, F{});
-                const F t = at.transmittance[p] * reciprocal(1.f - alpha);
-                const F weight = t * alpha;
-                at.transmittance[p] = t;
-                const F* v = at.grad + p * channels;
-                F shade = F{};
-                if (Lit) {
-                    const F lit = chunk.still[j] ? weight * at.light[p] : weight;
-                    for (int k = 0; k < kLitChannels; ++k) {
-                        shade += colour[k] * v[k];
-                        hc[k] += lit * v[k];
-                    }
-                    if (chunk.still[j]) {
-                        at.light_grad[p] += weight * shade;
-                        shade *= at.light[p];
-                    }
-                }
-                for (int k = Lit ? kLitChannels : 0; k < channels; ++k) {
-                    shade += colour[k] * v[k];
-                    hc[k] += weight * v[k];
-                }
-                const F differs = shade - at.behind[p];
-                at.behind[p] += alpha * differs;
-                const F h = select(a.raw <= kMaxAlpha, weight * differs, F{});
-                const F h_u = h * a.u, h_v = h * a.v;
-                slot[0] += h, slot[1] += h_u, slot[2] += h_v;
-                slot[3] += h_u * a.u, slot[4] += h_u * a.v, slot[5] += h_v * a.v;
+                add_gradient<C, Lit>(at, p, channels, a, alpha, chunk.still[j], colour, slot);
             }
             sums(slot, kMoments + channels, back.slots + size_t(entry.slot) * stride,
                  add && entry.gaussian >= job.split);

@@ -58,15 +58,15 @@ def gone_on(picture: Float[Tensor, "H W 3"], seen: Bool[Tensor, "H W"]) -> Float
     return _filled(picture.movedim(-1, 0)[None] * known, known)[0].movedim(0, -1)
 
 
-def _filled(sums: Float[Tensor, "1 3 H W"], known: Float[Tensor, "1 1 H W"]) -> Tensor:
+def _filled(colours: Float[Tensor, "1 3 H W"], known: Float[Tensor, "1 1 H W"]) -> Tensor:
     """Colours of every pixel from those of which ``known`` is 1; the others are 0."""
     if known.all():
-        return sums
+        return colours
     height, width = known.shape[-2:]
-    colours, shares = (avg_pool2d(each, 2, ceil_mode=True) for each in (sums, known))
-    coarse = _filled(colours / shares.clamp_min(1e-6), (shares > 0).to(shares))
+    sums, shares = (avg_pool2d(each, 2, ceil_mode=True) for each in (colours, known))
+    coarse = _filled(sums / shares.clamp_min(1e-6), (shares > 0).to(shares))
     fine = interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False)
-    return torch.where(known > 0, sums, fine[..., :height, :width])
+    return torch.where(known > 0, colours, fine[..., :height, :width])
 
 
 def _median_of(
