@@ -1,4 +1,5 @@
-"""What a spline misses between its keys is told from the keys within the factor it promises."""
+"""What a spline misses between its keys is told from the keys within the factor it promises, and
+apart from the errors of those keys."""
 
 import numpy as np
 import pytest
@@ -7,7 +8,13 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, default_body
-from evsplat.body.smoothing import FEWEST_SPLINE_KEYS, spline_error
+from evsplat.body.spline_error import (
+    _CARRIED,
+    _ERROR_RATIO,
+    FEWEST_SPLINE_KEYS,
+    SplineError,
+    spline_error,
+)
 
 
 @pytest.fixture(scope="module")
@@ -59,3 +66,56 @@ def test_too_few_keys_tell_nothing(body):
     track = BodyTrack(body, 40_000 * keys, *wander(body, 0, 1.0)(keys))
     found = spline_error(track)
     assert not found.rotation_rad.any() and found.translation_m == 0
+
+
+def still(body, seed: int, keys: int, joint_rad, root_m: float) -> BodyTrack:
+    """A body at rest whose keys err anew each time."""
+    rng = np.random.default_rng(seed)
+    turns = joint_rad[:, None] * rng.normal(size=(keys, len(body.parents), 3))
+    return BodyTrack(body, 40_000 * np.arange(keys), turns, root_m * rng.normal(size=(keys, 3)))
+
+
+def test_errors_that_a_spline_carries_are_its_squared_weights_summed():
+    keys = 60
+    (weights,) = CubicSpline(np.arange(keys), np.eye(keys))([keys // 2 + 0.5])
+    assert np.square(weights).sum() == pytest.approx(_CARRIED, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_at_rest_has_no_motion_apart_from_the_errors_of_its_keys(body, seed):
+    rng = np.random.default_rng(seed)
+    joint_rad, root_m = rng.uniform(0.005, 0.03, len(body.parents)), 0.01
+    found = spline_error(still(body, seed, 2_001, joint_rad, root_m))
+    # 1,000 keys of three axes tell a standard deviation to 1.3 %.
+    share = np.sqrt(1 + _CARRIED) / _ERROR_RATIO
+    assert found.rotation_rad == pytest.approx(share * joint_rad, rel=0.07)
+    assert found.translation_m == pytest.approx(share * root_m, rel=0.07)
+    more = found.apart_from_errors(1.1 * joint_rad, 1.1 * root_m)
+    assert not more.rotation_rad.any() and more.translation_m == 0
+    # Of what remains by chance next to nothing is told from what the spline carries.
+    told = found.apart_from_errors(joint_rad, root_m)
+    assert (told.rotation_rad < 0.01 * joint_rad).all() and told.translation_m < 0.01 * root_m
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_motion_with_errors_the_share_that_is_told_from_them_remains(body, seed):
+    """Regression of the motion missed on all that is missed, as least squares has it."""
+    rng = np.random.default_rng(seed)
+    joints, own = len(body.parents), rng.uniform(0.002, 0.02)
+    error = own * rng.uniform(0.2, 3, size=joints)
+    seen = np.sqrt(own**2 + (1 + _CARRIED) * error**2 / _ERROR_RATIO**2)
+    told = SplineError(seen.astype(np.float32), float(seen[0])).apart_from_errors(error, error[0])
+    motion = own * rng.normal(size=(200_000, joints))
+    missed = motion + np.sqrt(_CARRIED) * error * rng.normal(size=motion.shape)
+    share = (motion * missed).sum(0) / np.square(missed).sum(0)
+    assert told.rotation_rad == pytest.approx(own * share, rel=0.03, abs=0.005 * own)
+    assert told.translation_m == pytest.approx(float(told.rotation_rad[0]), rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_exact_keys_leave_what_is_missed_as_it_is(body, seed):
+    keys = np.arange(41)
+    found = spline_error(BodyTrack(body, 40_000 * keys, *wander(body, seed, 1.5)(keys)))
+    told = found.apart_from_errors(np.zeros(len(body.parents)), 0.0)
+    assert np.allclose(told.rotation_rad, found.rotation_rad, rtol=1e-5, atol=1e-9)
+    assert told.translation_m == pytest.approx(found.translation_m, rel=1e-5)

@@ -45,7 +45,6 @@ UNREAD = {
             for closed in ("event_weight=0", "event_term=paper")
         ),
         ("pose.refine=never", "pose.refine=auto", "pose.std_rad=0.1 pose.std_m=0.1"),
-        ("pose.refine=always", "pose.refine=auto", "pose.between=false"),
     ],
     "hugs": [
         *PERSON,

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, axis_angle_to_matrix, default_body
-from evsplat.body.smoothing import spline_error
+from evsplat.body.spline_error import spline_error
 from evsplat.models.pose_correction import SHARES, PoseCorrection, _apart
 from evsplat.models.ridge import Ridge
 
@@ -83,7 +83,7 @@ def test_sizes_are_those_expected_at_each_key_and_linear_between(seed):
         correction(track, joint_rad=rad, root_m=m) for rad, m in ((joint_rad, root_m), (1.0, 1.0))
     )
     for each in (sized, plain):
-        fill(each, seed)
+        fill(each.errors, seed)
     times = [5 * STEP_US, int(6.25 * STEP_US), -10]
     turns, shifts = (value.detach().numpy() for value in sized.residual(times))
     unit_turns, unit_shifts = (value.detach().numpy() for value in plain.residual(times))
@@ -92,6 +92,20 @@ def test_sizes_are_those_expected_at_each_key_and_linear_between(seed):
     at = [root_m[5], 0.75 * root_m[6] + 0.25 * root_m[7], root_m[0]]
     assert np.allclose(shifts, unit_shifts * np.array(at), atol=1e-5)
     assert not turns[:, 3].any()
+
+
+def test_motion_between_keys_that_errors_explain_is_no_unknown():
+    """Nor do errors that a state tells count where it tells that poses are exact."""
+    track = dance(0)
+    wrong, exact = correction(track, joint_rad=3.0, root_m=9.0), correction(track, exact=True)
+    with torch.no_grad():
+        wrong.between.rotations.normal_()
+        exact.between.rotations.normal_()
+    middles = (track.times_us[:-1] + STEP_US // 2).tolist()
+    assert not wrong.residual(middles)[0].any()
+    wrong.load_state_dict(exact.state_dict())
+    turns, _ = wrong.residual(middles)
+    assert turns.abs().max() > 1e-4 and torch.equal(turns, exact.residual(middles)[0])
 
 
 @pytest.mark.parametrize("exact", [False, True])
@@ -134,6 +148,31 @@ def uneven(seed: int, keys: int = 40) -> BodyTrack:
     times[keys // 2 :] += 900_000
     poses = 0.3 * rng.normal(size=(keys, len(body.parents), 3))
     return BodyTrack(body, times, poses, rng.normal(size=(keys, 3)))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_motion_between_keys_adds_to_errors_and_is_nothing_at_keys(seed):
+    track = uneven(seed)
+    both, alone = (correction(track, joint_rad=0.3, root_m=0.3) for _ in range(2))
+    for each in (both, alone):
+        fill(each, seed)
+    with torch.no_grad():
+        for value in alone.between.parameters():
+            value.zero_()
+    told = spline_error(track).apart_from_errors(
+        np.full(len(track.body.parents), SHARES["fast"] ** 0.5 * 0.3),
+        SHARES["fast"] ** 0.5 * 0.3,
+    )
+    keys, middles = track.times_us.tolist(), (track.times_us[:-1] + 9_000).tolist()
+    count = len(keys)
+    moved, placed = both.between.values(keys + middles)
+    sizes = moved * torch.from_numpy(told.rotation_rad)[:, None], placed * told.translation_m
+    pairs = zip(both.residual(keys + middles), alone.residual(keys + middles), sizes, strict=True)
+    for one, errors, size in pairs:
+        assert torch.allclose(one, errors + size, atol=1e-6)
+        assert torch.allclose(one[:count], errors[:count], atol=1e-5)
+        assert float(size[count:].detach().abs().max()) > 1e-4
+    assert float(both.price().detach()) > float(alone.price().detach())
 
 
 @pytest.mark.parametrize("track", [dance(0), uneven(1), uneven(2)], ids=["even", "1", "2"])

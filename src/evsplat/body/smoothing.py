@@ -1,26 +1,18 @@
-"""Errors of given key poses and of their spline, estimated from the poses alone; smoothing."""
+"""Errors of given key poses, estimated from the poses alone; smoothing."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from evsplat.body.rotations import matrix_to_quaternion
 from evsplat.body.track import BodyTrack
 
 FEWEST_KEYS = 8
 """Fewer key poses give no estimate of their noise."""
-_MOST_SPLINE_KEYS = 4_096
-FEWEST_SPLINE_KEYS = 5
-"""Fewer key poses give no estimate of the spline's error."""
-_ERROR_RATIO = 4.0
-"""Spline error with every other key over that with all keys. A cubic spline's falls 16-fold where
-motion is smooth, by less where it is fast; captures with true poses show 3 to 11."""
 _LONGEST_PIECE = 256
 """Key poses whose noise is estimated together: the cost grows with the cube."""
 _STIFFNESSES = np.geomspace(1e-6, 1e8, 100)
@@ -99,41 +91,6 @@ def smoothed(track: BodyTrack, noise: MotionNoise) -> BodyTrack:
         errors=track.errors,
         camera_up=track.camera_up,
     )
-
-
-@dataclass(frozen=True)
-class SplineError:
-    """Root mean square errors, per axis, of a track's spline between its keys."""
-
-    rotation_rad: Float[np.ndarray, " J"]
-    """Error of each joint's rotation."""
-    translation_m: float
-    """Error of the root's place."""
-
-
-def spline_error(track: BodyTrack) -> SplineError:
-    """Error of the spline between its keys, from the spline through every other one of them.
-
-    What the sparser spline misses at the keys that it leaves out, divided by `_ERROR_RATIO`. Of a
-    long recording the keys in its middle tell.
-    """
-    first = max(0, len(track.times_us) - _MOST_SPLINE_KEYS) // 2
-    times_us, poses, transl = (
-        values[first : first + _MOST_SPLINE_KEYS]
-        for values in (track.times_us, track.poses, track.transl)
-    )
-    keys, joints = poses.shape[:2]
-    if keys < FEWEST_SPLINE_KEYS:
-        return SplineError(np.zeros(joints, np.float32), 0.0)
-    sparse = BodyTrack(track.body, times_us[::2], poses[::2], transl[::2])
-    left_out = times_us[1 : keys - (keys % 2 == 0) : 2]
-    times = torch.from_numpy(left_out)
-    (turned, moved), (true_turn, true_move) = sparse.at(times), track.at(times)
-    apart = matrix_to_quaternion(turned.transpose(-1, -2) @ true_turn)
-    angles = 2 * torch.asin(apart[..., 1:].norm(dim=-1).clamp(max=1)).double().numpy()
-    rotation = np.sqrt(np.square(angles).mean(0) / 3) / _ERROR_RATIO
-    translation = float((moved - true_move).double().square().mean().sqrt()) / _ERROR_RATIO
-    return SplineError(rotation.astype(np.float32), translation)
 
 
 def _seconds(track: BodyTrack) -> Float[np.ndarray, " P"]:

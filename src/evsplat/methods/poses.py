@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import numpy as np
 
 from evsplat.body import BodyTrack, PoseErrors, PoseSource
-from evsplat.body.smoothing import motion_noise, moving_joints, smoothed, spline_error
+from evsplat.body.smoothing import motion_noise, moving_joints, smoothed
+from evsplat.body.spline_error import spline_error
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError, DataError
@@ -31,7 +32,6 @@ motion looks like noise as well, and with all of it up to 15 % was added to erro
 MOST_PIXELS = 100_000_000
 """Of the pictures by which poses are corrected before training: some ten minutes of one core."""
 
-_NOT_ALWAYS = ReadIf("pose.refine", "auto or never", lambda refine: refine != "always")
 _REFINED = ReadIf("pose.refine", "auto or always", lambda refine: refine != "never")
 
 
@@ -45,9 +45,9 @@ class PoseSettings:
     refine: When
     """Learn the errors of the poses from pictures and events. ``auto``: where the capture says that
     they err, and where it doesn't say, if pictures are explained better by others."""
-    between: Annotated[bool, _NOT_ALWAYS]
-    """Where poses are taken as exact, learn how the person moves between them: a residual that is
-    zero at every key pose."""
+    between: bool
+    """Learn how the person moves between the key poses: a residual that is zero at each of them.
+    The less, the more of what a spline misses between them is explained by their errors."""
     start: Nominal
     """Nominal iteration from which the residual is learned."""
     prior: Weight
@@ -84,6 +84,7 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
     ``fit``: find out what the capture does not say; otherwise a state that is loaded says it.
     """
     track = load_body_track(capture)
+    between = spline_error(track) if config.between else None
     source = None if track.errors is None else track.errors.source
     exact = {"always": False, "never": True}.get(config.refine)
     if exact is None and source is not None:
@@ -111,7 +112,6 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
     if fit:
         smooth = smooth or track is not given and config.smooth == "auto"
         _announce(config, source, joint_rad, root_m, exact=decided, smooth=smooth)
-    between = spline_error(given) if config.between and exact is not False else None
     if exact and between is None:
         return Poses(given)
     frames_us = [frame.mid_us for frame in capture.train_frames]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack
-from evsplat.body.smoothing import SplineError
+from evsplat.body.spline_error import SplineError
 from evsplat.devices import send
 from evsplat.models.kept import Kept
 from evsplat.models.pose_spline import PoseSpline
@@ -38,11 +38,12 @@ class PoseCorrection(nn.Module):
     knots reach over a few frames, so that what is learned at training times is carried into gaps;
     ``fast``, with a knot per key. The latter two have mean zero over the training frames. A fourth,
     ``between``, is zero at every key: how the person moves from one to the next, which the track's
-    own spline cannot know.
+    own spline cannot know. Beside errors it is in units of what can be told from them
+    (`SplineError.apart_from_errors`).
 
-    ``exact`` says which count: of poses that are exact only ``between``, else the other three. It
-    is part of the state, as are the errors expected and what was smoothed (`smooth_to`): they may
-    have been found from pictures.
+    ``exact`` says which count: of poses that are exact only ``between``, else all four. It is part
+    of the state, as are the errors expected and what was smoothed (`smooth_to`): they may have been
+    found from pictures.
     """
 
     exact: Tensor
@@ -50,7 +51,6 @@ class PoseCorrection(nn.Module):
     """True where the errors began at what was found before training: they count from the start."""
     joint_rad: Tensor
     root_m: Tensor
-    between_rad: Tensor
 
     def __init__(
         self,
@@ -80,18 +80,15 @@ class PoseCorrection(nn.Module):
             }
         )
         self.smoothing = PoseSpline(span, gap, joints, learned=False)
-        self.between, self.between_m = None, 0.0
+        self.between, self._missed = None, between
         if between is not None:
             self.between = PoseSpline(span, gap / 2, joints, held_us=times.tolist())
-            self.between_m = between.translation_m
         self.key_us = torch.from_numpy(times).double()  # on the host, where splines are weighed
-        rad = torch.zeros(joints) if between is None else torch.from_numpy(between.rotation_rad)
-        self.register_buffer("between_rad", rad, persistent=False)
         self.register_buffer("joint_rad", torch.as_tensor(joint_rad).float())
         self.register_buffer("root_m", torch.as_tensor(root_m).float())
         self.register_buffer("exact", torch.tensor(exact))
         self.register_buffer("started", torch.tensor(False))
-        self._moving = Kept()
+        self._moving, self._unit = Kept(), Kept()
 
     def _apply(self, fn: Any, recurse: bool = True) -> "PoseCorrection":
         exact, started = self.exact, self.started
@@ -104,13 +101,33 @@ class PoseCorrection(nn.Module):
     ) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T 3"]]:
         """Axis-angle vectors, radians, and shifts of the root, metres."""
         times = torch.as_tensor(times_us, dtype=torch.float64, device="cpu")
-        if bool(self.exact) and self.between is not None:
-            turns, shifts = self.between.values(times)
-            return turns * self.between_rad[:, None], shifts * self.between_m
         turns = self.joint_rad.new_zeros(len(times), self.joint_rad.shape[1], 3)
         shifts = self.root_m.new_zeros(len(times), 3)
-        if bool(self.exact):
-            return turns, shifts
+        if not bool(self.exact):
+            turns, shifts = self._erring(times, turns, shifts)
+        if self.between is not None:
+            moved, placed = self.between.values(times)
+            rad, metres = self._unit_between()
+            turns = turns + moved * rad[:, None]
+            shifts = shifts + placed * metres
+        return turns, shifts
+
+    def _unit_between(self) -> tuple[Float[Tensor, "J"], float]:
+        """Of what is learned between keys, radians and metres: follows from the state."""
+
+        def unit() -> tuple[Tensor, float]:
+            assert self._missed is not None
+            missed, new = self._missed, SHARES["fast"] ** 0.5
+            if not bool(self.exact):
+                joint_rad = new * self.joint_rad.square().mean(0).sqrt()
+                root_m = new * self.root_m.square().mean().sqrt()
+                missed = missed.apart_from_errors(joint_rad.cpu().numpy(), float(root_m))
+            return torch.from_numpy(missed.rotation_rad).to(self.joint_rad), missed.translation_m
+
+        return self._unit.of([self.exact, self.joint_rad, self.root_m], unit)
+
+    def _erring(self, times: Tensor, turns: Tensor, shifts: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors at the keys, added up from zeros, and what was smoothed."""
         for name, spline in self._errors():
             some_turns, some_shifts = spline.values(times)
             turns = turns + SHARES[name] ** 0.5 * some_turns
@@ -129,18 +146,17 @@ class PoseCorrection(nn.Module):
         if generator is not None and len(keys) > _PRICED:
             stretches = keys.tensor_split(-(-len(keys) // _PRICED))
             keys = stretches[int(torch.randint(len(stretches), (), generator=generator))]
+        price = self.joint_rad.new_zeros(())
         if not bool(self.exact):
-            price = self.joint_rad.new_zeros(())
             parts = dict(self._errors())
             for spline in parts.values():
                 share = spline.count / parts["fast"].count
                 price = price + share * self._price(spline, keys, self.joint_rad)
-            return price
         if self.between is not None:
             middles = ((keys[1:] + keys[:-1]) / 2).floor()
             if not self.between.still_zero(middles):
-                return self._price(self.between, middles, self.between_rad[None])
-        return self.joint_rad.new_zeros(())
+                price = price + self._price(self.between, middles, self._unit_between()[0][None])
+        return price
 
     def _price(
         self, spline: PoseSpline, times_us: Tensor, expected: Float[Tensor, "#P J"]
