@@ -34,7 +34,7 @@ def demo(
     out: NewRun = None,
     max_minutes: Annotated[
         float, option("M", "Minutes of training; evaluation and report come on top.")
-    ] = 3.0,
+    ] = 2.5,
     find_poses: Annotated[
         Flag, option(help="Take its poses away and find them again, in captures/.")
     ] = False,
