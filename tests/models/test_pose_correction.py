@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, axis_angle_to_matrix, default_body
-from evsplat.body.spline_error import spline_error
+from evsplat.body.spline_error import apart_from_errors, spline_error
 from evsplat.models.pose_correction import SHARES, PoseCorrection, _apart
 from evsplat.models.ridge import Ridge
 
@@ -159,14 +159,13 @@ def test_motion_between_keys_adds_to_errors_and_is_nothing_at_keys(seed):
     with torch.no_grad():
         for value in alone.between.parameters():
             value.zero_()
-    told = spline_error(track).apart_from_errors(
-        np.full(len(track.body.parents), SHARES["fast"] ** 0.5 * 0.3),
-        SHARES["fast"] ** 0.5 * 0.3,
-    )
+    missed = spline_error(track)
+    every = torch.tensor([*missed.rotation_rad, missed.translation_m])
+    told = apart_from_errors(every, torch.full_like(every, SHARES["fast"] ** 0.5 * 0.3))
     keys, middles = track.times_us.tolist(), (track.times_us[:-1] + 9_000).tolist()
     count = len(keys)
     moved, placed = both.between.values(keys + middles)
-    sizes = moved * torch.from_numpy(told.rotation_rad)[:, None], placed * told.translation_m
+    sizes = moved * told[:-1, None], placed * told[-1]
     pairs = zip(both.residual(keys + middles), alone.residual(keys + middles), sizes, strict=True)
     for one, errors, size in pairs:
         assert torch.allclose(one, errors + size, atol=1e-6)

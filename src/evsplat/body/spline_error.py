@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from evsplat.body.rotations import matrix_to_quaternion
 from evsplat.body.track import BodyTrack
@@ -29,25 +30,13 @@ class SplineError:
     translation_m: float
     """Error of the root's place."""
 
-    def apart_from_errors(self, joint_rad: Float[np.ndarray, " J"], root_m: float) -> "SplineError":
-        """Of a `spline_error` what can be told from errors that are new at every key.
-
-        These have standard deviations ``joint_rad`` and ``root_m`` per axis, radians and metres.
-        They are in what was missed at the keys left out, and are taken off its squares. What
-        remains is how the person moves; nothing remains where errors explain it all. Halfway
-        between two keys it adds to what the spline carries there of the errors, which are learned
-        as well: of the sum the share of its variance is the motion's, and by that share it is less.
-        """
-        rad = _apart(self.rotation_rad, joint_rad)
-        return SplineError(rad, float(_apart(np.array(self.translation_m), np.array(root_m))))
-
 
 def spline_error(track: BodyTrack) -> SplineError:
     """Error of the spline between its keys, from the spline through every other one of them.
 
     What the sparser spline misses at the keys that it leaves out, divided by `_ERROR_RATIO`. Of a
     long recording the keys in its middle tell. Errors of the keys are in it, see
-    `SplineError.apart_from_errors`.
+    `apart_from_errors`.
     """
     first = max(0, len(track.times_us) - _MOST_KEYS) // 2
     times_us, poses, transl = (
@@ -67,8 +56,16 @@ def spline_error(track: BodyTrack) -> SplineError:
     return SplineError(rotation.astype(np.float32), translation)
 
 
-def _apart(missed: np.ndarray, new: np.ndarray) -> np.ndarray:
-    known = (1 + _CARRIED) * np.square(new) / _ERROR_RATIO**2
-    own = np.maximum(np.square(missed) - known, 0)
-    share = own / np.maximum(own + _CARRIED * np.square(new), np.finfo(np.float32).tiny)
-    return (np.sqrt(own) * share).astype(np.float32)
+def apart_from_errors(missed: Float[Tensor, "*N"], new: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
+    """Of a `spline_error` what can be told from errors that are new at every key.
+
+    ``new``: their standard deviation per axis, in the same unit. They are in what was missed at the
+    keys left out, and are taken off its square. What remains is how the person moves; nothing
+    remains where errors explain it all. Halfway between two keys it adds to what the spline carries
+    there of the errors, which are learned as well: of the sum the share of its variance is the
+    motion's, and by that share it is less.
+    """
+    known = (1 + _CARRIED) * new.square() / _ERROR_RATIO**2
+    own = (missed.square() - known).clamp_min(0)
+    carried = _CARRIED * new.square()
+    return own.sqrt() * own / (own + carried).clamp_min(torch.finfo(own.dtype).tiny)

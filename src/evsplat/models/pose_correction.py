@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack
-from evsplat.body.spline_error import SplineError
+from evsplat.body.spline_error import SplineError, apart_from_errors
 from evsplat.devices import send
 from evsplat.models.kept import Kept
 from evsplat.models.pose_spline import PoseSpline
@@ -39,7 +39,7 @@ class PoseCorrection(nn.Module):
     ``fast``, with a knot per key. The latter two have mean zero over the training frames. A fourth,
     ``between``, is zero at every key: how the person moves from one to the next, which the track's
     own spline cannot know. Beside errors it is in units of what can be told from them
-    (`SplineError.apart_from_errors`).
+    (`apart_from_errors`).
 
     ``exact`` says which count: of poses that are exact only ``between``, else all four. It is part
     of the state, as are the errors expected and what was smoothed (`smooth_to`): they may have been
@@ -51,6 +51,8 @@ class PoseCorrection(nn.Module):
     """True where the errors began at what was found before training: they count from the start."""
     joint_rad: Tensor
     root_m: Tensor
+    missed_rad: Tensor
+    missed_m: Tensor
 
     def __init__(
         self,
@@ -80,8 +82,11 @@ class PoseCorrection(nn.Module):
             }
         )
         self.smoothing = PoseSpline(span, gap, joints, learned=False)
-        self.between, self._missed = None, between
+        self.between = None
         if between is not None:
+            missed = torch.from_numpy(between.rotation_rad), torch.tensor(between.translation_m)
+            for name, value in zip(("missed_rad", "missed_m"), missed, strict=True):
+                self.register_buffer(name, value, persistent=False)
             self.between = PoseSpline(span, gap / 2, joints, held_us=times.tolist())
         self.key_us = torch.from_numpy(times).double()  # on the host, where splines are weighed
         self.register_buffer("joint_rad", torch.as_tensor(joint_rad).float())
@@ -112,19 +117,19 @@ class PoseCorrection(nn.Module):
             shifts = shifts + placed * metres
         return turns, shifts
 
-    def _unit_between(self) -> tuple[Float[Tensor, "J"], float]:
+    def _unit_between(self) -> tuple[Float[Tensor, "J"], Float[Tensor, ""]]:
         """Of what is learned between keys, radians and metres: follows from the state."""
+        if bool(self.exact):
+            return self.missed_rad, self.missed_m
 
-        def unit() -> tuple[Tensor, float]:
-            assert self._missed is not None
-            missed, new = self._missed, SHARES["fast"] ** 0.5
-            if not bool(self.exact):
-                joint_rad = new * self.joint_rad.square().mean(0).sqrt()
-                root_m = new * self.root_m.square().mean().sqrt()
-                missed = missed.apart_from_errors(joint_rad.cpu().numpy(), float(root_m))
-            return torch.from_numpy(missed.rotation_rad).to(self.joint_rad), missed.translation_m
+        def told() -> tuple[Tensor, Tensor]:
+            share = SHARES["fast"]
+            new_rad = (share * self.joint_rad.square().mean(0)).sqrt()
+            new_m = (share * self.root_m.square().mean()).sqrt()
+            rad = apart_from_errors(self.missed_rad, new_rad)
+            return rad, apart_from_errors(self.missed_m, new_m)
 
-        return self._unit.of([self.exact, self.joint_rad, self.root_m], unit)
+        return self._unit.of([self.joint_rad, self.root_m], told)
 
     def _erring(self, times: Tensor, turns: Tensor, shifts: Tensor) -> tuple[Tensor, Tensor]:
         """Errors at the keys, added up from zeros, and what was smoothed."""
