@@ -93,7 +93,7 @@ class PoseCorrection(nn.Module):
         self.register_buffer("root_m", torch.as_tensor(root_m).float())
         self.register_buffer("exact", torch.tensor(exact))
         self.register_buffer("started", torch.tensor(False))
-        self._moving, self._unit = Kept(), Kept()
+        self._erring_axes, self._between_axes, self._unit = Kept(), Kept(), Kept()
 
     def _apply(self, fn: Any, recurse: bool = True) -> "PoseCorrection":
         exact, started = self.exact, self.started
@@ -154,24 +154,23 @@ class PoseCorrection(nn.Module):
         price = self.joint_rad.new_zeros(())
         if not bool(self.exact):
             parts = dict(self._errors())
+            axes = self._erring_axes.of([self.joint_rad], lambda: _axes(self.joint_rad))
             for spline in parts.values():
                 share = spline.count / parts["fast"].count
-                price = price + share * self._price(spline, keys, self.joint_rad)
+                price = price + share * self._price(spline, keys, axes)
         if self.between is not None:
             middles = ((keys[1:] + keys[:-1]) / 2).floor()
             if not self.between.still_zero(middles):
-                price = price + self._price(self.between, middles, self._unit_between()[0][None])
+                unit = self._unit_between()[0][None]
+                axes = self._between_axes.of([unit], lambda: _axes(unit))
+                price = price + self._price(self.between, middles, axes)
         return price
 
     def _price(
-        self, spline: PoseSpline, times_us: Tensor, expected: Float[Tensor, "#P J"]
+        self, spline: PoseSpline, times_us: Tensor, moving_axes: tuple[Tensor, Tensor]
     ) -> Tensor:
-        def joints() -> tuple[Tensor, Tensor]:
-            moving = (expected > 0).any(0)
-            return moving[:, None], 3 * (moving.sum() + 1)
-
         turns, shifts = spline.values(times_us)
-        moving, axes = self._moving.of([expected], joints)
+        moving, axes = moving_axes
         every = torch.cat([(turns * moving).flatten(1), shifts], 1).flatten()
         return torch.dot(every, every) / (len(shifts) * axes)
 
@@ -239,6 +238,12 @@ class PoseCorrection(nn.Module):
         with torch.no_grad():
             for value in (*self.parameters(), *self.smoothing.whole()):
                 value.zero_()
+
+
+def _axes(expected: Float[Tensor, "P J"]) -> tuple[Tensor, Tensor]:
+    """Joints that are expected to move, (J, 1), and how many axes they and the root have."""
+    moving = (expected > 0).any(0)
+    return moving[:, None], 3 * (moving.sum() + 1)
 
 
 @torch.no_grad()
