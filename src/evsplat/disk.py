@@ -48,7 +48,8 @@ def lock(handle: int, *, shared: bool = False, wait: bool = False) -> bool | Non
 def uninterrupted() -> Iterator[None]:
     """Ctrl-C and SIGTERM wait for the end of the block.
 
-    For libraries in C that call back into Python and crash where that raises.
+    For libraries in C that call back into Python and crash where that raises, or tell of
+    something else.
     """
     came: list[int] = []
     handlers = {}

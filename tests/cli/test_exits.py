@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+import torch
 from safetensors import SafetensorError
 
 from evsplat.cli import main
@@ -128,6 +129,46 @@ sys.exit(exit_code(work))
 def test_ctrl_c_that_python_drops_is_heard_all_the_same():
     done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True, timeout=20)
     assert (done.returncode, done.stderr) == (130, "\nevsplat: Stopped.\n")
+
+
+def stop_here() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+    for _ in range(1000):
+        pass
+
+
+def test_a_stop_that_a_library_made_an_error_of_is_a_stop(capsys):
+    class Sequence:
+        def __len__(self) -> int:
+            return 1
+
+        def __getitem__(self, place: int) -> float:
+            stop_here()
+            return 0.0
+
+    def work() -> None:
+        try:
+            torch.tensor(Sequence())
+        except ValueError as error:
+            raise DataError(f"not readable ({error})") from None
+
+    with pytest.raises(DataError, match="could not determine the shape"):
+        work()
+    assert exit_code(work) == 130
+    assert capsys.readouterr().err == "\nevsplat: Stopped.\n"
+    assert exit_code(raising(DataError("not readable"))) == 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_what_fails_after_a_stop_is_said(capsys):
+    def work() -> None:
+        try:
+            stop_here()
+        except KeyboardInterrupt:
+            raise OutputError("x: not written, the disk is full.") from None
+
+    assert exit_code(work) == 2
+    assert capsys.readouterr().err == "evsplat: x: not written, the disk is full.\n"
 
 
 def test_unwritable_output_is_said_before_the_work(tmp_path: Path, capsys):

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import signal
 import struct
 import warnings
 import zipfile
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import save_file
 
 from evsplat.body.motion import load_motion
 from evsplat.body.pose_files import read_poses
@@ -34,6 +36,7 @@ from evsplat.untrusted.arrays import read_npz, read_plain_npz
 from evsplat.untrusted.hdf5 import holds, open_hdf5
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.records import misfit
+from evsplat.untrusted.tensors import read_safetensors
 from evsplat.weights import read_state
 
 from ..conftest import write_tiny_capture
@@ -334,3 +337,20 @@ def test_dense_poses_need_no_more_than_poses(tmp_path: Path) -> None:
     np.savez(capture / "body_dense.npz", **keyed | {"transl": np.zeros((10, 3), np.uint8)})
     said = refused(lambda: load_body_track(load_capture(capture), dense=True))
     assert "body_dense.npz: transl: found 10x3 of uint8" in said
+
+
+def test_ctrl_c_within_a_file_of_tensors_is_not_taken_for_damage(tmp_path: Path, monkeypatch):
+    save_file({"a": torch.arange(3.0)}, tmp_path / "a.safetensors")
+    part_of = torch.UntypedStorage.__getitem__
+
+    def interrupted(storage: torch.UntypedStorage, part: slice | int) -> object:
+        if isinstance(part, int):  # torch's own question, whose answer may only be an element
+            os.kill(os.getpid(), signal.SIGINT)
+        return part_of(storage, part)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.UntypedStorage, "__getitem__", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            read_safetensors(tmp_path / "a.safetensors")
+    tensors, _ = read_safetensors(tmp_path / "a.safetensors")
+    assert torch.equal(tensors["a"], torch.arange(3.0))

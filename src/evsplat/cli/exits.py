@@ -25,6 +25,7 @@ _BAD_INPUT = 2
 _INTERRUPTED = 130
 _NOBODY_READS = 141
 _AGAIN_S = 0.02
+_PLAIN = signal.default_int_handler
 
 
 def exit_code(work: Callable[[], object]) -> int:
@@ -37,8 +38,9 @@ def exit_code(work: Callable[[], object]) -> int:
     """
     logging.basicConfig(format="%(message)s")
     logging.getLogger("evsplat").setLevel(logging.INFO)
+    stops = _Stops()
     try:
-        with _stopped_by_sigterm(), _dropped_interrupts_again(), _output_named():
+        with stops, _dropped_interrupts_again(), _output_named():
             try:
                 work()
             finally:
@@ -46,15 +48,16 @@ def exit_code(work: Callable[[], object]) -> int:
                 if sys.stdout is not None:  # closed by whoever started this
                     sys.stdout.flush()
     except EvsplatError as error:
-        return _said(error)
+        return _stopped() if stops.became(error) else _said(error)
     except KeyboardInterrupt as stop:
-        _tell(f"\nevsplat: {str(stop) or 'Stopped.'}")
-        return _INTERRUPTED
+        return _stopped(str(stop))
     except BrokenPipeError:
         # Whoever reads, such as head, has enough. What is still buffered goes nowhere, quietly.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _NOBODY_READS
     except Exception as error:
+        if stops.became(error):
+            return _stopped()
         fault = machine_error(error)
         if fault is None:
             raise
@@ -96,6 +99,11 @@ def end_quietly() -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+def _stopped(words: str = "") -> int:
+    _tell(f"\nevsplat: {words or 'Stopped.'}")
+    return _INTERRUPTED
+
+
 def _said(error: EvsplatError) -> int:
     _tell(f"evsplat: {error}{_kept_traceback(error)}")
     return _BAD_INPUT
@@ -131,18 +139,34 @@ def _output_named() -> Iterator[None]:
         yield
 
 
-@contextmanager
-def _stopped_by_sigterm() -> Iterator[None]:
-    """The end that docker stop or a batch system asks for is that of Ctrl-C."""
-    try:
-        previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    except ValueError:  # not in the main thread
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
+class _Stops:
+    """Ctrl-C, and SIGTERM for the same: it is how docker stop or a batch system asks for an end."""
+
+    def __init__(self) -> None:
+        self._came = False
+        self._before: dict[int, Any] = {}
+
+    def __call__(self, number: int, frame: object) -> None:
+        """Take a signal."""
+        self._came = True
+        raise KeyboardInterrupt
+
+    def became(self, error: BaseException | None) -> bool:
+        """Whether a library in C made this error of a stop, which did not lead to it otherwise."""
+        while error is not None and not isinstance(error, KeyboardInterrupt):
+            error = error.__context__
+        return self._came and error is None
+
+    def __enter__(self) -> "_Stops":
+        with suppress(ValueError):  # not in the main thread
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if number == signal.SIGTERM or signal.getsignal(number) is _PLAIN:
+                    self._before[number] = signal.signal(number, self)
+        return self
+
+    def __exit__(self, *of: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)
 
 
 @contextmanager

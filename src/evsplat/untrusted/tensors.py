@@ -8,6 +8,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from evsplat.disk import uninterrupted
 from evsplat.untrusted.faults import BROKEN, ordinary_file
 from evsplat.untrusted.sizes import open_zip
 
@@ -29,7 +30,8 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and texts of a file of safetensors; a `ValueError` where it is none."""
     ordinary_file(path)
     try:
-        with safe_open(path, framework="pt") as file:
+        # torch calls its storage's Python and says of any error there that the shape is unknown.
+        with uninterrupted(), safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}
             return tensors, file.metadata() or {}
     except (*BROKEN, SafetensorError) as error:
