@@ -10,7 +10,6 @@ from tqdm import tqdm
 
 from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence
-from evsplat.calibration.offset import BlockLevels
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
 from evsplat.footage import Footage, TimedPicture, open_footage
@@ -36,10 +35,14 @@ from evsplat.importers.option_types import (
     TimeUs,
 )
 from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_motion
-from evsplat.importers.recorded import add_recorded_events, offset_or_levels, recorded_camera
+from evsplat.importers.recorded import (
+    add_recorded_events,
+    gather_levels,
+    offset_or_levels,
+    recorded_camera,
+)
 from evsplat.importers.smpl import chosen_poses
 from evsplat.options.declare import Flag, option
-from evsplat.pictures.files import to_unit_range
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -117,8 +120,7 @@ class Folder(Importer):
             if index not in seen:
                 continue
             exposure = int(exposures[index, 0]), int(exposures[index, 1])
-            if isinstance(clock_offset, BlockLevels):
-                clock_offset.add(to_unit_range(timed.pixels), exposure)
+            gather_levels(clock_offset, timed, exposure)
             writer.add_frame(
                 timed.name,
                 "main",

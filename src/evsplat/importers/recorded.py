@@ -13,7 +13,9 @@ from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventRecording, EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
+from evsplat.footage import TimedPicture
 from evsplat.importers.base import check_positive, need
+from evsplat.pictures.files import to_unit_range
 
 GUESSED_FOV_DEG = 60.0
 """Angle of view across the longer side where nothing tells the focal length: a phone held upright
@@ -59,6 +61,14 @@ def offset_or_levels(
     if clock_offset_us != "auto":
         raise ConfigError(f"--clock-offset-us {clock_offset_us}: expected microseconds or auto.")
     return BlockLevels(camera.get("transfer", "power"))
+
+
+def gather_levels(
+    clock_offset: int | BlockLevels, picture: TimedPicture, exposure_us: tuple[int, int]
+) -> None:
+    """Take of a frame what its clock's offset is found by, where it is to be found."""
+    if isinstance(clock_offset, BlockLevels):
+        clock_offset.add(to_unit_range(picture.pixels), exposure_us)
 
 
 def add_recorded_events(

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from evsplat.calibration.offset import BlockLevels
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
 from evsplat.footage import open_footage
@@ -20,9 +19,13 @@ from evsplat.importers.option_types import (
     OwnRate,
     TimeUs,
 )
-from evsplat.importers.recorded import add_recorded_events, offset_or_levels, recorded_camera
+from evsplat.importers.recorded import (
+    add_recorded_events,
+    gather_levels,
+    offset_or_levels,
+    recorded_camera,
+)
 from evsplat.options.declare import Flag
-from evsplat.pictures.files import to_unit_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +72,7 @@ class Video(Importer):
             middle = timed.time_us + self.start_us
             exposure = exposure_around(middle, self.exposure_us)
             writer.add_frame(timed.name, "main", timed.pixels, exposure)
-            if isinstance(clock_offset, BlockLevels):
-                clock_offset.add(to_unit_range(timed.pixels), exposure)
+            gather_levels(clock_offset, timed, exposure)
         notes = add_recorded_events(
             writer,
             self.events,

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture, estimate_sensor
 from evsplat.errors import HeldOutError
 from evsplat.events import EventStore, deblur, polarity_counts
@@ -35,6 +36,11 @@ _KEPT_FRAMES = 8
 
 Made = tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"] | None]
 """A picture and its doubt, see `SharpPicture`."""
+
+
+def sharp_pixels(camera: Camera) -> int:
+    """Pixels of the sharp pictures that are taken of one frame."""
+    return len(FRACTIONS) * camera.width * camera.height
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from evsplat.body.spline_error import spline_error
 from evsplat.capture import TrainingCapture, load_body_track
 from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError, DataError
-from evsplat.landmarks.pictures import FRACTIONS
+from evsplat.landmarks.pictures import sharp_pixels
 from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, Weight
 from evsplat.models.pose_correction import SHARES, PoseCorrection
 from evsplat.posing.refine import Gain, Refined, Verdict, judge, refine
@@ -149,8 +149,7 @@ def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTr
 def _corrected(track: BodyTrack, capture: TrainingCapture) -> Gain | None:
     """Poses corrected by the whole recording; None where that is ruled out, which is logged."""
     frames = capture.train_frames
-    camera = capture.camera(frames[0])
-    most = MOST_PIXELS // (len(FRACTIONS) * camera.width * camera.height)
+    most = MOST_PIXELS // sharp_pixels(capture.camera(frames[0]))
     if len(frames) > most:
         logger.warning(
             "%s: has %d training frames, more than the %d of this size whose poses are corrected "

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from evsplat.body import BodyTrack, PoseErrors
 from evsplat.body.rotations import nearest_axis_angle
 from evsplat.capture import Frame, TrainingCapture
-from evsplat.landmarks.pictures import FRACTIONS, SharpPicture
+from evsplat.landmarks.pictures import SharpPicture, sharp_pixels
 
 _MOST_PIXELS = 24_000_000
 """Of the pictures of one piece: with all that is computed of them 140 B a pixel."""
@@ -43,8 +43,7 @@ def cut_in_pieces(track: BodyTrack, capture: TrainingCapture) -> list[Piece]:
     """The recording whole, or pieces of about the same length that overlap."""
     frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
     trained = [number for number, frame in enumerate(frames) if frame.split == "train"]
-    camera = capture.camera(frames[0])
-    pixels, shrink = len(FRACTIONS) * camera.width * camera.height, 1
+    pixels, shrink = sharp_pixels(capture.camera(frames[0])), 1
     while _FEWEST_FRAMES * pixels > _MOST_PIXELS * shrink**2:
         shrink *= 2
     # Those held out between training frames have pictures as well.
