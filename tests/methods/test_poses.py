@@ -16,7 +16,7 @@ from evsplat.errors import ConfigError
 from evsplat.methods import poses
 from evsplat.methods.evsplat import ERRORS_RATE
 from evsplat.methods.evsplat_settings import EvsplatConfig
-from evsplat.methods.poses import SMOOTHED, Poses, prepare_poses
+from evsplat.methods.poses import Poses, prepare_poses
 from evsplat.models.pose_correction import SHARES
 from evsplat.objectives import DeformationPrior
 from evsplat.posing.refine import LEAST_GAIN, Verdict
@@ -90,7 +90,7 @@ def test_poses_that_err_are_smoothed_and_corrected_by_what_is_said_of_them(captu
     assert "(source: estimated) are taken as off by some 0.050 rad and 10 mm" in caplog.text
     assert "smoothed in time, corrected in training" in caplog.text
     assert np.abs(found.track.poses - exact).mean() < np.abs(noisy - exact).mean()
-    believed = SMOOTHED * 0.05 * SHARES["fast"] ** 0.5
+    believed = 0.05 * SHARES["fast"] ** 0.5
     moved = np.sqrt(np.square(found.track.poses - noisy).mean())
     assert 0 < moved < 1.2 * believed, "the noise is larger, but may be fast motion"
     assert float(found.correction.joint_rad.max()) == pytest.approx(0.05)
@@ -98,6 +98,18 @@ def test_poses_that_err_are_smoothed_and_corrected_by_what_is_said_of_them(captu
     off = prepared(seen(captures[1]), smooth="never", refine="never", between=False)
     assert off.correction is None
     assert np.array_equal(off.track.poses, noisy)
+
+
+def test_a_joint_that_is_said_to_err_less_is_smoothed_by_less(captures):
+    noisy = load_body_track(captures[1]).poses
+    std = np.full(noisy.shape[:2], 0.05, np.float32)
+    std[:, 3:6], std[:, 6:9] = 0.005, 0.0
+    with_errors(captures[1].path, pose_std_rad=std)
+    found = prepared(seen(load_capture(captures[1].path)), refine="never")
+    moved = np.sqrt(np.square(found.track.poses - noisy).mean((0, 2)))
+    assert 0 < moved[3:6].max() < 1.2 * 0.005 * SHARES["fast"] ** 0.5
+    assert moved[6:9].max() < 1e-12
+    assert np.delete(moved, np.s_[3:9]).mean() > 2 * moved[3:6].mean()
 
 
 def test_poses_that_were_corrected_when_found_are_not_drawn_again(captures, monkeypatch):

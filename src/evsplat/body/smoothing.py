@@ -25,47 +25,46 @@ _STILL = 1e-4
 class MotionNoise:
     """Errors of key poses that are new in every pose."""
 
-    rotation_rad: float
-    """Standard deviation per axis, the median over the joints that move."""
-    translation_m: float
-    """Standard deviation per axis of the root."""
-    moving: Bool[np.ndarray, " J"]
-    """Joints that move at all."""
+    joint_rad: Float[np.ndarray, " J"]
+    """Standard deviation of each joint's rotation, radians per axis."""
+    root_m: float
+    """Standard deviation of the root's place, metres per axis."""
     stiffness_s3: Float[np.ndarray, " J+1"]
     """Weight, per joint and last for the root's place, of the squared second derivative in time
     against squared errors at the keys; what smooths best."""
 
 
-def motion_noise(
-    track: BodyTrack, *, most_rad: float = math.inf, most_m: float = math.inf
-) -> MotionNoise:
-    """Estimate the noise of a track's key poses, at most ``most_rad`` and ``most_m`` per axis.
+def motion_noise(track: BodyTrack, most_rad: Float[np.ndarray, " J"], most_m: float) -> MotionNoise:
+    """Estimate the noise of a track's key poses where it is known how it divides between joints.
+
+    ``most_rad``, radians per axis, is in proportion to each joint's noise and the most that it is;
+    joints of 0 are exact. The root's place has at most ``most_m``, metres per axis.
 
     Each joint's quaternions are compared with their smoothing spline, whose stiffness generalised
     cross-validation picks (Craven and Wahba, Smoothing noisy data with spline functions, 1979).
-    That misjudges single joints, mostly fast ones; the median over joints holds. Given the noise,
-    the stiffness of each joint is the one of least unbiased risk (same paper, eq. 1.8).
+    That misjudges single joints, mostly fast ones; the median over joints, as a share of what each
+    has at most, holds for all. Given the noise, the stiffness of each joint is the one of least
+    unbiased risk (same paper, eq. 1.8).
 
     Errors that change slowly look like motion and are not found.
     """
     joints = track.poses.shape[1]
+    found, stiffness = np.zeros(joints), np.zeros(joints + 1)
     if len(track.times_us) < FEWEST_KEYS:
-        return MotionNoise(0.0, 0.0, np.ones(joints, bool), np.zeros(joints + 1))
-    quaternions, moving = _quaternions(track.poses), moving_joints(track)
-    pieces = _pieces(_seconds(track))
-    stiffness = np.zeros(joints + 1)
-    if not moving.any():
-        rotation = 0.0
-    else:
-        # A small rotation changes a unit quaternion by half of it, in three of four directions.
-        per_component = math.sqrt(3) / 4
-        estimates = [_cross_validated(pieces, quaternions[:, j]) for j in np.flatnonzero(moving)]
-        rotation = min(float(np.median(estimates)) / per_component, most_rad)
-        for joint in np.flatnonzero(moving):
-            stiffness[joint] = _least_risk(pieces, quaternions[:, joint], rotation * per_component)
-    translation = min(_cross_validated(pieces, track.transl), most_m)
-    stiffness[-1] = _least_risk(pieces, track.transl, translation)
-    return MotionNoise(rotation, translation, moving, stiffness)
+        return MotionNoise(found, 0.0, stiffness)
+    quaternions, pieces = _quaternions(track.poses), _pieces(_seconds(track))
+    # A small rotation changes a unit quaternion by half of it, in three of four directions.
+    per_component = math.sqrt(3) / 4
+    noisy = np.flatnonzero(moving_joints(track) & (most_rad > 0))
+    if noisy.size:
+        told = [_cross_validated(pieces, quaternions[:, j]) / most_rad[j] for j in noisy]
+        found[noisy] = most_rad[noisy] * min(float(np.median(told)) / per_component, 1.0)
+    for joint in noisy:
+        size = float(found[joint]) * per_component
+        stiffness[joint] = _least_risk(pieces, quaternions[:, joint], size)
+    root_m = min(_cross_validated(pieces, track.transl), most_m)
+    stiffness[-1] = _least_risk(pieces, track.transl, root_m)
+    return MotionNoise(found, root_m, stiffness)
 
 
 def moving_joints(track: BodyTrack) -> Bool[np.ndarray, " J"]:

@@ -25,9 +25,11 @@ When = Literal["auto", "always", "never"]
 UNKNOWN = (0.05, 0.02)
 """Errors expected of joints (radians) and of the root's place (metres), per axis, of poses whose
 source is unknown, and of those that are said to be exact where they are to be corrected."""
-SMOOTHED = 0.5
-"""Noise that is believed of a curve alone, over what is expected to be new in every key: fast
-motion looks like noise as well, and with all of it up to 15 % was added to errors of joints."""
+SMOOTHED_PLACE = 0.5
+"""Noise that is believed of the root's place by its curve alone, over what is expected to be new in
+every key along its worst axis: fast motion looks like noise as well. Across the view, where it is
+seen, that is more than is new, which takes some of the slow errors out too. Of joints all that is
+new in each is believed."""
 
 MOST_PIXELS = 100_000_000
 """Of the pictures by which poses are corrected before training: some ten minutes of one core."""
@@ -40,8 +42,8 @@ class PoseSettings:
     """Errors of the given poses."""
 
     smooth: When
-    """Take out of the given key poses what looks like noise, up to half of what is expected to be
-    new in every pose. ``auto``: where the capture says how far its poses err."""
+    """Take out of the given key poses what looks like noise, of each joint up to what is expected
+    to be new in every pose. ``auto``: where the capture says how far its poses err."""
     refine: When
     """Learn the errors of the poses from pictures and events. ``auto``: where the capture says that
     they err, and where it doesn't say, if pictures are explained better by others."""
@@ -132,12 +134,12 @@ def _pace(joint_rad: np.ndarray) -> float:
 
 
 def _smoothed(track: BodyTrack, joint_rad: np.ndarray, root_m: np.ndarray) -> BodyTrack:
-    """Without the noise that is new in every pose, up to half of what is expected of it."""
-    new = SMOOTHED * SHARES["fast"] ** 0.5
-    noise = motion_noise(
-        track, most_rad=new * float(joint_rad.max()), most_m=new * float(root_m.max())
+    """Without the noise that is new in every pose, of each joint up to what is expected there."""
+    new = SHARES["fast"] ** 0.5
+    most_rad = new * np.sqrt(np.square(joint_rad).mean(0))
+    return smoothed(
+        track, motion_noise(track, most_rad, SMOOTHED_PLACE * new * float(root_m.max()))
     )
-    return smoothed(track, noise)
 
 
 def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTrack:
