@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.body import PoseErrors
+from evsplat.body import BodyTrack, PoseErrors
 from evsplat.capture import Capture, TrainingCapture, load_body_track, load_capture
 from evsplat.errors import ConfigError
 from evsplat.methods import poses
@@ -31,11 +31,13 @@ SETTINGS = ("lamps=0", "most_renders=3", "event_start=0", "pose.start=0")
 
 
 def with_errors(path: Path, **fields) -> None:
-    """Write fields of body.npz, and ``source`` into capture.json."""
+    """Write fields of body.npz (None leaves one out), and ``source`` into capture.json."""
     source = fields.pop("source", None)
     with np.load(path / "body.npz") as archive:
-        body = dict(archive)
-    np.savez(path / "body.npz", **body | fields)
+        body = dict(archive) | fields
+    np.savez(
+        path / "body.npz", **{name: value for name, value in body.items() if value is not None}
+    )
     if source is not None:
         document = json.loads((path / "capture.json").read_text("utf-8"))
         document["body"]["source"] = source or None
@@ -67,6 +69,19 @@ def composed(capture: Capture, *settings: str):
 
 def prepared(capture: TrainingCapture, **settings) -> Poses:
     return prepare_poses(replace(EvsplatConfig().pose, **settings), capture, fit=True)
+
+
+def noted_corrections(monkeypatch) -> list[BodyTrack]:
+    """The motions that are corrected by drawing from here on."""
+    noted: list[BodyTrack] = []
+    real = poses.refine
+
+    def refine(track: BodyTrack, *args, **options):
+        noted.append(track)
+        return real(track, *args, **options)
+
+    monkeypatch.setattr(poses, "refine", refine)
+    return noted
 
 
 def test_exact_poses_stay_at_every_key(captures, caplog):
@@ -149,18 +164,26 @@ def test_poses_that_say_nothing_are_corrected_once_they_are_disproved(
     keys, joints = load_body_track(capture).poses.shape[:2]
     told = PoseErrors("estimated", np.full((keys, joints), 0.07), np.full((keys, 3), 0.03))
     monkeypatch.setattr(poses, "judge", lambda *_, **__: Verdict(gain, 0.01, 1.0, told))
-    corrected, real = [], poses.refine
-
-    def noted(track, *args, **options):
-        corrected.append(track)
-        return real(track, *args, **options)
-
-    monkeypatch.setattr(poses, "refine", noted)
+    corrected = noted_corrections(monkeypatch)
     found = prepared(capture).correction
     assert bool(found.exact) == (gain < LEAST_GAIN)
     assert [track.errors for track in corrected] == ([] if gain < LEAST_GAIN else [told])
     if corrected:
         assert float(found.joint_rad.max()) == pytest.approx(0.07)
+
+
+def test_joints_whose_errors_nobody_told_are_smoothed_by_less(captures, monkeypatch):
+    """The same poses and errors, once said by the capture and once found by pictures."""
+    given, said = load_body_track(captures[1]), prepared(seen(captures[1]), refine="never").track
+    with_errors(captures[1].path, source=False, pose_std_rad=None, transl_std_m=None)
+    verdict, smoothed = Verdict(0.5, 0.01, 1.0, given.errors), noted_corrections(monkeypatch)
+    monkeypatch.setattr(poses, "judge", lambda *_, **__: verdict)
+    prepared(seen(load_capture(captures[1].path)))
+    by_joint = [
+        np.sqrt(np.square(track.poses - given.poses).mean((0, 2))) for track in (said, *smoothed)
+    ]
+    assert (by_joint[0] > by_joint[1]).all() and (by_joint[1] > 0).all()
+    assert np.array_equal(said.transl, smoothed[0].transl)
 
 
 @pytest.mark.parametrize(("said", "largest"), [(0.02, 0.02), (0.05, 0.05), (0.2, 0.05)])

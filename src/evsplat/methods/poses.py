@@ -30,6 +30,9 @@ SMOOTHED_PLACE = 0.5
 every key along its worst axis: fast motion looks like noise as well. Across the view, where it is
 seen, that is more than is new, which takes some of the slow errors out too. Of joints all that is
 new in each is believed."""
+SMOOTHED_ALIKE = 0.5
+"""Of poses that say nothing the same of joints, over what is expected of the worst: how errors
+divide between joints is known of estimators, not of whoever made these."""
 
 MOST_PIXELS = 100_000_000
 """Of the pictures by which poses are corrected before training: some ten minutes of one core."""
@@ -143,9 +146,12 @@ def _smoothed(track: BodyTrack, joint_rad: np.ndarray, root_m: np.ndarray) -> Bo
 
 
 def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTrack:
-    """The motion as one that says how far it errs, and smoothed accordingly."""
+    """The motion as one that says how far it errs, smoothed as one whose joints err alike."""
     told = track.with_errors(errors)
-    return _smoothed(told, errors.joint_rad, errors.root_m) if smooth else told
+    if not smooth:
+        return told
+    alike = np.full_like(errors.joint_rad, SMOOTHED_ALIKE * errors.joint_rad.max())
+    return _smoothed(told, alike, errors.root_m)
 
 
 def _corrected(track: BodyTrack, capture: TrainingCapture) -> Gain | None:

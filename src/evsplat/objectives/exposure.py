@@ -20,8 +20,8 @@ CHROMA_START = 8_000
 """First nominal iteration of the colour differences. While limbs are not yet where they belong they
 would rather fade than show a tint in the wrong place."""
 SQUARES_START = 8_000
-"""First nominal iteration of the squared difference. L1 pulls at a pixel of an outline, half of it
-the person and wrong by much, no harder than at one of the wall that is wrong by a level."""
+"""First nominal iteration of the squared difference. L1 pulls at a pixel that is wrong by much no
+harder than at one that is wrong by a level."""
 VERTEX_STRIDE = 13
 """Every so many vertices are enough to know how far the body moves."""
 
@@ -48,7 +48,7 @@ class Exposure(Objective):
     """L1 and D-SSIM between a blurry frame and the mean, in linear light, of K renders.
 
     In the end L1 of Cb and Cr as well, which nothing else decides: events see luminance alone; and
-    the mean squared difference, which outlines have most of.
+    the mean squared difference.
 
     The exposure is cut into K equal strata; a render lies at a random place of each but the middle
     one, whose is the middle. K grows with how far the body moves in the exposure, so that
