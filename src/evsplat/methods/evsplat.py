@@ -62,9 +62,6 @@ SCENE_NETWORK_RATE = 1e-3
 """Learning rate of the network of a random cube's colours."""
 CHROMA_WEIGHT = 1.6
 """Weight of the mean absolute difference of Cb and Cr to the blurry frame, twice that of sRGB."""
-SQUARES_WEIGHT = 30.0
-"""Weight of the mean squared difference to the blurry frame: pulls harder than `l1_weight` where
-sRGB differs by more than 0.013."""
 RELIEF_WEIGHT = 3e-3
 """Weight of the roughness of the scene's relief."""
 DEFORMATION_WEIGHT = 3e-3
@@ -153,7 +150,6 @@ def build(
         weights={
             "l1": config.l1_weight,
             "chroma": CHROMA_WEIGHT,
-            "squares": SQUARES_WEIGHT,
             "dssim": config.dssim_weight,
             "semantic": config.semantic_weight,
             "binarise": config.binarise_weight,

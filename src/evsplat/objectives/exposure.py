@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame, TrainingCapture
@@ -19,9 +18,6 @@ DARKEST_LINEAR = 1e-6
 CHROMA_START = 8_000
 """First nominal iteration of the colour differences. While limbs are not yet where they belong they
 would rather fade than show a tint in the wrong place."""
-SQUARES_START = 8_000
-"""First nominal iteration of the squared difference. L1 pulls at a pixel that is wrong by much no
-harder than at one that is wrong by a level."""
 VERTEX_STRIDE = 13
 """Every so many vertices are enough to know how far the body moves."""
 
@@ -47,8 +43,7 @@ def renders_for(motion: float, px_per_render: float, most: int) -> int:
 class Exposure(Objective):
     """L1 and D-SSIM between a blurry frame and the mean, in linear light, of K renders.
 
-    In the end L1 of Cb and Cr as well, which nothing else decides: events see luminance alone; and
-    the mean squared difference.
+    In the end L1 of Cb and Cr as well, which nothing else decides: events see luminance alone.
 
     The exposure is cut into K equal strata; a render lies at a random place of each but the middle
     one, whose is the middle. K grows with how far the body moves in the exposure, so that
@@ -79,10 +74,7 @@ class Exposure(Objective):
         data.prefetch(*picture(self.capture, frame))
 
     def loss(self, step: Step) -> dict[str, Tensor]:
-        """``l1`` and ``dssim`` of the drawn frame.
-
-        From `CHROMA_START` on ``chroma`` as well, from `SQUARES_START` on ``squares``.
-        """
+        """``l1`` and ``dssim`` of the drawn frame, from `CHROMA_START` on ``chroma`` as well."""
         start, end = step.frame.exposure_us
         first, last = (bisect_left(step.times_us, time) for time in (start, end))
         # Times of other objectives lie outside. A shutter adds light up before it is coded.
@@ -93,6 +85,4 @@ class Exposure(Objective):
         terms = {"l1": l1, "dssim": 1 - similarity}
         if step.nominal >= CHROMA_START:
             terms["chroma"] = chroma(drawn - observed).abs().mean()
-        if step.nominal >= SQUARES_START:
-            terms["squares"] = F.mse_loss(drawn, observed)
         return terms
