@@ -85,11 +85,11 @@ def case(settings: StageSettings, level: PoseNoise, told: float) -> Case:
     return Case(given, BodyTrack(body, mids_us, *true), trained, camera)
 
 
-def smooth(track: BodyTrack, joints: float, place: float) -> BodyTrack:
+def smooth(track: BodyTrack, of_joints: float, of_place: float) -> BodyTrack:
     """As training does, with shares as in `ROWS`."""
     new = SHARES["fast"] ** 0.5
     joint_rad, root_m = expected_errors(track)
-    noise = motion_noise(track, joints * new * joint_rad, place * new * float(root_m.max()))
+    noise = motion_noise(track, of_joints * new * joint_rad, of_place * new * float(root_m.max()))
     return smoothed(track, noise)
 
 

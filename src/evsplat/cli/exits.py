@@ -25,7 +25,6 @@ _BAD_INPUT = 2
 _INTERRUPTED = 130
 _NOBODY_READS = 141
 _AGAIN_S = 0.02
-_PLAIN = signal.default_int_handler
 
 
 def exit_code(work: Callable[[], object]) -> int:
@@ -47,8 +46,6 @@ def exit_code(work: Callable[[], object]) -> int:
                 # A reader that went away is noticed here, not at the interpreter's end.
                 if sys.stdout is not None:  # closed by whoever started this
                     sys.stdout.flush()
-    except EvsplatError as error:
-        return _stopped() if stops.became(error) else _said(error)
     except KeyboardInterrupt as stop:
         return _stopped(str(stop))
     except BrokenPipeError:
@@ -58,6 +55,8 @@ def exit_code(work: Callable[[], object]) -> int:
     except Exception as error:
         if stops.became(error):
             return _stopped()
+        if isinstance(error, EvsplatError):
+            return _said(error)
         fault = machine_error(error)
         if fault is None:
             raise
@@ -159,9 +158,9 @@ class _Stops:
 
     def __enter__(self) -> "_Stops":
         with suppress(ValueError):  # not in the main thread
-            for number in (signal.SIGINT, signal.SIGTERM):
-                if number == signal.SIGTERM or signal.getsignal(number) is _PLAIN:
-                    self._before[number] = signal.signal(number, self)
+            self._before[signal.SIGTERM] = signal.signal(signal.SIGTERM, self)
+            if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+                self._before[signal.SIGINT] = signal.signal(signal.SIGINT, self)
         return self
 
     def __exit__(self, *of: object) -> None:

@@ -31,8 +31,8 @@ every key along its worst axis: fast motion looks like noise as well. Across the
 seen, that is more than is new, which takes some of the slow errors out too. Of joints all that is
 new in each is believed."""
 SMOOTHED_ALIKE = 0.5
-"""Of poses that say nothing the same of joints, over what is expected of the worst: how errors
-divide between joints is known of estimators, not of whoever made these."""
+"""Noise that is believed of every joint alike where poses say nothing of their errors, over what is
+expected to be new in the worst: how errors divide between joints is known of estimators only."""
 
 MOST_PIXELS = 100_000_000
 """Of the pictures by which poses are corrected before training: some ten minutes of one core."""
