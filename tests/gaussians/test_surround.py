@@ -52,6 +52,27 @@ def test_a_wall_of_one_colour_goes_on_where_a_camera_beside_looks_past_it(size):
     assert torch.allclose(colours, rgb.expand_as(colours), atol=0.01)
 
 
+@pytest.mark.parametrize("width", range(128, 192, 3))
+def test_pictures_of_any_size_go_on_in_colours_of_their_rim(width):
+    """Where the last cell is cut by the border, its middle was a place outside."""
+    height = 132
+    recording = camera(width, height)
+    beyond = margins(recording)
+    wide = recording.widened(*beyond)
+    picture = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(width))
+    picture = 0.1 + 0.8 * picture
+    around = surround(wide, picture, torch.full((wide.height, wide.width), 4.0), -2.0, None)
+    assert all(value.isfinite().all() for value in around.values())
+    colours = around["colour_logits"].sigmoid()
+    assert 0.1 <= colours.min() and colours.max() <= 0.9
+    # A picture that brightens evenly from left to right goes on dark to the left and bright beyond.
+    slope = torch.linspace(0.1, 0.9, width).expand(3, height, width).permute(1, 2, 0)
+    around = surround(wide, slope, torch.full((wide.height, wide.width), 4.0), -2.0, None)
+    x = recording.project(around["means"])[0][:, 0]
+    shown = around["colour_logits"].sigmoid()[:, 0]
+    assert shown[x < 0].max() < 0.5 < shown[x > width].min()
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_the_recorded_picture_stays_and_its_rim_is_what_goes_on(seed):
     recording = camera()

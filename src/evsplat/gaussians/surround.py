@@ -74,7 +74,12 @@ def _continued(
     )[0].permute(1, 2, 0)
     rim = torch.ones(pooled.shape[:2], dtype=torch.bool)
     rim[1:-1, 1:-1] = False
-    weights = torch.cdist(places, (rim.nonzero().flip(-1) + 0.5) * cell).pow(-_NEARNESS)
+    # The last cell of a row or column may be cut by the border: its middle lies in the picture, and
+    # never at a place outside.
+    size = torch.tensor([picture.shape[1], picture.shape[0]])
+    first = rim.nonzero().flip(-1) * cell
+    middles = (first + torch.minimum(first + cell, size)) / 2
+    weights = torch.cdist(places, middles).pow(-_NEARNESS)
     return weights / weights.sum(-1, keepdim=True) @ pooled[rim]
 
 
