@@ -10,8 +10,8 @@ to the same composition and start as another is not trained again: `same_as` of 
 that one. Printed: PSNR of the person's pixels in held-out frames, dB, and how far `default` and
 `unsaid` stay behind the best of the forced settings and behind `paper`. What exists is not made
 again, so a grid can be stopped and gone on with; several processes may make rows of their own.
-``--table`` makes nothing: of what is there it prints the table of docs/method.md, and writes all to
-grid.json. The last line is one JSON object.
+``--table`` makes nothing: of what is there it prints the table of
+docs/experiments/poses.md, and writes all to grid.json. The last line is one JSON object.
 """
 
 import argparse

@@ -24,14 +24,14 @@ _RENAMED = {
 _EVENTS = {
     "event.weight": "renamed to event_weight",
     "event.start": "renamed to event_start",
-    "event.across_gaps": "gone, no run showed a gain (docs/experiments.md)",
-    "semantic_activity": "gone, no run showed a gain (docs/experiments.md)",
+    "event.across_gaps": "gone, no run showed a gain (docs/experiments/gone.md)",
+    "semantic_activity": "gone, no run showed a gain (docs/experiments/gone.md)",
 }
 
 _NETWORKS = {
-    "deform.encoding": "gone, the encoding is one-blob (docs/experiments.md)",
-    "deform.precision": "gone, networks compute in float32 (docs/experiments.md)",
-    "deform.skinning_grid": "gone, evsplat has no skinning network (docs/experiments.md)",
+    "deform.encoding": "gone, the encoding is one-blob (docs/experiments/gone.md)",
+    "deform.precision": "gone, networks compute in float32 (docs/experiments/gone.md)",
+    "deform.skinning_grid": "gone, evsplat has no skinning network (docs/experiments/gone.md)",
     "deform.pose_correction_start": "renamed to networks.pose_start",
     "deform.width": "renamed to networks.width",
     "deform.colour_width": "renamed to networks.colour_width",
@@ -73,7 +73,8 @@ PAPER = {
 """Of `paper`."""
 
 _NON_RIGID = (
-    "gone, it bent nothing (docs/experiments.md); shade_start is that of the brightness by pose"
+    "gone, it bent nothing (docs/experiments/outline-and-light.md); shade_start is that of the "
+    "brightness by pose"
 )
 
 EVSPLAT = {
@@ -91,14 +92,15 @@ EVSPLAT = {
     "loss": "its weights are l1_weight, dssim_weight, semantic_weight and binarise_weight",
     "isometry_samples": "evsplat has no isometry term",
     "skinning_prefit_steps": "evsplat has no skinning network",
-    "semantics": "evsplat learns the attribute by the posed silhouette only (docs/experiments.md)",
+    "semantics": "evsplat learns the attribute by the posed silhouette only "
+    "(docs/experiments/gone.md)",
     "semantic_start": "fixed at 2",
-    "edi": "gone, sharpened frames as targets lost 0.15 dB (docs/experiments.md)",
+    "edi": "gone, sharpened frames as targets lost 0.15 dB (docs/experiments/gone.md)",
     "event": "its settings begin with event_, as event_weight",
     "exposure": "its settings are px_per_render and most_renders",
     "pose.noisy_rad": "gone, the shape of a curve does not tell exact poses from wrong ones; "
     "body.source of capture.json does (docs/capture-format.md)",
-    "windows.pixel_thresholds": "gone, no run showed a gain (docs/experiments.md)",
+    "windows.pixel_thresholds": "gone, no run showed a gain (docs/experiments/gone.md)",
     "windows.begun_us": "renamed to event_ramp_us",
     "windows": "its settings are event_start, event_eps, event_reach, event_ramp_us, "
     "event_noise_aware, contrast_weight and clock",
