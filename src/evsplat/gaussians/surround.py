@@ -26,7 +26,7 @@ _NEARNESS = 3.0
 
 def margins(camera: Camera) -> tuple[int, int]:
     """Pixels beyond the left and right, and beyond the upper and lower border: half a picture."""
-    cell = _cell(camera.width, camera.height)
+    cell = cell_px(camera.width, camera.height)
     return -(-camera.width // (2 * cell)) * cell, -(-camera.height // (2 * cell)) * cell
 
 
@@ -43,7 +43,7 @@ def surround(
     ``background_srgb`` is the recorded picture in its middle, without the person.
     """
     height, width = background_srgb.shape[:2]
-    cell = _cell(width, height)
+    cell = cell_px(width, height)
     size, inner = torch.tensor([camera.width, camera.height]), torch.tensor([width, height])
     beyond = (size - inner) // 2
     middles = torch.cartesian_prod(*(torch.arange(count) for count in (size // cell).tolist()))
@@ -58,17 +58,20 @@ def surround(
         (_WIDTH * cell * z / camera.K[0, 0])[:, None].repeat(1, 3),
         opacity=_OPACITY,
         semantic_logit=semantic_logit,
-        rgb_srgb=_continued(background_srgb, middles - beyond, cell),
+        rgb_srgb=continued(background_srgb, middles - beyond, cell),
         feature_dim=feature_dim,
     )
     opacities = _OPACITY * ((1 - out) / _FADES).clamp(0.01, 1)
     return values | {"opacity_logits": opacities.logit()}
 
 
-def _continued(
+def continued(
     picture: Float[Tensor, "H W 3"], places: Float[Tensor, "N 2"], cell: int
 ) -> Float[Tensor, "N 3"]:
-    """Colours at ``places`` (x, y) outside of a picture: means of its rim, the near part first."""
+    """Colours at ``places`` (x, y) outside of a picture: means of its rim, the near part first.
+
+    ``cell``: see `cell_px`.
+    """
     pooled = avg_pool2d(
         picture.permute(2, 0, 1)[None], cell, ceil_mode=True, count_include_pad=False
     )[0].permute(1, 2, 0)
@@ -83,6 +86,6 @@ def _continued(
     return weights / weights.sum(-1, keepdim=True) @ pooled[rim]
 
 
-def _cell(width: int, height: int) -> int:
-    """Side of a cell, pixels."""
+def cell_px(width: int, height: int) -> int:
+    """Side of a cell of the surround, pixels."""
     return max(1, min(width, height) // CELLS)

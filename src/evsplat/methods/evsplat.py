@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack
-from evsplat.capture import Frame, TrainingCapture
+from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
 from evsplat.methods.background import background_without
@@ -36,6 +36,8 @@ from evsplat.methods.starts import Surface, human_start, scene_start
 from evsplat.models.discs import DiscModel
 from evsplat.models.discs.fill import filled
 from evsplat.models.discs.first_colours import first_colours
+from evsplat.models.discs.outskirts import outskirts
+from evsplat.models.seen import Seen
 from evsplat.objectives import (
     DeformationPrior,
     EventChange,
@@ -167,8 +169,27 @@ def build(
         # Errors of poses, and shapes that change, are still learned where the loss hardly falls.
         watched=("l1", "dssim") if poses.correction is None or poses.correction.exact else (),
         recording=recording,
-        fill=partial(filled, model, capture, config.fill) if config.fill else None,
+        fill=partial(_filled, model, capture, config.fill, recording) if config.fill else None,
     )
+
+
+def _filled(
+    model: DiscModel,
+    capture: TrainingCapture,
+    strength: float,
+    recording: Camera | None,
+    seen: Seen,
+) -> dict[str, Tensor]:
+    """What the end of training decides of the person, and around a recording at rest."""
+    decided = filled(model, capture, strength, seen)
+    if recording is None:
+        return decided
+    gaussians = model.gaussians
+    name = f"gaussians.{gaussians.colour}"
+    colours = decided.get(name, gaussians.get_parameter(gaussians.colour)).detach().clone()
+    around = outskirts(gaussians, recording.to(model.device), model.low_pass)
+    colours[gaussians.scene] = around.logit()
+    return decided | {name: colours}
 
 
 def _background(

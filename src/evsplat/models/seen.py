@@ -1,6 +1,6 @@
 """What training frames showed of each of the person's Gaussians."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -105,12 +105,23 @@ def shares_in(
 
     The first column is the plain sum, each of the ``draws`` others one with random signs.
     """
-    count, columns = layers.human.means.shape[1], 1 + draws
-    channels = layers.human.means.new_zeros(1, count, columns).requires_grad_()
-    image = draw_values(layers, camera, channels)
+    return shares_by(
+        lambda values: draw_values(layers, camera, values), layers.human.means, generator, draws
+    )
+
+
+def shares_by(
+    drawn: Callable[[Float[Tensor, "1 N K"]], Float[Tensor, "1 H W K"]],
+    means: Float[Tensor, "T N 3"],
+    generator: torch.Generator,
+    draws: int = _DRAWS,
+) -> Float[Tensor, "N K"]:
+    """`shares_in` of any Gaussians, by what draws a picture of values of theirs."""
+    values = means.new_zeros(1, means.shape[1], 1 + draws).requires_grad_()
+    image = drawn(values)
     signs = random_signs(image, generator)
     signs[..., 0] = 1
-    return transposed(image, channels, signs)[0]
+    return transposed(image, values, signs)[0]
 
 
 def transposed(image: Tensor, values: Tensor, weights: Tensor, *, again: bool = False) -> Tensor:

@@ -1,0 +1,105 @@
+"""Around the recorded picture colours go on as its rim does, and it looks as before."""
+
+import pytest
+import torch
+
+from evsplat.capture import Policy, load_capture
+from evsplat.gaussians.surround import cell_px, continued
+from evsplat.models.discs.outskirts import PRICE, outskirts
+from evsplat.models.discs.still import Still
+from evsplat.models.seen import fixed
+from evsplat.render import render
+
+from ...small_model import built
+
+
+@pytest.fixture(params=[0, 1, 2])
+def rainbow(request, tiny_capture):
+    """A model whose colours around the recorded picture are noise, and its camera."""
+    captured = load_capture(tiny_capture())
+    model = built("evsplat", captured).model
+    shown = captured.for_training(Policy())
+    recording = shown.camera(shown.train_frames[0])
+    gaussians = model.gaussians
+    generator = torch.Generator().manual_seed(request.param)
+    with torch.no_grad():
+        colours = gaussians.get_parameter(gaussians.colour)
+        outside = beyond_cells(gaussians, recording) > 0.25
+        noise = torch.randn(len(outside), 3, generator=generator)
+        colours[gaussians.scene] += noise * outside[:, None]
+    return model, recording
+
+
+def beyond_cells(gaussians, recording):
+    size = torch.tensor([recording.width, recording.height])
+    places = recording.project(gaussians.means[gaussians.scene].detach())[0]
+    return ((places - size / 2).abs() - size / 2).amax(-1) / cell_px(*size.tolist())
+
+
+def scene_of(model):
+    scene = Still.of(model.gaussians, None, hard_semantics=True).scene.with_times()
+    return fixed(scene, scene.channels.detach())
+
+
+def drawn(scene, colours, camera, low_pass):
+    return render(fixed(scene, colours[None]), camera, low_pass=low_pass).image[0]
+
+
+def test_a_rainbow_around_the_picture_goes_and_the_picture_stays(rainbow):
+    model, recording = rainbow
+    scene = scene_of(model)
+    own = scene.channels[0, :, :3]
+    found = outskirts(model.gaussians, recording, model.low_pass)
+    beyond = beyond_cells(model.gaussians, recording)
+    cell = cell_px(recording.width, recording.height)
+    before = drawn(scene, own, recording, model.low_pass)
+    rim = continued(before, recording.project(scene.means[0])[0], cell)
+    alone = torch.where((beyond > 0.25)[:, None], rim, own)
+    missed = [
+        float((drawn(scene, rgb, recording, model.low_pass) - before).square().mean())
+        for rgb in (alone, found)
+    ]
+    assert missed[1] < 0.05 * missed[0]
+    unseen = beyond > 4  # five standard deviations: no pixel shows any of it
+    assert bool(unseen.any())
+    assert float((own - rim)[unseen].abs().mean()) > 0.1
+    assert torch.allclose(found[unseen], rim[unseen], atol=1e-4)
+    within = beyond < -2
+    assert bool(within.any())
+    assert torch.equal(found[within], own[within])
+
+
+def test_their_cost_is_that_of_the_best_colours(rainbow):
+    """Against L-BFGS, from two starts."""
+    model, recording = rainbow
+    scene = scene_of(model)
+    own = scene.channels[0, :, :3]
+    beyond = beyond_cells(model.gaussians, recording)
+    cell = cell_px(recording.width, recording.height)
+    before = drawn(scene, own, recording, model.low_pass)
+    told = own.clone()
+    outside = beyond > 0.25
+    told[outside] = continued(before, recording.project(scene.means[0])[0][outside], cell)
+
+    def cost(colours):
+        missed = drawn(scene, colours, recording, model.low_pass) - before
+        held = PRICE * cell**2 * (colours - told).square()
+        return missed.square().sum() + held[beyond > -2].sum()
+
+    def least(start):
+        free = start.clone().requires_grad_()
+        optimiser = torch.optim.LBFGS([free], max_iter=60, line_search_fn="strong_wolfe")
+
+        def closure():
+            optimiser.zero_grad()
+            value = cost(torch.where((beyond > -2)[:, None], free, own))
+            value.backward()
+            return value
+
+        optimiser.step(closure)
+        return float(closure().detach())
+
+    found = float(cost(outskirts(model.gaussians, recording, model.low_pass)))
+    best = min(least(own), least(told))
+    assert best < 0.5 * min(float(cost(own)), float(cost(told)))
+    assert found < 1.3 * best  # of conditions far worse than those of a picture of usual size
