@@ -30,11 +30,16 @@ def record(
     frame_noise: float = 0.0,
     noise_hz: float = 0.0,
     start_us: int = 0,
+    still_rows: int = 0,
 ) -> Recording:
-    """Ideal pixels with random first reference levels; stamps are ``lag_us`` late."""
+    """Ideal pixels with random first reference levels; stamps are ``lag_us`` late.
+
+    Nothing changes in the last ``still_rows`` rows.
+    """
     rng = np.random.default_rng(seed)
     mean = rng.uniform(-2.0, -1.2, (HEIGHT, WIDTH))
     amplitude = rng.uniform(0.5, 1.1, (HEIGHT, WIDTH))
+    amplitude[HEIGHT - still_rows :] = 0
     hertz = rng.uniform(4.0, 9.0, (HEIGHT, WIDTH))
     phase = rng.uniform(0, 2 * np.pi, (HEIGHT, WIDTH))
     end_us = start_us + frames * period_us

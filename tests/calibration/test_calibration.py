@@ -12,6 +12,7 @@ from evsplat.calibration import (
     NoiseMeter,
     SensorEstimate,
     estimate_from_pairs,
+    estimate_thresholds,
     exposure,
     noise_of,
     pair,
@@ -54,6 +55,28 @@ def test_noise_of_frames_and_events_moves_the_estimates_little(seed) -> None:
     assert abs(found.clock.lag_us - 5_000) < 2_500
     assert found.thresholds.plus == pytest.approx(0.25, rel=0.1)
     assert found.thresholds.minus == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize("frame_noise", [0.0, 0.002])
+@pytest.mark.parametrize(("plus", "minus"), [(0.36, 0.4), (0.2, 0.25)])
+def test_noise_where_nothing_moves_is_no_lower_threshold(plus, minus, frame_noise) -> None:
+    """Of the pixels with events most saw none but the noise's, and did not change."""
+    noisy = {"still_rows": 19, "noise_hz": 4.0, "frame_noise": frame_noise}
+    found = _estimate(3, plus=plus, minus=minus, frames=30, **noisy)
+    assert found.thresholds.plus == pytest.approx(plus, rel=0.1)
+    assert found.thresholds.minus == pytest.approx(minus, rel=0.1)
+
+
+def test_a_sensor_whose_pixels_fire_once_has_thresholds_as_well() -> None:
+    found = _estimate(5, plus=0.9, minus=0.9, frames=40)
+    assert found.thresholds.plus == pytest.approx(0.9, rel=0.2)
+    assert found.thresholds.minus == pytest.approx(0.9, rel=0.2)
+
+
+def test_what_noise_alone_tells_is_no_threshold() -> None:
+    """All that moves is in too few pixels to fit to, and the rest has no change."""
+    still = record(7, plus=0.3, minus=0.3, frames=40, still_rows=24, noise_hz=10.0)
+    assert estimate_thresholds(still.pairs, still.events) is None
 
 
 @pytest.mark.parametrize("seed", [6, 7])

@@ -10,6 +10,11 @@ from evsplat.calibration.brightness import EventSource, FramePair, PairEvents
 
 LEAST_EVENTS = 300
 """Least events of either polarity that a threshold is fitted to."""
+SEVERAL = 1.5
+"""Events of a pixel, weighed by the exposures, that no noise makes between two frames: where little
+of a picture moves, most of its single events tell of no change."""
+LOWEST = 0.01
+"""No sensor's threshold; what is fitted to noise alone."""
 _HUBER = 1.345
 _ITERATIONS = 30
 
@@ -33,6 +38,8 @@ def estimate_thresholds(
 ) -> ThresholdEstimate | None:
     """Fit ``change = C+ n+ - C- n-`` over the pixels with events; None where those are too few.
 
+    Those with `SEVERAL` events count, and where these are too few all with any.
+
     The fit is Huber's robust regression (weight 1 up to 1.345 standard deviations of the rest),
     because pixels miss events and frames clip. It gives the change that one event stands for, on
     average: a little less than the sensor's threshold where most pixels fire only once or twice,
@@ -48,12 +55,20 @@ def estimate_thresholds(
         counts.append(np.stack([plus[active], -minus[active]], axis=-1))
         changes.append(near.change[active])
     design, change = np.concatenate(counts), np.concatenate(changes)
-    if (np.abs(design).sum(0) < LEAST_EVENTS).any():
+    several = np.abs(design).sum(1) >= SEVERAL
+    if _enough(design[several]):
+        design, change = design[several], change[several]
+    elif not _enough(design):
         return None
     (plus_c, minus_c), residual = _huber(design, change)
-    if plus_c <= 0 or minus_c <= 0:
+    if min(plus_c, minus_c) < LOWEST:
         return None
     return ThresholdEstimate(float(plus_c), float(minus_c), residual, len(change))
+
+
+def _enough(design: Float[np.ndarray, "N 2"]) -> bool:
+    """Whether there are events of either polarity to fit to."""
+    return bool((np.abs(design).sum(0) >= LEAST_EVENTS).all())
 
 
 def _huber(
