@@ -59,11 +59,12 @@ def outskirts(gaussians: GaussianSet, recording: Camera, low_pass: float) -> Flo
     beyond = ((places - size / 2).abs() - size / 2).amax(-1) / cell
     outside, near = beyond > _BEYOND, beyond > -_RIM
     told = own.clone()
-    told[outside] = continued(before[0], places[outside], cell)
+    rim = continued(before[0].cpu(), places[outside].cpu(), cell)
+    told[outside] = rim.to(own.device)
     leaf, image = picture(told)
     missing = transposed(image, leaf, before - image.detach())[0]
     shares = shares_by(drawn, scene.means, torch.Generator().manual_seed(0))
-    price = torch.where(near, PRICE * cell**2, _FAST)
+    price = torch.where(near, PRICE * cell**2, _FAST).to(own)
     squares = shares[:, 1:].square().mean(1)
     colours = closest(told, missing, seen, squares, price, torch.zeros_like(price), STEPS)
     return torch.where(near[:, None], colours.clamp(LEAST, MOST), own)
