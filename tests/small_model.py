@@ -1,5 +1,6 @@
 """Every method so small that a training step takes milliseconds."""
 
+import importlib
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,8 @@ SMALL = {
         *_NETWORKS,
         "terms.perceptual=none",
     ),
-    "evsplat": (*_PERSON, "scene.prefit_steps=3", "width=16"),
+    # The fill takes as long as all else of a short training; tests that ask about it switch it on.
+    "evsplat": (*_PERSON, "scene.prefit_steps=3", "width=16", "fill=0"),
     "hugs": (
         "human.count=80",
         "scene.cube_count=600",
@@ -36,6 +38,8 @@ SMALL = {
     "paper": (*_PERSON, "scene.prefit_steps=3", *_NETWORKS),
 }
 """Settings by method."""
+FILL = "fill=0.001"
+"""What `evsplat` decides at its end where little was seen, as by default."""
 _UNREAD = {
     "scene.kind=random_cube": ("scene.prefit_steps", "scene.backdrop_stride_px"),
     "scene.kind=median_backdrop": ("scene.cube_count",),
@@ -58,6 +62,11 @@ def few_descent_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before training poses are drawn a little; tests/posing/test_refine.py asks how well."""
     for how in ("refine", "judge"):
         monkeypatch.setattr(poses, how, partial(getattr(poses, how), steps=(4, 4), discs=100))
+    # The package has a function of the module's name.
+    drawing = [importlib.import_module(f"evsplat.posing.{name}") for name in ("descent", "refine")]
+    for module in drawing:
+        monkeypatch.setattr(module, "LOOK_STEPS", 4)
+    monkeypatch.setattr(drawing[1], "_LAST_STEPS", 4)
 
 
 def built(

@@ -15,6 +15,7 @@ from evsplat.cli.main import main
 from evsplat.inspection import Belonging, check_body, fit_sheet, inspect_capture, judge_body
 
 from ..firewall.scrambled import Recorded, scrambled, write_recorded
+from ..small_model import small
 
 Factory = Callable[..., Path]
 FRAMES = 20
@@ -139,12 +140,13 @@ def test_training_refuses_anothers_body_in_one_sentence_unless_told_otherwise(
     strangers(path)
     run = tmp_path / "run"
     train = ["train", str(path), "--out", str(run), "--iterations", "1", "--no-evaluate"]
-    assert main([*train, "--set", "human.count=120", "scene.prefit_steps=1"]) == 2
+    train += ["--set", *small("evsplat")]
+    assert main(train) == 2
     said = capsys.readouterr().err
     assert f"{path}/body.npz: the posed body follows nothing" in said and "--any-body" in said
     assert not run.exists()
     with caplog.at_level(logging.WARNING):
-        assert main([*train, "--any-body", "--set", "human.count=120"]) == 0
+        assert main([*train, "--any-body"]) == 0
     assert (run / "body_fit.png").exists()
 
 

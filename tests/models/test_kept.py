@@ -40,10 +40,14 @@ def test_nothing_is_kept_of_what_is_learned():
     assert [counted(kept, [learned]) for _ in range(2)] == [1, 0]
 
 
-@pytest.mark.parametrize("scene", ["median_backdrop", "random_cube"])
+@pytest.mark.parametrize(
+    "scene",
+    [("scene.kind=median_backdrop",), ("scene.kind=random_cube", "scene.cube_count=300")],
+    ids=["median_backdrop", "random_cube"],
+)
 def test_pictures_of_a_model_at_rest_are_those_of_one_that_keeps_nothing(tiny_capture, scene):
     capture = load_capture(tiny_capture())
-    model = built("evsplat", capture, "lamps=2", f"scene.kind={scene}", "shade_start=0").model
+    model = built("evsplat", capture, "lamps=2", *scene, "shade_start=0").model
     camera = capture.camera(capture.train_frames[0])
     times = [frame.mid_us for frame in capture.train_frames[:2]]
 

@@ -15,7 +15,7 @@ from evsplat.errors import DataError
 from evsplat.training import load_run, train
 
 from ..conftest import write_tiny_capture
-from ..small_model import small
+from ..small_model import FILL, few_descent_steps, small
 
 ROWS = "model.gaussians"
 
@@ -28,7 +28,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     document = json.loads((place / "capture" / "capture.json").read_text())
     document["body"]["source"] = "estimated"
     (place / "capture" / "capture.json").write_text(json.dumps(document))
-    _train(place, place / "run", overrides=small("evsplat"), iterations=4)
+    with pytest.MonkeyPatch.context() as patch:
+        few_descent_steps(patch)
+        _train(place, place / "run", overrides=small("evsplat", FILL), iterations=4)
     return place
 
 

@@ -12,7 +12,7 @@ from evsplat.training.run import load_run, reload_run
 from evsplat.training.train import train
 
 from ..conftest import write_tiny_capture
-from ..small_model import small
+from ..small_model import FILL, small
 
 GONE = (0, 3, 7)
 """Rows that the end of training makes transparent."""
@@ -24,7 +24,7 @@ def thinned_once(tmp_path_factory):
     """A run whose end made some Gaussians transparent."""
     place = tmp_path_factory.mktemp("thinned")
     capture = write_tiny_capture(place / "tiny")
-    run = train(capture, out=place / "run", iterations=3, overrides=small("evsplat"))
+    run = train(capture, out=place / "run", iterations=3, overrides=small("evsplat", FILL))
     path, tensors, state = load_latest(run / "checkpoints")
     tensors[OPACITIES].clamp_(min=-2.0)
     tensors[OPACITIES][list(GONE)] = -14.0

@@ -18,14 +18,15 @@ from evsplat.training.checkpoint import below, load_latest, load_model, write_st
 from evsplat.training.run import load_run
 from evsplat.training.train import train
 
-from ...small_model import built, small
+from ...conftest import write_tiny_capture
+from ...small_model import FILL, built, small
 
 
-@pytest.fixture
-def spoilt(tiny_capture):
-    """A model with light whose unseen colours are noise, what it saw, and its capture."""
-    capture = load_capture(tiny_capture()).for_training(Policy())
-    model = built("evsplat", load_capture(tiny_capture("again"))).model
+@pytest.fixture(scope="module")
+def spoilt_once(tmp_path_factory):
+    whole = load_capture(write_tiny_capture(tmp_path_factory.mktemp("spoilt") / "tiny"))
+    capture = whole.for_training(Policy())
+    model = built("evsplat", whole).model
     generator = torch.Generator().manual_seed(0)
     gaussians = model.gaussians
     seen = seen_by(model, capture)
@@ -36,6 +37,13 @@ def spoilt(tiny_capture):
         colours[gaussians.human][seen.little()] += noise[seen.little()]
         model.shading.coefficients.normal_(0, 0.02, generator=generator)
     return model, capture, seen
+
+
+@pytest.fixture
+def spoilt(spoilt_once):
+    """A model with light whose unseen colours are noise, what it saw, and its capture."""
+    model, capture, seen = spoilt_once
+    return copy.deepcopy(model), capture, seen
 
 
 @torch.no_grad()
@@ -206,7 +214,12 @@ def test_nothing_is_decided_where_nobody_was_seen(spoilt):
 
 
 @pytest.mark.parametrize(
-    "settings", [("lamps=0",), ("shading=false", "lamps=2"), ("scene.kind=random_cube",)]
+    "settings",
+    [
+        ("lamps=0",),
+        ("shading=false", "lamps=2"),
+        ("scene.kind=random_cube", "scene.cube_count=300"),
+    ],
 )
 def test_every_kind_of_model_is_filled(tiny_capture, settings):
     capture = load_capture(tiny_capture())
@@ -242,8 +255,8 @@ def test_of_many_frames_some_stand_for_all(spoilt, monkeypatch):
 
 def test_a_run_is_drawn_filled_and_goes_on_unfilled(tiny_capture, tmp_path):
     capture = tiny_capture()
-    run = train(capture, out=tmp_path / "run", iterations=3, overrides=small("evsplat"))
-    bare = train(capture, out=tmp_path / "bare", iterations=3, overrides=small("evsplat", "fill=0"))
+    run = train(capture, out=tmp_path / "run", iterations=3, overrides=small("evsplat", FILL))
+    bare = train(capture, out=tmp_path / "bare", iterations=3, overrides=small("evsplat"))
     states = [load_latest(path / "checkpoints") for path in (run, bare)]
     (_, tensors, state), (_, others, _) = states
     assert below("filled", tensors) and not below("filled", others) and below("seen", others)

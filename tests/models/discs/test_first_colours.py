@@ -62,7 +62,7 @@ def test_what_is_seen_gets_nearly_its_colour_and_the_rest_what_neighbours_have(p
     assert float(found.max()) < float(pictures.max()) + 0.01
 
 
-@pytest.mark.parametrize("settings", [(), ("scene.kind=random_cube",)])
+@pytest.mark.parametrize("settings", [(), ("scene.kind=random_cube", "scene.cube_count=300")])
 def test_training_starts_at_them_and_a_run_that_goes_on_does_not(tiny_capture, settings):
     capture = load_capture(tiny_capture())
     trained = built("evsplat", capture, *settings, purpose="train").model.gaussians
