@@ -1,7 +1,11 @@
 """When the rest of a schedule is worth its steps: told by means of the pictures' loss alone."""
 
+import io
 import logging
+import shutil
 import sys
+from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,6 +15,7 @@ from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.outlook import FIRST, PARTS, REST, SPAN, Outlook
 from evsplat.training.trainer import Trainer
 
+from ..conftest import write_tiny_capture
 from ..small_model import few_descent_steps, small
 
 STEPS = 2 * PARTS
@@ -20,6 +25,32 @@ WEIGHTS = {"l1": 2.0, "dssim": ((0.0, 1.0), (7_500.0, 3.0))}
 
 class Killed(Exception):
     """What ends a process here."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A training that was asked for no number of steps, which no test changes."""
+
+    capture: Path
+    settings: tuple[str, ...]
+    out: Path
+    said: str
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
+    place, said = tmp_path_factory.mktemp("ended"), io.StringIO()
+    capture, settings = write_tiny_capture(place / "tiny"), small("evsplat", f"iterations={STEPS}")
+    logger, handler = logging.getLogger("evsplat"), logging.StreamHandler(said)
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        out = train(capture, out=place / "run", overrides=settings)
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+    return Ended(capture, settings, out, said.getvalue())
 
 
 def told(losses: list[float], *, weights=WEIGHTS, resumed_at: int | None = None) -> dict:
@@ -66,17 +97,16 @@ def test_a_method_that_names_no_terms_is_never_told_anything():
     assert told([0.4] * PARTS, weights={}) == {}
 
 
-def test_a_run_without_a_number_of_steps_ends_earlier_and_says_so(tiny_capture, tmp_path, caplog):
-    capture, settings = tiny_capture(frames=10), small("evsplat", f"iterations={STEPS}")
-    with caplog.at_level(logging.INFO):
-        out = train(capture, out=tmp_path / "run", overrides=settings)
-    _, state = load_checkpoint(latest_checkpoint(out / "checkpoints"))
+def test_a_run_without_a_number_of_steps_ends_earlier_and_says_so(ended, tmp_path):
+    capture, settings = ended.capture, ended.settings
+    _, state = load_checkpoint(latest_checkpoint(ended.out / "checkpoints"))
     clock = state["clock"]
     assert clock["fraction"] == 1.0 and clock["ends_at"] == clock["iteration"] < STEPS
-    assert "of the schedule: what is left of it ends with step" in caplog.text
-    assert "whose end was brought forward" in caplog.text
-    train(capture, out=out, resume=True)
-    assert load_run(out).iteration == clock["iteration"]
+    assert "of the schedule: what is left of it ends with step" in ended.said
+    assert "whose end was brought forward" in ended.said
+    again = shutil.copytree(ended.out, tmp_path / "again")
+    train(capture, out=again, resume=True)
+    assert load_run(again).iteration == clock["iteration"]
     # Adding shares of what is left may take one step more within minutes.
     small_model = small("evsplat")
     steps = train(capture, out=tmp_path / "steps", overrides=small_model, iterations=STEPS)
@@ -91,13 +121,10 @@ def test_a_run_on_poses_that_err_makes_all_its_steps(tiny_capture, tmp_path, mon
     assert load_run(out).iteration == STEPS
 
 
-def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(tiny_capture, tmp_path, monkeypatch):
+def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(ended, tmp_path, monkeypatch):
     module = sys.modules["evsplat.training.train"]  # its name in the package is the function
     monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
-    capture, settings = tiny_capture(frames=10), small("evsplat", f"iterations={STEPS}")
-    whole = train(capture, out=tmp_path / "whole", overrides=settings)
-
-    step, turn = Trainer.step, load_run(whole).iteration - round(STEPS * REST)
+    step, turn = Trainer.step, load_run(ended.out).iteration - round(STEPS * REST)
     for kill_at in (turn - 1, turn + 3):
 
         def killed(self: Trainer, kill_at: int = kill_at):
@@ -108,10 +135,10 @@ def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(tiny_capture, tmp
         out = tmp_path / f"killed{kill_at}"
         monkeypatch.setattr(Trainer, "step", killed)
         with pytest.raises(Killed):
-            train(capture, out=out, overrides=settings)
+            train(ended.capture, out=out, overrides=ended.settings)
         monkeypatch.setattr(Trainer, "step", step)
-        train(capture, out=out, resume=True)
-        ends = [load_checkpoint(latest_checkpoint(run / "checkpoints")) for run in (whole, out)]
+        train(ended.capture, out=out, resume=True)
+        ends = [load_checkpoint(latest_checkpoint(run / "checkpoints")) for run in (ended.out, out)]
         (expected, state), (found, again) = ends
         assert again["clock"]["ends_at"] == state["clock"]["ends_at"] == state["clock"]["iteration"]
         assert [name for name in expected if not torch.equal(expected[name], found[name])] == []

@@ -7,9 +7,8 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -33,36 +32,19 @@ from evsplat.untrusted.text import read_json
 
 from ..conftest import write_tiny_capture
 from ..seen import seen
-from ..small_model import built, small
+from ..small_model import FILL, built, small
+from .own_process import errors_of, start
 
 training = importlib.import_module("evsplat.training.train")
-# The same call in a process of its own that saves after every step.
-SCRIPT = """
-import importlib, sys
-module = importlib.import_module("evsplat.training.train")
-module.CHECKPOINT_SECONDS = 0.0
-module.train(sys.argv[1], out=sys.argv[2], iterations=int(sys.argv[3]), method=sys.argv[4],
-             overrides=sys.argv[5:], threads=1)
-"""
 
 
-def start(capture: Path, out: Path, iterations: int, *, method: str = "paper") -> subprocess.Popen:
-    command = [sys.executable, "-c", SCRIPT, capture, out, iterations, method, *small(method)]
-    return subprocess.Popen(
-        [str(part) for part in command],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def wait_for_step(out: Path, step: int, process: subprocess.Popen) -> None:
+def wait_for_step(out: Path, step: int, process: BaseProcess) -> None:
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
         found = latest_checkpoint(out / "checkpoints")
         if found is not None and int(found.stem) >= step:
             return
-        assert process.poll() is None, process.stderr.read()
+        assert process.is_alive(), errors_of(out).read_text()
         time.sleep(0.005)
     raise AssertionError("no checkpoint in time")
 
@@ -93,20 +75,22 @@ def log_without_times(out: Path) -> list[dict]:
     return [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
 
 
-@pytest.mark.parametrize("method", ["paper", "evsplat"])
+@pytest.mark.parametrize(
+    ("method", "settings"), [("paper", ()), ("evsplat", (FILL,))], ids=["paper", "evsplat"]
+)
 def test_killed_and_resumed_run_equals_the_uninterrupted_one_bit_for_bit(
-    method, tiny_capture, tmp_path, monkeypatch
+    method, settings, tiny_capture, tmp_path, monkeypatch
 ):
-    capture = tiny_capture(frames=10)
+    capture, settings = tiny_capture(frames=10), small(method, *settings)
     monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
     asked = {"iterations": 24, "threads": 1}
-    train(capture, out=tmp_path / "whole", method=method, overrides=small(method), **asked)
+    train(capture, out=tmp_path / "whole", method=method, overrides=settings, **asked)
     for kill_at in (3, 13):
         broken = tmp_path / f"broken{kill_at}"
-        process = start(capture, broken, asked["iterations"], method=method)
+        process = start(capture, broken, asked["iterations"], method=method, settings=settings)
         wait_for_step(broken, kill_at, process)
         process.kill()  # SIGKILL: nothing can be tidied up
-        process.wait()
+        process.join()
         train(capture, out=broken, resume=True, **asked)
         expected, found = final_tensors(tmp_path / "whole"), final_tensors(broken)
         assert expected.keys() == found.keys()
@@ -118,12 +102,12 @@ def test_killed_and_resumed_run_equals_the_uninterrupted_one_bit_for_bit(
 def test_ctrl_c_finishes_the_step_saves_and_says_how_to_resume(tiny_capture, tmp_path):
     capture = tiny_capture(frames=10)
     out = tmp_path / "run"
-    process = start(capture, out, 5_000)
+    process = start(capture, out, 5_000, method="paper", settings=small("paper"))
     wait_for_step(out, 2, process)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode != 0
-    assert f"--out {out} --resume" in errors
+    os.kill(process.pid, signal.SIGINT)
+    process.join(60)
+    assert process.exitcode not in (None, 0)
+    assert f"--out {out} --resume" in errors_of(out).read_text()
     assert load_run(out).iteration >= 2
 
 
@@ -193,10 +177,10 @@ def test_random_cube_is_selectable(tiny_capture, tmp_path):
 
 def test_a_training_brings_no_compiler_along(tiny_capture, tmp_path):
     """PyTorch imports it, which takes a second, for gradients of more than plain sums."""
-    last = 'assert not {"sympy", "torch._dynamo"} & set(sys.modules)'
-    command = [sys.executable, "-c", SCRIPT + last, tiny_capture(frames=10), tmp_path / "run"]
-    command += [3, "evsplat", *small("evsplat")]
-    subprocess.run([str(part) for part in command], check=True)
+    out, asked = tmp_path / "run", {"method": "evsplat", "settings": small("evsplat", FILL)}
+    process = start(tiny_capture(frames=10), out, 3, without=("sympy", "torch._dynamo"), **asked)
+    process.join(120)
+    assert process.exitcode == 0, errors_of(out).read_text()
 
 
 def test_non_finite_steps_are_skipped_counted_and_finally_stop(tiny_capture, caplog):
