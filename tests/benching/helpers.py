@@ -43,11 +43,14 @@ def records(folder: Path) -> dict[str, dict]:
 
 
 class _InThisProcess(LocalPool):
-    """Cells one after another without the seconds in which a process of their own starts."""
+    """Cells one after another, on one thread as tests beside each other share the cores.
+
+    Without the seconds in which a process of their own starts.
+    """
 
     def run(self, cells):
         for cell in cells:
-            run_cell(self.folder, cell, threads=self.threads, device=self.device)
+            run_cell(self.folder, cell, threads=1, device=self.device)
             yield cell, None
 
 

@@ -31,8 +31,21 @@ from .helpers import MEDIAN, PAPER, cells_in_this_process, records, write_suite
 training = importlib.import_module("evsplat.training.train")
 
 
-def command(suite: Path, out: Path, *options: str) -> list[str]:
-    return [sys.executable, "-m", "evsplat", "bench", str(suite), "--out", str(out), *options]
+def start(suite: Path, out: Path, **options) -> subprocess.Popen:
+    command = [sys.executable, "-m", "evsplat", "bench", str(suite), "--out", str(out)]
+    return subprocess.Popen([*command, "--cpus-per-cell", "1"], **options)
+
+
+def wait_until_begun(lock: Path, process: subprocess.Popen, *, before: str) -> str:
+    """The number of the process that does the cell, another than ``before``, or of none."""
+    deadline = time.monotonic() + 300
+    while process.poll() is None:
+        assert time.monotonic() < deadline
+        number = lock.read_text() if lock.exists() else ""
+        if number not in ("", before):
+            return number
+        time.sleep(0.01)
+    return ""
 
 
 def test_killed_at_random_moments_and_started_again_it_ends_with_the_same_records(
@@ -41,14 +54,17 @@ def test_killed_at_random_moments_and_started_again_it_ends_with_the_same_record
     rows = (PAPER | {"restore": "edi"},)
     suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, *rows)
     started = time.monotonic()
-    subprocess.run(command(suite, tmp_path / "whole", "--jobs", "1"), check=True)
+    with cells_in_this_process():
+        ev.bench(suite, out=tmp_path / "whole", jobs=1)
     took = time.monotonic() - started
     seed = random.randrange(1 << 30)
-    moments = random.Random(seed)
+    moments, worker = random.Random(seed), ""
     for _ in range(2):
-        process = subprocess.Popen(command(suite, tmp_path / "killed", "--jobs", "1"))
+        process = start(suite, tmp_path / "killed")
+        lock = BenchFolder(tmp_path / "killed").lock_of("one/paper/seed0")
+        worker = wait_until_begun(lock, process, before=worker)
         try:
-            process.wait(moments.uniform(0.3, 0.9) * took)
+            process.wait(moments.uniform(0, 0.9) * took)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -151,7 +167,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tiny_capture, tmp_path):
         tmp_path / "suite.yaml", {"one": tiny_capture("one")}, PAPER, iterations=1_000_000
     )
     out = tmp_path / "out"
-    process = subprocess.Popen(command(suite, out), stderr=subprocess.PIPE, text=True)
+    process = start(suite, out, stderr=subprocess.PIPE, text=True)
     run = out / "runs" / "one" / "paper" / "seed0"
     deadline = time.monotonic() + 300
     while not (run / "log.jsonl").exists():  # opened right before the first step
