@@ -4,12 +4,14 @@ Imports count wherever they stand: at the top, in functions, and for types alone
 """
 
 import ast
+import functools
 import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+from .source import SOURCE, modules
+
 ROOT = Path(__file__).parents[1]
-SOURCE = ROOT / "src" / "evsplat"
 # Rows of the table "Folders, and who imports whom": a layer and what is in it.
 ROWS = re.findall(r"^\| (\d+) \| (`.+?`) \|", (ROOT / "ARCHITECTURE.md").read_text("utf-8"), re.M)
 RANK = {name: int(layer) for layer, names in ROWS for name in re.findall("`(.+?)`", names)}
@@ -40,7 +42,7 @@ def imports_of(module: str, tree: ast.Module) -> Iterator[tuple[str, str, str]]:
             package, _, target = f"{node.module}".partition(".")
             for name in (entry.name for entry in node.names if package == "evsplat"):
                 inner = f"{target}.{name}".lstrip(".")
-                yield module, inner if inner in FILES else target or "evsplat", name
+                yield module, inner if inner in files() else target or "evsplat", name
 
 
 def packages(module: str) -> list[str]:
@@ -54,30 +56,37 @@ def place(module: str, places: Collection[str]) -> str:
     return next((name for name in packages(module) if name in places), module)
 
 
-FILES = {
-    ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix("__init__").rstrip(".")
-    or "evsplat": ast.parse(path.read_text("utf-8"))
-    for path in (*SOURCE.rglob("*.py"), SOURCE / "_native.pyi")
-}
-IMPORTS = [found for module, tree in FILES.items() for found in imports_of(module, tree)]
-UPWARD = {
-    (module, target)
-    for module, target, _ in IMPORTS
-    if target != "evsplat" and place(module, RANK) != place(target, RANK)
-    if RANK[place(module, RANK)] <= RANK[place(target, RANK)]
-}
-SEERS = {
-    module
-    for module, target, name in IMPORTS
-    if name in ("Capture", "CaptureReader", "load_capture", "capture")
-    or target in ("capture.capture", "capture.read")
-}
+@functools.cache
+def files() -> dict[str, ast.Module]:
+    """Modules by their dotted names in the package, and the package itself."""
+    native = ast.parse((SOURCE / "_native.pyi").read_text("utf-8"))
+    return {
+        path.rpartition(".")[0].replace("/", ".").removesuffix("__init__").rstrip(".")
+        or "evsplat": tree
+        for path, tree in {**modules(), "_native.pyi": native}.items()
+    }
+
+
+@functools.cache
+def imports() -> list[tuple[str, str, str]]:
+    return [found for module, tree in files().items() for found in imports_of(module, tree)]
+
+
+@functools.cache
+def seers() -> set[str]:
+    """Modules that import the whole capture."""
+    return {
+        module
+        for module, target, name in imports()
+        if name in ("Capture", "CaptureReader", "load_capture", "capture")
+        or target in ("capture.capture", "capture.read")
+    }
 
 
 def files_run() -> dict[str, set[str]]:
     """Modules that Python runs for each module."""
-    runs: dict[str, set[str]] = {module: set() for module in FILES}
-    for module, target, _ in IMPORTS:
+    runs: dict[str, set[str]] = {module: set() for module in files()}
+    for module, target, _ in imports():
         if target != "evsplat":
             # Python runs the packages around a module before it.
             runs[module] |= {target} | set(packages(target)) - set(packages(module))
@@ -98,11 +107,17 @@ def circles(runs: dict[str, set[str]]) -> list[set[str]]:
 
 
 def test_every_folder_has_a_layer_and_every_layer_a_folder():
-    assert {place(module, RANK) for module in FILES} == set(RANK)
+    assert {place(module, RANK) for module in files()} == set(RANK)
 
 
 def test_folders_import_from_lower_layers_alone():
-    assert UPWARD == set()
+    upward = {
+        (module, target)
+        for module, target, _ in imports()
+        if target != "evsplat" and place(module, RANK) != place(target, RANK)
+        if RANK[place(module, RANK)] <= RANK[place(target, RANK)]
+    }
+    assert upward == set()
 
 
 def test_no_files_import_each_other_in_a_circle():
@@ -110,16 +125,16 @@ def test_no_files_import_each_other_in_a_circle():
 
 
 def test_modules_take_nothing_of_the_package_itself_but_its_version():
-    nodes = [node for tree in FILES.values() for node in ast.walk(tree)]
+    nodes = [node for tree in files().values() for node in ast.walk(tree)]
     used = [node for node in nodes if isinstance(node, ast.Attribute)]
     taken = {node.attr for node in used if getattr(node.value, "id", "") == "evsplat"}
-    taken |= {name for _, target, name in IMPORTS if target == "evsplat" and name}
+    taken |= {name for _, target, name in imports() if target == "evsplat" and name}
     assert taken == {"__version__"}
 
 
 def test_what_training_is_made_of_never_imports_the_whole_capture():
-    assert [name for name in SEERS if place(name, SEE_TRAINING_ALONE) in SEE_TRAINING_ALONE] == []
+    assert [name for name in seers() if place(name, SEE_TRAINING_ALONE) in SEE_TRAINING_ALONE] == []
 
 
 def test_the_whole_capture_is_imported_where_it_is_needed_and_nowhere_else():
-    assert {place(module, SEE_EVERYTHING) for module in SEERS} == SEE_EVERYTHING
+    assert {place(module, SEE_EVERYTHING) for module in seers()} == SEE_EVERYTHING

@@ -1,12 +1,12 @@
 """Files of strangers are parsed in `evsplat.untrusted` and nowhere else."""
 
 import ast
-from collections.abc import Iterator
-from pathlib import Path
+import functools
 
 import pytest
 
-SOURCE = Path(__file__).parents[2] / "src" / "evsplat"
+from ..source import modules
+
 READERS = {
     *("json.load", "json.loads", "json.JSONDecoder", "tomllib.load", "tomllib.loads"),
     *("yaml.load", "yaml.load_all", "yaml.safe_load", "yaml.safe_load_all", "yaml.parse"),
@@ -32,9 +32,10 @@ CONTAINERS = ("av", "archive", "found", "Showcase(folder.path)")
 """Have an ``open`` of their own, which opens no file to read it."""
 
 
-def calls(tree: ast.Module) -> Iterator[tuple[str, ast.Call]]:
+@functools.cache
+def calls(tree: ast.Module) -> list[tuple[str, ast.Call]]:
     """Full names of what is called, and the calls."""
-    names = {}
+    names, found = {}, []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for entry in node.names:
@@ -47,7 +48,8 @@ def calls(tree: ast.Module) -> Iterator[tuple[str, ast.Call]]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             first, _, rest = ast.unparse(node.func).partition(".")
-            yield f"{names.get(first, first)}.{rest}".rstrip("."), node
+            found.append((f"{names.get(first, first)}.{rest}".rstrip("."), node))
+    return found
 
 
 def writes(call: ast.Call) -> bool:
@@ -56,10 +58,10 @@ def writes(call: ast.Call) -> bool:
     return any(isinstance(mode, ast.Constant) and mode.value in ("w", "x") for mode in modes)
 
 
-def openings(text: str) -> set[str]:
-    """Ways in which a text opens files to read them, other than those of the gate."""
+def openings(tree: ast.Module) -> set[str]:
+    """Ways in which a module opens files to read them, other than those of the gate."""
     found = set()
-    for name, call in calls(ast.parse(text)):
+    for name, call in calls(tree):
         way = name.rpartition(".")[2]
         archive = (
             isinstance(call.func, ast.Attribute) and ast.unparse(call.func.value) in CONTAINERS
@@ -71,30 +73,29 @@ def openings(text: str) -> set[str]:
     return found
 
 
-def found_in(text: str) -> list[str]:
-    return [name for name, call in calls(ast.parse(text)) if name in READERS and not writes(call)]
+def found_in(tree: ast.Module) -> list[str]:
+    return [name for name, call in calls(tree) if name in READERS and not writes(call)]
+
+
+def others() -> dict[str, ast.Module]:
+    """The modules that are not the gate."""
+    return {path: tree for path, tree in modules().items() if not path.startswith("untrusted/")}
 
 
 def test_no_other_module_calls_a_parser_of_files():
-    found = {
-        (path.relative_to(SOURCE).as_posix(), name)
-        for path in SOURCE.rglob("*.py")
-        if path.parent.name != "untrusted"
-        for name in found_in(path.read_text("utf-8"))
-    }
+    found = {(path, name) for path, tree in others().items() for name in found_in(tree)}
     assert found == {OWN_PIPE}
 
 
 def test_no_other_module_opens_a_file_that_may_be_a_pipe():
-    found = {
-        (path.relative_to(SOURCE).as_posix(), way)
-        for path in SOURCE.rglob("*.py")
-        if path.parent.name != "untrusted"
-        for way in openings(path.read_text("utf-8"))
-    }
+    found = {(path, way) for path, tree in others().items() for way in openings(tree)}
     assert found == OWN_FILES
-    assert openings("path.open('rb')\nopen(path)\npath.read_bytes()") == {"open", "read_bytes"}
-    assert openings("path.open('w')\nread_text(path)") == set()
+    read, written = (
+        "path.open('rb')\nopen(path)\npath.read_bytes()",
+        "path.open('w')\nread_text(path)",
+    )
+    assert openings(ast.parse(read)) == {"open", "read_bytes"}
+    assert openings(ast.parse(written)) == set()
 
 
 @pytest.mark.parametrize(
@@ -108,5 +109,5 @@ def test_no_other_module_opens_a_file_that_may_be_a_pipe():
     ],
 )
 def test_calls_are_known_by_whatever_name(text: str, name: str):
-    assert found_in(text) == [name]
-    assert found_in("import h5py\nh5py.File(path, 'w')") == []
+    assert found_in(ast.parse(text)) == [name]
+    assert found_in(ast.parse("import h5py\nh5py.File(path, 'w')")) == []
