@@ -20,6 +20,7 @@ from evsplat.pictures import decode, shown, stored
 from evsplat.pictures.files import write_image
 from evsplat.restore.network import NetworkRestorer
 
+from ..conftest import write_tiny_capture
 from ..evaluation.helpers import TruthWithNoise
 
 STEP = 1.5 / 255
@@ -27,17 +28,14 @@ STEP = 1.5 / 255
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory, demo_capture_path) -> dict[str, Capture]:
-    """The demo's first frames coded as sRGB, and as the light that they stand for in 16 bit."""
+def recordings(tmp_path_factory) -> dict[str, Capture]:
+    """A small recording coded as sRGB, and as the light that it stands for in 16 bit."""
     root = tmp_path_factory.mktemp("shown")
+    small = write_tiny_capture(root / "small", frames=8, width=96, height=72)
     made = {}
     for kind in ("srgb", "linear"):
-        path = Path(shutil.copytree(demo_capture_path, root / kind))
+        path = Path(shutil.copytree(small, root / kind))
         document = json.loads((path / "capture.json").read_text())
-        document["frames"] = [*document["frames"][:4], document["frames"][7]]
-        document["novel_views"] = [
-            view for view in document["novel_views"] if view["frame"] == "0007"
-        ]
         for camera in document["cameras"].values():
             camera["transfer"] = kind
         entries = [(entry, key) for entry in document["frames"] for key in ("image", "sharp")]

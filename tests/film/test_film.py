@@ -84,11 +84,11 @@ def test_pictures_of_other_options_or_a_further_trained_run_are_not_taken(lamp, 
     for change in ("options", "training"):
         lamp.lamp.drawn, lamp.lamp.stop_after = [], 8
         with pytest.raises(KeyboardInterrupt):
-            render_run(lamp.run, fps=100, out=tmp_path / "film.mp4")
+            render_run(lamp.run, fps=100, out=tmp_path / change)
         lamp.lamp.drawn, lamp.lamp.stop_after = [], None
         lamp.loaded.iteration += change == "training"
         fps = 50 if change == "options" else 100
-        render_run(lamp.run, fps=fps, out=tmp_path / "film.mp4")
+        render_run(lamp.run, fps=fps, out=tmp_path / change)
         assert len(lamp.lamp.drawn) == 1 + LAST_US * fps // 10**6
 
 
