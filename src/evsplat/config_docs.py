@@ -52,9 +52,9 @@ def _explained(setting: Setting, docs: dict[str, str], every: list[Setting]) -> 
     if is_section and not doc:
         doc = (type(setting.value).__doc__ or "").partition("\n")[0]
     takes = expected(setting.hint)
-    alike = [other.name for other in every if _names(setting.hint, type(other.value))]
-    if alike and not is_section:
-        takes = takes.replace("with keys", f"with the keys of {alike[0]}")
+    if "with keys" in takes and not is_section:
+        alike = [other.name for other in every if _names(setting.hint, type(other.value))]
+        takes = takes.replace("with keys", f"with the keys of {alike[0]}") if alike else takes
     conditions = dict.fromkeys(f"{name} is {mark.condition}" for name, mark in setting.conditions)
     value = None if is_section else to_dict(setting.value)
     default = "" if is_section else flow(to_dict(setting.default))
