@@ -18,6 +18,8 @@ LEAST = 1 / 9
 count as seen: an outline's own pixels show the person in part."""
 MOST_FRAMES = 48
 """Training frames that are looked at, spread evenly: the body's outlines take the time."""
+NEVER = -1.0
+"""Distance to the body of what a frame does not show."""
 
 
 def background_without(
@@ -31,15 +33,29 @@ def background_without(
     What it hides or touches in all of them nobody saw: there the colours around go on evenly, where
     a median would show the person.
     """
-    frames = capture.train_frames
-    frames = frames[:: -(-len(frames) // MOST_FRAMES)]
+    frames = looked_at(capture)
     # In eight bits and row by row: 48 large pictures would fill the memory.
     coded = [(255 * capture.image(frame)).round().byte().cpu().numpy() for frame in frames]
     band = band_px_at_256 * coded[0].shape[0] / 256
-    near = [np.minimum(_apart(capture, track, frame), band).astype(np.float16) for frame in frames]
-    pictures, apart = np.stack(coded), np.stack(near)
-    farthest = apart.max(0)
-    counts = apart == farthest
+    near = [np.minimum(apart(capture, track, frame), band).astype(np.float16) for frame in frames]
+    return median_far_away(np.stack(coded), np.stack(near), band)
+
+
+def looked_at(capture: TrainingCapture) -> tuple[Frame, ...]:
+    """The training frames that a background is made of, `MOST_FRAMES` at most."""
+    frames = capture.train_frames
+    return frames[:: -(-len(frames) // MOST_FRAMES)]
+
+
+def median_far_away(
+    pictures: UInt8[np.ndarray, "F H W 3"], near: Float[np.ndarray, "F H W"], band: float
+) -> Float[Tensor, "H W 3"]:
+    """Per-pixel median of the frames in which the body is farthest; see `background_without`.
+
+    ``near``: pixels to the body, at most ``band``; `NEVER` where a frame shows nothing.
+    """
+    farthest = near.max(0)
+    counts = near == farthest
     rows = [_median_of(pictures[:, row], counts[:, row]) for row in range(pictures.shape[1])]
     picture = torch.from_numpy(np.stack(rows) / np.float32(255))
     return gone_on(picture, torch.from_numpy(farthest > max(1.0, LEAST * band)))
@@ -82,7 +98,7 @@ def _median_of(
     return middle
 
 
-def _apart(capture: TrainingCapture, track: BodyTrack, frame: Frame) -> Float[np.ndarray, "H W"]:
+def apart(capture: TrainingCapture, track: BodyTrack, frame: Frame) -> Float[np.ndarray, "H W"]:
     """Pixels to the body as it is at the ends and in the middle of the exposure."""
     camera = capture.camera(frame)
     times = sorted({*frame.exposure_us, frame.mid_us})

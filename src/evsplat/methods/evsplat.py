@@ -9,7 +9,6 @@ import logging
 from functools import cache, partial
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack
@@ -29,10 +28,11 @@ from evsplat.methods.base import (
 )
 from evsplat.methods.evsplat_settings import DiscRates, EvsplatConfig
 from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
+from evsplat.methods.moving_background import middle_view, moving_backdrop, require_one_side
 from evsplat.methods.poses import prepare_poses
 from evsplat.methods.prefit import fit_scene
 from evsplat.methods.sensor import event_windows
-from evsplat.methods.starts import Surface, human_start, scene_start
+from evsplat.methods.starts import Backdrop, Surface, human_start, scene_start
 from evsplat.models.discs import DiscModel
 from evsplat.models.discs.fill import filled
 from evsplat.models.discs.first_colours import first_colours
@@ -95,10 +95,11 @@ def build(
     fit = purpose == "train"
     generator = start_of_randomness(seed)
     poses = prepare_poses(config.pose, capture, fit=fit)
-    background = _background(config, capture, poses.track) if fit else None
+    background = _background(config, capture, poses.track, fit=fit)
     frames = capture.train_frames
     times_us = [frame.mid_us for frame in frames]
-    recording = None if config.scene.kind == "random_cube" else capture.camera(frames[0])
+    still = config.scene.kind != "random_cube" and capture.is_static_camera
+    recording = capture.camera(frames[0]) if still else None
     changes = poses.may_err and config.rates.deformation > 0
     model = DiscModel(
         poses.track,
@@ -193,25 +194,34 @@ def _filled(
 
 
 def _background(
-    config: EvsplatConfig, capture: TrainingCapture, track: BodyTrack
-) -> Float[Tensor, "H W 3"] | None:
-    """What a backdrop is to show; None where there is to be none."""
-    if config.scene.kind != "median_backdrop" or not capture.is_static_camera:
+    config: EvsplatConfig, capture: TrainingCapture, track: BodyTrack, *, fit: bool
+) -> Backdrop | None:
+    """What a backdrop is to show; None where there is to be none, or a still one's is loaded."""
+    if config.scene.kind != "median_backdrop":
         return None
-    return background_without(capture, track, config.semantic_band_px_at_256)
+    if not capture.is_static_camera:
+        require_one_side(capture)
+        if fit:
+            return moving_backdrop(capture, track, config.semantic_band_px_at_256)
+        camera = middle_view(capture)
+        return Backdrop(camera, torch.zeros(camera.height, camera.width, 3))
+    if not fit:
+        return None
+    picture = background_without(capture, track, config.semantic_band_px_at_256)
+    return Backdrop(capture.camera(capture.train_frames[0]), picture)
 
 
 def _fit_colours(
     config: EvsplatConfig,
     capture: TrainingCapture,
     model: DiscModel,
-    background: Float[Tensor, "H W 3"] | None,
+    background: Backdrop | None,
 ) -> None:
     """The scene as in ``background``, the person in the colours that the frames show."""
     gaussians = model.gaussians
     if background is not None:
-        camera = capture.camera(capture.train_frames[0]).to(model.device)
-        picture, steps = background.to(model.device), config.scene.prefit_steps
+        camera = background.camera.to(model.device)
+        picture, steps = background.picture.to(model.device), config.scene.prefit_steps
         fit_scene(gaussians, camera, picture, steps, low_pass=config.low_pass)
     colours = first_colours(model, capture)
     with torch.no_grad():
@@ -223,7 +233,7 @@ def _start(
     capture: TrainingCapture,
     track: BodyTrack,
     generator: torch.Generator,
-    background: Float[Tensor, "H W 3"] | None,
+    background: Backdrop | None,
 ) -> GaussianSet:
     """Discs on the body and behind it; random points get features for a network of their colour."""
     features = FEATURE_DIM if config.scene.kind == "random_cube" else None

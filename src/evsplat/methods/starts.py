@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack, skin, up_axis
-from evsplat.capture import Frame, TrainingCapture
+from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.config import Above, AtLeast, ReadIf
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM
@@ -67,7 +67,8 @@ class SceneStart:
 
     kind: Literal["median_backdrop", "random_cube"]
     """``random_cube``: as HUGS in the paper, needs far more steps. ``median_backdrop``: the
-    temporal median of the training frames on a floor and a wall; static cameras only."""
+    temporal median of the training frames on a floor and a wall; static cameras, and with
+    `evsplat` cameras that move on one side of the scene."""
     cube_count: Annotated[int, AtLeast(4), _CUBE]
     """Points of the random cube."""
     cube_half_side_m: Annotated[float, Above(0), _CUBE] | None
@@ -90,6 +91,18 @@ class FittedScene(SceneStart):
 
     prefit_steps: Annotated[int, AtLeast(0), _BACKDROP]
     """Steps of fitting the sheet to the median before training proper."""
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """What the sheet behind the person is to show."""
+
+    camera: Camera
+    """Sees all of it."""
+    picture: Float[Tensor, "H W 3"]
+    """In ``camera``, as the frames are coded."""
+    margin: float = BACKDROP_MARGIN
+    """Distance of the wall behind the deepest body point, as a fraction of its depth."""
 
 
 FROM_MEDIAN = FittedScene(
@@ -149,7 +162,7 @@ def cube(start: SceneStart, capture: TrainingCapture, track: BodyTrack) -> tuple
     return middle, start.cube_half_side_m or max(2.0, 1.5 * distance)
 
 
-def _posed(track: BodyTrack, frames: Sequence[Frame]) -> Iterator[Float[Tensor, "M 3"]]:
+def posed(track: BodyTrack, frames: Sequence[Frame]) -> Iterator[Float[Tensor, "M 3"]]:
     """Every `_STRIDE`-th vertex of the body at the frames, some frames at a time."""
     points, weights = (
         values[::_STRIDE] for values in (track.body.canonical_vertices(), track.body.weights)
@@ -166,7 +179,7 @@ def scene_start(
     generator: torch.Generator,
     semantic_logit: float,
     feature_dim: int | None = FEATURE_DIM,
-    background: Float[Tensor, "H W 3"] | None = None,
+    background: Backdrop | None = None,
     goes_on: bool = False,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Start values of the scene's Gaussians, and the colours they shall show.
@@ -175,35 +188,29 @@ def scene_start(
     ``goes_on``: a backdrop goes on beyond the borders of the recorded picture.
     """
     frames = capture.train_frames
-    camera = capture.camera(frames[0])
     around: dict[str, Tensor] = {}
     if start.kind == "random_cube":
         points, colours = random_cube(*cube(start, capture, track), start.cube_count, generator)
         scales = nearest_spacing(points)[:, None].repeat(1, 3)
         opacity = CUBE_OPACITY
     else:
-        if not capture.is_static_camera:
-            raise ConfigError(
-                f"{capture.path}: scene.kind is median_backdrop, which needs one static camera; "
-                "this capture's camera moves. Pass --set scene.kind=random_cube."
-            )
-        if background is None:
-            background = capture.median_background()
+        backdrop = background or _median(capture)
+        camera, picture = backdrop.camera, backdrop.picture
         beyond = margins(camera)
         wide = camera.widened(*beyond)
         depth = backdrop_depth(
-            wide, _posed(track, frames), up=up_axis(track), margin=BACKDROP_MARGIN
+            wide, posed(track, frames), up=up_axis(track), margin=backdrop.margin
         )
         points, scales, colours = median_backdrop(
             camera,
-            background,
+            picture,
             depth[beyond[1] : -beyond[1], beyond[0] : -beyond[0]],
             stride=start.backdrop_stride_px,
             edge_points=int(BACKDROP_EDGE_SHARE * camera.width * camera.height),
         )
         opacity = BACKDROP_OPACITY
         if goes_on:
-            around = surround(wide, background, depth, semantic_logit, feature_dim)
+            around = surround(wide, picture, depth, semantic_logit, feature_dim)
     values = gaussians_at(
         points,
         scales,
@@ -216,6 +223,17 @@ def scene_start(
         name: torch.cat([value, around[name]]) if around else value
         for name, value in values.items()
     }, colours
+
+
+def _median(capture: TrainingCapture) -> Backdrop:
+    """The median of the training frames, of a camera that stands still."""
+    if not capture.is_static_camera:
+        raise ConfigError(
+            f"{capture.path}: scene.kind is median_backdrop, which needs one static camera; "
+            "this capture's camera moves. Pass --set scene.kind=random_cube, or train method "
+            "evsplat."
+        )
+    return Backdrop(capture.camera(capture.train_frames[0]), capture.median_background())
 
 
 def as_person(scene: dict[str, Tensor], track: BodyTrack, time_us: int) -> dict[str, Tensor]:
