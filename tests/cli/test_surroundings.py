@@ -33,20 +33,26 @@ sys.exit(max(codes))
 """
 
 
-@pytest.mark.parametrize("surroundings", ["bare", "no home", "full path"])
+@pytest.mark.parametrize("surroundings", ["bare", "no home in a full path"])
 def test_the_way_from_capture_to_pictures_without_a_home_and_in_odd_places(
     tmp_path: Path, surroundings: str
 ) -> None:
-    """No HOME, no TMPDIR, the C locale; a home that cannot be written; names with every letter."""
-    place = tmp_path / ("a b ü\n'\"$x%41" if surroundings == "full path" else "plain")
+    """No HOME, no TMPDIR, the C locale; names with every letter, and a home that is not there."""
+    odd = "a b ü\n'\"$x%41"
+    place = tmp_path / ("plain" if surroundings == "bare" else odd)
     place.mkdir()
     capture = write_tiny_capture(place / "tïny cäpture")
     kept = {key: os.environ[key] for key in ("PATH", "OMP_NUM_THREADS") if key in os.environ}
-    environment = {
-        "bare": kept | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-        "no home": kept | {"HOME": "/proc/nobody", "XDG_CACHE_HOME": "/proc/nobody/.cache"},
-        "full path": kept | {"HOME": str(place)},
-    }[surroundings]
+    environment = (
+        kept
+        | {
+            "bare": {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+            "no home in a full path": {
+                "HOME": f"/proc/{odd}",
+                "XDG_CACHE_HOME": f"/proc/{odd}/.cache",
+            },
+        }[surroundings]
+    )
     done = subprocess.run(
         [sys.executable, "-c", WAY, str(capture), str(place / "run"), *SETTINGS],
         env=environment,
