@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from PIL import Image
@@ -32,6 +33,17 @@ def test_summary_states_what_was_recorded(tiny_capture: Factory, tmp_path: Path)
     for picture in report.pictures:
         with Image.open(picture) as image:
             assert image.width >= 700 and len(np.unique(np.asarray(image.convert("L")))) > 50
+
+
+def test_events_without_polarity_are_told_from_a_scene_that_stands_still(
+    tiny_capture: Factory, tmp_path: Path
+) -> None:
+    path = tiny_capture()
+    with h5py.File(path / "events.h5", "r+") as file:
+        file["events/p"][...] = 0
+    summary = inspect_capture(path, tmp_path / "out").summary
+    assert "not estimated: events without polarity" in summary
+    assert "too little moves, or" not in summary and "--clock-offset-us" not in summary
 
 
 def test_one_frame_has_no_delay(

@@ -141,7 +141,7 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
         f"{_transfer_text(capture)}",
         f"time       {(end - start) / 1e6:.3f} s{rate}, exposure {exposure / 1000:.4g} ms",
         f"events     {_events_text(capture)}",
-        *(sensor_lines(estimate, capture.clock_offset_us) if capture.events is not None else []),
+        *_sensor_lines(capture, estimate),
         f"body       {_body_text(capture, track)}",
         f"truth      {_truth_text(capture)}",
     ]
@@ -167,6 +167,13 @@ def _transfer_text(capture: Capture) -> str:
     """The curve from values to light, where capture.json says it."""
     stated = {capture.metadata.transfers.get(frame.camera) for frame in capture.frames} - {None}
     return f"; values: {', '.join(sorted(str(one) for one in stated))}" if stated else ""
+
+
+def _sensor_lines(capture: Capture, estimate: SensorEstimate | None) -> list[str]:
+    events = capture.events
+    if events is None:
+        return []
+    return sensor_lines(estimate, capture.clock_offset_us, has_polarity=events.has_polarity)
 
 
 def _events_text(capture: Capture) -> str:

@@ -80,7 +80,7 @@ def inspect_recording(
     }
     if spans:
         lines.append(f"frames     {_frames_text(spans, frames)}")
-        lines += sensor_lines(estimate, 0)
+        lines += sensor_lines(estimate, 0, has_polarity=recording.has_polarity)
     if estimate is not None:
         clock = estimate.clock
         drawings["clock"] = draw_curve(

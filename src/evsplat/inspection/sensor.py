@@ -6,12 +6,16 @@ from evsplat.capture.finding import Finding, Findings
 from evsplat.capture.sensor_estimate import looks_linear
 
 
-def sensor_lines(estimate: SensorEstimate | None, clock_offset_us: int) -> list[str]:
+def sensor_lines(
+    estimate: SensorEstimate | None, clock_offset_us: int, *, has_polarity: bool
+) -> list[str]:
     """Clock and contrast in words; ``clock_offset_us`` is what was added to the events' times."""
+    if estimate is None and not has_polarity:
+        return ["clock      not estimated: events without polarity say nothing of which way"]
     if estimate is None:
         return [
-            "clock      not estimated: too little moves, or the clocks differ by more than 0.1 s "
-            "(evsplat import finds that: --clock-offset-us auto)"
+            "clock      not estimated: too little moves, the pictures are too dark, or the clocks "
+            "differ by more than 0.1 s (evsplat import finds that: --clock-offset-us auto)"
         ]
     clock, contrast = estimate.clock, estimate.thresholds
     text = (
