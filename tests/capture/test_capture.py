@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from evsplat.capture import load_capture
+from evsplat.capture import Capture, load_capture
 from evsplat.capture.distortion import Distortion
 from evsplat.errors import DataError
 from evsplat.events import count_map
@@ -202,6 +202,56 @@ def test_moving_camera_overrides_the_pose_of_its_frame(tiny_capture: Factory) ->
     assert capture.camera("0005") is capture.cameras["main"]
     with pytest.raises(DataError, match="camera that stands still"):
         capture.median_background()
+
+
+def repeated(path: Path, pose: np.ndarray, *, given: slice = slice(None)) -> Capture:
+    """The capture with one pose in the entries of its frames."""
+
+    def change(document: dict) -> None:
+        for frame in document["frames"][given]:
+            frame["world_to_camera"] = pose.tolist()
+
+    edit(path, change)
+    return load_capture(path)
+
+
+def test_a_pose_that_every_frame_repeats_is_that_of_a_camera_at_rest(tiny_capture: Factory) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = 0.25, 0.5, 3.0
+    capture = repeated(tiny_capture(), pose)
+    assert capture.is_static_camera
+    assert np.array_equal(capture.cameras["main"].world_to_camera.numpy(), pose)
+    assert all(capture.camera(frame) is capture.cameras["main"] for frame in capture.frames)
+    capture.median_background()
+
+
+def test_a_pose_of_some_frames_is_that_of_all_only_where_the_camera_has_it(
+    tiny_capture: Factory,
+) -> None:
+    own = load_capture(tiny_capture()).cameras["main"].world_to_camera.numpy().astype(float)
+    assert repeated(tiny_capture("same"), own, given=slice(3)).is_static_camera
+    other = own.copy()
+    other[0, 3] += 1e-3
+    assert not repeated(tiny_capture("other"), other, given=slice(3)).is_static_camera
+
+
+def test_a_camera_of_novel_views_keeps_its_own_pose(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    own = load_capture(path).cameras["main"].world_to_camera.numpy().astype(float)
+
+    def add_view(document: dict) -> None:
+        frame = document["frames"][2]
+        middle = sum(frame["exposure_us"]) // 2
+        view = {"camera": "main", "frame": frame["name"], "time_us": middle}
+        document["novel_views"] = [view | {"image": frame["image"]}]
+
+    edit(path, add_view)
+    moved = own.copy()
+    moved[0, 3] += 0.5
+    capture = repeated(path, moved)
+    assert len(capture.novel_views) == 1
+    assert not capture.is_static_camera
+    assert np.allclose(capture.cameras["main"].world_to_camera.numpy(), own)
 
 
 def test_median_background_is_the_median_of_the_train_frames(tiny_capture: Factory) -> None:

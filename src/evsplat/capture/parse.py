@@ -8,7 +8,7 @@ from evsplat.capture.fields import Fields
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Metadata
 from evsplat.capture.parse_cameras import parse_cameras
-from evsplat.capture.parse_frames import parse_frames, parse_novel_views
+from evsplat.capture.parse_frames import at_rest, parse_frames, parse_novel_views
 from evsplat.errors import DataError
 from evsplat.options.inputs import no_capture
 from evsplat.untrusted.faults import brief
@@ -60,6 +60,8 @@ def _parse(file: Path, document: dict[str, Any], findings: Findings) -> Metadata
     top = Fields(file, "", document, (*known, "provenance"), findings)
     cameras, distortions, transfers = parse_cameras(top)
     frames = parse_frames(top, cameras)
+    novel_views = parse_novel_views(top, cameras, frames)
+    cameras, frames = at_rest(cameras, frames, novel_views)
     body = _body(top)
     provenance = document.get("provenance", {})
     body_file = body.path("file") if body else None
@@ -70,7 +72,7 @@ def _parse(file: Path, document: dict[str, Any], findings: Findings) -> Metadata
         distortions=distortions,
         transfers=transfers,
         frames=frames,
-        novel_views=parse_novel_views(top, cameras, frames),
+        novel_views=novel_views,
         body_file=body_file or top.folder / "body.npz",
         body_model=_body_model(body) if body else "",
         body_source=body.choice("source", POSE_SOURCES) if body else None,

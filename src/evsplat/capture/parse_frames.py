@@ -1,5 +1,6 @@
 """Frames and novel views of capture.json."""
 
+from dataclasses import replace
 from typing import Any, Literal
 
 from evsplat.camera import Camera
@@ -8,6 +9,8 @@ from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.parse_cameras import rigid
 
 _LONGEST_EXPOSURE_US = 60_000_000
+_SAME_POSE = 1e-6
+"""Largest difference of entries, metres or none, up to which poses count as one."""
 
 
 def parse_frames(top: Fields, cameras: dict[str, Camera]) -> tuple[Frame, ...]:
@@ -62,6 +65,30 @@ def parse_novel_views(
         if entry.valid and image is not None:
             views.append(NovelView(index, camera, frame, time_us, image))
     return tuple(views)
+
+
+def at_rest(
+    cameras: dict[str, Camera], frames: tuple[Frame, ...], views: tuple[NovelView, ...]
+) -> tuple[dict[str, Camera], tuple[Frame, ...]]:
+    """Cameras and frames; a pose that all frames of the only camera repeat becomes its own.
+
+    Trackers write one for every frame, of a tripod as well; only a camera that stands still has a
+    median background, a relief and one drawing of the scene for all frames.
+    """
+    names = {frame.camera for frame in frames}
+    poses = [frame.world_to_camera for frame in frames if frame.world_to_camera is not None]
+    if len(names) != 1 or not poses:
+        return cameras, frames
+    camera = cameras[frames[0].camera]
+    pose = poses[0]
+    others = [camera.world_to_camera] if len(poses) < len(frames) else []
+    if any(view.camera in names for view in views):
+        others.append(camera.world_to_camera)
+    if any(float((other - pose).abs().max()) > _SAME_POSE for other in (*poses, *others)):
+        return cameras, frames
+    standing = Camera(camera.width, camera.height, camera.K, pose)
+    still = tuple(replace(frame, world_to_camera=None) for frame in frames)
+    return cameras | {frames[0].camera: standing}, still
 
 
 def _frame(top: Fields, index: int, value: Any, cameras: dict[str, Camera]) -> Frame | None:
