@@ -42,6 +42,10 @@ class OutputError(EvsplatError):
         self.no_room = no_room
 
 
+TRACEBACK = "evsplat-traceback-"
+"""How names begin of files with what nobody expected of a machine."""
+
+
 class MachineError(EvsplatError):
     """Memory, disk or system failed where nobody expected it; `__cause__` is what they said."""
 

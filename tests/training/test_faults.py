@@ -151,6 +151,24 @@ def test_a_machine_that_fails_is_a_sentence_with_the_traceback_beside_the_run(
     assert "Traceback (most recent call last)" in file.read_text()
 
 
+def test_the_traceback_of_a_training_that_never_began_is_in_nobodys_way(
+    tiny_capture, tmp_path, monkeypatch
+):
+    capture, out = tiny_capture(), tmp_path / "run"
+    command = ["train", str(capture), "--out", str(out), "--iterations", "2", "--no-evaluate"]
+    command += [f"--set={setting}" for setting in small("evsplat")]
+
+    def failing(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, "Input/output error", "config.yaml")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(MODULE, "save_yaml", failing)
+        assert main(command) == 2
+    assert list(out.glob("evsplat-traceback-*.txt")) and not (out / "config.yaml").exists()
+    assert main(command) == 0
+    assert (out / "config.yaml").exists()
+
+
 def test_a_fault_of_the_program_stays_one(tiny_capture, tmp_path, monkeypatch):
     fails_after_a_step(monkeypatch, RuntimeError("shapes do not match"))
     with pytest.raises(RuntimeError, match="shapes do not match") as caught:

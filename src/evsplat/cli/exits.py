@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO, cast
 
 from evsplat.errors import (
+    TRACEBACK,
     EvsplatError,
     MachineError,
     OutputError,
@@ -119,7 +120,7 @@ def _kept_traceback(error: EvsplatError) -> str:
     if not isinstance(error, MachineError) or error.__cause__ is None:
         return ""
     text = "".join(traceback.format_exception(error.__cause__))
-    name = f"evsplat-traceback-{os.getpid()}.txt"
+    name = f"{TRACEBACK}{os.getpid()}.txt"
     for folder in (error.folder, Path(tempfile.gettempdir())):
         with suppress(EvsplatError, OSError, MemoryError):
             if folder is not None and folder.is_dir():

@@ -17,7 +17,7 @@ from typing import Any
 from torch import Tensor
 
 from evsplat.disk import is_held
-from evsplat.errors import OutputError
+from evsplat.errors import TRACEBACK, OutputError
 from evsplat.files import held_folder, remove_file
 from evsplat.training.checkpoint import latest_checkpoint, write_state
 
@@ -101,7 +101,8 @@ def is_training(run: Path) -> bool:
 
 def is_unused(run: Path) -> bool:
     """Whether a folder holds nothing but what a training that never began left in it."""
-    return not run.exists() or {path.name for path in run.iterdir()} <= {_SIGN, _FACTS}
+    names = {path.name for path in run.iterdir()} if run.exists() else set()
+    return all(name in {_SIGN, _FACTS} or name.startswith(TRACEBACK) for name in names)
 
 
 def watch(run: Path) -> None:
