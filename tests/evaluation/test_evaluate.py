@@ -217,8 +217,9 @@ def test_without_events_and_novel_views_both_say_so(tiny_capture, tmp_path):
 def test_a_moving_camera_has_no_median_background(tiny_capture, tmp_path):
     def change(document):
         pose = document["cameras"]["main"]["world_to_camera"]
-        for frame in document["frames"]:
-            frame["world_to_camera"] = pose
+        for number, frame in enumerate(document["frames"]):
+            aside = pose[0][:3] + [pose[0][3] + 1e-4 * number]
+            frame["world_to_camera"] = [aside, *pose[1:]]
 
     metrics = run(edit(tiny_capture(), change), tmp_path / "run")
     assert metrics["trivial"]["median_background"]["full"]["psnr"] is None

@@ -150,7 +150,9 @@ def test_bad_options_are_named(tiny_capture: Factory, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=words):
             mask_capture(path, tmp_path / "out", **options)
     document = json.loads((path / "capture.json").read_text())
-    document["frames"][0]["world_to_camera"] = document["cameras"]["main"]["world_to_camera"]
+    pose = document["cameras"]["main"]["world_to_camera"]
+    moved = [pose[0][:3] + [pose[0][3] + 0.1], *pose[1:]]
+    document["frames"][0]["world_to_camera"] = moved
     (path / "capture.json").write_text(json.dumps(document))
     with pytest.raises(DataError, match="moving camera.*silhouette or rvm"):
         mask_capture(path, tmp_path / "out", method="background")

@@ -167,8 +167,10 @@ def test_training_on_a_capture_without_poses_offers_to_find_them(unposed):
 def test_a_moving_camera_is_not_refined_and_refused_where_it_was_asked_for(unposed, tmp_path):
     path, points = unposed
     document = json.loads((path / "capture.json").read_text())
-    for frame in document["frames"]:
-        frame["world_to_camera"] = CAMERA.world_to_camera.tolist()
+    for number, frame in enumerate(document["frames"]):
+        pose = CAMERA.world_to_camera.tolist()
+        pose[0][3] += 1e-4 * number
+        frame["world_to_camera"] = pose
     (path / "capture.json").write_text(json.dumps(document))
     with pytest.raises(ConfigError, match="--refine 5: .* moving camera"):
         find_poses(path, tmp_path / "new", keypoints=points, refine_s=5)
