@@ -10,6 +10,7 @@ from evsplat.benching.folder import BenchFolder
 from evsplat.capture.policy import policy_of
 from evsplat.evaluation.tables import REGION_TITLES
 from evsplat.pages import folded, section
+from evsplat.wording import counted
 
 _HEADS = ("", "seed", *REGION_TITLES.values(), "minutes", "files")
 
@@ -17,7 +18,7 @@ _HEADS = ("", "seed", *REGION_TITLES.values(), "minutes", "files")
 def cells_section(records: Records, folder: BenchFolder) -> str:
     """A folded table per capture of the cells that are over, each with links beside the page."""
     tables = "".join(
-        folded(f"{name}: {len(over)} cells", _table(records, over, folder))
+        folded(f"{name}: {counted(len(over), 'cell')}", _table(records, over, folder))
         for name in records.captures
         if (over := [cell for cell in records.plan.cells if _over(records, cell, name)])
     )
