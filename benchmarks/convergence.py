@@ -254,6 +254,7 @@ def main() -> None:
                 f"{found['full_psnr_db']:.2f} / {found['crop_psnr_db']:.2f} / "
                 f"{found['mask_psnr_db']:.2f} dB"
             )
+    make_folder(options.out)
     draw(curves, options.out / "convergence.png")
     print(json.dumps({"gain_db": options.gain, "knees": knees}))
 

@@ -27,11 +27,9 @@ from evsplat.body import BodyTrack, PoseErrors
 from evsplat.body.motion import load_motion
 from evsplat.body.pose_noise import noise_errors, poses_off_by
 from evsplat.body.rotations import nearest_axis_angle
-from evsplat.body.smoothing import motion_noise, smoothed
 from evsplat.camera import Camera
 from evsplat.capture.parse_frames import default_split
-from evsplat.methods.poses import SMOOTHED_PLACE
-from evsplat.models.pose_correction import SHARES
+from evsplat.methods.poses import SMOOTHED_PLACE, smoothed_by_expected
 from evsplat.options import StageSettings
 from evsplat.options.captures import PoseNoise
 from evsplat.posing.correction import Correction
@@ -87,10 +85,9 @@ def case(settings: StageSettings, level: PoseNoise, told: float) -> Case:
 
 def smooth(track: BodyTrack, of_joints: float, of_place: float) -> BodyTrack:
     """As training does, with shares as in `ROWS`."""
-    new = SHARES["fast"] ** 0.5
     joint_rad, root_m = expected_errors(track)
-    noise = motion_noise(track, of_joints * new * joint_rad, of_place * new * float(root_m.max()))
-    return smoothed(track, noise)
+    shares = {"of_joints": of_joints, "of_place": of_place}
+    return smoothed_by_expected(track, joint_rad[None], root_m[None], **shares)
 
 
 def corrected(case: Case, track: BodyTrack, seen: float, seed: int) -> BodyTrack:

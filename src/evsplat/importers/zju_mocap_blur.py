@@ -61,10 +61,6 @@ class ZjuMocapBlur(Importer):
         cameras = {
             name: _camera(tables["cameras"], name, source / "cameras.pkl") for name in frames
         }
-        moving = any(
-            np.abs(camera.world_to_camera - cameras[first].world_to_camera).max() > 1e-6
-            for camera in cameras.values()
-        )
         cameras[first].add_to(writer, "main", frames[first], self.shrink, transfer="linear")
         exposure_us, sub_frames = _exposure(list(moments), list(moments.values()), unit)
         times = []
@@ -78,7 +74,7 @@ class ZjuMocapBlur(Importer):
                 self.shrink,
                 exposure_us=exposure_us,
                 mask=human_mask(source / "masks" / f"{name}.png", self.shrink),
-                world_to_camera=cameras[name].world_to_camera if moving else None,
+                world_to_camera=cameras[name].world_to_camera,
             )
             times.append(round(time_us))
         width, height = image_size(frames[first])

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from evsplat.body import BodyTrack, PoseErrors, PoseSource
 from evsplat.body.smoothing import motion_noise, moving_joints, smoothed
@@ -100,7 +101,7 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
     pace = _pace(joint_rad) if told or config.std_rad is not None else 1.0
     smooth = config.smooth == "always" or (config.smooth == "auto" and told)
     if smooth:
-        track = _smoothed(track, joint_rad, root_m)
+        track = smoothed_by_expected(track, joint_rad, root_m)
     # Poses that were corrected when they were found need not wait for the same again.
     tried = source is not None and capture.poses_refined
     found: Gain | None = None
@@ -136,13 +137,22 @@ def _pace(joint_rad: np.ndarray) -> float:
     return min(1.0, UNKNOWN[0] / float(np.sqrt(np.square(moving).mean()))) if moving.size else 1.0
 
 
-def _smoothed(track: BodyTrack, joint_rad: np.ndarray, root_m: np.ndarray) -> BodyTrack:
-    """Without the noise that is new in every pose, of each joint up to what is expected there."""
+def smoothed_by_expected(
+    track: BodyTrack,
+    joint_rad: Float[np.ndarray, "P J"],
+    root_m: Float[np.ndarray, "P 3"],
+    *,
+    of_joints: float = 1.0,
+    of_place: float = SMOOTHED_PLACE,
+) -> BodyTrack:
+    """Without the noise that is new in every pose, of each joint up to what is expected there.
+
+    ``joint_rad`` (radians) and ``root_m`` (metres) are errors expected per axis; the shares of them
+    that are new in every pose are believed, times ``of_joints`` and ``of_place``.
+    """
     new = SHARES["fast"] ** 0.5
-    most_rad = new * np.sqrt(np.square(joint_rad).mean(0))
-    return smoothed(
-        track, motion_noise(track, most_rad, SMOOTHED_PLACE * new * float(root_m.max()))
-    )
+    most_rad = of_joints * new * np.sqrt(np.square(joint_rad).mean(0))
+    return smoothed(track, motion_noise(track, most_rad, of_place * new * float(root_m.max())))
 
 
 def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTrack:
@@ -151,7 +161,7 @@ def _as_far_off(track: BodyTrack, errors: PoseErrors, *, smooth: bool) -> BodyTr
     if not smooth:
         return told
     alike = np.full_like(errors.joint_rad, SMOOTHED_ALIKE * errors.joint_rad.max())
-    return _smoothed(told, alike, errors.root_m)
+    return smoothed_by_expected(told, alike, errors.root_m)
 
 
 def _corrected(track: BodyTrack, capture: TrainingCapture) -> Gain | None:
