@@ -10,7 +10,9 @@ import pytest
 from PIL import Image
 
 from evsplat.capture import load_body_track, load_capture
-from evsplat.inspection import body_mask_overlap, inspect_capture
+from evsplat.inspection import body_mask_overlap, inspect_capture, warn_of_events
+
+from ..seen import seen
 
 Factory = Callable[..., Path]
 
@@ -75,3 +77,37 @@ def test_posed_body_falls_on_the_person_of_shared_captures(captures_root: Path, 
     """The masks show clothes and hair, which the body lacks; a wrong pose would be far below."""
     capture = load_capture(captures_root / name)
     assert min(body_mask_overlap(capture, load_body_track(capture), capture.frames[::6])) > 0.8
+
+
+@pytest.mark.parametrize("spoilt", ["nothing", "mirrored", "inverted", "one sign"])
+def test_events_that_say_otherwise_than_the_frames_are_told(
+    tiny_capture: Factory, tmp_path: Path, spoilt: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """`warn_of_events` says before a training what `inspect` finds, and neither more than that."""
+    path = tiny_capture(frames=20, width=96, height=72)
+    with h5py.File(path / "events.h5", "r+") as file:
+        if spoilt == "mirrored":
+            file["events/x"][...] = 95 - file["events/x"][...]
+        if spoilt == "inverted":
+            file["events/p"][...] = 1 - file["events/p"][...]
+        if spoilt == "one sign":
+            file["events/p"][...] = 1
+    report = inspect_capture(path, tmp_path / "out")
+    words = {
+        "nothing": None,
+        "mirrored": "events/x, events/y: found events that fit the frames only if they were "
+        "mirrored left to right (",
+        "inverted": "events/p: found events that fit the frames only if they were of the other",
+        "one sign": "events/p: found brighter events alone",
+    }[spoilt]
+    of_events = [str(finding) for finding in report.findings if finding.file.suffix == ".h5"]
+    caplog.clear()
+    with caplog.at_level("WARNING"):
+        warn_of_events(seen(path))
+    if words is None:
+        assert not of_events and not caplog.messages
+        assert "clock      events" in report.summary
+        return
+    assert len(of_events) == len(caplog.messages) == 1
+    assert words in of_events[0] and words in caplog.messages[0]
+    assert "not estimated: events do not tell what the frames show" in report.summary

@@ -3,20 +3,25 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from evsplat.calibration.agreement import Disagreement, estimate_disagreement
 from evsplat.calibration.brightness import EventSource, FramePair, exposure, pair, pair_indices
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
+from evsplat.calibration.lost import lost_spans
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
 __all__ = [
     "ClockEstimate",
+    "Disagreement",
     "EventSource",
     "FramePair",
     "NoiseEstimate",
     "NoiseMeter",
     "SensorEstimate",
     "ThresholdEstimate",
+    "estimate_disagreement",
     "estimate_from_pairs",
+    "lost_spans",
     "noise_of",
     "exposure",
     "pair",

@@ -79,6 +79,13 @@ def estimate_clock(
     )
 
 
+def correlations_at(
+    pairs: Sequence[FramePair], events: EventSource, lags_us: Float[np.ndarray, "L"]
+) -> Float[np.ndarray, "L"]:
+    """Correlation of frames and events at ascending lags; NaN where too little is there."""
+    return _correlation(_moments(pairs, events, lags_us).sum(0))
+
+
 def _moments(
     pairs: Sequence[FramePair],
     events: EventSource,

@@ -4,6 +4,7 @@ import logging
 
 from evsplat.calibration import (
     MOST_PAIRS,
+    FramePair,
     SensorEstimate,
     estimate_from_pairs,
     exposure,
@@ -55,6 +56,12 @@ def estimate_sensor(capture: TrainingCapture) -> SensorEstimate | None:
     """
     if capture.events is None or len(capture.events) == 0 or not capture.events.has_polarity:
         return None
+    return estimate_from_pairs(frame_pairs(capture), capture.events)
+
+
+def frame_pairs(capture: TrainingCapture) -> list[FramePair]:
+    """At most 60 pairs of consecutive training frames with no held-out one between them."""
+    assert capture.events is not None
     first, last = capture.events.time_range_us
     frames = capture.train_frames
     spans = [frame.exposure_us for frame in frames]
@@ -67,4 +74,4 @@ def estimate_sensor(capture: TrainingCapture) -> SensorEstimate | None:
             for i in both
         )
         pairs.append(pair(before, after, (max(start, first), min(end, last))))
-    return estimate_from_pairs(pairs, capture.events)
+    return pairs

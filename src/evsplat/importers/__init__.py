@@ -20,7 +20,7 @@ from evsplat.importers.poses import attach_poses
 from evsplat.importers.video import Video
 from evsplat.importers.zju_mocap import ZjuMocap
 from evsplat.importers.zju_mocap_blur import ZjuMocapBlur
-from evsplat.inspection import warn_of_body
+from evsplat.inspection import warn_of_capture
 from evsplat.landmarks.keypoint_files import read_points
 from evsplat.options import PoseOptions, PoseSearch
 from evsplat.options.declare import given
@@ -152,7 +152,7 @@ def run_importer(
         )
     else:
         _import(importer, source, CaptureWriter(out, overwrite=overwrite), smpl)
-    warn_of_body(out)
+    warn_of_capture(out)
     return out
 
 

@@ -20,7 +20,7 @@ from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.errors import DataError
 from evsplat.files import remove_file
 from evsplat.importers.smpl import add_body, chosen_poses, model_file
-from evsplat.inspection import warn_of_body
+from evsplat.inspection import warn_of_capture
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ def attach_poses(
         remove_file(making.folder / "poses.html")  # it shows others
     for note in notes:
         logger.info("%s", note)
-    warn_of_body(out)
+    warn_of_capture(out)
     return out
 
 

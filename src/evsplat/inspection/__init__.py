@@ -6,8 +6,9 @@ from evsplat.inspection.capture import (
     InspectReport,
     body_mask_overlap,
     inspect_capture,
-    warn_of_body,
+    warn_of_capture,
 )
+from evsplat.inspection.event_check import warn_of_events
 from evsplat.inspection.recording import inspect, inspect_recording
 
 __all__ = [
@@ -21,5 +22,6 @@ __all__ = [
     "inspect_recording",
     "judge_body",
     "save_fit_sheet",
-    "warn_of_body",
+    "warn_of_capture",
+    "warn_of_events",
 ]

@@ -33,6 +33,7 @@ from evsplat.inspection.drawing import (
     short_number,
     to_picture,
 )
+from evsplat.inspection.event_check import WHICH_WAY, event_findings, warn_of_events
 from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings, contrast_findings, sensor_lines
 
@@ -74,8 +75,12 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     capture = Capture(metadata)
     seen = capture.for_training(Policy(use="everything"))
     estimate = estimate_sensor(seen)
+    of_events = event_findings(seen)
+    if any(finding.field in WHICH_WAY for finding in of_events):
+        estimate = None  # clock and thresholds of events that lie elsewhere are chance
     findings = (
         *found,
+        *of_events,
         *clock_findings(capture, estimate),
         *contrast_findings(capture, estimate),
     )
@@ -91,7 +96,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
         drawings["events"] = _events_sheet(capture)
     drawings["timeline"] = draw_timeline(capture)
     pictures = save_drawings(drawings, out_dir)
-    summary = _summary(capture, track, estimate)
+    summary = _summary(capture, track, estimate, doubted=bool(of_events))
     if fitting is not None:
         summary += f"\nbelongs    {fitting.sentence}"
     summary += f"\n{_findings_text(findings)}\npictures   {out_dir}: "
@@ -99,12 +104,13 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     return replace(report, findings=findings, summary=summary, pictures=pictures)
 
 
-def warn_of_body(path: Path) -> None:
-    """Log a warning where a new capture's body does not belong to it, as training will see it."""
+def warn_of_capture(path: Path) -> None:
+    """Log what is odd about a new capture's events and body, as training will see them."""
     metadata, _ = check_capture(path, deep=False)  # what it finds, the writer has said
     if metadata is None:
         return
     seen = Capture(metadata).for_training(Policy())
+    warn_of_events(seen)
     try:
         if seen.has_body:
             check_body(seen, refuse=False)
@@ -124,7 +130,9 @@ def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, .
     return overlaps
 
 
-def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate | None) -> str:
+def _summary(
+    capture: Capture, track: BodyTrack | None, estimate: SensorEstimate | None, *, doubted: bool
+) -> str:
     frames = capture.frames
     cameras = ", ".join(
         f"{name} {capture.cameras[name].width}x{capture.cameras[name].height}"
@@ -141,7 +149,7 @@ def _summary(capture: Capture, track: BodyTrack | None, estimate: SensorEstimate
         f"{_transfer_text(capture)}",
         f"time       {(end - start) / 1e6:.3f} s{rate}, exposure {exposure / 1000:.4g} ms",
         f"events     {_events_text(capture)}",
-        *_sensor_lines(capture, estimate),
+        *_sensor_lines(capture, estimate, doubted),
         f"body       {_body_text(capture, track)}",
         f"truth      {_truth_text(capture)}",
     ]
@@ -169,10 +177,12 @@ def _transfer_text(capture: Capture) -> str:
     return f"; values: {', '.join(sorted(str(one) for one in stated))}" if stated else ""
 
 
-def _sensor_lines(capture: Capture, estimate: SensorEstimate | None) -> list[str]:
+def _sensor_lines(capture: Capture, estimate: SensorEstimate | None, doubted: bool) -> list[str]:
     events = capture.events
     if events is None:
         return []
+    if estimate is None and doubted:
+        return ["clock      not estimated: events do not tell what the frames show (findings)"]
     return sensor_lines(estimate, capture.clock_offset_us, has_polarity=events.has_polarity)
 
 

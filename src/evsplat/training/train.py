@@ -21,7 +21,7 @@ from evsplat.config_docs import save_yaml
 from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError, machine_error
 from evsplat.files import open_output, try_target
-from evsplat.inspection import check_body, save_fit_sheet
+from evsplat.inspection import check_body, save_fit_sheet, warn_of_events
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, Purpose, method_config
 from evsplat.methods.settings import Weight
 from evsplat.options import TrainOptions
@@ -139,6 +139,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
         fitting = check_body(seen, refuse=not options.any_body)
     if purpose == "train" and getattr(start.settings, "event_weight", 0.0) != 0.0:
         check_events_reach(seen)
+        warn_of_events(seen)
     composition = TRAINABLE[start.method].build(
         start.settings, seen, start.seed, device=device, purpose=purpose
     )

@@ -1,0 +1,77 @@
+"""Warnings about events that do not tell what frames show: turned, inverted, one-sided, lost."""
+
+import logging
+
+from evsplat.calibration import (
+    FramePair,
+    estimate_disagreement,
+    lost_spans,
+)
+from evsplat.capture import TrainingCapture
+from evsplat.capture.finding import Finding, Findings
+from evsplat.capture.sensor_estimate import frame_pairs
+from evsplat.events import EventStore
+
+logger = logging.getLogger(__name__)
+
+WHICH_WAY = ("events/p", "events/x, events/y")
+"""Fields of findings with which events tell nothing of the clock or of thresholds."""
+_MANY = 100
+"""Events of which some are of either polarity."""
+
+
+def event_findings(capture: TrainingCapture) -> list[Finding]:
+    """What is wrong with events that are there and readable.
+
+    Compared are at most 60 pairs of frames with the events between them, so that of a
+    long recording a part is looked at.
+    """
+    findings = Findings()
+    events = capture.events
+    if events is None or not len(events) or not events.has_polarity:
+        return []
+    pairs = frame_pairs(capture)
+    sign = _only_sign(pairs, events)
+    other_way = None if sign else estimate_disagreement(pairs, events)
+    if sign:
+        findings.warning(
+            events.path, WHICH_WAY[0], f"{sign} events alone between all frames",
+            "events of either polarity, as every motion makes them",
+            "Check how the recording was exported, and the sensor's biases.",
+        )  # fmt: skip
+    elif other_way is not None:
+        findings.warning(
+            events.path, WHICH_WAY[bool(other_way.turned)],
+            str(other_way), "events in the pixels of the frames, 1 where it grows brighter",
+            "Write the events anew that way (evsplat.events.write_events), or the pictures.",
+        )  # fmt: skip
+    lost = lost_spans(pairs, events) if other_way is None else []
+    if lost:
+        where = ", ".join(f"{first / 1e6:.3f} to {last / 1e6:.3f} s" for first, last in lost[:3])
+        where += f" and {len(lost) - 3} more" if len(lost) > 3 else ""
+        findings.warning(
+            events.path, "events/t", f"hardly an event where pictures change from {where}",
+            "events wherever the brightness changes",
+            "The sensor lost them: record again with a lower rate of events, or leave out these "
+            "frames. Training takes no event for no change.",
+        )  # fmt: skip
+    return findings.items
+
+
+def warn_of_events(capture: TrainingCapture) -> None:
+    """Log what `event_findings` finds, before a training that learns from these events."""
+    for finding in event_findings(capture):
+        logger.warning("%s", finding)
+
+
+def _only_sign(pairs: list[FramePair], events: EventStore) -> str:
+    """What all events between frames are, "brighter" or "darker"; empty where they are not."""
+    count = brighter = 0
+    for pair in pairs:
+        start, end = pair.span_us
+        low, high = pair.recorded_us
+        polarity = events.between(max(start, low), max(start, low, min(end, high))).p
+        count, brighter = count + len(polarity), brighter + int((polarity > 0).sum())
+    if count < _MANY or 0 < brighter < count:
+        return ""
+    return "brighter" if brighter else "darker"

@@ -1,0 +1,104 @@
+"""Events that lie or count otherwise than the frames are told, and those that fit are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evsplat.calibration import estimate_disagreement, lost_spans
+from evsplat.events import EventStream
+
+from .synthetic import HEIGHT, WIDTH, Recording, record
+
+
+def _changed(events: EventStream, **columns: np.ndarray) -> EventStream:
+    return replace(events, **columns)
+
+
+@pytest.mark.parametrize(
+    ("turned", "flip_x", "flip_y"),
+    [
+        ("", False, False),
+        ("mirrored left to right", True, False),
+        ("mirrored top to bottom", False, True),
+        ("turned by 180 degrees", True, True),
+    ],
+)
+@pytest.mark.parametrize("inverted", [False, True])
+def test_what_events_went_through_is_found(turned, flip_x, flip_y, inverted) -> None:
+    seed = int(np.random.default_rng().integers(10_000))
+    recording = record(seed, plus=0.2, minus=0.25, lag_us=6_000, noise_hz=0.5)
+    given = recording.events
+    events = _changed(
+        given,
+        x=(WIDTH - 1 - given.x).astype(np.uint16) if flip_x else given.x,
+        y=(HEIGHT - 1 - given.y).astype(np.uint16) if flip_y else given.y,
+        p=-given.p if inverted else given.p,
+    )
+    found = estimate_disagreement(recording.pairs, events)
+    if not (turned or inverted):
+        assert found is None
+        return
+    assert found is not None and (found.turned, found.inverted) == (turned, inverted)
+    assert found.correlation > max(0.8, found.as_given)
+    assert ("other polarity" in str(found)) == inverted and turned in str(found)
+
+
+@pytest.mark.parametrize(
+    ("turned", "quarters", "mirrored"),
+    [
+        ("turned by 90 degrees to the right", 1, False),
+        ("turned by 90 degrees to the left", 3, False),
+        ("mirrored with x and y exchanged", 1, True),
+        ("turned by 180 degrees with x and y exchanged", 3, True),
+    ],
+)
+def test_quarter_turns_are_told_of_square_pictures_by_what_takes_them_back(
+    turned, quarters, mirrored
+) -> None:
+    """NumPy says which way: each event's pixel is followed through ``rot90`` by its number."""
+    recording = record(int(np.random.default_rng().integers(10_000)), plus=0.2, minus=0.2)
+    side = HEIGHT
+    pairs = [
+        replace(pair, change=pair.change[:, :side], usable=pair.usable[:, :side])
+        for pair in recording.pairs
+    ]
+    inside = recording.events.take(recording.events.x < side)
+    numbers = np.rot90(np.arange(side * side).reshape(side, side), quarters)
+    numbers = numbers[::-1] if mirrored else numbers
+    goes_to = np.argsort(numbers.ravel())[inside.y.astype(int) * side + inside.x]
+    events = _changed(
+        inside, x=(goes_to % side).astype(np.uint16), y=(goes_to // side).astype(np.uint16)
+    )
+    found = estimate_disagreement(pairs, events)
+    assert found is not None and (found.turned, found.inverted) == (turned, False)
+    assert estimate_disagreement(pairs, inside) is None
+
+
+def test_events_of_another_scene_or_none_fit_in_no_way() -> None:
+    ours, others = record(0, plus=0.2, minus=0.2), record(1, plus=0.2, minus=0.2)
+    assert estimate_disagreement(ours.pairs, others.events) is None
+    assert estimate_disagreement(ours.pairs, ours.events.take(slice(0, 0))) is None
+    assert estimate_disagreement([], ours.events) is None
+
+
+def _without(recording: Recording, start_us: int, end_us: int) -> EventStream:
+    t = recording.events.t
+    return recording.events.take((t < start_us) | (t >= end_us))
+
+
+def test_a_gap_in_the_events_is_found_where_it_is() -> None:
+    seed = int(np.random.default_rng().integers(10_000))
+    recording = record(seed, plus=0.2, minus=0.2)
+    assert lost_spans(recording.pairs, recording.events) == []
+    # frames are 40 ms apart: those of 200.5 to 280.5 and 280.5 to 320.5 ms saw no event
+    found = lost_spans(recording.pairs, _without(recording, 200_000, 325_000))
+    assert found == [(200_500, 320_500)]
+
+
+def test_no_gap_is_told_where_nothing_moves_or_nothing_was_recorded() -> None:
+    recording = record(3, plus=0.2, minus=0.2)
+    still = [replace(pair, change=np.zeros_like(pair.change)) for pair in recording.pairs]
+    assert lost_spans(still, recording.events.take(slice(0, 0))) == []
+    late = [replace(pair, recorded_us=(400_000, 900_000)) for pair in recording.pairs]
+    assert lost_spans(late, _without(recording, 0, 400_000)) == []
