@@ -37,7 +37,7 @@ from evsplat.importers.option_types import (
 from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_motion
 from evsplat.importers.recorded import (
     add_recorded_events,
-    gather_levels,
+    add_recorded_frame,
     offset_or_levels,
     recorded_camera,
 )
@@ -120,12 +120,11 @@ class Folder(Importer):
             if index not in seen:
                 continue
             exposure = int(exposures[index, 0]), int(exposures[index, 1])
-            gather_levels(clock_offset, timed, exposure)
-            writer.add_frame(
-                timed.name,
-                "main",
-                timed.pixels,
+            add_recorded_frame(
+                writer,
+                timed,
                 exposure,
+                clock_offset,
                 mask=masks.of(timed),
                 world_to_camera=views.get(index),
             )

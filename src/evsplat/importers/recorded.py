@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from evsplat.calibration.offset import LEAST_CORRELATION, BlockLevels, TooLong, estimate_offset
 from evsplat.capture.write import CaptureWriter, read_camera
@@ -63,10 +64,24 @@ def offset_or_levels(
     return BlockLevels(camera.get("transfer", "power"))
 
 
-def gather_levels(
-    clock_offset: int | BlockLevels, picture: TimedPicture, exposure_us: tuple[int, int]
+def add_recorded_frame(
+    writer: CaptureWriter,
+    picture: TimedPicture,
+    exposure_us: tuple[int, int],
+    clock_offset: int | BlockLevels,
+    *,
+    mask: Bool[np.ndarray, "H W"] | None = None,
+    world_to_camera: Float[np.ndarray, "4 4"] | None = None,
 ) -> None:
-    """Take of a frame what its clock's offset is found by, where it is to be found."""
+    """Write a frame of camera "main"; gather its levels where the clock's offset is to be found."""
+    writer.add_frame(
+        picture.name,
+        "main",
+        picture.pixels,
+        exposure_us,
+        mask=mask,
+        world_to_camera=world_to_camera,
+    )
     if isinstance(clock_offset, BlockLevels):
         clock_offset.add(to_unit_range(picture.pixels), exposure_us)
 

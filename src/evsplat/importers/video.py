@@ -21,7 +21,7 @@ from evsplat.importers.option_types import (
 )
 from evsplat.importers.recorded import (
     add_recorded_events,
-    gather_levels,
+    add_recorded_frame,
     offset_or_levels,
     recorded_camera,
 )
@@ -71,8 +71,7 @@ class Video(Importer):
         for timed in tqdm(footage, "pictures", len(footage.times_us), leave=False):
             middle = timed.time_us + self.start_us
             exposure = exposure_around(middle, self.exposure_us)
-            writer.add_frame(timed.name, "main", timed.pixels, exposure)
-            gather_levels(clock_offset, timed, exposure)
+            add_recorded_frame(writer, timed, exposure, clock_offset)
         notes = add_recorded_events(
             writer,
             self.events,

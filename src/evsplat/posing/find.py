@@ -113,11 +113,78 @@ def find_poses(
     rig = _rig(search.body)
     capture = load_capture(path, needs_body=False)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
+    stages = _Stages()
+    motion = _found(capture, policy, rig, search, keypoints, stages)
+    made = {
+        "from": "key points of a file" if keypoints else "landmarks of BlazePose",
+        **to_dict(search),
+        **motion.made(),
+        "evsplat": evsplat.__version__,
+    }
+    landmarks, fitted, track = motion.landmarks, motion.fitted, motion.track
+    with derived_capture(capture, out, replace=overwrite) as making:
+        _write_body(making, track, fitted, motion.dressed)
+        if motion.focal_px is not None:
+            _set_focal(making, motion.focal_px)
+        making.document["provenance"] = {**capture.provenance, "poses": made}
+        page = poses_page(
+            capture.name, motion.seen, motion.pictures, landmarks, track, fitted, made
+        )
+        write_text(making.folder / "poses.html", page)
+    said = _summary(out, track, landmarks, stages.seconds)
+    return FoundPoses(out, track, fitted, landmarks, stages.seconds, said)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """What was found, before any of it is written."""
+
+    seen: TrainingCapture
+    """The recording through the camera that it was found with."""
+    pictures: Sequence[SharpPicture]
+    landmarks: Landmarks
+    fitted: PoseFit
+    track: BodyTrack
+    refined: Refined | None
+    """None where nothing was refined."""
+    dressed: Body | None
+    """The body with what it wears, where that is known and ours to write."""
+    focal_px: float | None
+    """None where the capture's camera says it."""
+    focal: FocalFit | None
+    """Where it was fitted."""
+
+    def made(self) -> dict[str, Any]:
+        """What the provenance says of it."""
+        said: dict[str, Any] = {
+            "pictures": len(self.landmarks.times_us),
+            "in_doubt": [doubt.part for doubt in self.fitted.doubts],
+            "policy": to_dict(self.seen.policy),
+        }
+        if self.refined is not None:
+            gain, seconds = round(self.refined.gain, 4), round(self.refined.seconds, 1)
+            taken = self.refined.better
+            said["refinement"] = {"gain": gain, "taken": taken, "seconds": seconds}
+        if self.focal_px is not None:
+            said["focal_px"] = round(self.focal_px, 2)
+        if self.focal is not None:
+            said["focal_std_share"] = round(self.focal.std_share, 3)
+        return said
+
+
+def _found(
+    capture: Capture,
+    policy: Policy,
+    rig: Rig,
+    search: PoseSearch,
+    keypoints: Path | str | None,
+    stages: _Stages,
+) -> _Motion:
+    """Landmarks, the motion fitted to them, and its refinement."""
     focal: FocalFit | None = None
     focal_px = _first_focal(capture) if search.focal == "auto" else search.focal_px
     seen = _seen(capture, policy, focal_px)
     limit_s = _refinement_s(seen, search)
-    stages = _Stages()
     with tqdm(total=2 + (limit_s > 0), desc="poses", unit="stage") as bar:
         with stages(bar, "landmarks"):
             pictures = sharp_pictures(seen)
@@ -141,27 +208,7 @@ def find_poses(
                 if rig.model == "default":  # the vertices of a licensed model are not ours to write
                     dressed = refined.dressed
                     track = track.with_body(dressed)
-    made = {
-        "from": "key points of a file" if keypoints else "landmarks of BlazePose",
-        **to_dict(search),
-        "pictures": len(landmarks.times_us),
-        "in_doubt": [doubt.part for doubt in fitted.doubts],
-        "evsplat": evsplat.__version__,
-        "policy": to_dict(seen.policy),
-        **_refinement_made(refined),
-    }
-    with derived_capture(capture, out, replace=overwrite) as making:
-        _write_body(making, track, fitted, dressed)
-        if focal_px is not None:
-            _set_focal(making, focal_px)
-            made["focal_px"] = round(focal_px, 2)
-        if focal is not None:
-            made["focal_std_share"] = round(focal.std_share, 3)
-        making.document["provenance"] = {**capture.provenance, "poses": made}
-        page = poses_page(capture.name, seen, pictures, landmarks, track, fitted, made)
-        write_text(making.folder / "poses.html", page)
-    said = _summary(out, track, landmarks, stages.seconds)
-    return FoundPoses(out, track, fitted, landmarks, stages.seconds, said)
+    return _Motion(seen, pictures, landmarks, fitted, track, refined, dressed, focal_px, focal)
 
 
 def _first_focal(capture: Capture) -> float:
@@ -210,14 +257,6 @@ def _rig(model: str) -> Rig:
 def _seen(capture: Capture, policy: Policy, focal_px: float | None) -> TrainingCapture:
     """What a policy shows of a capture; with a focal length where one is given."""
     return (capture if focal_px is None else capture.with_focal(focal_px)).for_training(policy)
-
-
-def _refinement_made(refined: Refined | None) -> dict[str, Any]:
-    """What the provenance says of it; nothing where there was none."""
-    if refined is None:
-        return {}
-    gain, seconds = round(refined.gain, 4), round(refined.seconds, 1)
-    return {"refinement": {"gain": gain, "taken": refined.better, "seconds": seconds}}
 
 
 def _refinement_s(capture: TrainingCapture, search: PoseSearch) -> float:

@@ -41,52 +41,23 @@ def line_chart(
     prepared = [(name, x, y) for name, x, y in prepared if len(x)]
     if not prepared:
         return ""
-    x_all = np.concatenate([x for _, x, _ in prepared])
-    y_all = np.concatenate([y for _, _, y in prepared])
-    x_low, x_high = _widened(float(x_all.min()), float(x_all.max()))
-    y_low, y_high = _widened(float(y_all.min()), float(y_all.max()))
-    margin = 0.05 * (y_high - y_low)
-    y_low, y_high = y_low - margin, y_high + margin
-
-    def place_x(value: float) -> float:
-        return _LEFT + (value - x_low) / (x_high - x_low) * (_WIDTH - _LEFT - _RIGHT)
-
-    def place_y(value: float) -> float:
-        return _HEIGHT - _BOTTOM - (value - y_low) / (y_high - y_low) * (_HEIGHT - _TOP - _BOTTOM)
-
-    parts = []
-    y_ticks = _log_ticks(y_low, y_high) if log else _ticks(y_low, y_high)
-    for value, label in y_ticks:
-        y = place_y(value)
-        parts.append(
-            f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
-        )
-        parts.append(
-            f'<text class="tick" x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>'
-        )
-    for value, label in _ticks(x_low, x_high):
-        x, y = place_x(value), _HEIGHT - _BOTTOM + 18
-        parts.append(f'<text class="tick" x="{x:.1f}" y="{y}" text-anchor="middle">{label}</text>')
-    base = _HEIGHT - _BOTTOM
-    parts.append(
-        f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{base}" y2="{base}"/>'
-    )
+    area = _Area.of([(x, y) for _, x, y in prepared])
+    parts = area.axes(log=log)
     # A single line takes the accent colour; the first of several is the sum, in the text colour.
     first = 1 if len(prepared) == 1 else 0
-    for number, (name, xs, ys) in enumerate(prepared, start=first):
-        places = [
-            (f"{place_x(float(a)):.1f}", f"{place_y(float(b)):.1f}")
-            for a, b in zip(xs, ys, strict=True)
-        ]
-        colour = f"c{number % SERIES_COLOURS}"
+    for number, (name, x, y) in enumerate(prepared, start=first):
+        places, colour = area.places(x, y), f"c{number % SERIES_COLOURS}"
         if lines:
-            points = " ".join(f"{x},{y}" for x, y in places)
+            points = " ".join(f"{left},{top}" for left, top in places)
             parts.append(
                 f'<polyline class="line {colour}" points="{points}">'
                 f"<title>{escape(name)}</title></polyline>"
             )
         if dots:
-            parts += [f'<circle class="dot {colour}" cx="{x}" cy="{y}" r="3"/>' for x, y in places]
+            parts += [
+                f'<circle class="dot {colour}" cx="{left}" cy="{top}" r="3"/>'
+                for left, top in places
+            ]
     parts.append(
         f'<text class="tick" x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 2}" text-anchor="end">'
         f"{escape(x_title)}</text>"
@@ -102,6 +73,58 @@ def line_chart(
         f"{''.join(parts)}</svg>"
         f'<div class="legend">{legend if len(prepared) > 1 else ""}</div></figure>'
     )
+
+
+@dataclass(frozen=True)
+class _Area:
+    """Ranges of both axes; on a logarithmic one those of decimal logarithms."""
+
+    x_low: float
+    x_high: float
+    y_low: float
+    y_high: float
+
+    @classmethod
+    def of(cls, lines: Sequence[tuple[np.ndarray, np.ndarray]]) -> "_Area":
+        """That holds the points of all lines, with a margin above and below."""
+        x, y = (np.concatenate(values) for values in zip(*lines, strict=True))
+        y_low, y_high = _widened(float(y.min()), float(y.max()))
+        margin = 0.05 * (y_high - y_low)
+        return cls(*_widened(float(x.min()), float(x.max())), y_low - margin, y_high + margin)
+
+    def left(self, x: float) -> float:
+        """Of a value, in the SVG's units."""
+        return _LEFT + (x - self.x_low) / (self.x_high - self.x_low) * (_WIDTH - _LEFT - _RIGHT)
+
+    def top(self, y: float) -> float:
+        """Of a value, in the SVG's units, downwards."""
+        share = (y - self.y_low) / (self.y_high - self.y_low)
+        return _HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM)
+
+    def places(self, x: np.ndarray, y: np.ndarray) -> list[tuple[str, str]]:
+        """Of points, as the SVG has them."""
+        return [
+            (f"{self.left(float(a)):.1f}", f"{self.top(float(b)):.1f}")
+            for a, b in zip(x, y, strict=True)
+        ]
+
+    def axes(self, *, log: bool) -> list[str]:
+        """Grid, labels and the base line."""
+        right, base = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
+        parts = []
+        for value, label in (_log_ticks if log else _ticks)(self.y_low, self.y_high):
+            y = self.top(value)
+            parts += [
+                f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>',
+                f'<text class="tick" x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}'
+                "</text>",
+            ]
+        for value, label in _ticks(self.x_low, self.x_high):
+            parts.append(
+                f'<text class="tick" x="{self.left(value):.1f}" y="{base + 18}" '
+                f'text-anchor="middle">{label}</text>'
+            )
+        return [*parts, f'<line class="axis" x1="{_LEFT}" x2="{right}" y1="{base}" y2="{base}"/>']
 
 
 def _prepared(line: Series, log: bool, *, whole: bool) -> tuple[np.ndarray, np.ndarray]:
