@@ -11,8 +11,8 @@ seed 5117 numbers 0, 2, 4, 6; 6203 numbers 0, 2, 4; 8819 numbers 0, 2; 18 to 20 
 three times, woman four times, worker twice.
 """
 
+import argparse
 import json
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -144,8 +144,19 @@ def residuals_of(
     return residuals
 
 
-if __name__ == "__main__":
-    if sys.argv[1] == "prior":
+def main() -> None:
+    """Learn one of the two."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    what = parser.add_subparsers(dest="what", required=True)
+    what.add_parser("prior", help="the pose prior")
+    offsets = what.add_parser("offsets", help="where BlazePose's points sit")
+    offsets.add_argument("captures", nargs="+", metavar="CAPTURE=LANDMARKS.npz")
+    options = parser.parse_args()
+    if options.what == "prior":
         learn_prior()
     else:
-        learn_offsets(sys.argv[2:])
+        learn_offsets(options.captures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,6 +1,6 @@
 """Make the figures of the documentation: python tools/make_doc_figures.py RUN."""
 
-import sys
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -100,4 +100,6 @@ def main(run: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
+    parser.add_argument("run", type=Path, metavar="RUN")
+    main(parser.parse_args().run)

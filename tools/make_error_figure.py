@@ -5,6 +5,7 @@ rendering at mid-exposure and the truth; below, the error maps of the first ones
 white: 64 of 255 levels, as in reports). Frames and truth are those of the first run's capture.
 """
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -48,4 +49,9 @@ def main(out: Path, names: list[str], folders: list[Path]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2].split(","), [Path(run) for run in sys.argv[3:]])
+    parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
+    parser.add_argument("out", type=Path, metavar="OUT.webp")
+    parser.add_argument("frames", metavar="FRAME[,FRAME ...]")
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    options = parser.parse_args()
+    main(options.out, options.frames.split(","), options.runs)

@@ -23,10 +23,12 @@ import numpy as np
 import torch
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT))
 
-import conftest  # noqa: E402
-import test_imports as imports  # noqa: E402
+from tests import test_imports as imports  # noqa: E402
+from tests.conftest import write_tiny_capture  # noqa: E402
+from tests.source import SOURCE  # noqa: E402
+
 from evsplat.config import Setting, settings, to_dict  # noqa: E402
 from evsplat.config_docs import flow  # noqa: E402
 from evsplat.errors import EvsplatError  # noqa: E402
@@ -56,7 +58,7 @@ def lines(*folders: str) -> int:
 def circles(*, of_folders: bool) -> list[list[str]]:
     """Files, or folders as ARCHITECTURE.md lists them, that import each other."""
     folders: dict[str, set[str]] = {folder: set() for folder in imports.RANK}
-    for module, target, _ in imports.IMPORTS:
+    for module, target, _ in imports.imports():
         here, there = (imports.place(name, imports.RANK) for name in (module, target))
         folders[here] |= {there} - {here, "evsplat"}
     return list(map(sorted, imports.circles(folders if of_folders else imports.files_run())))
@@ -78,7 +80,7 @@ def homes(method: str) -> list[str]:
 
 def tiny_capture(folder: Path, *, jitter_rad: float) -> Path:
     """The capture of the tests, its poses jittered and its thresholds not those of a guess."""
-    path = conftest.write_tiny_capture(folder / f"tiny-{jitter_rad}")
+    path = write_tiny_capture(folder / f"tiny-{jitter_rad}")
     metadata = json.loads((path / "capture.json").read_text("utf-8"))
     metadata["events"]["contrast_threshold"] = [0.31, 0.27]
     (path / "capture.json").write_text(json.dumps(metadata), "utf-8")
@@ -158,8 +160,8 @@ def effects(folder: Path, method: str) -> dict[str, list[str]]:
 def measured(method: str, *, inert: bool) -> dict[str, Any]:
     """The table."""
     folder = "models"
-    files = {p: len(p.read_text("utf-8").splitlines()) for p in imports.SOURCE.rglob("*.py")}
-    nodes = [(module, n) for module, tree in imports.FILES.items() for n in ast.walk(tree)]
+    files = {p: len(p.read_text("utf-8").splitlines()) for p in SOURCE.rglob("*.py")}
+    nodes = [(module, n) for module, tree in imports.files().items() for n in ast.walk(tree)]
     classes = {node.name for _, node in nodes if isinstance(node, ast.ClassDef)}
     defined = [(f"{module}.{n.name}", n) for module, n in nodes if hasattr(n, "returns")]
     functions = [(node.end_lineno - node.lineno + 1, name) for name, node in defined]
@@ -168,7 +170,7 @@ def measured(method: str, *, inert: bool) -> dict[str, Any]:
         "distinct settings": len({s.name for each in TRAINABLE for s in leaves(each)}),
         f"files with defaults of {method}": homes(method),
         f"largest file of {folder}": max(
-            (n, p.name) for p, n in files.items() if imports.SOURCE / folder in p.parents
+            (n, p.name) for p, n in files.items() if SOURCE / folder in p.parents
         ),
         "longest function": max(functions),
         f"functions above {LONGEST_FUNCTION} lines": sorted(
