@@ -28,17 +28,11 @@ from evsplat.methods.base import (
 )
 from evsplat.methods.evsplat_settings import DiscRates, EvsplatConfig
 from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
-from evsplat.methods.moving_background import moving_backdrop, require_one_side
+from evsplat.methods.moving_background import middle_view, moving_backdrop, require_one_side
 from evsplat.methods.poses import Poses, prepare_poses
 from evsplat.methods.prefit import fit_scene
 from evsplat.methods.sensor import event_windows
-from evsplat.methods.starts import (
-    Backdrop,
-    Surface,
-    human_start,
-    no_gaussians,
-    scene_start,
-)
+from evsplat.methods.starts import Backdrop, Surface, human_start, scene_start
 from evsplat.models.discs import DiscModel
 from evsplat.models.discs.fill import filled
 from evsplat.models.discs.first_colours import first_colours
@@ -101,11 +95,11 @@ def build(
     fit = purpose == "train"
     generator = start_of_randomness(seed)
     poses = prepare_poses(config.pose, capture, fit=fit)
-    background = _background(config, capture, poses.track) if fit else None
+    background = _background(config, capture, poses.track, fit=fit)
     frames = capture.train_frames
     still = config.scene.kind != "random_cube" and capture.is_static_camera
     recording = capture.camera(frames[0]) if still else None
-    gaussians = _start(config, capture, poses.track, generator, background, fit=fit)
+    gaussians = _start(config, capture, poses.track, generator, background)
     model = _model(config, capture, poses, gaussians, recording).to(device)
     if fit:
         _fit_colours(config, capture, model, background)
@@ -222,14 +216,19 @@ def _filled(
 
 
 def _background(
-    config: EvsplatConfig, capture: TrainingCapture, track: BodyTrack
+    config: EvsplatConfig, capture: TrainingCapture, track: BodyTrack, *, fit: bool
 ) -> Backdrop | None:
-    """What a backdrop is to show; None where there is to be none."""
+    """What a backdrop is to show; None where there is to be none, or a still one's is loaded."""
     if config.scene.kind != "median_backdrop":
         return None
     if not capture.is_static_camera:
         require_one_side(capture)
-        return moving_backdrop(capture, track, config.semantic_band_px_at_256)
+        if fit:
+            return moving_backdrop(capture, track, config.semantic_band_px_at_256)
+        camera = middle_view(capture)
+        return Backdrop(camera, torch.zeros(camera.height, camera.width, 3))
+    if not fit:
+        return None
     picture = background_without(capture, track, config.semantic_band_px_at_256)
     return Backdrop(capture.camera(capture.train_frames[0]), picture)
 
@@ -257,19 +256,12 @@ def _start(
     track: BodyTrack,
     generator: torch.Generator,
     background: Backdrop | None,
-    *,
-    fit: bool,
 ) -> GaussianSet:
-    """Discs on the body and behind it; random points get features for a network of their colour.
-
-    Unless ``fit`` none are behind it: a checkpoint brings the scene's rows, as many as it has.
-    """
+    """Discs on the body and behind it; random points get features for a network of their colour."""
     features = FEATURE_DIM if config.scene.kind == "random_cube" else None
     human = human_start(
         config.human, CLOSED_SURFACE, capture, track, generator, LABEL, feature_dim=features
     )
-    if not fit:
-        return GaussianSet(human, no_gaussians(features))
     scene, _ = scene_start(
         config.scene,
         capture,

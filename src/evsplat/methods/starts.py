@@ -249,12 +249,6 @@ def as_person(scene: dict[str, Tensor], track: BodyTrack, time_us: int) -> dict[
     return values
 
 
-def no_gaussians(feature_dim: int | None = FEATURE_DIM) -> dict[str, Tensor]:
-    """The start of a class that is empty, with colours as in `gaussians_at`."""
-    return gaussians_at(
-        torch.zeros(0, 3),
-        torch.ones(0, 3),
-        opacity=0.5,
-        semantic_logit=0.0,
-        feature_dim=feature_dim,
-    )
+def no_gaussians() -> dict[str, Tensor]:
+    """The start of a class that is empty."""
+    return gaussians_at(torch.zeros(0, 3), torch.ones(0, 3), opacity=0.5, semantic_logit=0.0)
