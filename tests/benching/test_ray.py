@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import evsplat as ev
-from evsplat.benching.cell import run_cell
+from evsplat.benching.cell import DONE, run_cell
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.plan import make_plan
 from evsplat.benching.suite import read_suite
@@ -36,6 +36,9 @@ def two_workers(monkeypatch):
     ray.shutdown()
 
 
+KILLED = "one/paper/seed0"
+
+
 def kill_once_it_trains(folder: BenchFolder, cell: str, killed: list[int]) -> None:
     """SIGKILL to the worker that holds the cell's lock, as soon as its training has begun."""
     deadline = time.monotonic() + 300
@@ -52,14 +55,17 @@ def test_a_killed_worker_loses_nothing(two_workers, tiny_capture, tmp_path: Path
     suite = write_suite(tmp_path / "suite.yaml", captures, PAPER, iterations=25)
     folder = BenchFolder(tmp_path / "ray")
     killed: list[int] = []
-    killer = threading.Thread(target=kill_once_it_trains, args=(folder, "one/paper/seed0", killed))
+    killer = threading.Thread(target=kill_once_it_trains, args=(folder, KILLED, killed))
     killer.start()
     ev.bench(suite, out=folder.path, ray="auto")
     killer.join()
     assert killed and killed[0] != os.getpid()
-    for cell in make_plan(read_suite(suite), folder).cells:
-        run_cell(tmp_path / "here", cell, threads=1, device="cpu")
-    assert records(folder.path) == records(tmp_path / "here")
+    made = records(folder.path)
+    assert [record["status"] for record in made.values()] == [DONE, DONE]
+    cells = {cell.id: cell for cell in make_plan(read_suite(suite), folder).cells}
+    run_cell(tmp_path / "here", cells[KILLED], threads=1, device="cpu")
+    (undisturbed,) = records(tmp_path / "here").items()
+    assert undisturbed in made.items()
 
 
 def test_no_cluster_at_the_address_is_one_sentence(tiny_capture, tmp_path):

@@ -16,6 +16,10 @@ from ..seen import seen
 from ..small_model import built
 from .foreign_device import NAME, NEEDS_DATA, ForeignDevice, Here, HostWaits, as_on_a_gpu
 
+# Its weights come with the extra `perceptual`.
+_WEIGHTS = importlib.util.find_spec("stlpips_pytorch")
+PERCEPTUAL = ("terms.perceptual=st_lpips",) if _WEIGHTS is not None else ()
+
 
 def quick(capture_path, method="paper", *settings):
     """A trainer on the CPU in the middle of its schedule, without the fits before it."""
@@ -128,17 +132,9 @@ def foreign(monkeypatch):
         ("paper", ()),
         ("evsplat", ("lamps=2",)),
         ("evsplat", ("lamps=2", "pose.refine=always", "clock=always")),
-        ("paper", ("networks.pose_start=0",)),
-        pytest.param(
-            "paper",
-            ("terms.perceptual=st_lpips",),
-            marks=pytest.mark.skipif(
-                importlib.util.find_spec("stlpips_pytorch") is None,
-                reason="the weights of ST-LPIPS come with the extra `perceptual`",
-            ),
-        ),
+        ("paper", ("networks.pose_start=0", *PERCEPTUAL)),
     ],
-    ids=["paper", "evsplat", "evsplat with all", "paper with all", "perceptual"],
+    ids=["paper", "evsplat", "evsplat with all", "paper with all"],
 )
 def test_a_step_stays_on_its_device_and_never_waits(method, settings, foreign, tiny_capture):
     device, make = foreign
@@ -150,6 +146,8 @@ def test_a_step_stays_on_its_device_and_never_waits(method, settings, foreign, t
     named = {"l1", "dssim", "event", "semantic"}
     if method != "evsplat":  # its person hangs on the body's own weights
         named |= {"skinning", "isometry_centers"}
+    if set(PERCEPTUAL) & {*settings}:
+        named |= {"st_lpips"}
     assert named <= {*report.names}
     assert report.measured.device.type == NAME
     for parameter in trainer.model.parameters():
