@@ -303,37 +303,61 @@ FAULTS = {
     ),
     "a device of exposures": (
         lambda root: (root / "exposures.txt").symlink_to("/dev/zero"),
-        {},
+        {"start_us": 0},
         DataError,
         "exposures.txt: a device or pipe, expected a file",
     ),
     "exposures of fewer": (
         lambda root: (root / "exposures.txt").write_text("0 10\n20 30\n"),
-        {},
+        {"start_us": 0},
         DataError,
         r"exposures.txt: has 2 lines of 2 numbers, expected start and end .* of the 6 pictures",
     ),
     "exposures with a header": (
         lambda root: (root / "exposures.txt").write_text("start end\n" + "0 9\n" * 6),
-        {},
+        {"start_us": 0},
         DataError,
         "exposures.txt: not a table of numbers .*expected start and end in microseconds of each",
     ),
+    "two event files": (
+        lambda root: (root / "events.txt").write_text("0 1 1 1"),
+        {},
+        ConfigError,
+        "mine: holds events.csv, events.txt, expected one of them; say which with --events",
+    ),
+    "two pose files": (
+        lambda root: (root / "poses.pkl").write_bytes(b""),
+        {},
+        ConfigError,
+        "mine: holds poses.*, poses.*, expected one of them; say which with --poses",
+    ),
+    "exposures and a rate": (
+        lambda root: (root / "exposures.txt").write_text(exposures()),
+        {"fps": 25.0},
+        ConfigError,
+        "--fps 25: .*exposures.txt says when every picture was exposed; leave out the one or",
+    ),
+    "exposures and their length": (
+        lambda root: (root / "exposures.txt").write_text(exposures()),
+        {"exposure_us": 1e3},
+        ConfigError,
+        "--exposure-us 1000: .*exposures.txt says when every picture was exposed",
+    ),
     "exposures in seconds": (
         lambda root: (root / "exposures.txt").write_text(exposures(scale=1e-6)),
-        {},
+        {"start_us": 0},
         DataError,
         "exposures.txt: line 1 of numbers is 0 0.03, expected when .* in microseconds",
     ),
     "an exposure that is none": (
         lambda root: (root / "exposures.txt").write_text(exposures().replace("110000", "nan")),
-        {},
+        {"start_us": 0},
         DataError,
         "exposures.txt: line 3 of numbers is 80000 nan, expected when",
     ),
     "exposures out of order": (
         lambda root: (root / "exposures.txt").write_text(exposures((0, 2, 1, 3, 4, 5))),
-        {},
+        {"start_us": 0},
         DataError,
         "exposures.txt: line 3 of numbers is 40000 70000, expected a start after 80000",
     ),
@@ -410,3 +434,11 @@ def test_what_is_missing_is_one_sentence(recording: Path, tmp_path: Path, fault:
         import_capture("folder", recording, tmp_path / "out", **options)
     assert isinstance(caught.value, error)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
+
+
+def test_frames_that_are_odd_are_told_as_they_are_written(
+    recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("WARNING"):
+        import_capture("folder", recording, tmp_path / "out", fps=25.0, exposure_us=5e4)
+    assert any("5 exposures that begin before the one before ends" in m for m in caplog.messages)

@@ -130,7 +130,7 @@ class Folder(Importer):
             )
         notes = masks.notes(len(seen)) + add_recorded_events(
             writer,
-            self.events or next(iter(sorted(source.glob("events.*"))), None),
+            self.events or _only("events", sorted(source.glob("events.*"))),
             size,
             clock_offset,
             contrast=self.contrast,
@@ -171,6 +171,13 @@ class Folder(Importer):
         """Start and end of every picture's exposure."""
         path, count = source / "exposures.txt", len(footage.times_us)
         if path.exists():
+            said = {"fps": self.fps, "exposure-us": self.exposure_us, "start-us": self.start_us}
+            for name, value in said.items():
+                if value:
+                    raise ConfigError(
+                        f"--{name} {value:g}: {path} says when every picture was exposed; leave "
+                        "out the one or the other."
+                    )
             return read_exposures(path, count)
         if self.exposure_us is None:
             raise ConfigError(
@@ -206,7 +213,7 @@ class Folder(Importer):
         found = sorted(source.glob("poses.*")) + [
             path for path in (source / "poses", source / "body.npz") if path.exists()
         ]
-        return found[0] if found else None
+        return _only("poses", found)
 
     def _camera(
         self, source: Path, size: tuple[int, int], motion: Motion | None
@@ -224,6 +231,16 @@ class Folder(Importer):
                 f"{GUIDE}."
             )
         return recorded_camera(None, self.focal, size)
+
+
+def _only(option: str, found: list[Path]) -> Path | None:
+    """The one file that was found; None where none was, and an error where several were."""
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise ConfigError(
+            f"{found[0].parent}: holds {names}, expected one of them; say which with --{option}."
+        )
+    return found[0] if found else None
 
 
 class _Masks:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
+from PIL.TiffImagePlugin import BITSPERSAMPLE, TiffImageFile
 from torch import Tensor
 
 from evsplat.errors import DataError
@@ -122,6 +123,8 @@ def _pixels(image: Image.Image) -> np.ndarray | None:
 
 
 def _has_16_bits(image: Image.Image) -> bool:
+    if isinstance(image, TiffImageFile):  # a packed one's tiles do not say it
+        return max(image.tag_v2.get(BITSPERSAMPLE, (8,))) > 8
     return any(
         "16" in str(tile[3][0] if isinstance(tile[3], tuple) else tile[3])
         for tile in getattr(image, "tile", [])

@@ -1,0 +1,24 @@
+"""Pictures come out of files with all the bits that they were stored with."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from evsplat.pictures.files import read_image
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+@pytest.mark.parametrize("packing", [1, 5, 8])  # none, LZW, Deflate
+def test_a_tiff_keeps_its_depth_however_it_is_packed(
+    tmp_path: Path, channels: int, kind: str, packing: int
+) -> None:
+    rng = np.random.default_rng()
+    pixels = rng.integers(0, np.iinfo(kind).max, (9, 14, channels), dtype=kind, endpoint=True)
+    path = tmp_path / "p.tif"
+    assert cv2.imwrite(str(path), pixels[..., ::-1], [cv2.IMWRITE_TIFF_COMPRESSION, packing])
+    read = read_image(path)
+    assert read.dtype == pixels.dtype
+    assert np.array_equal(read.reshape(pixels.shape), pixels)
