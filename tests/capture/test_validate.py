@@ -377,6 +377,32 @@ def test_overlapping_exposures_are_a_warning(tiny_capture: Factory) -> None:
     load_capture(path)
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "milliseconds"), (1e3, "nanoseconds")])
+def test_times_of_another_unit_are_a_warning(
+    tiny_capture: Factory, factor: float, unit: str
+) -> None:
+    """The body is moved along and events are left out, which is told beside."""
+    path = tiny_capture()
+    document = json.loads((path / "capture.json").read_text())
+    for frame in document["frames"]:
+        frame["exposure_us"] = [round(time * factor) for time in frame["exposure_us"]]
+    del document["events"], document["novel_views"]
+    (path / "capture.json").write_text(json.dumps(document))
+    with np.load(path / "body.npz") as body:
+        times = (body["times_us"] * factor).astype(np.int64)
+    edit_body(path, times_us=times)
+    finding, other = validate_capture(path)
+    assert other.field == "events" and finding.severity == "warning"
+    check(
+        finding,
+        path / "capture.json",
+        "frames[0].exposure_us",
+        f"every {40_000 * factor:g} us",
+        "500 to 10000000 us from one frame to the next",
+    )
+    assert unit in finding.remedy
+
+
 def test_pictures_that_serve_twice_are_one_warning_with_their_number(tiny_capture: Factory) -> None:
     path = tiny_capture()
     frames = json.loads((path / "capture.json").read_text())["frames"]

@@ -1,5 +1,6 @@
 """`inspect_capture`: right words, right pictures, and nothing drawn of a broken capture."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 from PIL import Image
 
 from evsplat.capture import load_body_track, load_capture
-from evsplat.inspection import body_mask_overlap, inspect_capture, warn_of_events
+from evsplat.inspection import body_mask_overlap, inspect_capture, warn_of_events, warn_of_pictures
 
 from ..seen import seen
 
@@ -111,3 +112,50 @@ def test_events_that_say_otherwise_than_the_frames_are_told(
     assert len(of_events) == len(caplog.messages) == 1
     assert words in of_events[0] and words in caplog.messages[0]
     assert "not estimated: events do not tell what the frames show" in report.summary
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda pixels: pixels // 16, "brightest values are"),
+        (lambda pixels: pixels * 0 + 255, "100% of the pixels clipped"),
+        (lambda pixels: pixels * 0 + 128, "the same in "),
+        (lambda pixels: pixels, None),
+    ],
+)
+def test_pictures_of_which_nothing_can_be_learned_are_told(
+    tiny_capture: Factory,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    change: Callable[[np.ndarray], np.ndarray],
+    words: str | None,
+) -> None:
+    path = tiny_capture()
+    for file in (path / "images").iterdir():
+        with Image.open(file) as image:
+            pixels = np.array(image)
+        Image.fromarray(change(pixels).astype(np.uint8)).save(file)
+    with caplog.at_level("WARNING"):
+        warn_of_pictures(seen(path))
+    assert [words in message for message in caplog.messages] == ([True] if words else [])
+    findings = inspect_capture(path, tmp_path / "out").findings
+    found = [each.found for each in findings if each.file.name == "images"]
+    assert len(found) == (words is not None)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_given_thresholds_that_are_not_the_fitted_are_told(
+    tiny_capture: Factory, tmp_path: Path, factor: float
+) -> None:
+    path = tiny_capture(frames=20, width=96, height=72)
+    document = json.loads((path / "capture.json").read_text())
+    given = [factor * one for one in document["events"]["contrast_threshold"]]
+    document["events"]["contrast_threshold"] = given
+    (path / "capture.json").write_text(json.dumps(document))
+    found = [
+        finding.found
+        for finding in inspect_capture(path, tmp_path / "out").findings
+        if finding.field == "events.contrast_threshold"
+    ]
+    assert len(found) == (factor != 1)
+    assert all(text.startswith(f"{given}, and an event stands for") for text in found)

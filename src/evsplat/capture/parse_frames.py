@@ -1,6 +1,8 @@
 """Frames and novel views of capture.json."""
 
 from dataclasses import replace
+from itertools import pairwise
+from statistics import median
 from typing import Any, Literal
 
 from evsplat.camera import Camera
@@ -9,6 +11,9 @@ from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.parse_cameras import rigid
 
 _LONGEST_EXPOSURE_US = 60_000_000
+_USUAL_GAP_US = (500, 10_000_000)
+"""From one frame to the next: no camera of blurry video takes 2,000 a second, and a person in one
+frame every ten seconds is another one in each."""
 _SAME_POSE = 1e-6
 """Largest difference of entries, metres or none, up to which poses count as one."""
 
@@ -189,6 +194,7 @@ def _check_frames(top: Fields, frames: list[Frame]) -> None:
             "exposures that do not overlap",
             "Check the exposure time; a sharp moment is then seen by two frames.",
         )
+    _check_unit(frames, top)
     for split, note in (("train", top.findings.error), ("test", top.findings.warning)):
         if frames and not any(frame.split == split for frame in frames):
             note(
@@ -203,3 +209,23 @@ def _check_frames(top: Fields, frames: list[Frame]) -> None:
 def default_split(index: int) -> str:
     """The split where a capture gives none: three frames of ten are test."""
     return "test" if index % 10 in (7, 8, 9) else "train"
+
+
+def _check_unit(frames: list[Frame], top: Fields) -> None:
+    """A warning where exposures follow each other as they do if times are in another unit."""
+    starts: dict[str, list[int]] = {camera: [] for camera in {frame.camera for frame in frames}}
+    for frame in frames:
+        starts[frame.camera].append(frame.exposure_us[0])
+    gaps = [b - a for each in starts.values() for a, b in pairwise(each)]
+    gap_us = median(gaps) if gaps else _USUAL_GAP_US[0]
+    shortest, longest = _USUAL_GAP_US
+    if shortest <= gap_us <= longest:
+        return
+    unit = "milliseconds" if gap_us < shortest else "nanoseconds"
+    top.findings.warning(
+        top.file,
+        "frames[0].exposure_us",
+        f"exposures that begin every {gap_us:g} us",
+        f"{shortest} to {longest} us from one frame to the next",
+        f"Give times in microseconds; these look like {unit}.",
+    )

@@ -9,6 +9,7 @@ from evsplat.inspection.capture import (
     warn_of_capture,
 )
 from evsplat.inspection.event_check import warn_of_events
+from evsplat.inspection.picture_check import warn_of_pictures
 from evsplat.inspection.recording import inspect, inspect_recording
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "save_fit_sheet",
     "warn_of_capture",
     "warn_of_events",
+    "warn_of_pictures",
 ]

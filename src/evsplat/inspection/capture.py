@@ -34,6 +34,7 @@ from evsplat.inspection.drawing import (
     to_picture,
 )
 from evsplat.inspection.event_check import WHICH_WAY, event_findings, warn_of_events
+from evsplat.inspection.picture_check import picture_findings, warn_of_pictures
 from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings, contrast_findings, sensor_lines
 
@@ -80,6 +81,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
         estimate = None  # clock and thresholds of events that lie elsewhere are chance
     findings = (
         *found,
+        *picture_findings(seen),
         *of_events,
         *clock_findings(capture, estimate),
         *contrast_findings(capture, estimate),
@@ -105,11 +107,15 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
 
 
 def warn_of_capture(path: Path) -> None:
-    """Log what is odd about a new capture's events and body, as training will see them."""
-    metadata, _ = check_capture(path, deep=False)  # what it finds, the writer has said
+    """Log what is odd about a new capture's pictures, events and body, as training sees them."""
+    metadata, found = check_capture(path, deep=False)
     if metadata is None:
         return
+    for finding in found:
+        if finding.field.startswith("frames"):  # notes of an import speak of events and body
+            logger.warning("%s", finding)
     seen = Capture(metadata).for_training(Policy())
+    warn_of_pictures(seen)
     warn_of_events(seen)
     try:
         if seen.has_body:

@@ -21,7 +21,7 @@ from evsplat.config_docs import save_yaml
 from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError, machine_error
 from evsplat.files import open_output, try_target
-from evsplat.inspection import check_body, save_fit_sheet, warn_of_events
+from evsplat.inspection import check_body, save_fit_sheet, warn_of_events, warn_of_pictures
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, Purpose, method_config
 from evsplat.methods.settings import Weight
 from evsplat.options import TrainOptions
@@ -135,6 +135,8 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     loaded = load_latest(start.folder.checkpoints) if options.resume else None
     purpose: Purpose = "train" if loaded is None else "resume"
     fitting = None
+    if purpose == "train":
+        warn_of_pictures(seen)
     if purpose == "train" and seen.has_body:
         fitting = check_body(seen, refuse=not options.any_body)
     if purpose == "train" and getattr(start.settings, "event_weight", 0.0) != 0.0:
