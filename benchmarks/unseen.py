@@ -12,6 +12,7 @@ is one JSON object, with the means over runs.
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -86,7 +87,7 @@ def main() -> None:
         load_model(model, tensors, state["human_count"])
         training = run.capture.for_training(run.policy)
         seen = seen_by(model, training)
-        object.__setattr__(run.reconstruction, "seen", seen)
+        run = replace(run, reconstruction=replace(run.reconstruction, seen=seen))
         sheets: dict[str, list[torch.Tensor]] = {"before": [], "after": []}
         rows[str(path)] = {}
         for name, sheet in sheets.items():
