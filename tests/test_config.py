@@ -9,25 +9,13 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from evsplat.config import (
-    Above,
-    AtLeast,
-    AtMost,
-    ReadIf,
-    Within,
-    check,
-    check_read,
-    from_dict,
-    load_yaml,
-    override,
-    settings,
-    to_dict,
-)
+from evsplat.config import check, check_read, from_dict, load_yaml, override, settings, to_dict
 from evsplat.config_docs import save_yaml
 from evsplat.errors import ConfigError
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.methods.avatar3dgs import AvatarConfig
 from evsplat.methods.paper import PaperConfig
+from evsplat.ranges import Above, AtLeast, AtMost, ReadIf, Within
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evsplat.cli import main
-from evsplat.config import Above, AtLeast, ReadIf, from_dict, load_yaml
+from evsplat.config import from_dict, load_yaml
 from evsplat.config_docs import explained, explained_yaml, save_yaml
 from evsplat.methods import TRAINABLE
+from evsplat.ranges import Above, AtLeast, ReadIf
 
 ROOT = Path(__file__).parents[1]
 

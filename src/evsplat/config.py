@@ -1,7 +1,7 @@
 """Configuration as frozen dataclasses: to YAML and back, with errors that name the nearest key.
 
-Ranges and conditions of settings stand in their annotations, as `Above` and `ReadIf`; numbers are
-always finite. Settings of older versions stand in the class attribute ``DROPPED``: what became of
+Ranges and conditions of settings stand in their annotations (`evsplat.ranges`); numbers are always
+finite. Settings of older versions stand in the class attribute ``DROPPED``: what became of
 them ("renamed to pose.start") by dotted name.
 """
 
@@ -9,12 +9,13 @@ import dataclasses
 import difflib
 import math
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from evsplat.errors import ConfigError
+from evsplat.ranges import Range, ReadIf, expected, ranges_of
 from evsplat.untrusted.faults import brief
 from evsplat.untrusted.text import parse_yaml, read_text
 
@@ -25,50 +26,6 @@ _LONGEST_NAME = 80
 """Of a setting in a message; those that there are have 40."""
 _MOST_NAMED = 5
 """Unknown settings that one message names."""
-
-
-@dataclass(frozen=True)
-class Range:
-    """Numbers that a setting takes, in its annotation: ``Annotated[float, Above(0)]``."""
-
-    words: str
-    """Words for it that follow "a number": "above 0"."""
-    holds: Callable[[float], bool]
-
-    def __contains__(self, number: float) -> bool:
-        return self.holds(number)
-
-
-def Above(bound: float) -> Range:
-    """Numbers above a bound."""
-    return Range(f"above {bound}", lambda number: number > bound)
-
-
-def AtLeast(bound: float) -> Range:
-    """Numbers from a bound on."""
-    return Range(f"of at least {bound}", lambda number: number >= bound)
-
-
-def AtMost(bound: float) -> Range:
-    """Numbers up to a bound."""
-    return Range(f"of at most {bound}", lambda number: number <= bound)
-
-
-def Within(low: float, high: float) -> Range:
-    """Numbers between two bounds, both included."""
-    return Range(f"within {low} and {high}", lambda number: low <= number <= high)
-
-
-@dataclass(frozen=True)
-class ReadIf:
-    """Condition under which a setting, or all of a section, is read at all."""
-
-    setting: str
-    """Another field of the same section, or else a name from the root of the configuration."""
-    condition: str
-    """Words for it that follow the setting's name and "is": "above 0"."""
-    holds: Callable[[Any], bool]
-    """Whether a value of that setting fulfils it."""
 
 
 @dataclass(frozen=True)
@@ -228,36 +185,6 @@ def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, An
     return values
 
 
-def expected(hint: Any, ranges: Sequence[Range] = (), *, many: bool = False) -> str:
-    """What a setting takes, in words: "a number above 0 or null"."""
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        return expected(arguments[0], (*ranges, *_ranges(hint)), many=many)
-    if origin is Literal:
-        return "one of " + ", ".join(str(a) for a in arguments)
-    if origin in (Union, types.UnionType):
-        return " or ".join(expected(a, ranges, many=many) for a in arguments)
-    if origin is tuple and arguments[-1] is Ellipsis:
-        return f"a list of {expected(arguments[0], ranges, many=True)}"
-    if origin is tuple:
-        return f"[{', '.join(expected(a, ranges) for a in arguments)}]"
-    if dataclasses.is_dataclass(hint):
-        return "sections with keys" if many else "a section with keys"
-    one, several = {
-        int: ("an integer", "integers"),
-        float: ("a number", "numbers"),
-        bool: ("true or false", "true or false"),
-        str: ("a text", "texts"),
-        type(None): ("null", "null"),
-    }.get(hint, (str(hint), str(hint)))
-    bounds = " and ".join(bound.words for bound in ranges if hint in (int, float))
-    return f"{several if many else one} {bounds}".rstrip()
-
-
-def _ranges(hint: Any) -> list[Range]:
-    return [mark for mark in hint.__metadata__ if isinstance(mark, Range)]
-
-
 def _convert(
     kind: Any, value: Any, where: str, key: str, ranges: Sequence[Range] = (), start: Any = None
 ) -> Any:
@@ -270,7 +197,7 @@ def _convert(
         return _convert_dataclass(kind, value, where, key, start)
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        bounds = (*ranges, *_ranges(kind))
+        bounds = (*ranges, *ranges_of(kind))
         return _convert(arguments[0], value, where, key, bounds, start)
     if origin in (Union, types.UnionType):
         inside = None

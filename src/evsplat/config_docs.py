@@ -9,9 +9,10 @@ from typing import Any, get_args
 
 import yaml
 
-from evsplat.config import Setting, expected, settings, to_dict
+from evsplat.config import Setting, settings, to_dict
 from evsplat.field_docs import field_docs
 from evsplat.files import write_text
+from evsplat.ranges import expected
 
 _WIDTH = 100
 """Columns of a written configuration."""

@@ -6,10 +6,10 @@ from typing import Annotated, get_args
 import numpy as np
 
 from evsplat.body.motion import load_motion
-from evsplat.config import AtLeast, Within
 from evsplat.options import StageSettings
 from evsplat.options.captures import PoseNoise
 from evsplat.options.declare import Sensor
+from evsplat.ranges import AtLeast, Within
 from evsplat.staging.assets import characters, find_motion, motions
 
 RATES_HZ = (12.5, 15.0, 20.0, 25.0)

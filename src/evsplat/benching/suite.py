@@ -9,8 +9,9 @@ from typing import Annotated
 from evsplat.benching.cell import UNTRAINED
 from evsplat.benching.drawn import Draw
 from evsplat.benching.given_pictures import PICTURES
-from evsplat.config import Above, AtLeast, from_dict, load_yaml
+from evsplat.config import from_dict, load_yaml
 from evsplat.errors import ConfigError
+from evsplat.ranges import Above, AtLeast
 from evsplat.staging import StageSettings
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")

@@ -10,11 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.compiled import native_for
-from evsplat.config import AtLeast, Within, check
+from evsplat.config import check
 from evsplat.errors import ConfigError, DataError
 from evsplat.events.stream import EventStream
 from evsplat.options.declare import Sensor, given
 from evsplat.pictures.light import luminance
+from evsplat.ranges import AtLeast, Within
 
 LOWEST_CONTRAST = 0.01
 """Thresholds, drawn ones too, stay at or above this: one 8-bit level near white is 0.009."""

@@ -16,7 +16,6 @@ import torch
 from evsplat.body import body_box
 from evsplat.capture import Frame, Policy, TrainingCapture, load_body_track
 from evsplat.capture.masked import MaskedCapture
-from evsplat.config import Above, AtLeast
 from evsplat.gaussians import GaussianSet
 from evsplat.methods.avatar_parts import (
     RELEASED_RATES,
@@ -49,6 +48,7 @@ from evsplat.methods.starts import (
 )
 from evsplat.objectives import Alpha, RenderedSemantics
 from evsplat.objectives.photometric import Box
+from evsplat.ranges import Above, AtLeast
 
 SURELY_PERSON = 20.0
 """Logit whose sigmoid is 1 to the last bit of float32: nothing moves it, and its channel of a

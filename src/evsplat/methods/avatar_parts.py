@@ -11,7 +11,6 @@ import torch
 
 from evsplat.body import BodyTrack, SurfaceSamples
 from evsplat.capture import Frame, TrainingCapture
-from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.gaussians import GaussianSet
 from evsplat.methods.base import Purpose
 from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
@@ -21,6 +20,7 @@ from evsplat.models.paper import PaperModel, Semantics
 from evsplat.objectives import Isometry, Objective, Photometric, SkinningPrior
 from evsplat.objectives.perceptual import PerceptualChoice, choose_perceptual
 from evsplat.objectives.photometric import Box
+from evsplat.ranges import Above, AtLeast, AtMost, ReadIf, Within
 
 SURFACE_SAMPLES = 100_000
 """Body surface points drawn once for the skinning prior."""

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 from evsplat.capture import Policy
-from evsplat.config import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.methods.dropped import EVSPLAT
 from evsplat.methods.poses import PoseSettings
 from evsplat.methods.settings import (
@@ -17,6 +16,7 @@ from evsplat.methods.settings import (
     Weight,
 )
 from evsplat.methods.starts import FROM_MEDIAN, FittedScene, HumanStart
+from evsplat.ranges import Above, AtLeast, AtMost, ReadIf, Within
 from evsplat.render import LOW_PASS
 
 _LAMPS = ReadIf("lamps", "above 0", lambda lamps: lamps > 0)

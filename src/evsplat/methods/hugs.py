@@ -15,7 +15,6 @@ from torch import Tensor
 from evsplat.body import BodyTrack
 from evsplat.capture import Policy, TrainingCapture, load_body_track
 from evsplat.capture.masked import require_masks
-from evsplat.config import AtLeast, ReadIf, Within
 from evsplat.gaussians import DensifyLimits, Part
 from evsplat.gaussians.initialise import nearest_spacing
 from evsplat.methods.base import (
@@ -32,6 +31,7 @@ from evsplat.models.hugs import HugsModel, SphericalScene, TriplaneHuman
 from evsplat.models.hugs.start import fit_to_body
 from evsplat.objectives.hugs import HumanPicture, JointPicture, SkinningTarget
 from evsplat.objectives.perceptual import PerceptualName, make_perceptual
+from evsplat.ranges import AtLeast, ReadIf, Within
 
 FIT_SAMPLES = 50_000
 """Points of the body's surface that the decoders start from."""

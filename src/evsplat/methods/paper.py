@@ -10,7 +10,6 @@ import torch
 
 from evsplat.body import body_box
 from evsplat.capture import Policy, TrainingCapture, load_body_track
-from evsplat.config import Above, AtLeast, ReadIf
 from evsplat.errors import DataError
 from evsplat.gaussians import GaussianSet
 from evsplat.methods.avatar_parts import (
@@ -50,6 +49,7 @@ from evsplat.methods.starts import (
 )
 from evsplat.models.paper import Semantics
 from evsplat.objectives import EventChange, Objective, RenderedSemantics
+from evsplat.ranges import Above, AtLeast, ReadIf
 
 _RENDERED = ReadIf("semantics", "rendered", lambda semantics: semantics == "rendered")
 

@@ -12,12 +12,12 @@ from evsplat.body import BodyTrack, PoseErrors, PoseSource
 from evsplat.body.smoothing import motion_noise, moving_joints, smoothed
 from evsplat.body.spline_error import spline_error
 from evsplat.capture import TrainingCapture, load_body_track
-from evsplat.config import Above, ReadIf
 from evsplat.errors import ConfigError, DataError
 from evsplat.landmarks.pictures import sharp_pixels
 from evsplat.methods.settings import WITH_EVENTS, WITH_WINDOWS, Nominal, Weight
 from evsplat.models.pose_correction import SHARES, PoseCorrection
 from evsplat.posing.refine import Gain, Refined, Verdict, judge, refine
+from evsplat.ranges import Above, ReadIf
 
 logger = logging.getLogger(__name__)
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from evsplat.config import Above, AtLeast, ReadIf, Within
 from evsplat.gaussians import DensifyLimits, Part
+from evsplat.ranges import Above, AtLeast, ReadIf, Within
 
 NOMINAL_ITERATIONS = 15_000
 """Length of the schedule in the units that every setting uses (3DGS-Avatar's default, A9).

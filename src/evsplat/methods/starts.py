@@ -10,7 +10,6 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack, skin, up_axis
 from evsplat.capture import Camera, Frame, TrainingCapture
-from evsplat.config import Above, AtLeast, ReadIf
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM
 from evsplat.gaussians.flip import carry
@@ -23,6 +22,7 @@ from evsplat.gaussians.initialise import (
     random_cube,
 )
 from evsplat.gaussians.surround import margins, surround
+from evsplat.ranges import Above, AtLeast, ReadIf
 
 MOST_SAMPLES = 20_000
 """Upper bound of the automatic number of samples of the person."""

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
 
-from evsplat.config import Above, AtLeast, Within
 from evsplat.errors import ConfigError
 from evsplat.options.declare import Flag, Sensor, Transfer, Use, check_options, option
+from evsplat.ranges import Above, AtLeast, Within
 
 
 @dataclass(frozen=True)

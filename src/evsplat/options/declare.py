@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 import tyro
 
-from evsplat.config import AtLeast, Range, expected
 from evsplat.errors import ConfigError
 from evsplat.options.inputs import Input, check_capture_folder, check_run_folder
+from evsplat.ranges import AtLeast, Range, expected
 
 Options = TypeVar("Options")
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from evsplat.config import Above, AtLeast, AtMost, Within
 from evsplat.errors import ConfigError
 from evsplat.options.declare import (
     Device,
@@ -18,6 +17,7 @@ from evsplat.options.declare import (
     check_twins,
     option,
 )
+from evsplat.ranges import Above, AtLeast, AtMost, Within
 
 
 @dataclass(frozen=True)

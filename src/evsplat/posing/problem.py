@@ -16,12 +16,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.config import Above, AtLeast
 from evsplat.posing.evidence import Evidence
 from evsplat.posing.kinematics import PLACE, SIX, SIZE, TURNS, Posed, pose, row_slice
 from evsplat.posing.prior import HINGES, PosePrior
 from evsplat.posing.rig import Rig
 from evsplat.posing.splines import NormalEquations, UniformSpline, Weights
+from evsplat.ranges import Above, AtLeast
 
 GRID_S = 0.02
 """Spacing of the times at which motion and pose have their price."""
