@@ -1,5 +1,6 @@
 """Scripts beside the package, which no other test runs, fit the package as it is."""
 
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -25,3 +26,16 @@ def test_every_script_finds_what_it_imports_and_explains_itself(script, monkeypa
         runpy.run_path(str(ROOT / script), run_name="__main__")
     assert ended.value.code == 0
     assert capsys.readouterr().out.startswith("usage: ")
+
+
+def test_architecture_tells_what_each_of_them_is_of():
+    page = (ROOT / "ARCHITECTURE.md").read_text("utf-8").partition("## Beside the package")[2]
+    named = {
+        name
+        for cell in re.findall(r"\| ([^|]*`[^|]*) \|$", page, re.M)
+        for name in re.findall("`(.+?)`", cell)
+    }
+    there = {
+        path.stem for folder in ("benchmarks", "tools") for path in (ROOT / folder).glob("*.py")
+    }
+    assert named - {"browser/", "make_venv.sh", "benchmarks/", "tools/"} == there
