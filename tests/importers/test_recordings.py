@@ -1,6 +1,7 @@
 """Recordings without poses: a video, a DAVIS file, and poses that shall not be taken."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,19 @@ def test_the_offset_of_the_events_clock_is_found(tmp_path: Path) -> None:
     # The bar of a picture stands still for the period about it, and moves in two steps.
     assert capture.clock_offset_us == pytest.approx(-3_000_000, abs=PERIOD_US / 2)
     assert any("offset of their clock is found" in note for note in capture.provenance["notes"])
+
+
+def test_mirrored_events_are_told_where_their_offset_is_looked_for(tmp_path: Path) -> None:
+    """As a beam splitter mirrors one of two cameras whose clocks know nothing of each other."""
+    clip, events = tmp_path / "clip.mp4", tmp_path / "events.h5"
+    write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)
+    given = events_of_the_bar(3_000_000)
+    write_events(events, replace(given, x=(WIDTH - 1 - given.x).astype(np.uint16)))
+    options = {"exposure_us": 20_000.0, "clock_offset_us": "auto"}
+    with pytest.raises(DataError, match="only if they were mirrored left to right") as refusal:
+        import_capture("video", clip, tmp_path / "out", events=events, **options)
+    offset_us = float(str(refusal.value).split("offset of ")[1].split(" us")[0])
+    assert offset_us == pytest.approx(-3_000_000, abs=PERIOD_US / 2)
 
 
 @pytest.mark.parametrize(

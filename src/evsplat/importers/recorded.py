@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -142,6 +143,8 @@ def _found_offset(
     except TooLong as error:
         raise DataError(f"{path}: {error}; cut it, or give --clock-offset-us US.") from None
     give = "give --clock-offset-us US, or film more that moves"
+    if found is None or not found.is_certain:
+        _refuse_turned(levels, recording, path, size)
     if found is None or found.correlation < LEAST_CORRELATION:
         best = "" if found is None else f" (correlation {found.correlation:.2f} at best)"
         raise DataError(
@@ -160,6 +163,41 @@ def _found_offset(
         f"{found.correlation:.2f}, elsewhere {found.rival:.2f} at most)"
     )
     return offset_us, note
+
+
+def _refuse_turned(
+    levels: BlockLevels, recording: EventRecording, path: Path, size: tuple[int, int]
+) -> None:
+    """Raise where events that were mirrored or inverted would have an offset that is certain."""
+    found = []
+    for mirror_x, mirror_y, inverted in product((False, True), repeat=3):
+        pieces = (
+            EventStream(
+                piece.t,
+                (size[0] - 1 - piece.x).astype(np.uint16) if mirror_x else piece.x,
+                (size[1] - 1 - piece.y).astype(np.uint16) if mirror_y else piece.y,
+                -piece.p if inverted else piece.p,
+            )
+            for piece in recording.chunks()
+        )
+        ways = {
+            "mirrored left to right": mirror_x and not mirror_y,
+            "mirrored top to bottom": mirror_y and not mirror_x,
+            "turned by 180 degrees": mirror_x and mirror_y,
+            "of the other polarity": inverted,
+        }
+        words = " and ".join(way for way, taken in ways.items() if taken)
+        offset = estimate_offset(levels, pieces, size) if words else None
+        if offset is not None and offset.is_certain:
+            found.append((offset.correlation, words, offset.offset_us))
+    if found:
+        # of ways that fit alike, as those of a scene that is the same upside down, the plainest
+        correlation, words, offset_us = max(found, key=lambda one: round(one[0], 3))
+        raise DataError(
+            f"{path}: its events agree with the changes of the pictures only if they were {words} "
+            f"(correlation {correlation:.2f}, at an offset of {offset_us:.0f} us); write them anew "
+            "that way (evsplat.events.write_events), or the pictures."
+        )
 
 
 @dataclass
