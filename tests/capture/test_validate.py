@@ -377,6 +377,24 @@ def test_overlapping_exposures_are_a_warning(tiny_capture: Factory) -> None:
     load_capture(path)
 
 
+def test_half_floats_are_compared_with_the_limit(
+    tiny_capture: Factory, recwarn: pytest.WarningsRecorder
+) -> None:
+    path = tiny_capture()
+    edit_body(path, poses=lambda poses: poses.astype(np.float16))
+    assert validate_capture(path) == []
+    edit_body(
+        path,
+        poses=lambda poses: (
+            np.where(np.arange(poses.size) == 4, np.inf, poses.flat)
+            .reshape(poses.shape)
+            .astype(np.float16)
+        ),
+    )
+    check(the_only(path), path / "body.npz", "poses[0, 1, 1]", "inf", "finite numbers up to 1e+06")
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize(("factor", "unit"), [(1e-3, "milliseconds"), (1e3, "nanoseconds")])
 def test_times_of_another_unit_are_a_warning(
     tiny_capture: Factory, factor: float, unit: str

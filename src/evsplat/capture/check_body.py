@@ -122,7 +122,9 @@ class _Check:
             found = f"{'x'.join(map(str, array.shape)) or 'a single value'} of {array.dtype}"
             self.error(key, found, f"{wanted} {kind}")
             return None
-        wrong = ~(np.abs(array) <= _LARGEST) if array.dtype.kind == "f" else np.zeros(0, bool)
+        # As float64, which halves are compared in: as one of those the limit is infinite.
+        limit = np.float64(_LARGEST)
+        wrong = ~(np.abs(array) <= limit) if array.dtype.kind == "f" else np.zeros(0, bool)
         if wrong.any():
             index = tuple(int(i) for i in np.argwhere(wrong)[0])
             count = int(wrong.sum())
