@@ -1,5 +1,6 @@
 """Pinhole cameras: the OpenCV convention, pixel centres at +0.5."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -53,3 +54,9 @@ class Camera:
         depth = in_camera[..., 2]
         homogeneous = in_camera @ self.K.to(points).T
         return homogeneous[..., :2] / depth[..., None], depth
+
+
+def distinct(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """The cameras of pictures; one alone where all are the same object, as of a camera at rest."""
+    first = cameras[0]
+    return (first,) if all(camera is first for camera in cameras) else tuple(cameras)

@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, default_body
 from evsplat.capture import Camera, Frame
+from evsplat.capture.camera_track import CameraTrack
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import render_run, rendering
 from evsplat.export.rendering import FILM_HEIGHT
-from evsplat.film import Film, FilmPlan, camera_at
+from evsplat.film import Film, FilmPlan
 from evsplat.film.frame_cache import FilmFrame
 from evsplat.methods.reconstruction import Rendering
 
@@ -66,6 +67,10 @@ class _Recording:
         if frame.world_to_camera is None:
             return camera
         return Camera(camera.width, camera.height, camera.K, frame.world_to_camera)
+
+    def cameras_at(self, name: str, times_us: list[int]) -> tuple[Camera, ...]:
+        frames = [frame for frame in self.frames if frame.camera == name]
+        return CameraTrack(self.cameras[name], frames).at(times_us)
 
     def image(self, frame: Frame) -> torch.Tensor:
         return torch.full((HEIGHT, WIDTH, 3), 10 * frame.index / 255)
@@ -123,17 +128,13 @@ def test_no_test_frame_is_told():
         planned(recording, what="test")
 
 
-def test_moving_camera_passes_through_its_poses_and_turns_evenly_between():
-    recording = _Recording(moving=True)
-    for frame in recording.frames:
-        at = camera_at(recording, "main", frame.mid_us).world_to_camera
-        torch.testing.assert_close(at, frame.world_to_camera, atol=1e-6, rtol=0)
-    halfway = camera_at(recording, "main", (MIDS_US[1] + MIDS_US[2]) // 2)
-    torch.testing.assert_close(halfway.world_to_camera, _pose(0.3, 1.5), atol=1e-6, rtol=0)
-    torch.testing.assert_close(
-        camera_at(recording, "main", MIDS_US[-1] + 10**6).world_to_camera, _pose(0.6, 3.0)
-    )
-    assert camera_at(recording, "side", 0) is recording.cameras["side"]
+@pytest.mark.parametrize("rate_hz", [12.5, 30.0, 240.0])
+def test_a_moving_camera_is_where_it_was_at_each_time(rate_hz):
+    frames = planned(_Recording(moving=True), fps=rate_hz, parts="human")
+    for frame in frames:
+        passed = (frame.time_us - MIDS_US[0]) / (MIDS_US[1] - MIDS_US[0])
+        found = frame.camera.world_to_camera
+        torch.testing.assert_close(found, _pose(0.2 * passed, passed), atol=1e-5, rtol=0)
 
 
 def test_video_shows_the_asked_times_in_slow_motion_beside_the_blurry_frame(run):

@@ -18,6 +18,7 @@ SIDE, FRAMES, SKIN = 64, 9, 230 / 255
 class Shot:
     mid_us: int
     exposure_us: tuple[int, int]
+    camera: str = "main"
 
 
 class Still:
@@ -29,6 +30,9 @@ class Still:
 
     def camera(self, frame: Shot) -> Camera:
         return self._camera
+
+    def cameras_at(self, name: str, times_us: list[int]) -> tuple[Camera, ...]:
+        return (self._camera,) * len(times_us)
 
     def image(self, frame: Shot) -> torch.Tensor:
         """The wall, and skin within a pixel of where the body's vertices are."""

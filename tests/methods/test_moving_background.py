@@ -26,6 +26,7 @@ UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 class Shot:
     mid_us: int
     exposure_us: tuple[int, int]
+    camera: str = "main"
 
 
 class Moving:
@@ -63,6 +64,11 @@ class Moving:
 
     def camera(self, frame: Shot) -> Camera:
         return self.cameras[frame]
+
+    def cameras_at(self, name: str, times_us: list[int]) -> list[Camera]:
+        """It stands during the exposures, which are short."""
+        nearest = [min(self.cameras, key=lambda shot: abs(shot.mid_us - t)) for t in times_us]
+        return [self.cameras[shot] for shot in nearest]
 
     def scene(self, camera: Camera) -> torch.Tensor:
         """Colours where each pixel's ray first meets floor or wall."""

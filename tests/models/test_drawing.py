@@ -1,13 +1,15 @@
-"""Shadows in pictures: which part they darken, and where the scene's places are."""
+"""Pictures of one camera or several, and shadows in them."""
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from evsplat.capture import load_capture
 from evsplat.errors import ConfigError
-from evsplat.models.drawing import _enlarge, draw, shadowed_scene
+from evsplat.models.drawing import _enlarge, draw, draw_for_training, shadowed_scene
 from evsplat.models.scene_places import places_of
 from evsplat.render import LOW_PASS, Splats, render
 
@@ -144,3 +146,80 @@ def test_lights_get_a_gradient_from_the_picture(shadowed):
         for name, parameter in part.named_parameters():
             if not name.startswith("own"):  # of shadows on the person, which is not lit yet
                 assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
+
+
+def moved(camera, seed: int):
+    """A camera a little beside another one."""
+    rng = np.random.default_rng(seed)
+    turn = torch.from_numpy(Rotation.from_rotvec(0.03 * rng.normal(size=3)).as_matrix()).float()
+    pose = torch.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, torch.from_numpy(0.05 * rng.normal(size=3)).float()
+    return replace(camera, world_to_camera=pose @ camera.world_to_camera)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_time_of_a_step_is_drawn_from_its_own_camera(shadowed, seed):
+    _, layers, camera = shadowed
+    cameras = [camera, moved(camera, seed)]
+    drawn = draw_for_training(layers, cameras)
+    for time, (each, picture) in enumerate(zip(cameras, drawn.rgb, strict=True)):
+        alone = draw(layers, each)
+        assert torch.allclose(picture, alone.rgb[time], atol=2e-6)
+        assert torch.allclose(drawn.semantic[time], alone.semantic[time], atol=2e-6)
+        assert torch.equal(drawn.output.radii[time], alone.output.radii[time])
+    both = torch.stack([draw(layers, each).output.static_radii for each in cameras])
+    assert torch.equal(drawn.output.static_radii, both.amax(0))
+    assert (drawn.rgb[1] - draw(layers, camera).rgb[1]).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_its_gradients_are_those_of_the_times_drawn_one_by_one(shadowed, seed):
+    model, layers, camera = shadowed
+    cameras = [camera, moved(camera, seed)]
+    wanted = [name for name, _ in model.gaussians.named_parameters() if "feature" not in name]
+    weights = [torch.randn(camera.height, camera.width, 3) for _ in cameras]
+
+    def gradients(pictures):
+        loss = sum((w * p).sum() for w, p in zip(weights, pictures, strict=True))
+        parameters = [model.gaussians.get_parameter(name) for name in wanted]
+        return torch.autograd.grad(loss, parameters, retain_graph=True)
+
+    alone = [draw(layers, each).rgb[time] for time, each in enumerate(cameras)]
+    drawn = draw_for_training(layers, cameras)
+    for one, other in zip(gradients(drawn.rgb), gradients(alone), strict=True):
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()))
+    sum((w * p).sum() for w, p in zip(weights, drawn.rgb, strict=True)).backward()
+    human, scene = drawn.center_gradients()
+    assert human.shape[0] == 2 and scene.shape[0] == 1
+    assert human.abs().sum() > 0 and scene.abs().sum() > 0
+
+
+def test_of_a_camera_at_rest_the_pictures_are_bit_for_bit_those_of_one(shadowed):
+    _, layers, camera = shadowed
+    drawn, one = draw_for_training(layers, [camera, camera]), draw(layers, camera)
+    assert torch.equal(drawn.output.image, one.output.image)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_point_of_the_scene_moves_in_the_pictures_as_the_camera_does(shadowed, seed):
+    _, layers, camera = shadowed
+    cameras = [camera, moved(camera, seed)]
+    place = torch.linalg.inv(camera.world_to_camera) @ torch.tensor([0.1, -0.1, 4.0, 1.0])
+    point = Splats(
+        place[None, None, :3],
+        torch.tensor([[[1.0, 0, 0, 0]]]),
+        torch.full((1, 1, 3), 0.1),
+        torch.full((1, 1), 0.9),
+        torch.ones(1, 1, 4),
+    )
+    nobody = replace(layers.human, opacities=torch.zeros_like(layers.human.opacities))
+    layers = replace(layers, human=nobody, scene=point, shadow=None, shaded=None)
+    for each, picture in zip(cameras, draw_for_training(layers, cameras).rgb, strict=True):
+        light = picture.detach()[..., 0]
+        y, x = torch.meshgrid(
+            torch.arange(each.height) + 0.5, torch.arange(each.width) + 0.5, indexing="ij"
+        )
+        found = torch.stack([(x * light).sum(), (y * light).sum()]) / light.sum()
+        assert (found - each.project(place[:3])[0]).abs().max() < 0.05
+    ways = [each.project(place[:3])[0] for each in cameras]
+    assert (ways[1] - ways[0]).norm() > 0.2

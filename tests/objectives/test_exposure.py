@@ -1,11 +1,13 @@
 """The exposure's mean in linear light, its times, and how many renders it takes."""
 
+import math
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from evsplat.objectives import Exposure, renders_for
+from evsplat.camera import Camera
+from evsplat.objectives import Exposure, motion_px, renders_for, sweep_px
 from evsplat.objectives.exposure import CHROMA_START
 from evsplat.pictures import CodedPictures
 from evsplat.similarity import ssim
@@ -107,3 +109,29 @@ def test_a_black_exposure_has_a_finite_gradient():
     )
     Exposure(None, lambda frame: 3, torch.Generator()).loss(step)["l1"].backward()
     assert pictures.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("degrees", [0.3, 2.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_camera_that_turns_sweeps_its_picture_by_the_focal_length(degrees, seed):
+    """In closed form: what lies in the middle moves by f tan(a), whatever its distance."""
+    distance = float(torch.empty(()).uniform_(1, 9, generator=torch.Generator().manual_seed(seed)))
+    body = torch.tensor([[0.0, 0.0, distance]]).expand(26, 3)
+    track = SimpleNamespace(vertices=lambda time_us: body)
+    K = torch.tensor([[400.0, 0, 32.0], [0, 400.0, 24.0], [0, 0, 1]])
+    angle = math.radians(degrees)
+    turned = torch.eye(4)
+    turned[0, 0] = turned[2, 2] = math.cos(angle)
+    turned[0, 2], turned[2, 0] = math.sin(angle), -math.sin(angle)
+    ends = [Camera(64, 48, K, pose) for pose in (torch.eye(4), turned)]
+    middle = 400 * math.tan(angle)
+    assert motion_px(ends, track, frame()) == pytest.approx(middle, rel=1e-4)
+    # At the border up to 1 + (32 / 400)^2 times as far, and a little more for what it turns by.
+    swept = sweep_px(ends, track, frame())
+    assert middle < swept < middle * (1 + 0.08**2) * (1 + 0.1 * math.tan(angle)) + 0.05
+    assert sweep_px([ends[0], ends[0]], track, frame()) == 0.0
+    # Who goes along with the picture's middle hardly moves in it.
+    after = body @ turned[:3, :3]
+    goes = SimpleNamespace(vertices=lambda time_us: after if time_us == 31_000 else body)
+    assert motion_px(ends, goes, frame()) < 1e-3
+    assert sweep_px(ends, goes, frame()) > middle

@@ -20,7 +20,7 @@ class Capture(CaptureReader):
     Pictures are float32 in [0, 1], coded as `transfer` says; `shown` codes light for a display.
     Lens distortion is removed on reading, from pictures and events alike, so that `camera`
     describes them exactly. The pose of a moving camera is known at the mid-exposure of its frames
-    only: nothing here interpolates between them.
+    only; `cameras_at` interpolates between them.
     """
 
     def for_training(

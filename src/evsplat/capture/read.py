@@ -1,6 +1,7 @@
 """All of a capture folder, read when asked for."""
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile, body_from_arrays
+from evsplat.capture.camera_track import CameraTrack
 from evsplat.capture.check_body import check_dense
 from evsplat.capture.finding import Findings
 from evsplat.capture.metadata import Frame, Metadata, NovelView
@@ -84,6 +86,17 @@ class CaptureReader:
         if frame.world_to_camera is None:
             return camera
         return Camera(camera.width, camera.height, camera.K, frame.world_to_camera)
+
+    def cameras_at(self, camera: str, times_us: Sequence[int]) -> tuple[Camera, ...]:
+        """The camera of that name at each time (`CameraTrack`); one object where it stands."""
+        return self._tracks[camera].at(times_us)
+
+    @functools.cached_property
+    def _tracks(self) -> dict[str, CameraTrack]:
+        frames: dict[str, list[Frame]] = {name: [] for name in self.cameras}
+        for frame in self.frames:
+            frames[frame.camera].append(frame)
+        return {name: CameraTrack(camera, frames[name]) for name, camera in self.cameras.items()}
 
     def transfer(self, frame: Frame | str) -> Transfer:
         """From the values of a frame's pictures to light; the power curve where nothing is said."""

@@ -107,6 +107,10 @@ class TrainingCapture:
         """The pinhole camera of any frame, held out or not (`Capture.camera`)."""
         return self._source.camera(self._name(frame))
 
+    def cameras_at(self, camera: str, times_us: Sequence[int]) -> tuple[Camera, ...]:
+        """The camera of that name at each time (`Capture.cameras_at`)."""
+        return self._source.cameras_at(camera, times_us)
+
     def transfer(self, frame: Frame | str) -> Transfer:
         """From the values of a frame's pictures to light (`Capture.transfer`)."""
         return self._source.transfer(self._name(frame))

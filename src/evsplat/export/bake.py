@@ -14,7 +14,7 @@ from evsplat.capture import Capture
 from evsplat.errors import DataError
 from evsplat.export.avatar import Avatar, Clip, avatar_of, clip_of, recorded_clip, write_avatar
 from evsplat.export.gaussians import cloud_at, facts_of, instant_of
-from evsplat.film import camera_at, load_motion_of
+from evsplat.film import load_motion_of
 from evsplat.film.camera_path import check_camera
 from evsplat.methods.reconstruction import Parts
 from evsplat.models.at_rest import SkinnedGaussians
@@ -32,7 +32,7 @@ def at_rest(run: Run, camera: str | None) -> SkinnedGaussians:
     if camera is not None:
         check_camera(capture, camera)
     views = [
-        (frame.mid_us, camera_at(capture, camera or frame.camera, frame.mid_us))
+        (frame.mid_us, capture.cameras_at(camera or frame.camera, [frame.mid_us])[0])
         for frame in capture.train_frames
     ]
     return run.reconstruction.at_rest(views)
@@ -49,7 +49,7 @@ def with_correctives(run: Run, gaussians: SkinnedGaussians, camera: str | None) 
     shown = camera or capture.train_frames[0].camera
     count = min(_BAKED_POSES, 3 * len(mids))
     times = [mids[0] + k * (mids[-1] - mids[0]) // max(count - 1, 1) for k in range(count)]
-    views = [(time, camera_at(capture, shown, time)) for time in times]
+    views = list(zip(times, capture.cameras_at(shown, times), strict=True))
     return run.reconstruction.with_correctives(gaussians, views)
 
 

@@ -13,7 +13,6 @@ from evsplat.capture import Camera, Capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.export.cloud import SplatCloud, cloud_of, joined
 from evsplat.export.formats import write_gltf, write_ply, write_splat, write_spz
-from evsplat.film import camera_at
 from evsplat.film.camera_path import check_camera
 from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import FileKind, UpAxis
@@ -67,7 +66,8 @@ def instant_of(
     name = camera or chosen.camera
     check_camera(capture, name)
     label = f"frame-{frame}" if frame is not None else f"{(time_us - first) / 1e6:.3f}s"
-    return Instant(time_us, camera_at(capture, name, time_us), name, label)
+    (there,) = capture.cameras_at(name, [time_us])
+    return Instant(time_us, there, name, label)
 
 
 def cloud_at(

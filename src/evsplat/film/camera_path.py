@@ -46,28 +46,6 @@ def check_camera(capture: Capture, name: str) -> None:
         raise ConfigError(f"--camera {name}: the capture has no such camera, only {known}.")
 
 
-def camera_at(capture: Capture, name: str, time_us: int) -> Camera:
-    """Return a camera of the capture at any time.
-
-    A moving one is interpolated between the mid-exposures of its frames, where its poses are
-    known: centre linearly, orientation along the shortest rotation; beyond the ends it stands.
-    """
-    frames = [frame for frame in capture.frames if frame.camera == name]
-    if all(frame.world_to_camera is None for frame in frames):
-        return capture.cameras[name]
-    frames.sort(key=lambda frame: frame.mid_us)
-    mids = np.array([frame.mid_us for frame in frames])
-    after = int(np.clip(np.searchsorted(mids, time_us), 1, max(len(frames) - 1, 1)))
-    ends = [capture.camera(frame) for frame in frames[after - 1 : after + 1]]
-    if len(ends) == 1:
-        return ends[0]
-    share = float(np.clip((time_us - mids[after - 1]) / (mids[after] - mids[after - 1]), 0, 1))
-    rotations = np.stack([end.world_to_camera[:3, :3].double().numpy() for end in ends])
-    rotation = Slerp([0, 1], Rotation.from_matrix(rotations))(share).as_matrix()
-    center = torch.lerp(ends[0].center().double(), ends[1].center().double(), share).numpy()
-    return _placed(ends[0], rotation, center)
-
-
 def through(shares: Sequence[float], cameras: Sequence[Camera]) -> CameraPath:
     """A smooth path through cameras, each at its share of the film; it stands before and after.
 

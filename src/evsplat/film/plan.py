@@ -10,7 +10,7 @@ import torch
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, Frame
 from evsplat.errors import ConfigError, DataError
-from evsplat.film.camera_path import CameraPath, camera_at, interpolated, read_camera_path
+from evsplat.film.camera_path import CameraPath, interpolated, read_camera_path
 from evsplat.film.following import follow, in_view, straight, to_both_sides, whole_turn
 from evsplat.film.frame_cache import FilmFrame
 from evsplat.film.motion import load_motion_of
@@ -67,7 +67,7 @@ class FilmPlan:
         view = film.camera or recording
 
         middle = _middle(track, times)
-        start = camera_at(capture, view, times[0])
+        start = capture.cameras_at(view, times[:1])[0]
         # Up is where people stood in the recording: a motion may be a somersault.
         room = Room.of(recorded, track, start if capture.is_static_camera else None)
         surroundings = _surroundings(film, room)
@@ -82,7 +82,7 @@ class FilmPlan:
         elif film.path is not None or leaves:
             cameras = follow(start, track, times, room.up, turn)
         elif film.at is None and film.motion is None and not capture.is_static_camera:
-            cameras = [camera_at(capture, view, time) for time in times]
+            cameras = list(capture.cameras_at(view, times))
         else:
             cameras = [start] * len(times)
         changes = [room.stand_back] if film.motion is not None else []

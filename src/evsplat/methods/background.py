@@ -100,8 +100,11 @@ def _median_of(
 
 def apart(capture: TrainingCapture, track: BodyTrack, frame: Frame) -> Float[np.ndarray, "H W"]:
     """Pixels to the body as it is at the ends and in the middle of the exposure."""
-    camera = capture.camera(frame)
     times = sorted({*frame.exposure_us, frame.mid_us})
-    seen = [silhouette(track.vertices(time), track.body.faces, camera).numpy() for time in times]
+    cameras = capture.cameras_at(frame.camera, times)
+    seen = [
+        silhouette(track.vertices(time), track.body.faces, camera).numpy()
+        for time, camera in zip(times, cameras, strict=True)
+    ]
     body = np.logical_or.reduce(seen)
     return distance_transform_edt(~body) if body.any() else np.full(body.shape, np.inf)

@@ -50,6 +50,7 @@ from evsplat.objectives import (
     RenderedSemantics,
     motion_px,
     renders_for,
+    sweep_px,
 )
 
 logger = logging.getLogger(__name__)
@@ -123,7 +124,8 @@ def build(
         _fit_colours(config, capture, model, background)
 
     def renders(frame: Frame) -> int:
-        motion = motion_px(capture.camera(frame), poses.track, frame)
+        ends = capture.cameras_at(frame.camera, frame.exposure_us)
+        motion = max(each(ends, poses.track, frame) for each in (motion_px, sweep_px))
         return renders_for(motion, config.px_per_render, config.most_renders)
 
     bounds = semantic_bounds(capture, poses.track, config.semantic_band_px_at_256)

@@ -1,5 +1,6 @@
 """Pictures of posed Gaussians, with the person's shadow on the scene."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from evsplat.camera import Camera
+from evsplat.camera import Camera, distinct
 from evsplat.compiled import native, runs_native
 from evsplat.models.layers import SHADOW_STEP_PX, Layers
 from evsplat.models.scene_places import LEAST_SCENE, ScenePlaces
@@ -42,13 +43,12 @@ def draw(
     layers: Layers,
     camera: Camera,
     *,
-    center_gradients: bool = False,
     background: Float[Tensor, "3"] | None = None,
     backdrop: Backdrop | None = None,
     places: ScenePlaces | None = None,
     shadow_step_px: int = SHADOW_STEP_PX,
 ) -> Drawing:
-    """Draw person and scene; ``center_gradients`` makes the projected centres tell theirs.
+    """Draw person and scene at all times from one camera.
 
     ``background`` is the sRGB colour behind all of it, black without. ``backdrop`` is what the
     scene looked like to the picture before, see `render`.
@@ -57,9 +57,6 @@ def draw(
     ``places`` tells of the scene without the person; without, they are drawn for this picture.
     """
     human, scene = layers.human, layers.scene
-    if center_gradients:
-        human, scene = _with_centers(human), _with_centers(scene)
-    layers = replace(layers, human=human, scene=scene)
     light = None
     if layers.shaded is not None:
         light = _enlarge(layers.shaded, camera, SHADOW_STEP_PX)
@@ -77,6 +74,38 @@ def draw(
         backdrop=backdrop,
         static_light=light,
     )
+    return _drawing(output, layers)
+
+
+def draw_for_training(
+    layers: Layers,
+    cameras: Sequence[Camera],
+    *,
+    background: Float[Tensor, "3"] | None = None,
+    places: ScenePlaces | None = None,
+) -> Drawing:
+    """Draw each time as that time's camera sees it, with gradients of the projected centres.
+
+    Of a camera at rest all are one object: then the scene is projected once, as by `draw`.
+    """
+    human, scene = _with_centers(layers.human), _with_centers(layers.scene)
+    layers, cameras = replace(layers, human=human, scene=scene), distinct(cameras)
+    if len(cameras) == 1:
+        return draw(layers, cameras[0], background=background, places=places)
+    each = [
+        draw(layers.of_time(index), camera, background=background, places=places).output
+        for index, camera in enumerate(cameras)
+    ]
+    output = RenderOutput(
+        image=torch.cat([one.image for one in each]),
+        alpha=torch.cat([one.alpha for one in each]),
+        radii=torch.cat([one.radii for one in each]),
+        static_radii=torch.stack([one.static_radii for one in each]).amax(0),
+    )
+    return _drawing(output, layers)
+
+
+def _drawing(output: RenderOutput, layers: Layers) -> Drawing:
     rgb, semantic = split_channels(output.image, (3, 1))
     return Drawing(rgb, tuple(s.squeeze(-1) for s in semantic), output, layers)
 

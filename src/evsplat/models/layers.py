@@ -1,7 +1,7 @@
 """Person and scene at given times, in world space: what a model hands to the rasteriser."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -35,13 +35,24 @@ class Layers:
     low_pass: float = LOW_PASS
     """Variance of the filter of a pixel, px^2; see `evsplat.render.render`."""
     shaded: Float[Tensor, "T h w"] | None = None
-    """The shadow at every `SHADOW_STEP_PX`-th pixel of the one picture that will be drawn, where it
-    was found beside that on the person."""
+    """The shadow at every `SHADOW_STEP_PX`-th pixel of the pictures that will be drawn, one per
+    time, where it was found beside that on the person."""
 
     @property
     def times(self) -> int:
         """Number of times T."""
         return len(self.human.means)
+
+    def of_time(self, index: int) -> "Layers":
+        """The same at one of the times alone."""
+        only, shadow = slice(index, index + 1), self.shadow
+        return replace(
+            self,
+            human=self.human.of_time(index),
+            transforms=self.transforms[only],
+            shadow=None if shadow is None else lambda places: shadow(places)[only],
+            shaded=None if self.shaded is None else self.shaded[only],
+        )
 
 
 def human_splats(

@@ -59,11 +59,12 @@ class Model(Protocol):
         self,
         times_us: Sequence[int],
         frame: Frame,
-        camera: Camera,
+        cameras: Sequence[Camera],
         generator: torch.Generator,
     ) -> Drawing:
         """Pictures of a training step of ``frame``, with gradients of the projected centres.
 
+        ``cameras``: one per time; the same object at all times where it stands still.
         Whatever a method perturbs in training is drawn from ``generator``.
         """
         ...
@@ -95,6 +96,11 @@ class Model(Protocol):
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
         """Take back what `state_dict` gave; the sets have as many rows already."""
         ...
+
+
+def nearest_time(times_us: Sequence[int], frame: Frame) -> int:
+    """Index of the time that is nearest to the middle of a frame's exposure."""
+    return min(range(len(times_us)), key=lambda index: abs(times_us[index] - frame.mid_us))
 
 
 class PoseResidual(Protocol):

@@ -4,7 +4,7 @@ from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event import EventChange
 from evsplat.objectives.event_sensor import EventNoise, EventSensor, minute_around
 from evsplat.objectives.event_windows import EventWindows, HeldOutWindows
-from evsplat.objectives.exposure import Exposure, motion_px, renders_for
+from evsplat.objectives.exposure import Exposure, motion_px, renders_for, sweep_px
 from evsplat.objectives.isometry import Isometry
 from evsplat.objectives.photometric import Alpha, Photometric
 from evsplat.objectives.priors import DeformationPrior, PosePrior, ReliefPrior, SkinningPrior
@@ -30,5 +30,6 @@ __all__ = [
     "Step",
     "minute_around",
     "motion_px",
+    "sweep_px",
     "renders_for",
 ]

@@ -22,11 +22,35 @@ VERTEX_STRIDE = 13
 """Every so many vertices are enough to know how far the body moves."""
 
 
-def motion_px(camera: Camera, track: BodyTrack, frame: Frame) -> float:
-    """Largest path of a body vertex over a frame's exposure, as its camera sees it, pixels."""
-    start, end = frame.exposure_us
-    ends = [camera.project(track.vertices(t)[::VERTEX_STRIDE])[0] for t in (start, end)]
+def motion_px(cameras: Sequence[Camera], track: BodyTrack, frame: Frame) -> float:
+    """Largest path of a body vertex over a frame's exposure, as its camera sees it, pixels.
+
+    ``cameras``: that one at the start and at the end of the exposure.
+    """
+    ends = [
+        camera.project(track.vertices(time)[::VERTEX_STRIDE])[0]
+        for camera, time in zip(cameras, frame.exposure_us, strict=True)
+    ]
     return float((ends[1] - ends[0]).norm(dim=-1).max())
+
+
+def sweep_px(cameras: Sequence[Camera], track: BodyTrack, frame: Frame) -> float:
+    """Largest path over a frame's exposure of what stands still as far away as the body, pixels.
+
+    At the corners and the middle of the picture, before ``cameras`` as in `motion_px`. A camera
+    that follows somebody sweeps over the scene while they hardly move in the picture.
+    """
+    start, end = cameras
+    if start is end:
+        return 0.0
+    width, height = start.width, start.height
+    pixels = torch.tensor(
+        [[0, 0], [width, 0], [0, height], [width, height], [width / 2, height / 2]]
+    )
+    depth = start.project(track.vertices(frame.mid_us)[::VERTEX_STRIDE])[1].mean().cpu()
+    rays = torch.cat([pixels, torch.ones(len(pixels), 1)], 1) @ torch.linalg.inv(start.K).T
+    places = start.center() + depth * rays @ start.world_to_camera[:3, :3]
+    return float((end.project(places)[0] - pixels).norm(dim=-1).max())
 
 
 def renders_for(motion: float, px_per_render: float, most: int) -> int:

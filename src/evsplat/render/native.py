@@ -37,26 +37,32 @@ def render(job: RenderJob) -> RenderOutput:
 
 
 def rows_in_view(
-    means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], camera: Camera
+    means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], *cameras: Camera
 ) -> Int[Tensor, " V"] | None:
-    """Rows that may reach into the picture, whatever their rotation and opacity; None for all.
+    """Rows that may reach into a picture, whatever their rotation and opacity; None for all.
 
     Where the compiled module does not run it is None as well: a GPU would have to be waited for.
-    No row is left out that `render` draws (with its default ``near``).
+    No row is left out that `render` draws (with its default ``near``) for any of the ``cameras``.
     """
     if not (runs_native(means) and runs_native(scales)):
         return None
-    rows = torch.empty(len(means), dtype=torch.int64)
-    count = native.rows_in_view(
-        means.detach().contiguous(),
-        scales.detach().contiguous(),
-        camera.K.detach().float().contiguous(),
-        camera.world_to_camera.detach().float().contiguous(),
-        camera.width,
-        camera.height,
-        rows,
-    )
-    return None if count == len(means) else rows[:count]
+    places, sizes = means.detach().contiguous(), scales.detach().contiguous()
+    found: list[Tensor] = []
+    for camera in cameras:
+        rows = torch.empty(len(means), dtype=torch.int64)
+        count = native.rows_in_view(
+            places,
+            sizes,
+            camera.K.detach().float().contiguous(),
+            camera.world_to_camera.detach().float().contiguous(),
+            camera.width,
+            camera.height,
+            rows,
+        )
+        if count == len(means):
+            return None
+        found.append(rows[:count])
+    return found[0] if len(found) == 1 else torch.cat(found).unique()
 
 
 _FIELDS = len(fields(Splats))

@@ -45,6 +45,15 @@ class Splats:
             }
         )
 
+    def of_time(self, index: int) -> "Splats":
+        """The same at one of the T times alone."""
+        return Splats(
+            **{
+                name: value if value is None or len(value) == 1 else value[index : index + 1]
+                for name, value in vars(self.with_times()).items()
+            }
+        )
+
 
 def join(first: Splats, second: Splats, times: int) -> Splats:
     """Both sets in one, at each of ``times`` times; both have their axis of times."""

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -101,7 +101,7 @@ class Trainer:
         self.data = DeviceCache(
             self.device, default_cache_bytes(self.device) if cache_bytes is None else cache_bytes
         )
-        self._cameras: dict[Hashable, Camera] = {}
+        self._sent: dict[str, tuple[Camera, Camera]] = {}
         self.queue: list[int] = []
         self.outlook = Outlook({name: composition.weights[name] for name in composition.watched})
         self.bad = BadSteps(self.device, str(capture.path))
@@ -160,9 +160,9 @@ class Trainer:
     def _drawn(self, frame: Frame, objectives: Sequence[Objective], nominal: float) -> Step:
         """Pictures of a frame at all times that objectives ask for."""
         times = sorted({t for o in objectives for t in o.times(frame, nominal)})
-        camera = self._camera(frame)
+        cameras = self._cameras(frame, times)
         generator = self.composition.generator
-        drawing = self.model.training_drawing(times, frame, camera, generator)
+        drawing = self.model.training_drawing(times, frame, cameras, generator)
         return Step(
             self.capture,
             self.model,
@@ -174,12 +174,14 @@ class Trainer:
             self.data,
         )
 
-    def _camera(self, frame: Frame) -> Camera:
-        """On the device; the same object at every visit, of all frames of a camera at rest."""
-        key = frame.camera if frame.world_to_camera is None else (frame.camera, frame.name)
-        if key not in self._cameras:
-            self._cameras[key] = self.capture.camera(frame).to(self.device)
-        return self._cameras[key]
+    def _cameras(self, frame: Frame, times_us: Sequence[int]) -> list[Camera]:
+        """On the device, at each time; the same object at every visit of a camera at rest."""
+        cameras = self.capture.cameras_at(frame.camera, times_us)
+        first = cameras[0]
+        if frame.camera not in self._sent or self._sent[frame.camera][0] is not first:
+            self._sent[frame.camera] = first, first.to(self.device)
+        sent = self._sent[frame.camera][1]
+        return [sent if camera is first else camera.to(self.device) for camera in cameras]
 
     def _weighted(self, terms: dict[str, Tensor], nominal: float) -> Tensor:
         values = torch.stack(list(terms.values()))

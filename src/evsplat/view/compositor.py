@@ -13,7 +13,6 @@ from PIL import Image, ImageDraw
 from evsplat.camera import Camera
 from evsplat.capture import Capture
 from evsplat.events.maps import count_map
-from evsplat.film import camera_at
 from evsplat.inspection.drawing import BRIGHTER, DARKER, font
 from evsplat.methods.trivial import nearest_in_time
 from evsplat.view.camera import Box, letterboxed
@@ -77,7 +76,7 @@ class Compositor:
         # Another motion has times of its own; the camera then stands where it stood first.
         recorded = request.motion.name is None
         time_us = request.time_us if recorded else self.capture.frames[0].mid_us
-        camera = camera_at(self.capture, request.recording_camera, time_us)
+        (camera,) = self.capture.cameras_at(request.recording_camera, [time_us])
         return Pane(*letterboxed(camera, width, height))
 
     def _run_picture(

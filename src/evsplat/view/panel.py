@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from evsplat.capture import Frame
-from evsplat.film import Look, camera_at
+from evsplat.film import Look
 from evsplat.film.looks import Shown
 from evsplat.film.plan import recorded_by
 from evsplat.methods.reconstruction import Parts
@@ -177,7 +177,7 @@ class Panel:
     def look_through(self, camera: str) -> None:
         """Put the browser's camera where a recording camera is at this time."""
         request = self.client.current
-        recording = camera_at(self.capture, camera, request.time_us)
+        (recording,) = self.capture.cameras_at(camera, [request.time_us])
         view, _ = letterboxed(recording, request.width, request.height)
         centre, ahead = recording.center().double().numpy(), forward(recording)
         # The view turns around the place on the optical axis that is as far as the pivot.

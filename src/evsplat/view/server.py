@@ -15,7 +15,6 @@ import viser
 
 from evsplat.body import up_axis
 from evsplat.errors import ConfigError, DataError
-from evsplat.film import camera_at
 from evsplat.film.plan import recorded_by
 from evsplat.training.run import Run
 from evsplat.training.watching import is_training
@@ -89,7 +88,7 @@ class Viewer:
     def _set_scene(self, up: np.ndarray) -> None:
         server, first = self.server, self.capture.frames[0]
         server.scene.set_up_direction(tuple(up.tolist()))
-        camera = camera_at(self.capture, first.camera, first.mid_us)
+        (camera,) = self.capture.cameras_at(first.camera, [first.mid_us])
         centre = camera.center().double().numpy()
         start = server.initial_camera
         start.position = centre

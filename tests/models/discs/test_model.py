@@ -208,8 +208,11 @@ def test_what_the_body_hides_from_a_lamp_is_darker(tiny_capture, seed):
         assert (expected < light.factors(lit.transforms, lit.human.means) - 0.01).any()
         # A training step looks for shadows on the person at its middle alone.
         expected = light.factors(lit.transforms, lit.human.means, shares[:, 1:2])
-        camera, generator = capture.camera(frames[1]), torch.Generator().manual_seed(0)
-        step = model.training_drawing(times, frames[1], camera, generator).layers
+        cameras, generator = (
+            [capture.camera(frames[1])] * len(times),
+            torch.Generator().manual_seed(0),
+        )
+        step = model.training_drawing(times, frames[1], cameras, generator).layers
     assert torch.allclose(step.human.channels[..., :3], dark * expected, atol=1e-5)
 
 
@@ -247,7 +250,8 @@ def test_a_training_step_shades_by_the_pose_at_the_middle_of_its_frame(tiny_capt
         value[gaussians.human].detach() for value in (gaussians.means, gaussians.colour_logits)
     )
     with torch.no_grad():
-        step = model.training_drawing(times, frame, capture.camera(frame), generator).layers
+        cameras = [capture.camera(frame)] * len(times)
+        step = model.training_drawing(times, frame, cameras, generator).layers
         each = model.at(times, center)
         shade = model.shade(canonical, model.pose([frame.mid_us])[0])
         placed = deformed(model, [frame.mid_us]).expand(len(times), -1, -1)
@@ -267,7 +271,7 @@ def test_half_of_the_training_steps_see_noise_on_the_pose(tiny_capture):
     camera = capture.camera(frame)
     with torch.no_grad():
         drawn = [
-            model.training_drawing(times, frame, camera, generator).layers.human.channels[0]
+            model.training_drawing(times, frame, [camera] * 2, generator).layers.human.channels[0]
             for _ in range(40)
         ]
     clean = model.at([frame.mid_us], camera.center()).human.channels[0].detach()
@@ -315,7 +319,7 @@ def test_random_points_take_their_colours_from_a_network_that_sees_the_direction
         model.nominal.zero_()  # the person as at the start
         generator = torch.Generator().manual_seed(draw_seed)
         camera = capture.camera(frame)
-        step = model.training_drawing(times, frame, camera, generator)
+        step = model.training_drawing(times, frame, [camera] * 2, generator)
         scene = step.layers.scene.channels[0, :, :3]
         drawn = step.output.static_radii[0] > 0
         assert (scene[drawn] > 0).all()

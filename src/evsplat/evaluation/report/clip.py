@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from evsplat.camera import distinct
 from evsplat.capture import Capture
 from evsplat.files import scratch_folder
 from evsplat.methods.reconstruction import Reconstruction
@@ -40,25 +41,21 @@ class Clip:
 def make_clip(capture: Capture, reconstruction: Reconstruction) -> Clip | None:
     """Both halves over the recording, or over its middle where it is long; None for one frame.
 
-    The left half shows the recorded frame nearest in time. Instants between frames are drawn for
-    cameras that stand still; a moving camera's pose is known at its frames only, so its clip has
-    one picture per frame.
+    The left half shows the recorded frame nearest in time; a camera that moves is drawn where it is
+    between its frames.
     """
     camera_name = capture.frames[0].camera
     frames = sorted((f for f in capture.frames if f.camera == camera_name), key=lambda f: f.mid_us)
-    moves = any(frame.world_to_camera is not None for frame in frames)
     first, last = frames[0].mid_us, frames[-1].mid_us
     if last <= first:
         return None
     shown_us = min(last - first, int(_LONGEST_SECONDS / _SLOWER * 1e6 * 1.5))
     middle = (first + last) // 2
     first, last = middle - shown_us // 2, middle + shown_us // 2
-    if moves:
-        frames = [frame for frame in frames if first <= frame.mid_us <= last]
-        times = [frame.mid_us for frame in frames]
-    else:
-        count = round(min(shown_us / 1e6 * _SLOWER, _LONGEST_SECONDS) * _PLAYED_HZ)
-        times = [round(float(t)) for t in np.linspace(first, last, max(2, count))]
+    count = round(min(shown_us / 1e6 * _SLOWER, _LONGEST_SECONDS) * _PLAYED_HZ)
+    times = [round(float(t)) for t in np.linspace(first, last, max(2, count))]
+    cameras = capture.cameras_at(camera_name, times)
+    at_rest = len(distinct(cameras)) == 1
     camera = capture.cameras[camera_name]
     factor = max(1, _WIDE // camera.width)
     # Of an odd factor an even number of columns, as the video's width has to be even.
@@ -71,12 +68,12 @@ def make_clip(capture: Capture, reconstruction: Reconstruction) -> Clip | None:
         return to_bytes(capture.shown(capture.image(name)))
 
     def pictures() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-        at_once = 1 if moves else _TIMES_AT_ONCE
+        at_once = _TIMES_AT_ONCE if at_rest else 1
         for start in range(0, len(times), at_once):
             batch = times[start : start + at_once]
             nearest = [nearest_in_time(frames, time) for time in batch]
             with torch.no_grad():
-                rgb = reconstruction.render(capture.camera(nearest[0]), batch).rgb
+                rgb = reconstruction.render(cameras[start], batch).rgb
             for frame, image in zip(nearest, rgb, strict=True):
                 halves = recorded(frame.name), to_bytes(capture.shown(image.cpu()))
                 yield np.concatenate([halves[0], line, halves[1]], axis=1)

@@ -237,4 +237,8 @@ def _speeds(source: Source) -> dict[str, float]:
     test = {entry["frame"] for entry in source.metrics["per_frame"]}
     step = -(-len(capture.frames) // _MOST_FRAMES)
     frames = [f for i, f in enumerate(capture.frames) if i % step == 0 or f.name in test]
-    return {frame.name: motion_px(capture.camera(frame), track, frame) for frame in frames}
+    ends = [capture.cameras_at(frame.camera, frame.exposure_us) for frame in frames]
+    return {
+        frame.name: motion_px(cameras, track, frame)
+        for frame, cameras in zip(frames, ends, strict=True)
+    }

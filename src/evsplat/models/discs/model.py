@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from evsplat.body import BodyTrack, skin_with_linear, up_axis
-from evsplat.capture import Camera, Frame
+from evsplat.camera import Camera, distinct
+from evsplat.capture import Frame
 from evsplat.gaussians import GaussianSet
 from evsplat.models.discs.deformation import Deformation
 from evsplat.models.discs.pose_shade import PoseShade
@@ -24,10 +25,10 @@ from evsplat.models.discs.relief import Relief
 from evsplat.models.discs.shading import NearestSurface, Shading, SurfaceLight
 from evsplat.models.discs.shadow import BodyShadow, Lamps
 from evsplat.models.discs.still import Still
-from evsplat.models.drawing import Drawing, draw
+from evsplat.models.drawing import Drawing, draw_for_training
 from evsplat.models.kept import Kept
 from evsplat.models.layers import SHADOW_STEP_PX, Layers, SceneShadow, human_splats
-from evsplat.models.model import PosedModel, RowCache
+from evsplat.models.model import PosedModel, RowCache, nearest_time
 from evsplat.models.networks.colour import SceneColour, scene_rgb
 from evsplat.models.networks.non_rigid import draw_pose_noise
 from evsplat.models.pose_correction import PoseCorrection
@@ -55,8 +56,8 @@ class _View:
     center: Float[Tensor, "3"] | None
     """Where a network is asked for colours."""
     hide_direction: bool = False
-    shown: Camera | None = None
-    """Only this camera's picture is asked for."""
+    shown: tuple[Camera, ...] = ()
+    """Only these cameras' pictures are asked for: one of all times, or one of each."""
 
 
 class DiscModel(PosedModel):
@@ -187,28 +188,28 @@ class DiscModel(PosedModel):
         self,
         times_us: Sequence[int],
         frame: Frame,
-        camera: Camera,
+        cameras: Sequence[Camera],
         generator: torch.Generator,
     ) -> Drawing:
         """Pictures of a training step; see `Model`.
 
         The times of a step lie within a frame of each other: the network sees the pose, and the
-        person has the shape, of the frame's middle alone, and own shadows are looked up at the time
-        nearest to it.
+        person has the shape, of the frame's middle alone; own shadows are looked up at the time
+        nearest to it, from whose camera a network's colours of the scene are seen.
         """
         # Posed together: the skeleton is walked once for all times.
         turned, bones = self.pose([*times_us, frame.mid_us])
         bones, rotations = bones[:-1], turned[-1:]
         joints = rotations.shape[1]
         rotations = rotations + draw_pose_noise(joints, self.pose_noise, generator, self.device)
-        nearest = min(range(len(times_us)), key=lambda t: abs(times_us[t] - frame.mid_us))
-        view = _View(None, shown=camera)
+        nearest, shown = nearest_time(times_us, frame), distinct(cameras)
+        view = _View(None, shown=shown)
         if self.scene_colour is not None:
             hidden = float(torch.rand((), generator=generator)) < _DIRECTION_DROPOUT
-            view = _View(camera.center(), hidden, camera)
+            view = _View(cameras[nearest].center(), hidden, shown)
         offsets = self._offsets([frame.mid_us])
         layers = self._layers(bones, rotations, offsets, slice(nearest, nearest + 1), view)
-        return draw(layers, camera, center_gradients=True, places=self.places)
+        return draw_for_training(layers, cameras, places=self.places)
 
     def following(self, track: BodyTrack) -> "DiscModel":
         """The same person doing what ``track`` says, without what times did; see `Model`."""
@@ -297,7 +298,7 @@ class DiscModel(PosedModel):
     ) -> Float[Tensor, "S 3"]:
         """The network's colours of the scene, which may be black outside of the picture."""
         assert self.scene_colour is not None and view.center is not None
-        rows = None if view.shown is None else rows_in_view(means, scales, view.shown)
+        rows = rows_in_view(means, scales, *view.shown) if view.shown else None
         return scene_rgb(
             self.scene_colour,
             colours,
@@ -336,18 +337,27 @@ class DiscModel(PosedModel):
         casters: Float[Tensor, "T P 3"] | None,
         at: slice,
         scene: SceneAlone | None = None,
-        shown: Camera | None = None,
+        shown: tuple[Camera, ...] = (),
     ) -> tuple[Float[Tensor, "L T H"] | None, Float[Tensor, "T h w"] | None]:
         """Shares of the lamps' light that the body leaves its own ``places``, of the times ``at``.
 
-        None: all of it. And where the one picture that is ``shown`` is known, the shadow in it,
+        None: all of it. And where the pictures that are ``shown`` are known, the shadow in them,
         which costs less beside the other.
         """
         shadow, lamps = self.shadow, None if light is None else light.lamps
         if shadow is None or casters is None or not shadow.on_body or lamps is None:
             return None, None
-        if scene is None or shown is None:
+        if scene is None or not shown:
             return shadow.lit(casters[at].detach(), places, lamps), None
+        if len(shown) > 1:
+            # What each camera sees lies in the shadow of its own time.
+            fallen = [
+                self._on_relief(partial(shadow, casters[time : time + 1], lamps=lamps))(
+                    self.places.of(scene, camera, SHADOW_STEP_PX)
+                )
+                for time, camera in enumerate(shown)
+            ]
+            return shadow.lit(casters[at].detach(), places, lamps), torch.cat(fallen)
         lit: list[Tensor] = []
 
         def both(fallen_on: Float[Tensor, "h w 3"]) -> Float[Tensor, "T h w"]:
@@ -355,7 +365,7 @@ class DiscModel(PosedModel):
             lit.append(light_on_body)
             return factors
 
-        shaded = self._on_relief(both)(self.places.of(scene, shown, SHADOW_STEP_PX))
+        shaded = self._on_relief(both)(self.places.of(scene, shown[0], SHADOW_STEP_PX))
         return lit[0], shaded
 
     def _cast(self, light: SurfaceLight | None, casters: Tensor | None) -> SceneShadow | None:

@@ -13,10 +13,10 @@ from evsplat.body.rotations import six_to_matrix
 from evsplat.capture import Camera, Frame
 from evsplat.devices import send
 from evsplat.gaussians import OneClassRows
-from evsplat.models.drawing import Drawing, draw
+from evsplat.models.drawing import Drawing, draw_for_training
 from evsplat.models.hugs.gaussians import Decoded, SphericalScene, TriplaneHuman
 from evsplat.models.layers import Layers, human_splats, scene_splats
-from evsplat.models.model import PosedModel, RowCache
+from evsplat.models.model import PosedModel, RowCache, nearest_time
 from evsplat.render import LOW_PASS
 
 DEGREE_EVERY = 1_000
@@ -109,14 +109,15 @@ class HugsModel(PosedModel):
         self,
         times_us: Sequence[int],
         frame: Frame,
-        camera: Camera,
+        cameras: Sequence[Camera],
         generator: torch.Generator,
     ) -> Drawing:
         """Person and scene over a random colour; see `Model`."""
         background = send(torch.rand(3, generator=generator), self.device)
         decoded = self.human.for_training()
-        layers = self._layers(decoded, times_us, camera.center())
-        drawing = draw(layers, camera, center_gradients=True, background=background)
+        center = cameras[nearest_time(times_us, frame)].center()
+        layers = self._layers(decoded, times_us, center)
+        drawing = draw_for_training(layers, cameras, background=background)
         return HugsDrawing(**vars(drawing), decoded=decoded)
 
     def following(self, track: BodyTrack) -> "HugsModel":

@@ -10,12 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack, skin_with_linear
-from evsplat.capture import Camera, Frame
+from evsplat.camera import Camera, distinct
+from evsplat.capture import Frame
 from evsplat.devices import send
 from evsplat.gaussians import GaussianSet
-from evsplat.models.drawing import Drawing, draw
+from evsplat.models.drawing import Drawing, draw_for_training
 from evsplat.models.layers import Layers, human_splats, scene_splats
-from evsplat.models.model import PosedModel, RowCache
+from evsplat.models.model import PosedModel, RowCache, nearest_time
 from evsplat.models.networks.colour import (
     HumanColour,
     SceneColour,
@@ -139,18 +140,21 @@ class PaperModel(PosedModel):
         self,
         times_us: Sequence[int],
         frame: Frame,
-        camera: Camera,
+        cameras: Sequence[Camera],
         generator: torch.Generator,
     ) -> Drawing:
-        """Pictures of a training step, with all its noise; see `Model`."""
+        """Pictures of a training step, with all its noise; see `Model`.
+
+        Colours are those seen from the camera at the time nearest to the frame's middle.
+        """
         layers = self._layers(
             times_us,
-            camera.center(),
+            cameras[nearest_time(times_us, frame)].center(),
             self._shared_weights,
             noise=self._draw_noise(generator),
-            shown=camera,
+            shown=distinct(cameras),
         )
-        return draw(layers, camera, center_gradients=True)
+        return draw_for_training(layers, cameras)
 
     def following(self, track: BodyTrack) -> "PaperModel":
         """The same person doing what ``track`` says, see `Model`.
@@ -186,12 +190,12 @@ class PaperModel(PosedModel):
         *,
         hard_semantics: bool = False,
         noise: _Noise | None = None,
-        shown: Camera | None = None,
+        shown: Sequence[Camera] = (),
     ) -> Layers:
         """Both classes at given times, with skinning weights by ``weights_at``.
 
-        ``shown``: only this camera's picture is asked for; rows of the scene outside of it may be
-        black.
+        ``shown``: only these cameras' pictures are asked for, if any are given; rows of the scene
+        outside of them may be black.
         """
         gaussians = self.gaussians
         parts = [
@@ -220,7 +224,7 @@ class PaperModel(PosedModel):
         semantics, scene_semantics = gaussians.of_parts(labels)
         opacities, scene_opacities = gaussians.of_parts(gaussians.opacities())
         scene_scales = scene_scales_log.exp()
-        in_view = None if shown is None else rows_in_view(scene_means, scene_scales, shown)
+        in_view = rows_in_view(scene_means, scene_scales, *shown) if shown else None
         return Layers(
             human_splats(
                 human_means,
