@@ -21,6 +21,7 @@ from evsplat.calibration import (
 from evsplat.capture import estimate_sensor
 from evsplat.errors import DataError
 from evsplat.events import ALWAYS, EventStream, open_recording
+from evsplat.inspection.sensor import sensor_lines
 
 from ..seen import seen
 from .synthetic import record
@@ -47,6 +48,17 @@ def test_known_lag_and_thresholds_are_found(seed, lag_us, plus, minus) -> None:
     assert found.thresholds.minus == pytest.approx(minus, rel=0.08)
     assert found.clock.correlation > 0.95
     assert found.clock.spread_us < 200
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_one_pair_of_frames_leaves_doubt_of_the_clock(seed) -> None:
+    recording = record(seed, plus=0.2, minus=0.2, lag_us=30_000)
+    of_all = estimate_from_pairs(recording.pairs, recording.events)
+    of_one = estimate_from_pairs(recording.pairs[:1], recording.events)
+    assert of_all is not None and of_all.clock.differs
+    assert of_one is not None and not of_one.clock.differs
+    line = sensor_lines(of_one, 0, has_polarity=True)[0]
+    assert "of one pair of frames" in line and "nan" not in line
 
 
 @pytest.mark.parametrize("seed", [4, 5])

@@ -1,5 +1,7 @@
 """Words for an event sensor's clock and thresholds, and the warnings about them."""
 
+import math
+
 from evsplat.calibration import ClockEstimate, SensorEstimate, ThresholdEstimate
 from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding, Findings
@@ -23,10 +25,9 @@ def sensor_lines(
             "differ by more than 0.1 s (evsplat import finds that: --clock-offset-us auto)"
         ]
     clock, contrast = estimate.clock, estimate.thresholds
-    text = (
-        f"clock      events {_lag_text(clock)} (+-{clock.spread_us / 1000:.1f} ms; correlation "
-        f"{clock.correlation:.2f})"
-    )
+    one_pair = math.isnan(clock.spread_us)
+    doubt = "of one pair of frames" if one_pair else f"+-{clock.spread_us / 1000:.1f} ms"
+    text = f"clock      events {_lag_text(clock)} ({doubt}; correlation {clock.correlation:.2f})"
     if clock.differs:
         text += f"; clock_offset_us {_aligning_us(clock, clock_offset_us)} would align them"
     lines = [text]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from evsplat.body import BodyTrack
-from evsplat.capture import Camera, Frame, TrainingCapture
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
 from evsplat.methods.background import background_without
@@ -172,26 +172,25 @@ def build(
         # Errors of poses, and shapes that change, are still learned where the loss hardly falls.
         watched=("l1", "dssim") if poses.correction is None or poses.correction.exact else (),
         recording=recording,
-        fill=partial(_filled, model, capture, config.fill, recording) if config.fill else None,
+        fill=partial(_filled, model, capture, config) if config.fill else None,
     )
 
 
 def _filled(
-    model: DiscModel,
-    capture: TrainingCapture,
-    strength: float,
-    recording: Camera | None,
-    seen: Seen,
+    model: DiscModel, capture: TrainingCapture, config: EvsplatConfig, seen: Seen
 ) -> dict[str, Tensor]:
-    """What the end of training decides of the person, and around a recording at rest."""
-    decided = filled(model, capture, strength, seen)
-    if recording is None:
+    """What the end of training decides of the person, and around the pictures of one camera."""
+    decided = filled(model, capture, config.fill, seen)
+    frames = capture.train_frames
+    several = len({frame.camera for frame in frames}) > 1
+    if config.scene.kind == "random_cube" or several:
         return decided
+    recorded = frames[:1] if capture.is_static_camera else frames
+    cameras = [capture.camera(frame).to(model.device) for frame in recorded]
     gaussians = model.gaussians
     name = f"gaussians.{gaussians.colour}"
     colours = decided.get(name, gaussians.get_parameter(gaussians.colour)).detach().clone()
-    around = outskirts(gaussians, recording.to(model.device), model.low_pass)
-    colours[gaussians.scene] = around.logit()
+    colours[gaussians.scene] = outskirts(gaussians, cameras, model.low_pass).logit()
     return decided | {name: colours}
 
 

@@ -1,5 +1,7 @@
 """Around the recorded picture colours go on as its rim does, and it looks as before."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -49,7 +51,7 @@ def test_a_rainbow_around_the_picture_goes_and_the_picture_stays(rainbow):
     model, recording = rainbow
     scene = scene_of(model)
     own = scene.channels[0, :, :3]
-    found = outskirts(model.gaussians, recording, model.low_pass)
+    found = outskirts(model.gaussians, [recording], model.low_pass)
     beyond = beyond_cells(model.gaussians, recording)
     cell = cell_px(recording.width, recording.height)
     before = drawn(scene, own, recording, model.low_pass)
@@ -99,7 +101,67 @@ def test_their_cost_is_that_of_the_best_colours(rainbow):
         optimiser.step(closure)
         return float(closure().detach())
 
-    found = float(cost(outskirts(model.gaussians, recording, model.low_pass)))
+    found = float(cost(outskirts(model.gaussians, [recording], model.low_pass)))
     best = min(least(own), least(told))
     assert best < 0.5 * min(float(cost(own)), float(cost(told)))
     assert found < 1.3 * best  # of conditions far worse than those of a picture of usual size
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_a_moving_camera_what_no_view_shows_goes_on_as_the_nearest_rim(tiny_capture, seed):
+    captured = load_capture(tiny_capture())
+    model = built("evsplat", captured).model
+    recording = captured.camera(captured.frames[0])
+    views = [recording]
+    for across in (-0.4, 0.4):
+        pose = recording.world_to_camera.clone()
+        pose[0, 3] += across
+        views.append(replace(recording, world_to_camera=pose))
+    gaussians = model.gaussians
+    beyond = torch.stack([beyond_cells(gaussians, view) for view in views])
+    least, nearest = beyond.min(0)
+    with torch.no_grad():
+        colours = gaussians.get_parameter(gaussians.colour)
+        noise = torch.randn(len(least), 3, generator=torch.Generator().manual_seed(seed))
+        colours[gaussians.scene] += noise * (least > 0.25)[:, None]
+    scene = scene_of(model)
+    own = scene.channels[0, :, :3]
+    before = [drawn(scene, own, view, model.low_pass) for view in views]
+    cell = cell_px(recording.width, recording.height)
+    rims = [
+        continued(picture, view.project(scene.means[0])[0], cell)
+        for view, picture in zip(views, before, strict=True)
+    ]
+    rim = torch.stack(rims)[nearest, torch.arange(len(nearest))]
+    alone = torch.where((least > 0.25)[:, None], rim, own)
+    found = outskirts(gaussians, views, model.low_pass)
+    for view, picture in zip(views, before, strict=True):
+        missed = [
+            float((drawn(scene, rgb, view, model.low_pass) - picture).square().mean())
+            for rgb in (alone, found)
+        ]
+        assert missed[1] < 0.1 * missed[0]
+    unseen, within = least > 4, least < -2
+    assert bool(unseen.any()) and torch.allclose(found[unseen], rim[unseen], atol=1e-4)
+    # What the first view does not show, and another does, is no outside.
+    elsewhere = within & (beyond[0] > 0.25)
+    assert bool(elsewhere.any()) and torch.equal(found[within], own[within])
+    assert len(nearest[unseen].unique()) > 1
+
+
+def test_what_a_picture_that_is_not_drawn_shows_is_no_outside(tiny_capture, monkeypatch):
+    captured = load_capture(tiny_capture())
+    model = built("evsplat", captured).model
+    recording = captured.camera(captured.frames[0])
+    pose = recording.world_to_camera.clone()
+    pose[0, 3] -= 1.2
+    aside = replace(recording, world_to_camera=pose)
+    monkeypatch.setattr("evsplat.models.discs.outskirts.MOST_VIEWS", 2)
+    found = outskirts(model.gaussians, [recording, aside, recording], model.low_pass)
+    alone = outskirts(model.gaussians, [recording, recording], model.low_pass)
+    own = scene_of(model).channels[0, :, :3]
+    shown = (beyond_cells(model.gaussians, aside) < -2) & (
+        beyond_cells(model.gaussians, recording) > 0.25
+    )
+    assert not torch.equal(alone[shown], own[shown])
+    assert torch.equal(found[shown], own[shown])

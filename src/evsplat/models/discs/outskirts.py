@@ -1,10 +1,13 @@
-"""Colours around the recorded picture: what its rim says, where no pixel says anything else.
+"""Colours around the recorded pictures: what their rims say, where no pixel says anything else.
 
-The recorded picture shows tails of the Gaussians beyond its borders, and Adam, which moves rows of
-small gradients as far as any, makes a rainbow of them that cameras beside the recording one see.
+A recorded picture shows tails of the Gaussians beyond its borders, and Adam, which moves rows of
+small gradients as far as any, makes a rainbow of them that cameras beside the recording ones see.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial, reduce
+from operator import add
 
 import torch
 from jaxtyping import Float
@@ -17,8 +20,10 @@ from evsplat.gaussians.surround import cell_px, continued
 from evsplat.models.discs.first_colours import LEAST, MOST
 from evsplat.models.discs.still import Still
 from evsplat.models.seen import fixed, shares_by, transposed
-from evsplat.render import render
+from evsplat.render import Splats, render
 
+MOST_VIEWS = 12
+"""Pictures of a moving camera that are drawn."""
 STEPS = 16
 """Of conjugate gradients."""
 PRICE = 1 / 800
@@ -29,42 +34,69 @@ colours may make up for what is missed of those."""
 _FAST = 1e6
 
 
-def outskirts(gaussians: GaussianSet, recording: Camera, low_pass: float) -> Float[Tensor, "S 3"]:
-    """The scene's own colours, sRGB; outside of the recorded picture as its rim goes on.
+def outskirts(
+    gaussians: GaussianSet, recorded: Sequence[Camera], low_pass: float
+) -> Float[Tensor, "S 3"]:
+    """The scene's own colours, sRGB; outside of all recorded pictures as the nearest one's rim.
 
-    Those closest to that with which the recorded picture of the scene alone looks as before
-    (`closest`). What lies within is changed by as little as that takes, and only near the border.
+    Those closest to that with which the pictures of the scene alone look as before (`closest`).
+    What lies within any of them is changed by as little as that takes, and only near its border.
+    ``recorded`` are cameras of one size along one way, of which at most `MOST_VIEWS` are drawn.
     """
+    drawn = torch.linspace(0, len(recorded) - 1, min(MOST_VIEWS, len(recorded))).round().int()
+    views = [recorded[index] for index in drawn.tolist()]
     with torch.no_grad():
         scene = Still.of(gaussians, None, hard_semantics=True).scene.with_times()
     scene = fixed(scene, scene.channels[..., :3])
     own = scene.channels[0]
-
-    def drawn(values: Float[Tensor, "1 S C"]) -> Float[Tensor, "1 H W C"]:
-        return render(replace(scene, channels=values), recording, low_pass=low_pass).image
-
-    def picture(values: Float[Tensor, "S 3"]) -> tuple[Tensor, Tensor]:
-        leaf = values[None].clone().requires_grad_()
-        return leaf, drawn(leaf)
+    pictures = [partial(_drawn, scene, view, low_pass) for view in views]
 
     def seen(values: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
-        leaf, image = picture(values)
-        return transposed(image, leaf, image.detach())[0]
+        return _over(pictures, values, lambda drawn, _: drawn)
 
     with torch.no_grad():
-        before = drawn(own[None])
-    places = recording.project(scene.means[0])[0]
-    size = places.new_tensor([recording.width, recording.height])
-    cell = cell_px(recording.width, recording.height)
-    beyond = ((places - size / 2).abs() - size / 2).amax(-1) / cell
-    outside, near = beyond > _BEYOND, beyond > -_RIM
+        before = [draw(own[None]) for draw in pictures]
+    cell = cell_px(views[0].width, views[0].height)
+    least = torch.stack([_cells_beyond(scene, camera, cell) for camera in recorded]).amin(0)
+    outside, near = least > _BEYOND, least > -_RIM
+    nearest = torch.stack([_cells_beyond(scene, view, cell) for view in views]).argmin(0)
     told = own.clone()
-    rim = continued(before[0].cpu(), places[outside].cpu(), cell)
-    told[outside] = rim.to(own.device)
-    leaf, image = picture(told)
-    missing = transposed(image, leaf, before - image.detach())[0]
-    shares = shares_by(drawn, scene.means, torch.Generator().manual_seed(0))
+    for index, (view, picture) in enumerate(zip(views, before, strict=True)):
+        rows = outside & (nearest == index)
+        places = view.project(scene.means[0])[0]
+        told[rows] = continued(picture[0].cpu(), places[rows].cpu(), cell).to(own.device)
+    missing = _over(pictures, told, lambda drawn, index: before[index] - drawn)
+    generator = torch.Generator().manual_seed(0)
+    shares = [shares_by(draw, scene.means, generator) for draw in pictures]
     price = torch.where(near, PRICE * cell**2, _FAST).to(own)
-    squares = shares[:, 1:].square().mean(1)
+    squares = reduce(add, [each[:, 1:].square().mean(1) for each in shares])
     colours = closest(told, missing, seen, squares, price, torch.zeros_like(price), STEPS)
     return torch.where(near[:, None], colours.clamp(LEAST, MOST), own)
+
+
+def _drawn(
+    scene: Splats, view: Camera, low_pass: float, values: Float[Tensor, "1 S C"]
+) -> Float[Tensor, "1 H W C"]:
+    return render(replace(scene, channels=values), view, low_pass=low_pass).image
+
+
+def _over(
+    pictures: Sequence[Callable[[Tensor], Tensor]],
+    values: Float[Tensor, "S 3"],
+    weights: Callable[[Tensor, int], Tensor],
+) -> Float[Tensor, "S 3"]:
+    """Sum over all pictures of ``J^T weights``, of a picture with these values and its number."""
+    sums: list[Tensor] = []
+    for index, draw in enumerate(pictures):
+        leaf = values[None].clone().requires_grad_()
+        image = draw(leaf)
+        sums.append(transposed(image, leaf, weights(image.detach(), index))[0])
+    return reduce(add, sums)
+
+
+def _cells_beyond(scene: Splats, view: Camera, cell: int) -> Float[Tensor, " S"]:
+    """Cells from the border of a picture to each centre outside; negative within."""
+    places, depth = view.project(scene.means[0])
+    size = places.new_tensor([view.width, view.height])
+    beyond = ((places - size / 2).abs() - size / 2).amax(-1) / cell
+    return beyond.where(depth > 0, torch.inf)
