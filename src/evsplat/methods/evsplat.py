@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from evsplat.body import BodyTrack
-from evsplat.capture import Frame, TrainingCapture
+from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
 from evsplat.methods.background import background_without
@@ -29,7 +29,7 @@ from evsplat.methods.base import (
 from evsplat.methods.evsplat_settings import DiscRates, EvsplatConfig
 from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
 from evsplat.methods.moving_background import middle_view, moving_backdrop, require_one_side
-from evsplat.methods.poses import prepare_poses
+from evsplat.methods.poses import Poses, prepare_poses
 from evsplat.methods.prefit import fit_scene
 from evsplat.methods.sensor import event_windows
 from evsplat.methods.starts import Backdrop, Surface, human_start, scene_start
@@ -98,47 +98,13 @@ def build(
     poses = prepare_poses(config.pose, capture, fit=fit)
     background = _background(config, capture, poses.track, fit=fit)
     frames = capture.train_frames
-    times_us = [frame.mid_us for frame in frames]
     still = config.scene.kind != "random_cube" and capture.is_static_camera
     recording = capture.camera(frames[0]) if still else None
-    changes = poses.may_err and config.rates.deformation > 0
-    model = DiscModel(
-        poses.track,
-        times_us,
-        _start(config, capture, poses.track, generator, background),
-        width=config.width,
-        shade_start=config.shade_start,
-        pose_noise=config.pose_noise,
-        low_pass=config.low_pass,
-        shading=config.shading,
-        lamps=config.lamps,
-        self_shadow=config.self_shadow,
-        scene_network=config.scene.kind == "random_cube",
-        camera=recording,
-        residual=poses.correction,
-        residual_start=config.pose.start,
-        deformation_start=DEFORMATION_START if changes else None,
-        deformation_freedom=min(1 / poses.pace, FREEST),
-    ).to(device)
+    gaussians = _start(config, capture, poses.track, generator, background)
+    model = _model(config, capture, poses, gaussians, recording).to(device)
     if fit:
         _fit_colours(config, capture, model, background)
-
-    def renders(frame: Frame) -> int:
-        ends = capture.cameras_at(frame.camera, frame.exposure_us)
-        motion = max(each(ends, poses.track, frame) for each in (motion_px, sweep_px))
-        return renders_for(motion, config.px_per_render, config.most_renders)
-
-    bounds = semantic_bounds(capture, poses.track, config.semantic_band_px_at_256)
-    objectives: list[Objective] = [
-        Exposure(capture, cache(renders), generator),
-        RenderedSemantics(bounds),
-    ]
-    if poses.correction is not None:
-        objectives.append(PosePrior())
-    if model.deformation is not None:
-        objectives.append(DeformationPrior())
-    if model.relief is not None:
-        objectives.append(ReliefPrior())
+    objectives = _of_pictures(config, capture, poses.track, generator) + _priors(model)
     windows = None
     if config.event_weight != 0.0 and capture.events is None:
         logger.warning(
@@ -166,7 +132,7 @@ def build(
         },
         learning=_learning(config.rates, model, poses.pace),
         densify=config.densify.limits(cube_max_count=config.scene.growth_limit),
-        body_frames=body_frames(poses.track, times_us),
+        body_frames=body_frames(poses.track, [frame.mid_us for frame in frames]),
         generator=generator,
         held_out=None if windows is None else _held_out(config, capture, model, windows),
         # Errors of poses, and shapes that change, are still learned where the loss hardly falls.
@@ -174,6 +140,62 @@ def build(
         recording=recording,
         fill=partial(_filled, model, capture, config) if config.fill else None,
     )
+
+
+def _model(
+    config: EvsplatConfig,
+    capture: TrainingCapture,
+    poses: Poses,
+    gaussians: GaussianSet,
+    recording: Camera | None,
+) -> DiscModel:
+    """Person and scene at their start; ``recording`` is the camera where it stands still."""
+    changes = poses.may_err and config.rates.deformation > 0
+    return DiscModel(
+        poses.track,
+        [frame.mid_us for frame in capture.train_frames],
+        gaussians,
+        width=config.width,
+        shade_start=config.shade_start,
+        pose_noise=config.pose_noise,
+        low_pass=config.low_pass,
+        shading=config.shading,
+        lamps=config.lamps,
+        self_shadow=config.self_shadow,
+        scene_network=config.scene.kind == "random_cube",
+        camera=recording,
+        residual=poses.correction,
+        residual_start=config.pose.start,
+        deformation_start=DEFORMATION_START if changes else None,
+        deformation_freedom=min(1 / poses.pace, FREEST),
+    )
+
+
+def _of_pictures(
+    config: EvsplatConfig,
+    capture: TrainingCapture,
+    track: BodyTrack,
+    generator: torch.Generator,
+) -> list[Objective]:
+    """Objectives that look at the blurry frames, and at where the body is in them."""
+
+    def renders(frame: Frame) -> int:
+        ends = capture.cameras_at(frame.camera, frame.exposure_us)
+        motion = max(each(ends, track, frame) for each in (motion_px, sweep_px))
+        return renders_for(motion, config.px_per_render, config.most_renders)
+
+    bounds = semantic_bounds(capture, track, config.semantic_band_px_at_256)
+    return [Exposure(capture, cache(renders), generator), RenderedSemantics(bounds)]
+
+
+def _priors(model: DiscModel) -> list[Objective]:
+    """One for each part of the model that frames alone would not hold."""
+    parts = {
+        PosePrior: model.residual,
+        DeformationPrior: model.deformation,
+        ReliefPrior: model.relief,
+    }
+    return [prior() for prior, part in parts.items() if part is not None]
 
 
 def _filled(
