@@ -26,8 +26,8 @@ class ClockEstimate:
     lag_us: float
     """Events are stamped this much later than the frames: subtract it from their times."""
     spread_us: float
-    """Standard error of ``lag_us`` over the recording (jackknife over groups of frames); NaN of one
-    pair of frames."""
+    """Standard error of ``lag_us`` over the recording (jackknife over groups of frames); NaN where
+    too few frames tell it."""
     correlation: float
     """Pearson's, of log luminance change and signed event count at ``lag_us``."""
     lags_us: Float[np.ndarray, "L"]
@@ -36,7 +36,7 @@ class ClockEstimate:
 
     @property
     def differs(self) -> bool:
-        """True where events and frames are not on one clock, beyond doubt; never of one pair."""
+        """True where events and frames are not on one clock, beyond all doubt there is."""
         return abs(self.lag_us) > MOST_LAG_US and abs(self.lag_us) > 3 * self.spread_us
 
 

@@ -25,8 +25,8 @@ def sensor_lines(
             "differ by more than 0.1 s (evsplat import finds that: --clock-offset-us auto)"
         ]
     clock, contrast = estimate.clock, estimate.thresholds
-    one_pair = math.isnan(clock.spread_us)
-    doubt = "of one pair of frames" if one_pair else f"+-{clock.spread_us / 1000:.1f} ms"
+    unknown = math.isnan(clock.spread_us)
+    doubt = "by too few frames for an error" if unknown else f"+-{clock.spread_us / 1000:.1f} ms"
     text = f"clock      events {_lag_text(clock)} ({doubt}; correlation {clock.correlation:.2f})"
     if clock.differs:
         text += f"; clock_offset_us {_aligning_us(clock, clock_offset_us)} would align them"
