@@ -36,7 +36,7 @@ class ClockEstimate:
 
     @property
     def differs(self) -> bool:
-        """True where events and frames are not on one clock, beyond all doubt there is."""
+        """True where events and frames are surely not on one clock."""
         return abs(self.lag_us) > MOST_LAG_US and abs(self.lag_us) > 3 * self.spread_us
 
 
