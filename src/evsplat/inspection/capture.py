@@ -75,10 +75,10 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
         return replace(report, summary=f"{path}\n{_findings_text(report.findings)}")
     capture = Capture(metadata)
     seen = capture.for_training(Policy(use="everything"))
-    estimate = estimate_sensor(seen)
     of_events = event_findings(seen)
-    if any(finding.field in WHICH_WAY for finding in of_events):
-        estimate = None  # clock and thresholds of events that lie elsewhere are chance
+    # Clock and thresholds of events that lie elsewhere are chance.
+    elsewhere = any(finding.field in WHICH_WAY for finding in of_events)
+    estimate = None if elsewhere else estimate_sensor(seen)
     findings = (
         *found,
         *picture_findings(seen),
