@@ -1,12 +1,16 @@
 """Suites are read with errors that help, and those that ship say what the paper says."""
 
+from dataclasses import dataclass, replace
+
 import pytest
 
 import evsplat as ev
+from evsplat.benching import plan as planning
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.plan import make_plan
-from evsplat.benching.suite import read_suite, shipped_suites
+from evsplat.benching.suite import SuiteCapture, read_suite, shipped_suites
 from evsplat.errors import ConfigError
+from evsplat.options import StageSettings
 
 ROW = "rows: [{name: a, method: paper}]\n"
 
@@ -123,6 +127,26 @@ def test_a_row_has_its_own_number_of_steps_unless_the_bench_is_given_one(tmp_pat
     assert steps(max_minutes=2) == {"a": (None, 2), "b": (None, 2), "m": (None, None)}
     both = steps(max_minutes=2, iterations=7)
     assert both == {"a": (7, 2), "b": (7, 2), "m": (None, None)}
+
+
+@pytest.mark.parametrize("lens, fits", [("none", True), ("fisheye", False)])
+def test_a_new_option_at_its_default_leaves_staged_captures_what_they_were(
+    tmp_path, monkeypatch, lens, fits
+):
+    @dataclass(frozen=True)
+    class LaterSettings(StageSettings):
+        lens: str = "none"
+
+    def fingerprint(settings: StageSettings) -> str:
+        capture = SuiteCapture("kick", stage=settings)
+        suite = replace(read_suite(write(tmp_path, f"name: s\n{ROW}")), captures=(capture,))
+        return make_plan(suite, BenchFolder(tmp_path)).sources["kick"].fingerprint
+
+    before = fingerprint(StageSettings(motion="kick", width=64))
+    monkeypatch.setattr(planning, "StageSettings", LaterSettings)
+    after = fingerprint(LaterSettings(motion="kick", width=64, lens=lens))
+    assert (before == after) == fits
+    assert before != fingerprint(LaterSettings(motion="kick", width=96))
 
 
 def test_a_seed_that_is_named_twice_is_one(tmp_path):

@@ -14,7 +14,7 @@ from evsplat.benching.given_pictures import PICTURES, digest_of
 from evsplat.benching.suite import Suite, SuiteCapture, SuiteRow, check_names
 from evsplat.errors import ConfigError
 from evsplat.files import remove_file
-from evsplat.options import BenchOptions
+from evsplat.options import BenchOptions, StageSettings
 from evsplat.options.declare import given
 from evsplat.shipped import demo_capture
 
@@ -205,9 +205,8 @@ def _chosen(rows: Sequence[SuiteRow], only: Sequence[str]) -> list[SuiteRow]:
 def _source(capture: SuiteCapture, folder: BenchFolder) -> CaptureSource | str:
     """The capture, or a sentence that says how to get it."""
     if capture.stage is not None:
-        settings = json.dumps(asdict(capture.stage), sort_keys=True)
         made = folder.captures.resolve() / capture.name
-        return CaptureSource(capture.name, made, _digest(settings.encode()), capture.stage)
+        return CaptureSource(capture.name, made, _digest(_request(capture.stage)), capture.stage)
     assert capture.path is not None
     path = demo_capture() if capture.path == "demo" else Path(capture.path)
     description = path / "capture.json"
@@ -215,6 +214,13 @@ def _source(capture: SuiteCapture, folder: BenchFolder) -> CaptureSource | str:
         how = f"make it with `{capture.get}`" if capture.get else "check the path"
         return f"{path}: capture not found; {how}, or name captures with --captures."
     return CaptureSource(capture.name, path.resolve(), _digest(description.read_bytes()))
+
+
+def _request(settings: StageSettings) -> bytes:
+    """What of the settings is not at its default: so a new option leaves kept records as they are."""
+    usual = asdict(StageSettings())
+    chosen = {name: value for name, value in asdict(settings).items() if value != usual[name]}
+    return json.dumps(chosen, sort_keys=True).encode()
 
 
 def _digest(content: bytes) -> str:
