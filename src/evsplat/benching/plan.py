@@ -217,7 +217,7 @@ def _source(capture: SuiteCapture, folder: BenchFolder) -> CaptureSource | str:
 
 
 def _request(settings: StageSettings) -> bytes:
-    """What of the settings is not at its default: so a new option leaves kept records as they are."""
+    """What of the settings is not at its default, so that a new option leaves kept records fit."""
     usual = asdict(StageSettings())
     chosen = {name: value for name, value in asdict(settings).items() if value != usual[name]}
     return json.dumps(chosen, sort_keys=True).encode()

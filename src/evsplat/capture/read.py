@@ -91,6 +91,11 @@ class CaptureReader:
         """The camera of that name at each time (`CameraTrack`); one object where it stands."""
         return self._tracks[camera].at(times_us)
 
+    def camera_at(self, camera: str, time_us: int) -> Camera:
+        """The camera of that name at a time (`cameras_at`)."""
+        (there,) = self.cameras_at(camera, (time_us,))
+        return there
+
     @functools.cached_property
     def _tracks(self) -> dict[str, CameraTrack]:
         frames: dict[str, list[Frame]] = {name: [] for name in self.cameras}

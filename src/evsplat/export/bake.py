@@ -32,7 +32,7 @@ def at_rest(run: Run, camera: str | None) -> SkinnedGaussians:
     if camera is not None:
         check_camera(capture, camera)
     views = [
-        (frame.mid_us, capture.cameras_at(camera or frame.camera, [frame.mid_us])[0])
+        (frame.mid_us, capture.camera_at(camera or frame.camera, frame.mid_us))
         for frame in capture.train_frames
     ]
     return run.reconstruction.at_rest(views)

@@ -66,8 +66,7 @@ def instant_of(
     name = camera or chosen.camera
     check_camera(capture, name)
     label = f"frame-{frame}" if frame is not None else f"{(time_us - first) / 1e6:.3f}s"
-    (there,) = capture.cameras_at(name, [time_us])
-    return Instant(time_us, there, name, label)
+    return Instant(time_us, capture.camera_at(name, time_us), name, label)
 
 
 def cloud_at(

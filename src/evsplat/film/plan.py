@@ -67,7 +67,7 @@ class FilmPlan:
         view = film.camera or recording
 
         middle = _middle(track, times)
-        start = capture.cameras_at(view, times[:1])[0]
+        start = capture.camera_at(view, times[0])
         # Up is where people stood in the recording: a motion may be a somersault.
         room = Room.of(recorded, track, start if capture.is_static_camera else None)
         surroundings = _surroundings(film, room)

@@ -76,7 +76,7 @@ class Compositor:
         # Another motion has times of its own; the camera then stands where it stood first.
         recorded = request.motion.name is None
         time_us = request.time_us if recorded else self.capture.frames[0].mid_us
-        (camera,) = self.capture.cameras_at(request.recording_camera, [time_us])
+        camera = self.capture.camera_at(request.recording_camera, time_us)
         return Pane(*letterboxed(camera, width, height))
 
     def _run_picture(

@@ -88,7 +88,7 @@ class Viewer:
     def _set_scene(self, up: np.ndarray) -> None:
         server, first = self.server, self.capture.frames[0]
         server.scene.set_up_direction(tuple(up.tolist()))
-        (camera,) = self.capture.cameras_at(first.camera, [first.mid_us])
+        camera = self.capture.camera_at(first.camera, first.mid_us)
         centre = camera.center().double().numpy()
         start = server.initial_camera
         start.position = centre
