@@ -72,6 +72,9 @@ class _Recording:
         frames = [frame for frame in self.frames if frame.camera == name]
         return CameraTrack(self.cameras[name], frames).at(times_us)
 
+    def camera_at(self, name: str, time_us: int) -> Camera:
+        return self.cameras_at(name, [time_us])[0]
+
     def image(self, frame: Frame) -> torch.Tensor:
         return torch.full((HEIGHT, WIDTH, 3), 10 * frame.index / 255)
 
