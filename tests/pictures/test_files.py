@@ -5,7 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
+from evsplat.errors import DataError
 from evsplat.pictures.files import read_image
 
 
@@ -22,3 +24,11 @@ def test_a_tiff_keeps_its_depth_however_it_is_packed(
     read = read_image(path)
     assert read.dtype == pixels.dtype
     assert np.array_equal(read.reshape(pixels.shape), pixels)
+
+
+@pytest.mark.parametrize("kind", ["f4", "i4"])
+def test_pixels_of_32_bits_are_refused_not_clipped_at_255(tmp_path: Path, kind: str) -> None:
+    pixels = np.random.default_rng().uniform(0, 4_000, (9, 14)).astype(kind)
+    Image.fromarray(pixels).save(tmp_path / "p.tif")
+    with pytest.raises(DataError, match=r"p\.tif: its pixels are .*expected 8 or 16 bits; scale"):
+        read_image(tmp_path / "p.tif")

@@ -23,7 +23,7 @@ from evsplat.untrusted.pictures import read_16_bit_colour, read_picture
 
 def read_image(path: Path) -> np.ndarray:
     """The stored pixels: (H, W) or (H, W, 3), uint8 or uint16; transparency is dropped."""
-    pixels = read_picture(path, _pixels)
+    pixels = read_picture(path, lambda image: _pixels(path, image))
     return read_16_bit_colour(path) if pixels is None else pixels
 
 
@@ -111,8 +111,14 @@ def save_png(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
         Image.fromarray(picture).save(temporary, compress_type=zlib.Z_RLE)
 
 
-def _pixels(image: Image.Image) -> np.ndarray | None:
+def _pixels(path: Path, image: Image.Image) -> np.ndarray | None:
     """None for 16 bits per colour, which Pillow would cut to 8."""
+    if image.mode in ("I", "F"):  # Pillow would clip both at 255
+        kind = "whole numbers of 32 bits" if image.mode == "I" else "floating-point numbers"
+        raise DataError(
+            f"{path}: its pixels are {kind}, whose range a file does not say, expected 8 or 16 "
+            "bits; scale them to 0..65535 and save them as 16 bits."
+        )
     if image.mode in ("RGB", "RGBA") and _has_16_bits(image):
         return None
     if image.mode in ("L", "RGB", "I;16"):
