@@ -53,7 +53,22 @@ def _v2e(file: h5py.File, s: EventStream) -> None:
     file.create_dataset("events", data=table.astype("u4"), chunks=(100, 4), compression="gzip")
 
 
-@pytest.mark.parametrize("write", [_dsec, _metavision, _e2vid, _v2e])
+def _m3ed(file: h5py.File, s: EventStream) -> None:
+    """Beside the events of the sensor the track of a camera, which has t, x and y as well."""
+    columns = {"t": s.t, "x": s.x, "y": s.y, "p": (s.p > 0).astype("i1")}
+    for name, values in columns.items():
+        file[f"prophesee/left/{name}"] = values
+    for name in ("t", "x", "y", "z"):
+        file[f"pose/{name}"] = np.arange(5.0)
+
+
+def _mvsec(file: h5py.File, s: EventStream) -> None:
+    file["davis/left/events"] = np.stack([s.x, s.y, s.t * 1e-6, s.p], axis=1)
+    file["davis/left/imu"] = np.ones((20, 4))
+    file["self"] = h5py.SoftLink("/")
+
+
+@pytest.mark.parametrize("write", [_dsec, _metavision, _e2vid, _v2e, _m3ed, _mvsec])
 def test_hdf5_layouts_give_the_same_events(
     tmp_path: Path, write: Callable[[h5py.File, EventStream], None]
 ) -> None:
@@ -71,11 +86,24 @@ def test_named_datasets(tmp_path: Path) -> None:
     s = random_stream(22, 100)
     with h5py.File(tmp_path / "e.h5", "w") as file:
         file["left/stamp"], file["left/u"], file["left/v"] = s.t, s.x, s.y
-    with pytest.raises(DataError, match="no events at /events.*there: left.*columns"):
+    with pytest.raises(DataError, match="no events at /events.*there: left.*from Python.*columns"):
         open_recording(tmp_path / "e.h5")
     where = {"t": "left/stamp", "x": "left/u", "y": "left/v"}
     recording = open_recording(tmp_path / "e.h5", columns=where)
     assert not recording.has_polarity and np.array_equal(recording.read().x, s.x)
+
+
+def test_of_a_file_with_two_sensors_one_has_to_be_copied_out(tmp_path: Path) -> None:
+    path = tmp_path / "stereo.h5"
+    with h5py.File(path, "w") as file:
+        for side in ("left", "right"):
+            _v2e(file.create_group(f"davis/{side}"), random_stream(23, 150))
+    with pytest.raises(DataError, match=r"/davis/left/events, /davis/right/events, .*h5copy"):
+        open_recording(path)
+    # what the message says to do, by the library that h5copy is of
+    with h5py.File(path) as file, h5py.File(tmp_path / "one.h5", "w") as one:
+        file.copy("/davis/right/events", one, "events")
+    assert same(open_recording(tmp_path / "one.h5").read(), random_stream(23, 150))
 
 
 def test_prophesees_own_packing_is_refused_in_one_sentence(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from evsplat.events.formats.base import (
 from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
 from evsplat.options import ReadOptions
 from evsplat.untrusted.faults import broken_as
-from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5
+from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5, wrong_data_set
 
 _PLACES = ("events", "CD/events", "/")
 _ECF = 36559
@@ -115,35 +115,72 @@ def _find_columns(path: Path, file: h5py.File, options: ReadOptions) -> dict[str
             )
         return {key: _Column(name) for key, name in given.items()}
     for place in _PLACES:
-        if not holds(file, place):
-            continue
-        node = file[place]
-        if isinstance(node, h5py.Group):
-            keys = [key for key in node if isinstance(node.get(key), h5py.Dataset)]
-            keys = [key for key in keys if node[key].ndim == 1]
-            found = {
-                key: _Column(f"{place}/{name}".replace("//", "/"))
-                for key, name in match_names(keys).items()
-            }
-        elif node.dtype.names:
-            names = match_names(node.dtype.names)
-            found = {key: _Column(place, field=name) for key, name in names.items()}
-        elif node.ndim == 2 and node.shape[1] in (3, 4):
-            _check_filters(path, node)
-            order = given if isinstance(given, tuple) else None
-            order = order or tuple(table_order(path, node[:BLOCK_EVENTS], options))
-            found = {
-                name: _Column(place, index=i) for i, name in enumerate(order) if name in "txyp"
-            }
-        else:
-            continue
+        found = _columns_at(path, file, place, options) if holds(file, place) else {}
         if {"t", "x", "y"} <= set(found):
             return found
+    deeper = _deeper_places(path, file, options)
+    if len(deeper) == 1:
+        return next(iter(deeper.values()))
+    if deeper:
+        first = next(iter(deeper))
+        raise DataError(
+            f"{path}: holds events at {', '.join('/' + place for place in deeper)}, expected one "
+            f"recording; copy one into a file of its own, such as with h5copy -i IN -s /{first} "
+            "-o OUT -d /events."
+        )
     there = ", ".join(file) or "nothing"
     raise DataError(
-        f"{path}: no events at /events, /CD/events or its root (there: {there}); say where they "
-        "are with columns, such as {'t': 'stream/time', ...}."
+        f"{path}: no events at /events, /CD/events, its root or a group of t, x, y and p (there: "
+        f"{there}); name them so, or say from Python where they are with columns, such as "
+        "{'t': 'stream/time', ...}."
     )
+
+
+def _columns_at(
+    path: Path, file: h5py.File, place: str, options: ReadOptions
+) -> dict[str, _Column]:
+    """Components in a group of columns, in a compound or in a table; empty in anything else."""
+    node = file[place]
+    if isinstance(node, h5py.Group):
+        keys = [key for key in node if isinstance(node.get(key), h5py.Dataset)]
+        keys = [key for key in keys if node[key].ndim == 1]
+        return {
+            key: _Column(f"{place}/{name}".replace("//", "/"))
+            for key, name in match_names(keys).items()
+        }
+    if node.dtype.names:
+        names = match_names(node.dtype.names)
+        return {key: _Column(place, field=name) for key, name in names.items()}
+    if node.ndim == 2 and node.shape[1] in (3, 4):
+        _check_filters(path, node)
+        order = options.columns if isinstance(options.columns, tuple) else None
+        order = order or tuple(table_order(path, node[:BLOCK_EVENTS], options))
+        return {name: _Column(place, index=i) for i, name in enumerate(order) if name in "txyp"}
+    return {}
+
+
+def _deeper_places(
+    path: Path, file: h5py.File, options: ReadOptions
+) -> dict[str, dict[str, _Column]]:
+    """Components at each place below the usual ones that can only hold events.
+
+    Such are groups and compounds with p beside t, x and y, which tracks of a camera have as well
+    (M3ED's /prophesee/left), and tables that are called events (MVSEC's /davis/left/events).
+    """
+    places: list[str] = []
+    # follows no link, so that it ends and stays within the file
+    file.visit(places.append)
+    found = {}
+    for place in places:
+        node = file[place]
+        if isinstance(node, h5py.Dataset):
+            named = node.dtype.names or place.rpartition("/")[2] == "events"
+            if not named or wrong_data_set(file, place):
+                continue
+        columns = _columns_at(path, file, place, options)
+        if {"t", "x", "y", "p"} <= set(columns):
+            found[place] = columns
+    return found
 
 
 def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
