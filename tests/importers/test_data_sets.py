@@ -113,6 +113,34 @@ def test_zju_mocap(tmp_path: Path, models: Path, layout: str, shrink: int) -> No
     assert np.array_equal(read_image(capture.frames[2].image), shrunk(stored, shrink))
 
 
+@pytest.mark.parametrize("astray", [False, True])
+def test_the_body_is_compared_by_the_model_that_the_import_was_given(
+    tmp_path: Path, models: Path, caplog: pytest.LogCaptureFixture, astray: bool
+) -> None:
+    """No environment variable leads to it, which training alone needs."""
+    source = trees.write_zju_arah(tmp_path / "CoreView_392")
+    for path in (source / "models").iterdir() if astray else ():
+        arrays = dict(np.load(path))
+        arrays["trans"] = arrays["trans"] + 50  # metres, out of every picture
+        np.savez(path, **arrays)
+    with caplog.at_level("INFO", "evsplat"):
+        run("zju-mocap", source, tmp_path / "out", smpl=models)
+    assert "No folder for body models" not in caplog.text
+    assert ("the posed body is in none of the" in caplog.text) == astray
+
+
+def test_a_model_of_another_gender_is_said_to_be_missing(
+    tmp_path: Path, models: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    trees.write_mmhpsd_a(tmp_path / "data")
+    folder = write_smpl(tmp_path / "own", "female")
+    monkeypatch.setenv(ENVIRONMENT, str(folder))
+    with caplog.at_level("INFO", "evsplat"):
+        capture = run("mmhpsd", tmp_path / "data", tmp_path / "out", action=trees.ACTION)
+    assert capture.body_file.model == "default"
+    assert f"no SMPL file (male) in {folder}" in caplog.text
+
+
 @pytest.mark.parametrize("posed_with_shift", [True, False])
 def test_zju_mocap_without_a_body_model(
     tmp_path: Path, models: Path, posed_with_shift: bool
@@ -182,7 +210,7 @@ def test_mmhpsd_events_without_polarity_are_left_out(
         capture = run("mmhpsd", tmp_path / "data" / trees.ACTION, tmp_path / "out", smpl=models)
     assert capture.events is None
     assert "without polarity" in capture.provenance["events"]
-    assert "without polarity" in caplog.text and "1 pictures have no pose" in caplog.text
+    assert "without polarity" in caplog.text and "1 picture without a pose" in caplog.text
 
 
 def test_mmhpsd_release_a(tmp_path: Path, models: Path) -> None:

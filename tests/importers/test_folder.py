@@ -109,7 +109,7 @@ def test_exposures_of_a_list_and_pictures_without_a_pose(
     assert capture.body_file.source == "estimated"
     assert [frame.exposure_us[0] for frame in capture.frames] == starts[:4].tolist()
     assert worst_miss(capture) < 0.01
-    assert any("2 pictures have no pose" in note for note in capture.provenance["notes"])
+    assert any("2 pictures without a pose" in note for note in capture.provenance["notes"])
 
 
 def test_pictures_without_a_mask_are_counted(recording: Path, tmp_path: Path) -> None:

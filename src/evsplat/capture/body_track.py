@@ -1,6 +1,7 @@
 """The body of a capture and its pose at any time."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,12 +18,18 @@ from evsplat.capture.training_capture import TrainingCapture
 from evsplat.errors import DataError
 
 
-def load_body_track(capture: Capture | TrainingCapture, *, dense: bool = False) -> BodyTrack:
+def load_body_track(
+    capture: Capture | TrainingCapture,
+    *,
+    dense: bool = False,
+    body_models: Path | None = None,
+) -> BodyTrack:
     """The capture's body with its key poses; ``dense`` takes the true poses of body_dense.npz.
 
-    The dense poses are for evaluation and ablation, never for training.
+    The dense poses are for evaluation and ablation, never for training. ``body_models`` is as of
+    `load_body`.
     """
-    body, order = load_body(capture.body_file)
+    body, order = load_body(capture.body_file, body_models)
     file = capture.body_file
     if dense:
         if capture.dense_body_file is None:
@@ -56,11 +63,12 @@ def _camera_up(capture: Capture | TrainingCapture) -> Float[Tensor, "3"]:
     return torch.stack(upwards).mean(0).cpu()
 
 
-def load_body(file: BodyFile) -> tuple[Body, list[int]]:
+def load_body(file: BodyFile, body_models: Path | None = None) -> tuple[Body, list[int]]:
     """The body that a file names, and the order of the file's joints in it.
 
     ``poses[:, order]`` are the file's poses in the body's joint order. The SMPL family is read
-    from the user's licensed files in the folder that EVSPLAT_BODY_MODELS names.
+    from the user's licensed files: the one at ``body_models`` or under this folder, by default
+    under the folder that EVSPLAT_BODY_MODELS names.
     """
     rig = file.rig
     if rig is not None:
@@ -75,7 +83,8 @@ def load_body(file: BodyFile) -> tuple[Body, list[int]]:
     if file.model == "default":
         body = default_body(file.betas, source=source)
     elif file.model in ("smpl", "smplh", "smplx"):
-        body = smpl_body(file.model, file.betas, gender=file.gender or "neutral", source=source)
+        gender = file.gender or "neutral"
+        body = smpl_body(file.model, file.betas, gender=gender, path=body_models, source=source)
     else:
         raise DataError(
             f"{file.path}: model is '{file.model}', expected one of "

@@ -152,7 +152,7 @@ def run_importer(
         )
     else:
         _import(importer, source, CaptureWriter(out, overwrite=overwrite), smpl)
-    warn_of_capture(out)
+    warn_of_capture(out, smpl)
     return out
 
 

@@ -43,6 +43,7 @@ from evsplat.importers.recorded import (
 )
 from evsplat.importers.smpl import chosen_poses
 from evsplat.options.declare import Flag, option
+from evsplat.wording import counted
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 
@@ -138,7 +139,8 @@ class Folder(Importer):
         )
         notes += [*short_exposure(self.exposure_us), *([note] if note else [])]
         if len(seen) < len(middles):
-            notes.append(f"{len(middles) - len(seen)} pictures have no pose and were left out")
+            lacking = counted(len(middles) - len(seen), "picture")
+            notes.append(f"left out: {lacking} without a pose")
         writer.provenance |= {"source": "own recording", "focal": focal, "notes": notes}
         if path is None or motion is None:
             writer.leave_out_body()

@@ -32,6 +32,7 @@ from evsplat.options.declare import option
 from evsplat.untrusted.arrays import read_npz
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.pictures import image_size
+from evsplat.wording import counted
 
 _FOCAL_PX, _CENTRE_PX, _CANVAS_PX = 1679.3, 641.0, 1280
 """Intrinsics of the 800x1280 picture padded to a square; no distortion."""
@@ -77,7 +78,7 @@ class Mmhpsd(Importer):
         notes = [self._add_events(layout, writer, kept, (width, height))]
         missing = len(pictures) - len(both)
         if missing:
-            notes.append(f"{missing} pictures have no pose and were left out")
+            notes.append(f"left out: {counted(missing, 'picture')} without a pose")
         writer.provenance |= {
             "source": "MMHPSD",
             "layout": layout.name,

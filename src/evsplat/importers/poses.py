@@ -21,6 +21,7 @@ from evsplat.errors import DataError
 from evsplat.files import remove_file
 from evsplat.importers.smpl import add_body, chosen_poses, model_file
 from evsplat.inspection import warn_of_capture
+from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +71,8 @@ def attach_poses(
         raise DataError(f"{file}: has no pose of a frame of {path}; give poses of its pictures.")
     notes = []
     if len(kept) < len(middles):
-        notes.append(f"{len(middles) - len(kept)} frames have no pose and were left out")
+        lacking = counted(len(middles) - len(kept), "frame")
+        notes.append(f"left out: {lacking} without a pose")
     if isinstance(motion, PoseSequence):
         motion = chosen_poses(motion, kept)
         if motion.world == "camera":
@@ -84,7 +86,7 @@ def attach_poses(
         remove_file(making.folder / "poses.html")  # it shows others
     for note in notes:
         logger.info("%s", note)
-    warn_of_capture(out)
+    warn_of_capture(out, smpl)
     return out
 
 

@@ -72,9 +72,11 @@ def add_body(
     transl = transl + _limb_offset(motion, body, poses, transl)
     writer.set_body("default", times_us, poses, transl, betas=shape, source=sequence.pose_source)
     size = "at the subject's own size" if known else "at an average size, the data does not tell it"
+    folder = os.environ.get(ENVIRONMENT)
+    searched = f"({sequence.gender}) in {folder}" if folder else "(--smpl)"
     return [
-        f"body: no {sequence.model.upper()} file (--smpl), so the free body moves instead, {size}; "
-        "limbs may be off by some pixels"
+        f"body: no {sequence.model.upper()} file {searched}, so the free body moves instead, "
+        f"{size}; limbs may be off by some pixels"
     ]
 
 

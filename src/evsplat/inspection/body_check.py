@@ -38,14 +38,18 @@ FIT_SHEET = "body_fit"
 """Name of the picture."""
 
 
-def check_body(capture: TrainingCapture, *, refuse: bool) -> Belonging:
+def check_body(
+    capture: TrainingCapture, *, refuse: bool, body_models: Path | None = None
+) -> Belonging:
     """Judge the body that a training is given; a right one is said nothing of.
+
+    ``body_models`` is as of `evsplat.capture.body_track.load_body`.
 
     Raises:
         DataError: a body that is in no training picture; with ``refuse``, also one that follows
             nothing of what moves.
     """
-    found = judge_body(capture)
+    found = judge_body(capture, load_body_track(capture, body_models=body_models))
     if found.in_no_training_frame:
         raise DataError(
             f"{capture.body_file.path}: the posed body is in none of the "

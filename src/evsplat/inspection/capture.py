@@ -106,8 +106,11 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     return replace(report, findings=findings, summary=summary, pictures=pictures)
 
 
-def warn_of_capture(path: Path) -> None:
-    """Log what is odd about a new capture's pictures, events and body, as training sees them."""
+def warn_of_capture(path: Path, body_models: Path | None = None) -> None:
+    """Log what is odd about a new capture's pictures, events and body, as training sees them.
+
+    ``body_models`` is as of `evsplat.capture.body_track.load_body`.
+    """
     metadata, found = check_capture(path, deep=False)
     if metadata is None:
         return
@@ -119,7 +122,7 @@ def warn_of_capture(path: Path) -> None:
     warn_of_events(seen)
     try:
         if seen.has_body:
-            check_body(seen, refuse=False)
+            check_body(seen, refuse=False, body_models=body_models)
     except EvsplatError as error:  # such as an SMPL file that training will have to find
         logger.info("The body is not compared with the recording: %s", error)
 
