@@ -10,6 +10,7 @@ from PIL import Image
 
 from evsplat.capture import Policy, load_capture
 from evsplat.capture.policy import policy_of
+from evsplat.cli.runs import summary_table
 from evsplat.errors import DataError
 from evsplat.evaluation import evaluate
 from evsplat.evaluation import run as evaluation_run
@@ -82,6 +83,21 @@ def test_training_frames_are_measured_against_their_own_truth(tiny_capture, tmp_
     text = (tmp_path / "metrics_train.md").read_text("utf-8")
     assert f"Means over {len(names)} training frames" in text and "training saw it" in text
     assert "Training frames" in (tmp_path / "metrics_train.tex").read_text("utf-8")
+
+
+def test_pictures_that_are_the_truth_themselves_are_no_row(tiny_capture, tmp_path):
+    def sharp_is_image(document):
+        for frame in document["frames"]:
+            frame["image"] = frame["sharp"]
+
+    path = edit(tiny_capture(frames=20, width=48, height=40), sharp_is_image)
+    metrics = run(path, tmp_path)
+    assert metrics["protocols"]["standard"]["full"]["psnr"] == pytest.approx(20, abs=2)
+    assert set(metrics["blurry_input"]["full"].values()) == {None}
+    assert "is taken as the sharp truth" in metrics["reasons"]["blurry_input.full.psnr"]
+    write_tables(tmp_path, metrics)
+    told = (tmp_path / "metrics.md").read_text() + summary_table(metrics)
+    assert "nearest" in told and "blurry input" not in told and "blurry picture" not in told
 
 
 def test_training_frames_without_truth_are_refused(tiny_capture, tmp_path):

@@ -37,6 +37,10 @@ def run(kind: str, source: Path, out: Path, **options) -> Capture:
     findings = [f for f in validate_capture(out) if f.field != "events"]
     assert [f for f in findings if f.severity == "error"] == []
     capture = load_capture(out)
+    for frame in capture.frames:  # sharp pictures are their own truth, blurry ones have none
+        assert (frame.sharp is None) == (kind == "zju-mocap-blur")
+        if frame.sharp is not None:
+            assert torch.equal(capture.sharp(frame), capture.image(frame))
     one_camera = kind in ("neuman", "people-snapshot")
     assert capture.body_file.source == ("estimated" if one_camera else "markers")
     return capture

@@ -132,7 +132,7 @@ class CaptureWriter:
         exposure_us: tuple[int, int],
         *,
         split: Literal["train", "test"] | None = None,
-        sharp: np.ndarray | Path | str | None = None,
+        sharp: np.ndarray | Path | str | Literal[True] | None = None,
         mask: np.ndarray | Path | str | None = None,
         world_to_camera: ArrayLike | None = None,
     ) -> str:
@@ -140,8 +140,9 @@ class CaptureWriter:
 
         Pictures are arrays (H, W) or (H, W, 3), coded as the camera says: uint8, uint16 or floats
         in [0, 1] (stored as 8 bit), or the path of a PNG, JPEG or WebP file that is copied as it
-        is. ``mask`` is (H, W), the share of the person; booleans will do. Without ``split``, frames
-        whose index modulo 10 is 7, 8 or 9 are test.
+        is. ``sharp`` is the truth at mid-exposure; True: ``image`` is taken as sharp and is its own
+        truth. ``mask`` is (H, W), the share of the person; booleans will do. Without ``split``,
+        frames whose index modulo 10 is 7, 8 or 9 are test.
         """
         checked_name(name, "a frame")
         index = len(self._frames)
@@ -150,7 +151,11 @@ class CaptureWriter:
         entry["image"] = self._store(f"images/{name}", camera, image)
         entry["exposure_us"] = [int(start), int(end)]
         entry["split"] = split or default_split(index)
-        if sharp is not None:
+        if sharp is True:
+            # A file of its own, so that a capture derived from this one can replace the picture.
+            entry["sharp"] = f"sharp/{Path(entry['image']).name}"
+            copy_file(self._root / entry["image"], self._root / entry["sharp"], link=True)
+        elif sharp is not None:
             entry["sharp"] = self._store(f"sharp/{name}", camera, sharp)
         if mask is not None:
             entry["mask"] = self._store(f"masks/{name}", camera, mask)

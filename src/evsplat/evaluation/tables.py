@@ -155,6 +155,8 @@ def _table(
     for name, row in rows.items():
         competes = method is not None and name != "blurry_input"
         values = [row[region][metric] for region, metric in columns]
+        if name == "blurry_input" and not any(value is not None for value in values):
+            continue  # the camera's pictures are the truth itself
         figures = (None if v is None else Figure(v, competes=competes) for v in values)
         kind = "aside" if name == "blurry_input" else "ours" if name == method else "other"
         lines.append(Row(titles.get(name, name), tuple(figures), kind))

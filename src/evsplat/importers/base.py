@@ -111,13 +111,17 @@ def add_picture(
     shrink: int,
     *,
     camera: str = "main",
-    exposure_us: float = SHARP_EXPOSURE_US,
+    exposure_us: float | None = None,
     **details: Any,
 ) -> None:
     """Add a picture file, made smaller by ``shrink``, as the frame whose mid-exposure is given.
 
-    ``details`` are further arguments of `CaptureWriter.add_frame`.
+    Without ``exposure_us`` it is taken as sharp. ``details`` are further arguments of
+    `CaptureWriter.add_frame`.
     """
+    if exposure_us is None:
+        exposure_us = SHARP_EXPOSURE_US
+        details["sharp"] = True
     exposure = exposure_around(time_us, exposure_us)
     writer.add_frame(name, camera, picture(path, shrink), exposure, **details)
 

@@ -86,6 +86,7 @@ class PeopleSnapshot(Importer):
                     "main",
                     shrunk(pixels, self.shrink),
                     exposure_around(time_us, SHARP_EXPOSURE_US),
+                    sharp=True,
                     mask=masks.at(index, self.shrink),
                 )
                 times.append(time_us)
