@@ -1,5 +1,6 @@
 """From a data set to the paper's blurry version of it by one command."""
 
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -66,14 +67,20 @@ def test_mmhpsd_blur_is_one_call(tmp_path: Path) -> None:
     check(tmp_path / "s1g2t3_sharp", tmp_path / "s1g2t3", "mmhpsd-blur")
 
 
-def test_weights_that_are_missing_leave_the_sharp_capture(tmp_path: Path, monkeypatch) -> None:
+def test_weights_that_are_missing_leave_the_sharp_capture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """The recipe names Super SloMo: without its weights the error says so, the import stays."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "none"))
     source = trees.write_zju_raw(tmp_path / "CoreView_377")
-    with pytest.raises(WeightsError):
+    with caplog.at_level("INFO", "evsplat"), pytest.raises(WeightsError):
         import_capture("zju-mocap", source, tmp_path / "out", blur=True)
     assert not (tmp_path / "out").exists()
     assert len(load_capture(tmp_path / "out_sharp").frames) == trees.FRAMES
+    # the command that is said goes on from there, with the choice that needs no weights
+    said = caplog.text.rsplit("make it blurry with: evsplat ", 1)[1].splitlines()[0]
+    assert main([*shlex.split(said), "--interpolation", "flow"]) == 0
+    check(tmp_path / "out_sharp", tmp_path / "out", "zju-mocap-blur")
 
 
 def test_only_data_sets_of_the_paper_have_a_recipe(tmp_path: Path) -> None:

@@ -138,18 +138,7 @@ def run_importer(
             read_points(keypoints)  # a bad file is better found before the long work, too
         _import_and_pose(importer, source, out, smpl, poses, keypoints, overwrite=overwrite)
     elif blur is not None:
-        from evsplat.synthesis import synthesize
-
-        sharp = out.with_name(f"{out.name}_sharp")
-        _import(importer, source, CaptureWriter(sharp, overwrite=overwrite), smpl)
-        synthesize(
-            sharp,
-            out,
-            recipe=importer.blur_recipe,
-            weights=blur.weights,
-            overwrite=overwrite,
-            interpolation=blur.interpolation,
-        )
+        _import_and_blur(importer, source, out, smpl, blur, overwrite=overwrite)
     else:
         _import(importer, source, CaptureWriter(out, overwrite=overwrite), smpl)
     warn_of_capture(out, smpl)
@@ -175,6 +164,39 @@ def _import(
             notes.append(f"body: none; find the person's poses with: {find}")
     for note in notes:
         logger.info("%s", note)
+
+
+def _import_and_blur(
+    importer: Importer,
+    source: Path,
+    out: Path,
+    smpl: Path | None,
+    blur: Blur,
+    *,
+    overwrite: bool,
+) -> None:
+    """By way of the sharp capture beside ``out``, which stays, also where it cannot be blurred."""
+    from evsplat.synthesis import synthesize
+
+    sharp = out.with_name(f"{out.name}_sharp")
+    _import(importer, source, CaptureWriter(sharp, overwrite=overwrite), smpl)
+    recipe = importer.blur_recipe
+    try:
+        synthesize(
+            sharp,
+            out,
+            recipe=recipe,
+            weights=blur.weights,
+            overwrite=overwrite,
+            interpolation=blur.interpolation,
+        )
+    except BaseException:
+        logger.info(
+            "sharp it is: %s; make it blurry with: %s",
+            sharp,
+            command("synthesize", sharp, "--recipe", recipe, "--out", out),
+        )
+        raise
 
 
 def _import_and_pose(
