@@ -16,6 +16,7 @@ from evsplat.evaluation import evaluate
 from evsplat.evaluation import run as evaluation_run
 from evsplat.evaluation.event_maps import chosen_pairs
 from evsplat.evaluation.protocols import METRICS, PSNR_CEILING_DB, REGIONS
+from evsplat.evaluation.report.figures import figures
 from evsplat.evaluation.tables import write_tables
 from evsplat.methods.trivial import MedianBackground
 from evsplat.similarity.lpips import WEIGHTS_VARIABLE
@@ -97,7 +98,10 @@ def test_pictures_that_are_the_truth_themselves_are_no_row(tiny_capture, tmp_pat
     assert "is taken as the sharp truth" in metrics["reasons"]["blurry_input.full.psnr"]
     write_tables(tmp_path, metrics)
     told = (tmp_path / "metrics.md").read_text() + summary_table(metrics)
-    assert "nearest" in told and "blurry input" not in told and "blurry picture" not in told
+    told += figures(SimpleNamespace(metrics=metrics))
+    for words in ("blurry input itself", "own blurry picture", "Against the blurry pictures"):
+        assert words not in told
+    assert "nearest" in told
 
 
 def test_training_frames_without_truth_are_refused(tiny_capture, tmp_path):

@@ -295,7 +295,7 @@ def summary_table(metrics: dict[str, Any]) -> str:
     The last row is what the camera itself took at those times, which no method sees.
     """
     from evsplat.evaluation.splits import count_of, words_of
-    from evsplat.evaluation.tables import composited, terms, without_truth
+    from evsplat.evaluation.tables import composited, input_is_truth, terms, without_truth
 
     if not count_of(metrics):
         return f"No test figures. {terms(metrics)}"
@@ -306,7 +306,7 @@ def summary_table(metrics: dict[str, Any]) -> str:
         **composited(metrics),
         **metrics["trivial"],
     }
-    if metrics["blurry_input"]["full"]["psnr"] is not None:  # else it is the truth itself
+    if not input_is_truth(metrics):
         rows["own blurry picture"] = metrics["blurry_input"]
     width = max(map(len, rows))
     head = "".join(f"{region.replace('_', ' '):>18}" for region in _REGIONS)

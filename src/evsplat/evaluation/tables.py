@@ -181,6 +181,12 @@ def without_truth(metrics: dict[str, Any]) -> str | None:
     )
 
 
+def input_is_truth(metrics: dict[str, Any]) -> bool:
+    """Whether the camera's own pictures are the sharp truth, as those of sharp data sets are."""
+    ours, own = metrics["protocols"]["standard"], metrics.get("blurry_input")
+    return own is not None and ours["full"]["psnr"] is not None and own["full"]["psnr"] is None
+
+
 def terms(metrics: dict[str, Any]) -> str:
     """Terms of the run: a sentence on what training saw, and one on poses that were not given."""
     policy = policy_of(metrics)

@@ -11,6 +11,7 @@ from evsplat.evaluation.tables import (
     REGION_TITLES,
     Table,
     html,
+    input_is_truth,
     missing_networks,
     tables_of,
     terms,
@@ -35,7 +36,7 @@ def figures(source: Source) -> str:
     blurry = (
         f"<li>Against the blurry pictures instead of the sharp truth (no measure of deblurring): "
         f"{against:.2f} dB full frame.</li>"
-        if against is not None
+        if against is not None and not input_is_truth(metrics)
         else ""
     )
     count, frames = count_of(metrics), words_of(metrics).frames
