@@ -4,7 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from evsplat.calibration.agreement import Disagreement, estimate_disagreement
-from evsplat.calibration.brightness import EventSource, FramePair, exposure, pair, pair_indices
+from evsplat.calibration.brightness import (
+    EventSource,
+    Exposure,
+    FramePair,
+    exposure,
+    pair,
+    pair_indices,
+)
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
 from evsplat.calibration.lost import lost_spans
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
@@ -14,6 +21,7 @@ __all__ = [
     "ClockEstimate",
     "Disagreement",
     "EventSource",
+    "Exposure",
     "FramePair",
     "NoiseEstimate",
     "NoiseMeter",

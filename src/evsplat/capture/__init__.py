@@ -8,7 +8,11 @@ from evsplat.capture.coded import coded
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.policy import Policy
-from evsplat.capture.sensor_estimate import estimate_sensor, warn_of_linear_frames
+from evsplat.capture.sensor_estimate import (
+    estimate_sensor,
+    shared_pairs,
+    warn_of_linear_frames,
+)
 from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import validate_capture
 from evsplat.capture.write import CaptureWriter
@@ -28,5 +32,6 @@ __all__ = [
     "warn_of_linear_frames",
     "load_body_track",
     "load_capture",
+    "shared_pairs",
     "validate_capture",
 ]

@@ -1,9 +1,13 @@
 """Clock and contrast thresholds of a capture's event sensor, from its frames and events."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
 
 from evsplat.calibration import (
     MOST_PAIRS,
+    Exposure,
     FramePair,
     SensorEstimate,
     estimate_from_pairs,
@@ -20,6 +24,12 @@ logger = logging.getLogger(__name__)
 LIKELY_LARGEST = 0.6
 """Sensors' thresholds lie between 0.1 and 0.5; frames that are light and are taken as coded by the
 power curve make them look 2.2 times as large."""
+
+_KEPT_BYTES = 128 << 20
+"""Of shared pairs, which are there while a model is built: 60 of 512 x 512 pixels take 79 MB."""
+
+_shared: dict[TrainingCapture, list[FramePair] | None] = {}
+"""Pairs of captures within `shared_pairs`; None before they were asked for."""
 
 
 def looks_linear(capture: Capture | TrainingCapture, estimate: SensorEstimate | None) -> bool:
@@ -59,19 +69,47 @@ def estimate_sensor(capture: TrainingCapture) -> SensorEstimate | None:
     return estimate_from_pairs(frame_pairs(capture), capture.events)
 
 
+@contextmanager
+def shared_pairs(capture: TrainingCapture) -> Iterator[None]:
+    """Within it `frame_pairs` are made once for all who ask, unless they are too large to keep."""
+    _shared[capture] = None
+    try:
+        yield
+    finally:
+        del _shared[capture]
+
+
 def frame_pairs(capture: TrainingCapture) -> list[FramePair]:
-    """At most 60 pairs of consecutive training frames with no held-out one between them."""
+    """At most 60 pairs of consecutive training frames with no held-out one between them.
+
+    Not to be written to, as others may share them.
+    """
+    kept = _shared.get(capture)
+    if kept is not None:
+        return kept
+    pairs = _made_pairs(capture)
+    size = sum(one.change.nbytes + one.usable.nbytes for one in pairs)
+    if capture in _shared and size <= _KEPT_BYTES:
+        _shared[capture] = pairs
+    return pairs
+
+
+def _made_pairs(capture: TrainingCapture) -> list[FramePair]:
     assert capture.events is not None
     first, last = capture.events.time_range_us
     frames = capture.train_frames
     spans = [frame.exposure_us for frame in frames]
     stretch = [capture.events.readable_around(frame.mid_us) for frame in frames]
+
+    # The second frame of a pair is mostly the first one of the next.
+    @lru_cache(maxsize=2)
+    def exposed(index: int) -> Exposure:
+        frame = frames[index]
+        return exposure(capture.image(frame), spans[index], transfer=capture.transfer(frame))
+
     pairs = []
-    for both in pair_indices(spans, MOST_PAIRS, stretch=stretch):
-        start, end = stretch[both[0]]
-        before, after = (
-            exposure(capture.image(frames[i]), spans[i], transfer=capture.transfer(frames[i]))
-            for i in both
-        )
-        pairs.append(pair(before, after, (max(start, first), min(end, last))))
+    for before, after in pair_indices(spans, MOST_PAIRS, stretch=stretch):
+        start, end = stretch[before]
+        recorded_us = max(start, first), min(end, last)
+        pairs.append(pair(exposed(before), exposed(after), recorded_us))
     return pairs

@@ -11,7 +11,7 @@ from PIL import Image
 from evsplat.body import BodyTrack, silhouette
 from evsplat.calibration import SensorEstimate
 from evsplat.camera import Camera
-from evsplat.capture import estimate_sensor, load_body_track
+from evsplat.capture import estimate_sensor, load_body_track, shared_pairs
 from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame
@@ -75,10 +75,11 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
         return replace(report, summary=f"{path}\n{_findings_text(report.findings)}")
     capture = Capture(metadata)
     seen = capture.for_training(Policy(use="everything"))
-    of_events = event_findings(seen)
-    # Clock and thresholds of events that lie elsewhere are chance.
-    elsewhere = any(finding.field in WHICH_WAY for finding in of_events)
-    estimate = None if elsewhere else estimate_sensor(seen)
+    with shared_pairs(seen):
+        of_events = event_findings(seen)
+        # Clock and thresholds of events that lie elsewhere are chance.
+        elsewhere = any(finding.field in WHICH_WAY for finding in of_events)
+        estimate = None if elsewhere else estimate_sensor(seen)
     findings = (
         *found,
         *picture_findings(seen),

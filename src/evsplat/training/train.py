@@ -14,7 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from evsplat.capture import Capture, load_capture
+from evsplat.capture import Capture, load_capture, shared_pairs
 from evsplat.commands import command
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
@@ -139,12 +139,14 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
         warn_of_pictures(seen)
     if purpose == "train" and seen.has_body:
         fitting = check_body(seen, refuse=not options.any_body)
-    if purpose == "train" and getattr(start.settings, "event_weight", 0.0) != 0.0:
-        check_events_reach(seen)
-        warn_of_events(seen)
-    composition = TRAINABLE[start.method].build(
-        start.settings, seen, start.seed, device=device, purpose=purpose
-    )
+    # The check of the events and the estimate of their sensor compare the same frames.
+    with shared_pairs(seen):
+        if purpose == "train" and getattr(start.settings, "event_weight", 0.0) != 0.0:
+            check_events_reach(seen)
+            warn_of_events(seen)
+        composition = TRAINABLE[start.method].build(
+            start.settings, seen, start.seed, device=device, purpose=purpose
+        )
     clock = Clock(
         iterations or start.settings.iterations,
         None if max_minutes is None else 60 * max_minutes,
