@@ -169,6 +169,20 @@ def test_zju_mocap_without_a_body_model(
     assert np.mean(errors) < 2.6 and np.max(errors) < 5.5
 
 
+@pytest.mark.parametrize("lost", [1, trees.FRAMES])
+def test_masks_that_a_data_set_lacks_are_counted(
+    tmp_path: Path, models: Path, caplog: pytest.LogCaptureFixture, lost: int
+) -> None:
+    source = trees.write_neuman(tmp_path / "lab")
+    masks = sorted((source / "segmentations").iterdir())
+    for path in masks[trees.FRAMES - lost :]:
+        path.unlink()
+    with caplog.at_level("INFO", "evsplat"):
+        capture = run("neuman", source, tmp_path / "out", smpl=models)
+    assert f"masks: {lost} of {trees.FRAMES} pictures have none" in caplog.text
+    assert sum(frame.mask is None for frame in capture.frames) == lost
+
+
 def test_frames_are_chosen_by_number_and_by_subject(tmp_path: Path, models: Path) -> None:
     source = trees.write_zju_arah(tmp_path / "CoreView_392")
     capture = run("zju-mocap", source, tmp_path / "out", smpl=models, frames=(2, 5))

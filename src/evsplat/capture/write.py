@@ -226,6 +226,11 @@ class CaptureWriter:
         """True where `set_body` gave a body."""
         return self._body is not None
 
+    @property
+    def with_mask(self) -> tuple[int, int]:
+        """How many frames were given a mask so far, and how many frames there are."""
+        return sum("mask" in frame for frame in self._frames), len(self._frames)
+
     def set_events(
         self,
         events: EventStream | Iterable[EventStream],

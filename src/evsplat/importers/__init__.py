@@ -159,6 +159,12 @@ def _import(
         if importer.no_poses and writer.has_body:
             notes = [note for note in notes if not note.startswith("body:")]
             writer.leave_out_body()
+        found, frames = writer.with_mask
+        if importer.brings_masks and found < frames:
+            notes.append(
+                f"masks: {frames - found} of {frames} pictures have none where the data set keeps "
+                f"them (docs/import.md); find the person with: {command('masks', writer.path)}"
+            )
         if not writer.has_body and not going_on:
             find = command("poses", writer.path, "--out", "NEW")
             notes.append(f"body: none; find the person's poses with: {find}")

@@ -37,6 +37,9 @@ class Importer:
     blur_recipe: ClassVar[str | None] = None
     """Recipe of `evsplat.synthesize` that makes the paper's blurry version of this data set."""
 
+    brings_masks: ClassVar[bool] = False
+    """Whether masks come with the data set, so that missing ones are told."""
+
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read ``source`` into ``writer``; gives notes for the user.
 

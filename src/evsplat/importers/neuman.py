@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from tqdm import tqdm
@@ -32,6 +33,8 @@ from evsplat.untrusted.arrays import read_npz
 @dataclass(frozen=True, kw_only=True)
 class Neuman(Importer):
     """NeuMan, one sequence's folder (bike, citron, jogging, lab, parkinglot, seattle)."""
+
+    brings_masks: ClassVar[bool] = True
 
     frames: FrameRange = None
     """First frame and one past the last; by default all."""

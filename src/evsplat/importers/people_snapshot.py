@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import h5py
 import numpy as np
@@ -38,6 +39,8 @@ from evsplat.untrusted.videos import opened_video
 @dataclass(frozen=True, kw_only=True)
 class PeopleSnapshot(Importer):
     """PeopleSnapshot, one subject's folder, such as male-3-casual."""
+
+    brings_masks: ClassVar[bool] = True
 
     frames: FrameRange = None
     """First frame and one past the last; by default all."""

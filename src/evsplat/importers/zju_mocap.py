@@ -45,6 +45,7 @@ class ZjuMocap(Importer):
     """ZJU-MoCap, one subject's folder: as released (annots.npy) or preprocessed by ARAH."""
 
     blur_recipe: ClassVar[str | None] = "zju-mocap-blur"
+    brings_masks: ClassVar[bool] = True
 
     camera: Annotated[str, option("NAME")] = "1"
     """Number of the camera whose pictures become the frames."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,6 +41,8 @@ _EVENTS_PER_PIECE = 1 << 20
 @dataclass(frozen=True, kw_only=True)
 class ZjuMocapBlur(Importer):
     """ExFMan's ZJU-MoCap-Blur, one sequence's folder (event_info.pkl beside HumanNeRF's files)."""
+
+    brings_masks: ClassVar[bool] = True
 
     shrink: Shrink = 1
     """Pictures and events are made smaller by this factor."""
