@@ -180,6 +180,7 @@ def test_masks_that_a_data_set_lacks_are_counted(
     with caplog.at_level("INFO", "evsplat"):
         capture = run("neuman", source, tmp_path / "out", smpl=models)
     assert f"masks: {lost} of {trees.FRAMES} pictures have none" in caplog.text
+    assert "out --with silhouette" in caplog.text  # no static background to compare with
     assert sum(frame.mask is None for frame in capture.frames) == lost
 
 

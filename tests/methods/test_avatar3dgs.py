@@ -127,6 +127,21 @@ def test_missing_masks_are_told_with_what_to_do(tiny_capture):
         composed(path)
 
 
+def test_missing_masks_before_a_moving_camera_are_made_of_silhouettes(tiny_capture):
+    """Estimates by a static background would be refused next."""
+    path = tiny_capture()
+    forget_masks(path, "0002")
+    document = json.loads((path / "capture.json").read_text())
+    pose = document["cameras"]["main"]["world_to_camera"]
+    for number, frame in enumerate(document["frames"]):
+        aside = pose[0][:3] + [pose[0][3] + 1e-4 * number]
+        frame["world_to_camera"] = [aside, *pose[1:]]
+    (path / "capture.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match="make them with: evsplat masks .*silhouette") as refusal:
+        composed(path)
+    assert "estimated" not in str(refusal.value)
+
+
 def test_masks_that_the_policy_hides_are_not_looked_for(tiny_capture):
     with pytest.raises(ConfigError, match="policy.masks is none, and method avatar3dgs"):
         composed(tiny_capture(), "policy.masks=none")

@@ -22,11 +22,13 @@ def require_masks(capture: TrainingCapture, method: str) -> None:
     frames = capture.train_frames
     without = [frame.name for frame in frames if not capture.has_mask(frame)]
     if without:
+        ways = f"{command('masks', capture.path)}, or pass --set policy.masks=estimated"
+        if not capture.is_static_camera:  # estimates are differences to a static background
+            ways = command("masks", capture.path, "--with", "silhouette")
         raise DataError(
             f"{capture.path / 'capture.json'}: {len(without)} of {len(frames)} training frames "
             f"have no mask (the first is {without[0]!r}), and {method} learns the person from "
-            f"masks; make them with: {command('masks', capture.path)}, or pass --set "
-            "policy.masks=estimated."
+            f"masks; make them with: {ways}."
         )
 
 

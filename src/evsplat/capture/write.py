@@ -231,6 +231,11 @@ class CaptureWriter:
         """How many frames were given a mask so far, and how many frames there are."""
         return sum("mask" in frame for frame in self._frames), len(self._frames)
 
+    @property
+    def camera_moves(self) -> bool:
+        """True where a frame was given a pose of its own."""
+        return any("world_to_camera" in frame for frame in self._frames)
+
     def set_events(
         self,
         events: EventStream | Iterable[EventStream],

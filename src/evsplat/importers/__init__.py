@@ -161,9 +161,11 @@ def _import(
             writer.leave_out_body()
         found, frames = writer.with_mask
         if importer.brings_masks and found < frames:
+            how = ("--with", "silhouette") if writer.camera_moves else ()
+            find = command("masks", writer.path, *how)
             notes.append(
                 f"masks: {frames - found} of {frames} pictures have none where the data set keeps "
-                f"them (docs/import.md); find the person with: {command('masks', writer.path)}"
+                f"them (docs/import.md); find the person with: {find}"
             )
         if not writer.has_body and not going_on:
             find = command("poses", writer.path, "--out", "NEW")
