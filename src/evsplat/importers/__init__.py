@@ -189,6 +189,7 @@ def _import_and_blur(
     sharp = out.with_name(f"{out.name}_sharp")
     _import(importer, source, CaptureWriter(sharp, overwrite=overwrite), smpl)
     recipe = importer.blur_recipe
+    assert recipe is not None, "run_importer refuses kinds without one"
     try:
         synthesize(
             sharp,
