@@ -21,6 +21,7 @@ from evsplat.errors import ConfigError
 from evsplat.gaussians.initialise import backdrop_depth, pixel_rays
 from evsplat.gaussians.surround import margins
 from evsplat.methods.background import NEVER, apart, looked_at, median_far_away
+from evsplat.methods.plane_sweep import Shot, depth_shares
 from evsplat.methods.starts import Backdrop, posed
 
 MOST_TURN_DEG = 45.0
@@ -28,10 +29,12 @@ MOST_TURN_DEG = 45.0
 seen from other sides has other surfaces."""
 WALLS = (0.15, 0.3, 0.5, 0.75, 1.1, 1.6, 2.5)
 """Distances of the wall behind the deepest body point that are compared, as shares of its depth."""
-COMPARED_FRAMES, COMPARED_PIXELS = 12, 65_536
-"""Of the comparison, at most."""
+COMPARED_FRAMES, COMPARED_PIXELS, SWEPT_FRAMES = 12, 65_536, 24
+"""Of the comparison of walls, and frames that tell the depth of each pixel, at most."""
 BODY_FRAMES = 512
 """Training frames, at most, that tell where the person goes."""
+WELL_AWAY = 3.0
+"""Bands from the body at which a frame tells how far away the scene is: nearer by, shadows move."""
 _TELLING = 0.02
 """Share by which frames must agree better on a farther wall: of a camera that only turns, all agree
 alike."""
@@ -63,7 +66,7 @@ def moving_backdrop(capture: TrainingCapture, track: BodyTrack, band_px_at_256: 
     middle = middle_view(capture)
     frames = looked_at(capture)
     band = band_px_at_256 * middle.height / 256
-    seen = [_Seen.of(capture, track, frame, band) for frame in frames]
+    seen = [_Seen.of(capture, track, frame, WELL_AWAY * band) for frame in frames]
     every = -(-len(capture.train_frames) // BODY_FRAMES)
     body = _Body(torch.cat([*posed(track, capture.train_frames[::every])]), up_axis(track))
     share, spread = WALLS[0], math.inf
@@ -75,10 +78,14 @@ def moving_backdrop(capture: TrainingCapture, track: BodyTrack, band_px_at_256: 
         if apart_by < (1 - _TELLING) * spread:
             share, spread = wall, apart_by
     view = middle.widened(*_beyond([each.camera for each in seen], middle, body, share))
-    points = body.sheet(view, share)
+    sheet = body.sheet_depth(view, share)
+    compared = seen[:: -(-len(seen) // SWEPT_FRAMES)]
+    shares = depth_shares(view, sheet, (each.shot(WELL_AWAY * band) for each in compared))
+    points = view.center() + (sheet * shares)[..., None] * pixel_rays(view)
     shown = [each.carried(points) for each in seen]
     pictures, near = (np.stack([each[part] for each in shown]) for part in (0, 1))
-    return Backdrop(view, median_far_away(pictures, near, band), share)
+    near = np.minimum(near, np.float16(band))
+    return Backdrop(view, median_far_away(pictures, near, band), share, shares)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +95,19 @@ class _Seen:
     camera: Camera
     picture: UInt8[np.ndarray, "h w 3"]
     near: Float[np.ndarray, "h w"]
-    """Pixels to the body, at most a band."""
+    """Pixels to the body, up to some."""
 
     @staticmethod
-    def of(capture: TrainingCapture, track: BodyTrack, frame: Frame, band: float) -> "_Seen":
+    def of(capture: TrainingCapture, track: BodyTrack, frame: Frame, farthest: float) -> "_Seen":
         """In eight bits: many large pictures would fill the memory."""
         picture = (255 * capture.image(frame)).round().byte().cpu().numpy()
-        near = np.minimum(apart(capture, track, frame), band).astype(np.float32)
+        near = np.minimum(apart(capture, track, frame), farthest).astype(np.float32)
         return _Seen(capture.camera(frame), picture, near)
+
+    def shot(self, away: float) -> Shot:
+        """Its pixels count that are so far from the body, pixels."""
+        picture, free = torch.from_numpy(self.picture), torch.from_numpy(self.near >= away)
+        return Shot(self.camera, picture.float() / 255, free.float())
 
     def carried(
         self, points: Float[Tensor, "H W 3"]
@@ -127,8 +139,11 @@ class _Body:
 
     def sheet(self, view: Camera, share: float) -> Float[Tensor, "H W 3"]:
         """Places of floor and wall at the pixels of ``view``."""
-        depth = backdrop_depth(view, [self.points], up=self.up, margin=share)
-        return view.center() + depth[..., None] * pixel_rays(view)
+        return view.center() + self.sheet_depth(view, share)[..., None] * pixel_rays(view)
+
+    def sheet_depth(self, view: Camera, share: float) -> Float[Tensor, "H W"]:
+        """How far away they are, metres."""
+        return backdrop_depth(view, [self.points], up=self.up, margin=share)
 
 
 def _turns_deg(capture: TrainingCapture, view: Camera) -> Float[np.ndarray, "F"]:

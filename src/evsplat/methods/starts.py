@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from evsplat.body import BodyTrack, skin, up_axis
 from evsplat.capture import Camera, Frame, TrainingCapture
@@ -103,6 +104,8 @@ class Backdrop:
     """In ``camera``, as the frames are coded."""
     margin: float = BACKDROP_MARGIN
     """Distance of the wall behind the deepest body point, as a fraction of its depth."""
+    depth_shares: Float[Tensor, "H W"] | None = None
+    """Depth of the scene as a share of that of floor and wall, where frames tell it."""
 
 
 FROM_MEDIAN = FittedScene(
@@ -201,6 +204,9 @@ def scene_start(
         depth = backdrop_depth(
             wide, posed(track, frames), up=up_axis(track), margin=backdrop.margin
         )
+        if backdrop.depth_shares is not None:
+            sides = beyond[0], beyond[0], beyond[1], beyond[1]
+            depth = depth * pad(backdrop.depth_shares[None], sides, mode="replicate")[0]
         points, scales, colours = median_backdrop(
             camera,
             picture,
