@@ -154,7 +154,9 @@ def test_bad_options_are_named(tiny_capture: Factory, tmp_path: Path) -> None:
     moved = [pose[0][:3] + [pose[0][3] + 0.1], *pose[1:]]
     document["frames"][0]["world_to_camera"] = moved
     (path / "capture.json").write_text(json.dumps(document))
-    with pytest.raises(DataError, match="moving camera.*silhouette or rvm"):
+    with pytest.raises(
+        DataError, match="moving camera.*evsplat masks .*--with silhouette, or --with rvm"
+    ):
         mask_capture(path, tmp_path / "out", method="background")
     assert not (tmp_path / "out").exists()
 

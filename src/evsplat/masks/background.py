@@ -18,6 +18,7 @@ from scipy.ndimage import (
 from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture, load_body_track
+from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.masks.silhouette import track_silhouette
 from evsplat.pictures import Transfer, decode
@@ -56,7 +57,8 @@ class BackgroundDifference:
         if not capture.is_static_camera:
             raise DataError(
                 f"{capture.path}: has a moving camera or several, so there is no static background "
-                "to compare with; use silhouette or rvm."
+                "to compare with; find the person otherwise: "
+                f"{command('masks', capture.path, '--with', 'silhouette')}, or --with rvm."
             )
         if threshold is not None and not 0 < threshold < 1:
             raise ConfigError(f"threshold {threshold:g}: expected a number between 0 and 1.")
