@@ -222,6 +222,35 @@ def test_a_time_outside_of_the_exposure_is_asked_for_after_the_start():
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("begins", [True, False])
+def test_a_recording_says_nothing_of_frames_before_or_after_it(seed, begins):
+    """Two cameras are not switched on and off together."""
+    capture, step = scene(seed)
+    # the events of 1 to 9 ms are the last, or the first, of a recording of many more frames
+    beside = range(-90_000, 1, 10_000) if begins else range(10_000, 101_000, 10_000)
+    capture.frames = capture.train_frames = [
+        SimpleNamespace(mid_us=mid, exposure_us=(mid - 4_000, mid + 4_000))
+        for mid in sorted([*beside, 10_000 if begins else 0])
+    ]
+    objective = make(capture, 0.3, 0.2)
+    far = capture.frames[0 if begins else -1]
+    assert objective.times(far, 5_000) == ()
+    times = tuple(far.mid_us + time for time in (-4_000, -1_000, 4_000))
+    pictures = torch.rand(3, HEIGHT, WIDTH, 1).double().expand(-1, -1, -1, 3)
+    moved = StepAt(times_us=times, linear=pictures, nominal=5_000.0, frame=far)
+    assert objective.loss(moved) == {}
+    # within the recording nothing is different: of its times those up to the last event are kept
+    inner = slice(1, 3)
+    known = StepAt(
+        times_us=step.times_us[inner], linear=step.linear[inner], nominal=5_000.0, frame=step.frame
+    )
+    assert float(objective.loss(known)["event"]) < 1e-6
+    for _ in range(30):
+        drawn = objective.times(capture.frames[-1 if begins else 0], 5_000)
+        assert all(-4_000 <= time <= 14_000 for time in drawn)
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_without_polarity_the_size_of_the_change_is_compared(seed):
     capture, step = scene(seed, on=0.25, off=0.25)
     stream = capture.events.stream

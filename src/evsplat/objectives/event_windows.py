@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.compiled import native, runs_native
 from evsplat.devices import DeviceCache, constant, send
-from evsplat.events import Span, polarity_counts, window_counts
+from evsplat.events import ALWAYS, EventStore, Span, polarity_counts, window_counts
 from evsplat.events.on_device import EventBlocks
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event_sensor import EventNoise, EventSensor
@@ -24,6 +24,8 @@ _RATE_US = 1_000
 """Time before and after an instant in which events are counted for their rate there."""
 RENDERS = 3
 """Rendered times around a held-out frame."""
+_SILENT_FRAMES = 2
+"""Intervals between frames."""
 
 
 class EventWindows(Objective):
@@ -34,7 +36,8 @@ class EventWindows(Objective):
     ``reach`` intervals of the training frames, so that the gaps between exposures teach as well.
     All pixels count: where there is no event, nothing changed. Nothing is asked of times whose
     events may not be read (`EventStore.readable_around`): there the gap is on one side only, and
-    what is looked at around a window ends with it.
+    what is looked at around a window ends with it. The same holds for times before and after a
+    recording that does not cover the frames: it says nothing of them, not that nothing changed.
 
     Events that nothing caused are allowed for: differences weigh by the noise of their time
     (`EventNoise`), and hot pixels do not count.
@@ -74,6 +77,7 @@ class EventWindows(Objective):
         self.interval_us = _median_gap(mids)
         self.reach_us = reach * _median_gap([frame.mid_us for frame in capture.train_frames])
         self.range_us = (min(mids), max(mids))
+        self.recorded_us = _recorded(self.events, capture.train_frames, self.interval_us)
         self.noise = noise
         self.ramp_us = ramp_us
 
@@ -83,7 +87,9 @@ class EventWindows(Objective):
             return ()
         draw = torch.rand(2, generator=self.generator).tolist()
         start, end = frame.exposure_us
-        low, high = self.events.readable_around(frame.mid_us)
+        low, high = self._known_around(frame)
+        if end <= low or start >= high:
+            return ()
         before = min(self.reach_us, start - max(low, self.range_us[0]))
         after = min(self.reach_us, min(high, self.range_us[1]) - end)
         if max(before, after) < 1:
@@ -96,7 +102,7 @@ class EventWindows(Objective):
         """The events that any times around the frame could ask for."""
         if nominal < self.start or data.device.type == "cpu":
             return
-        low, high = self.events.readable_around(frame.mid_us)
+        low, high = self._known_around(frame)
         reach = int(self.reach_us) + max(_RATE_US, self.ramp_us)
         start, end = (time + self._late_us for time in frame.exposure_us)
         self.blocks.prefetch(data, max(start - reach, low), min(end + reach, high))
@@ -117,10 +123,18 @@ class EventWindows(Objective):
         return {"event": event, "contrast": self.sensor.apart()}
 
     def readable(self, step: Step) -> slice:
-        """The part of a step's times between which events may be read, by the events' clock."""
-        low, high = self.events.readable_around(step.frame.mid_us)
+        """The part of a step's times between which events are known, by the events' clock."""
+        low, high = self._known_around(step.frame)
         late = [time + self._late_us for time in step.times_us]
         return slice(bisect_left(late, low), bisect_right(late, high))
+
+    def _known_around(self, frame: Frame) -> Span:
+        """The stretch of the events' clock about a frame in which events are readable and recorded.
+
+        It is empty, its end before its start, for a frame that lies wholly beside the recording.
+        """
+        low, high = self.events.readable_around(frame.mid_us)
+        return max(low, self.recorded_us[0]), min(high, self.recorded_us[1])
 
     @property
     def _late_us(self) -> int:
@@ -138,7 +152,7 @@ class EventWindows(Objective):
     def _seen(self, step: Step, kept: slice) -> "_Seen":
         """What is compared at the times kept."""
         late = [time + self._late_us for time in step.times_us[kept]]
-        low, high = self.events.readable_around(step.frame.mid_us)
+        low, high = self._known_around(step.frame)
         # A sensor compares logarithms of light, before any transfer curve of a camera.
         pulls_at_all = step.nominal >= self.hue_from
         brightness = step.pictures.log_luminance(self.eps, kept, keeps_hue=pulls_at_all)
@@ -333,6 +347,9 @@ class HeldOutWindows(Objective):
         times = step.times_us
         if len(times) < 2:
             return {}
+        # without the training exposure the sums would begin nowhere
+        if self.windows.readable(step) != slice(0, len(times)):
+            return {}
         wrong = self.windows.differences(step, slice(None))
         lasting = [end - start for start, end in zip(times, times[1:], strict=False)]
         each = self.windows.mean(wrong, lasting)
@@ -349,6 +366,20 @@ class HeldOutWindows(Objective):
         before = [other for other in self.train_frames if other.mid_us < frame.mid_us]
         after = [other for other in self.train_frames if other.mid_us > frame.mid_us]
         return [*before[-1:], *after[:1]]
+
+
+def _recorded(events: EventStore, frames: Sequence[Frame], interval_us: int) -> Span:
+    """When events were recorded, by the first and the last; ALWAYS at an end that frames share.
+
+    A sensor that sees nothing move is silent for a while: only where the first event comes, or the
+    last went, more than `_SILENT_FRAMES` after the frames begin or before they end is the
+    recording taken to begin or to end there.
+    """
+    first, last = events.time_range_us
+    mids = [frame.mid_us for frame in frames]
+    late = first > min(mids) + _SILENT_FRAMES * interval_us
+    early = last < max(mids) - _SILENT_FRAMES * interval_us
+    return (first if late else ALWAYS[0]), (last if early else ALWAYS[1])
 
 
 def _median_gap(times_us: Sequence[int]) -> int:
