@@ -5,12 +5,13 @@ import re
 import shlex
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import evsplat
 from evsplat.cli import main
-from evsplat.events import EventStore
+from evsplat.events import EventStore, EventStream, read_events, write_events
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -35,6 +36,29 @@ def test_readme_commands_have_only_known_options(arguments, capsys, tmp_path, mo
     stdout, stderr = capsys.readouterr()
     assert any(path in stdout + stderr for path in ("runs/mine", "my_capture", "clip.mp4"))
     assert "Unrecognized" not in stderr
+
+
+def test_events_of_another_sensor_are_warped_as_the_guide_says(tmp_path, monkeypatch):
+    seed = int(np.random.default_rng().integers(10_000))
+    rng = np.random.default_rng(seed)
+    x, y = rng.integers(0, 1280, 3_000), rng.integers(0, 720, 3_000)
+    stream = EventStream(
+        np.arange(3_000), x.astype(np.uint16), y.astype(np.uint16), np.ones(3_000, np.int8)
+    )
+    H = np.array([[0.6, 0.01, -8.0], [-0.02, 0.62, 15.0], [1e-5, -2e-5, 1.0]])
+    H[:2] += rng.normal(0, 0.005, (2, 3))
+    (tmp_path / "rec").mkdir()
+    write_events(tmp_path / "rec/events.raw", [stream], width=1280, height=720)
+    np.savetxt(tmp_path / "homography.txt", H)
+    monkeypatch.chdir(tmp_path)
+    guide = FORMAT.parent / "event-formats.md"
+    code = next(block for block in _blocks(guide, "python") if "homography" in block)
+    exec(compile(code, str(guide), "exec"), {})
+    there = cv2.perspectiveTransform(np.stack([x, y], -1)[None].astype(float), H)[0]
+    seen = ((there > -0.5) & (there < (719.5, 539.5))).all(-1)
+    written = read_events(tmp_path / "warped.h5")
+    assert np.array_equal(written.t, stream.t[seen])
+    assert np.abs(np.stack([written.x, written.y], -1) - there[seen]).max() < 0.5001
 
 
 def test_readme_python_uses_what_the_package_has():
