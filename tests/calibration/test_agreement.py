@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evsplat.calibration import estimate_disagreement, lost_spans
+from evsplat.calibration import answered_share, estimate_disagreement, lost_spans
 from evsplat.events import EventStream
 
 from .synthetic import HEIGHT, WIDTH, Recording, record
@@ -102,3 +102,17 @@ def test_no_gap_is_told_where_nothing_moves_or_nothing_was_recorded() -> None:
     assert lost_spans(still, recording.events.take(slice(0, 0))) == []
     late = [replace(pair, recorded_us=(400_000, 900_000)) for pair in recording.pairs]
     assert lost_spans(late, _without(recording, 0, 400_000)) == []
+
+
+@pytest.mark.parametrize("lag_us", [0, 15_000])
+def test_pixels_that_change_very_much_have_events_unless_the_sensor_is_coarser(lag_us) -> None:
+    """As of a sensor with a third of the pixels' columns and rows, warped to the frames."""
+    seed = int(np.random.default_rng().integers(10_000))
+    recording = record(seed, plus=0.35, minus=0.4, lag_us=lag_us, noise_hz=1.0)
+    share = answered_share(recording.pairs, recording.events)
+    assert share is not None and share > 0.85
+    x, y = recording.events.x, recording.events.y
+    coarse = recording.events.take((x % 3 == 1) & (y % 3 == 1))
+    assert answered_share(recording.pairs, coarse) == pytest.approx(share / 9, abs=0.06)
+    still = [replace(pair, change=np.zeros_like(pair.change)) for pair in recording.pairs]
+    assert answered_share(still, recording.events) is None

@@ -1,8 +1,13 @@
-"""Times at which a sensor recorded nothing although pictures change: what a full buffer loses."""
+"""Times and places at which a sensor recorded nothing although pictures change.
+
+Times are what a full buffer loses; places, what a sensor coarser than the pictures leaves between
+its pixels, or events that were warped elsewhere.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool
 
 from evsplat.calibration.brightness import EventSource, FramePair
 from evsplat.events import Span
@@ -15,6 +20,8 @@ LEAST_PIXELS = 30
 SILENT = 0.1
 """Share of those pixels below which the sensor is taken to have recorded nothing: where it does,
 nearly all of them have events."""
+VERY_MUCH = 1.5
+"""Change that stays above thresholds where linear frames are taken as coded, 2.2 times as large."""
 
 
 def lost_spans(pairs: Sequence[FramePair], events: EventSource) -> list[Span]:
@@ -29,10 +36,7 @@ def lost_spans(pairs: Sequence[FramePair], events: EventSource) -> list[Span]:
         moved = pair.usable & (np.abs(pair.change) > MUCH)
         if moved.sum() < LEAST_PIXELS or not pair.recorded_at(0):
             continue
-        near = events.between(*pair.span_us)
-        fired = np.zeros(moved.size, bool)
-        fired[event_pixels(near, *moved.shape)] = True
-        if fired[moved.ravel()].mean() >= SILENT:
+        if _fired(pair, events)[moved].mean() >= SILENT:
             continue
         first, last = sum(pair.before_us) // 2, sum(pair.after_us) // 2
         if found and first <= found[-1][1]:
@@ -40,3 +44,27 @@ def lost_spans(pairs: Sequence[FramePair], events: EventSource) -> list[Span]:
         else:
             found.append((first, last))
     return found
+
+
+def answered_share(pairs: Sequence[FramePair], events: EventSource) -> float | None:
+    """Share of the pixels that change by more than `VERY_MUCH` between two frames that had an
+    event meanwhile, over all pairs; None where `LEAST_PIXELS` do not change so much.
+
+    Sensors whose pixels are those of the frames have events at nine of ten or more, whatever their
+    noise, with clocks up to half a frame apart.
+    """
+    changed = answered = 0
+    for pair in pairs:
+        moved = pair.usable & (np.abs(pair.change) > VERY_MUCH)
+        if moved.any() and pair.recorded_at(0):
+            changed += int(moved.sum())
+            answered += int(_fired(pair, events)[moved].sum())
+    return answered / changed if changed >= LEAST_PIXELS else None
+
+
+def _fired(pair: FramePair, events: EventSource) -> Bool[np.ndarray, "H W"]:
+    """Pixels that had an event from the begin of one exposure to the end of the other."""
+    height, width = pair.change.shape
+    fired = np.zeros(height * width, bool)
+    fired[event_pixels(events.between(*pair.span_us), height, width)] = True
+    return fired.reshape(height, width)

@@ -1,9 +1,10 @@
-"""Warnings about events that do not tell what frames show: turned, inverted, one-sided, lost."""
+"""Warnings about events that do not tell what frames show: turned, inverted, sparse, lost."""
 
 import logging
 
 from evsplat.calibration import (
     FramePair,
+    answered_share,
     estimate_disagreement,
     lost_spans,
 )
@@ -16,6 +17,8 @@ logger = logging.getLogger(__name__)
 
 WHICH_WAY = ("events/p", "events/x, events/y")
 """Fields of findings with which events tell nothing of the clock or of thresholds."""
+_FEWEST_ANSWERED = 0.7
+"""Share of pixels that change very much below which they are not those of the events."""
 _MANY = 100
 """Events of which some are of either polarity."""
 
@@ -54,6 +57,17 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
             "events wherever the brightness changes",
             "The sensor lost them: record again with a lower rate of events, or leave out these "
             "frames. Training takes no event for no change.",
+        )  # fmt: skip
+    answered = None if lost or sign or other_way else answered_share(pairs, events)
+    if answered is not None and answered < _FEWEST_ANSWERED:
+        findings.warning(
+            events.path, "events/x, events/y",
+            f"an event at {answered:.0%} of the pixels that change most between frames",
+            "events at nearly all of them",
+            "Look at events.png of 'evsplat inspect': where events lie beside the edges they are "
+            "those of another geometry; where they lie on edges with holes between them, the "
+            "pictures are finer than the sensor, and have to be made as coarse "
+            "(docs/own-capture.md, two sensors).",
         )  # fmt: skip
     return findings.items
 
