@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation
 
-from evsplat.body import BodyTrack, silhouette
+from evsplat.body import BodyTrack, silhouette, up_axis
 from evsplat.body.smpl import ENVIRONMENT
 from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
 from evsplat.importers import import_capture
@@ -267,7 +267,12 @@ def test_neuman(tmp_path: Path, models: Path, uneven: bool) -> None:
     assert beyond_a_pixel(capture, models) < 0.005
     points = capture.initial_points()
     assert points is not None
-    assert np.allclose(points[0], [[1, 0, -2], [0, 1 / 0.37, 2 / 0.37]], atol=1e-5)
+    turn = np.array(capture.provenance["world_from_colmap"])
+    assert np.allclose(points[0], [[1, 0, -2], [0, 1 / 0.37, 2 / 0.37]] @ turn.T, atol=1e-5)
+    # COLMAP's world is askew, the capture's stands upright: all pictures' rows are level.
+    up = up_axis(track_of(capture, models))
+    rows = torch.stack([capture.camera(frame).world_to_camera[0, :3] for frame in capture.frames])
+    assert (rows @ up).abs().max() < 0.02
     assert np.allclose(points[1][0], [1, 0, 0.2], atol=0.01)
 
 

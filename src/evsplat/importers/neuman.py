@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from evsplat.body.pose_files import PoseSequence
@@ -27,6 +28,7 @@ from evsplat.importers.base import (
 from evsplat.importers.colmap import read_colmap
 from evsplat.importers.option_types import FrameRange, Rate, Shrink
 from evsplat.importers.smpl import add_body, chosen_poses
+from evsplat.importers.upright import upright
 from evsplat.untrusted.arrays import read_npz
 
 
@@ -63,6 +65,9 @@ class Neuman(Importer):
             )
         views = [scene.cameras[path.name] for path in pictures.values()]
         sequence, scale = _read_poses(source, views, order)
+        # COLMAP's world has any axes; films and viewer take one of them for up.
+        trunks = Rotation.from_rotvec(sequence.poses[:, 0]).as_matrix()[:, :, 1]
+        turn = upright(np.stack([view.world_to_camera for view in views]), trunks.mean(0))
         kept = chosen_frames(self.frames, order, source)
         first = pictures[kept[0]]
         SourceCamera(views[0].K, np.eye(4), views[0].distortion).add_to(
@@ -71,6 +76,7 @@ class Neuman(Importer):
         times = []
         for number in tqdm(kept, desc="pictures", unit="frame", leave=False):
             pose = views[order.index(number)].world_to_camera.copy()
+            pose[:3, :3] = pose[:3, :3] @ turn.T
             pose[:3, 3] /= scale
             mask, turned = _mask(source, pictures[number])
             time_us = round(number * 1e6 / self.fps)
@@ -85,15 +91,16 @@ class Neuman(Importer):
             )
             times.append(time_us)
         if len(scene.points):
-            writer.set_points(scene.points / scale, scene.colours)
+            writer.set_points(scene.points @ turn.T / scale, scene.colours)
         writer.provenance |= {
             "source": "NeuMan",
             "sequence": source.resolve().name,
             "shrink": self.shrink,
             "fps_nominal": self.fps,
             "colmap_units_per_metre": scale,
+            "world_from_colmap": turn.tolist(),
         }
-        return add_body(writer, times, chosen_poses(sequence, kept), smpl)
+        return add_body(writer, times, chosen_poses(sequence, kept), smpl, turn=turn)
 
 
 def _read_poses(

@@ -18,7 +18,7 @@ from evsplat.body.pose_files.transfer import skeleton_motion
 from evsplat.body.retarget import SkeletonMotion, retarget
 from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.body.skeleton import find_skeleton
-from evsplat.body.smpl import ENVIRONMENT, find_model_file, read_model_file
+from evsplat.body.smpl import ENVIRONMENT, find_model_file, read_model_file, smpl_body
 from evsplat.body.tree import world_rotations
 from evsplat.capture.derive import Derivation
 from evsplat.capture.write import CaptureWriter
@@ -37,18 +37,24 @@ def add_body(
     smpl: Path | None,
     *,
     rest_joints: Float[np.ndarray, "J 3"] | None = None,
+    turn: Float[np.ndarray, "3 3"] | None = None,
 ) -> list[str]:
     """Give the capture its body, one key pose per time; returns notes for the user.
 
     With the user's SMPL file the body is the sequence's model; without it the motion is carried
     over to the body that ships with evsplat, at the size of ``rest_joints`` (the first joints of
-    the subject at rest in the model's axes) where the data set tells them.
+    the subject at rest in the model's axes) where the data set tells them. ``turn`` leads from the
+    axes of the sequence's world to the capture's.
     """
     file = model_file(smpl, sequence.model, sequence.gender)
     if file is not None:
         betas = sequence.betas
         if not len(betas) and rest_joints is not None:
             betas = _betas_of(file, rest_joints)
+        if turn is not None:
+            model, gender = sequence.model, sequence.gender
+            body = smpl_body(model, betas, gender=gender, path=file, source=sequence.source)
+            sequence = sequence.turned(turn, body.rest_joints[0].double().numpy())
         writer.set_body(
             sequence.model,
             times_us,
@@ -65,7 +71,7 @@ def add_body(
     known = rest_joints is not None
     average = smpl_skeleton.approximate_rest_joints(sequence.model)
     joints = np.asarray(rest_joints)[:_JOINTS] if known else average
-    motion = skeleton_motion(sequence, zero_joints=joints)
+    motion = skeleton_motion(sequence, zero_joints=joints, world_from_sequence=turn)
     shape = shape_like(smpl_skeleton.NAMES, smpl_skeleton.PARENTS, joints)
     body = default_body(shape)
     poses, transl = retarget(motion, body, root_scale=1.0)

@@ -1,7 +1,7 @@
 """Body poses of a video as one type, whatever tool they come from."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -46,6 +46,22 @@ class PoseSequence:
     """Per frame, where the file has cameras and the world is not the camera."""
     notes: tuple[str, ...] = ()
     """Gaps of the file, one sentence each."""
+
+    def turned(
+        self, turn: Float[np.ndarray, "3 3"], root_at_rest: Float[np.ndarray, "3"]
+    ) -> "PoseSequence":
+        """In a world whose axes are turned; ``root_at_rest`` is the root joint's place at rest."""
+        poses, cameras = self.poses.copy(), self.world_to_camera
+        poses[:, 0] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+        if cameras is not None:
+            cameras = cameras.copy()
+            cameras[:, :3, :3] = cameras[:, :3, :3] @ turn.T
+        return replace(
+            self,
+            poses=nearest_axis_angle(poses),
+            transl=(self.transl + root_at_rest) @ turn.T - root_at_rest,
+            world_to_camera=cameras,
+        )
 
     def times_us(self, fps: float | None = None, start_us: int = 0) -> Int[np.ndarray, "T"]:
         """Times of the poses at a constant frame rate; ``start_us`` is the time of frame 0."""
