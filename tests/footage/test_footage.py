@@ -106,6 +106,24 @@ def test_the_size_of_a_picture_that_is_upright_needs_no_pixels(tmp_path, suffix)
     assert image_size(path) == (width, height)
 
 
+@pytest.mark.parametrize("shape, square", [((4, 3), False), ((1, 1), True), ((0, 1), True)])
+def test_pixels_that_are_not_square_are_told(tmp_path, shape, square):
+    """HDV and DV: a focal length in pixels would be wrong along one side."""
+    path = tmp_path / "clip.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 32, 16, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(*shape)
+        picture = np.full((16, 32, 3), 90, np.uint8)
+        frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        container.mux([*stream.encode(frame), *stream.encode()])
+    if square:
+        assert open_footage(path).width == 32
+        return
+    with pytest.raises(DataError, match=r"pixels 1\.33 times as wide as high.*setsar=1"):
+        open_footage(path)
+
+
 def test_given_rate_replaces_the_times_of_a_slow_motion_file(tmp_path):
     write_video(tmp_path / "slow.mkv", some_pictures(4), [0, 33, 67, 100])
     assert open_footage(tmp_path / "slow.mkv", 240).times_us.tolist() == [0, 4167, 8333, 12500]

@@ -34,6 +34,13 @@ class VideoFootage:
                 f"{path}: is HDR video ({_HDR_TRANSFERS[first.color_trc]}), expected sRGB or "
                 "BT.709; convert it to SDR first."
             )
+        with opened_video(path) as (_, stream):
+            shape = stream.sample_aspect_ratio
+        if shape and shape != 1:  # None or 0 where the file does not say
+            raise DataError(
+                f"{path}: has pixels {float(shape):.3g} times as wide as high, expected square "
+                "ones; make them so with: ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 OUT.mp4"
+            )
         self.height, self.width = _pixels(first).shape[:2]
         stamps = self._timestamps()
         if fps is not None:
