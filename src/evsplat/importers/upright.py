@@ -26,9 +26,6 @@ def upright(
     axis = np.zeros(3)
     nearest = int(np.abs(up).argmax())
     axis[nearest] = np.sign(up[nearest])
-    across = np.cross(up, axis)
-    sine = float(np.linalg.norm(across))
-    if sine < 1e-9:
-        return np.eye(3)
-    turn: np.ndarray = Rotation.from_rotvec(across / sine * np.arctan2(sine, up @ axis)).as_matrix()
+    # of a single pair of directions it is the shortest way
+    turn: np.ndarray = Rotation.align_vectors(axis[None], up[None])[0].as_matrix()
     return turn

@@ -183,8 +183,6 @@ def _along(lines: Float[Tensor, "L N M"]) -> Float[Tensor, "L N M"]:
 
 
 def _smaller(shot: Shot, step: int) -> Shot:
-    if step == 1:
-        return shot
     free = _pooled(shot.free[..., None], step)[..., 0]
     return Shot(_smaller_camera(shot.camera, step), _pooled(shot.picture, step), free)
 
