@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 
 from evsplat.cli.main import main
+from evsplat.disk import held
 from evsplat.errors import DataError
 from evsplat.options.inputs import (
     check_capture_folder,
     check_capture_or_recording,
     check_run_folder,
+    check_run_or_training,
 )
 
 VERBS = [
@@ -59,6 +61,20 @@ def test_runs_one_level_below_are_named(tmp_path: Path) -> None:
     (tmp_path / "a" / "config.yaml").touch()
     with pytest.raises(DataError, match=r"is missing\. A run lies below: .*/a\.$"):
         check_run_folder(tmp_path)
+
+
+def test_a_training_that_prepares_its_first_step_is_told_from_no_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with held(tmp_path / ".watch"):
+        assert main(["evaluate", str(tmp_path)]) == 2
+        told = capsys.readouterr().err
+        assert "still being prepared" in told and "wait for the first one" in told
+        check_run_or_training(tmp_path)  # the viewer waits
+    # Left behind by one that was killed.
+    assert (tmp_path / ".watch").exists()
+    with pytest.raises(DataError, match="not a run folder"):
+        check_run_or_training(tmp_path)
 
 
 def test_what_inspect_takes_is_a_capture_a_recording_or_a_bag(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A run as the viewer draws it: still pictures are those of the run, whatever was drawn before."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,13 +9,16 @@ import pytest
 import torch
 
 from evsplat.capture import load_capture
+from evsplat.errors import DataError
 from evsplat.film import Look
 from evsplat.film.surroundings import Room
 from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.training.run import Run
+from evsplat.training.watching import training_in
+from evsplat.view import viewed_run
 from evsplat.view.posing import HeldPose, PoseSlider, turned
 from evsplat.view.request import Motion
-from evsplat.view.viewed_run import ViewedRun
+from evsplat.view.viewed_run import ViewedRun, load_newest
 
 from ..small_model import built, small_config
 
@@ -134,3 +138,28 @@ def test_from_elsewhere_holes_show_a_room_and_the_rest_what_films_show(run):
     expected = Look(surroundings=room).expose(drawn, camera, [time_us])[0] / 255
     found = viewed.picture(camera, time_us, Motion(), Look(), draft=False, elsewhere=True)
     assert np.abs(found - expected).max() < 0.05
+
+
+def test_a_training_that_ends_before_its_first_step_is_waited_for_and_told(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(viewed_run, "_POLL_S", 0.01)
+    begun, failed, waiting = threading.Event(), threading.Event(), threading.Event()
+    monkeypatch.setattr(viewed_run, "watch", lambda path: waiting.set())
+
+    def train():
+        with training_in(tmp_path / "run"):
+            begun.set()
+            failed.wait(60)
+
+    training = threading.Thread(target=train)
+    training.start()
+    assert begun.wait(60)
+    fail = threading.Thread(target=lambda: (waiting.wait(60), failed.set()))
+    fail.start()
+    with pytest.raises(DataError, match="ended before its first step"):
+        load_newest(tmp_path / "run", "cpu")
+    training.join()
+    fail.join()
+    told = capsys.readouterr().out
+    assert told.count("waiting for it") == 1

@@ -22,7 +22,7 @@ from evsplat.options.declare import (
     Threads,
     option,
 )
-from evsplat.options.inputs import Input, check_run_folder
+from evsplat.options.inputs import Input, check_run_folder, check_run_or_training
 from evsplat.options.runs import Kind, Split
 from evsplat.shipped import demo_capture
 
@@ -211,11 +211,15 @@ class Render:
 class View:
     """Show a run in the browser: any time, any viewpoint, beside its input or another."""
 
-    run: RunFolder
+    run: Annotated[
+        Positional[Path],
+        option("RUN", "Run folder written by 'evsplat train', or of one that trains."),
+        Input(check_run_or_training),
+    ]
     other: Annotated[
         Positional[Path | None],
         option("[RUN2]", default="no comparison"),
-        Input(check_run_folder),
+        Input(check_run_or_training),
     ] = None
     """A second run of the same capture to compare with."""
     port: Port = 8080

@@ -6,8 +6,11 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from evsplat.disk import is_held
 from evsplat.errors import DataError
 
+TRAINING_SIGN = ".watch"
+"""File in a run folder that is there while it trains, and whose lock the training holds."""
 _NAMED_RUNS = 5
 
 
@@ -62,9 +65,24 @@ def check_capture_folder(path: Path) -> None:
 
 
 def check_run_folder(path: Path) -> None:
-    """Raise a `DataError` that names the runs one level below where ``path`` is no run."""
-    if not (path / "config.yaml").exists():
-        raise DataError(f"{path}: not a run folder, config.yaml is missing.{_runs_below(path)}")
+    """Raise a `DataError` that names the runs one level below where ``path`` is no run.
+
+    A run whose training still prepares its first step is none yet.
+    """
+    if (path / "config.yaml").exists():
+        return
+    if is_held(path / TRAINING_SIGN):
+        raise DataError(
+            f"{path}: its training is still being prepared, expected one that has made a step; "
+            "wait for the first one, or open 'evsplat view', which waits by itself."
+        )
+    raise DataError(f"{path}: not a run folder, config.yaml is missing.{_runs_below(path)}")
+
+
+def check_run_or_training(path: Path) -> None:
+    """As `check_run_folder`, where a training that prepares its first step will do as well."""
+    if not is_held(path / TRAINING_SIGN):
+        check_run_folder(path)
 
 
 def check_file(path: Path) -> None:

@@ -19,6 +19,7 @@ from torch import Tensor
 from evsplat.disk import is_held
 from evsplat.errors import TRACEBACK, OutputError
 from evsplat.files import held_folder, remove_file
+from evsplat.options.inputs import TRAINING_SIGN
 from evsplat.training.checkpoint import latest_checkpoint, write_state
 
 SNAPSHOT_SECONDS = 3.0
@@ -28,7 +29,6 @@ LARGEST_SHARE = 0.01
 _WATCHED_SECONDS = 10.0
 """A watcher that was not seen for so long has gone."""
 _LOOK_SECONDS = 1.0
-_SIGN = ".watch"
 _FACTS = "versions.json"
 
 logger = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class Showcase:
     """The trainer's side."""
 
     def __init__(self, run: Path, clock: Callable[[], float] = time.perf_counter) -> None:
-        self.sign, self.file = run / _SIGN, run / "snapshot.safetensors"
+        self.sign, self.file = run / TRAINING_SIGN, run / "snapshot.safetensors"
         self._clock = clock
         self._looked = self._shown = -1e9
         self._seen = 0
@@ -90,25 +90,25 @@ def training_in(run: Path) -> Iterator[None]:
         ConfigError: Another process does.
     """
     busy = "is training in this folder; wait for it or choose another --out."
-    with held_folder(run, _SIGN, busy):
+    with held_folder(run, TRAINING_SIGN, busy):
         yield
 
 
 def is_training(run: Path) -> bool:
     """Whether a process trains in a run folder now: whether it holds the lock."""
-    return is_held(run / _SIGN)
+    return is_held(run / TRAINING_SIGN)
 
 
 def is_unused(run: Path) -> bool:
     """Whether a folder holds nothing but what a training that never began left in it."""
     names = {path.name for path in run.iterdir()} if run.exists() else set()
-    return all(name in {_SIGN, _FACTS} or name.startswith(TRACEBACK) for name in names)
+    return all(name in {TRAINING_SIGN, _FACTS} or name.startswith(TRACEBACK) for name in names)
 
 
 def watch(run: Path) -> None:
     """Ask the trainer for snapshots; where that is not allowed its checkpoints have to do."""
     with suppress(OSError):
-        os.utime(run / _SIGN)
+        os.utime(run / TRAINING_SIGN)
 
 
 def newest_state(run: Path) -> Path | None:

@@ -164,11 +164,24 @@ def _cached(reconstruction: GaussianReconstruction) -> GaussianReconstruction:
 
 
 def load_newest(path: Path, device: str) -> Run:
-    """The run at its newest checkpoint or snapshot; waits for the first one of a training."""
+    """The run at its newest checkpoint or snapshot; waits for the first one of a training.
+
+    Raises:
+        DataError: No run, or none to be waited for: its training ended before its first step.
+    """
+    waited = False
     while newest_state(path) is None and is_training(path):
+        if not waited:
+            print(f"{path}: nothing to see before its first step; waiting for it.", flush=True)
+            waited = True
         watch(path)
         threading.Event().wait(_POLL_S)
     newest = newest_state(path)
+    if waited and newest is None:
+        raise DataError(
+            f"{path}: its training ended before its first step, so that there is nothing to see; "
+            "mend what it said, and train again."
+        )
     # Of checkpoints the newest that can be read.
     snapshot = newest if newest is not None and newest.parent == path else None
     return load_run(path, device=device, state=snapshot)
