@@ -172,6 +172,23 @@ def test_page_shows_every_test_frame_pair_and_view(tiny_capture, tmp_path):
     )
 
 
+@pytest.mark.parametrize("split", ["test", "train"])
+def test_pictures_that_are_taken_as_sharp_are_not_called_blurry(tiny_capture, tmp_path, split):
+    def change(document):
+        for frame in document["frames"]:
+            frame["sharp"] = frame["image"]
+
+    parsed = Page(page(evaluated(edit(tiny_capture(), change), tmp_path, split=split)))
+    alts = [attributes.get("alt") or "" for tag, attributes in parsed.elements if tag == "img"]
+    sliders = [a["aria-label"] for _, a in parsed.elements if a.get("type") == "range"]
+    assert set(sliders) == {"recorded picture, taken as sharp | our render"}
+    assert "recorded picture, taken as sharp, frame 0007" in alts or split == "train"
+    # It is not shown a second time as the truth that it is.
+    assert not any(alt.startswith(("blurry", "sharp truth")) for alt in alts)
+    assert "blurry" not in " ".join(parsed.text)
+    assert any(alt.startswith("error") for alt in alts)
+
+
 def test_page_of_training_frames_says_so(tiny_capture, tmp_path):
     everything = Policy(use="everything")
     source = evaluated(tiny_capture(frames=20), tmp_path, split="train", policy=everything)

@@ -1,5 +1,7 @@
 """A run as the viewer draws it: still pictures are those of the run, whatever was drawn before."""
 
+import json
+import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +18,7 @@ from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.training.run import Run
 from evsplat.training.watching import training_in
 from evsplat.view import viewed_run
+from evsplat.view.compositor import comparisons
 from evsplat.view.posing import HeldPose, PoseSlider, turned
 from evsplat.view.request import Motion
 from evsplat.view.viewed_run import ViewedRun, load_newest
@@ -138,6 +141,20 @@ def test_from_elsewhere_holes_show_a_room_and_the_rest_what_films_show(run):
     expected = Look(surroundings=room).expose(drawn, camera, [time_us])[0] / 255
     found = viewed.picture(camera, time_us, Motion(), Look(), draft=False, elsewhere=True)
     assert np.abs(found - expected).max() < 0.05
+
+
+def test_recorded_pictures_that_are_taken_as_sharp_are_one_choice_to_compare_with(tiny_capture):
+    path = tiny_capture()
+    assert comparisons(load_capture(path), ["b"]) == ["blurry input", "sharp truth", "b"]
+    for picture in (path / "images").iterdir():
+        shutil.copy(picture, path / "sharp")
+    assert comparisons(load_capture(path), ["b"]) == ["recorded picture", "b"]
+    shutil.rmtree(path / "sharp")
+    document = json.loads((path / "capture.json").read_text())
+    for frame in document["frames"]:
+        del frame["sharp"]
+    (path / "capture.json").write_text(json.dumps(document))
+    assert comparisons(load_capture(path), []) == ["blurry input"]
 
 
 def test_a_training_that_ends_before_its_first_step_is_waited_for_and_told(

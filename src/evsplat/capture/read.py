@@ -136,6 +136,11 @@ class CaptureReader:
             )
         return to_rgb(self._picture(frame.sharp, frame.camera))
 
+    def is_own_truth(self, frame: Frame | str) -> bool:
+        """Whether a frame's own picture is its sharp truth, as in data sets of sharp video."""
+        frame = self._frame(frame)
+        return frame.sharp is not None and torch.equal(self.image(frame), self.sharp(frame))
+
     def mask(self, frame: Frame | str) -> Float[Tensor, "H W"] | None:
         """Share of the person per pixel in [0, 1]; None where the frame has no mask."""
         frame = self._frame(frame)

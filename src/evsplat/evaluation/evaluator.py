@@ -197,7 +197,7 @@ class _MeasuredFrames:
         mask, human = self.human_regions.in_frame(frame)
         self._seen |= not isinstance(human, Absent)
         truth = None if frame.sharp is None else self.capture.sharp(frame)
-        pictures = {"method": ours, **self._other_pictures(frame, truth)}
+        pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
         for protocol in self.protocols:
             reference = (
@@ -281,13 +281,12 @@ class _MeasuredFrames:
             **frames,
         }
 
-    def _other_pictures(self, frame: Frame, truth: Tensor | None) -> dict[str, Tensor | Absent]:
+    def _other_pictures(self, frame: Frame) -> dict[str, Tensor | Absent]:
         pictures = {
             row: picture if isinstance(picture, Absent) else picture(frame)
             for row, picture in self._others.items()
         }
-        recorded = pictures.get(BLURRY_INPUT)
-        if isinstance(recorded, Tensor) and truth is not None and torch.equal(recorded, truth):
+        if BLURRY_INPUT in pictures and self.capture.is_own_truth(frame):
             pictures[BLURRY_INPUT] = Absent("the camera's own picture is taken as the sharp truth")
         return pictures
 

@@ -16,7 +16,7 @@ from evsplat.events.maps import count_map
 from evsplat.inspection.drawing import BRIGHTER, DARKER, font
 from evsplat.methods.trivial import nearest_in_time
 from evsplat.view.camera import Box, letterboxed
-from evsplat.view.request import BLURRY, SHARP, ViewRequest
+from evsplat.view.request import BLURRY, OWN_TRUTH, SHARP, ViewRequest
 from evsplat.view.viewed_run import ViewedRun
 
 INSET_SHARE = 0.3
@@ -150,8 +150,10 @@ class Compositor:
 
 def comparisons(capture: Capture, others: Sequence[str]) -> list[str]:
     """Everything that a run of this capture can be compared with."""
-    truth = [SHARP] if any(frame.sharp for frame in capture.frames) else []
-    return [BLURRY, *truth, *others]
+    known = next((frame for frame in capture.frames if frame.sharp), None)
+    if known is None:
+        return [BLURRY, *others]
+    return [*([OWN_TRUTH] if capture.is_own_truth(known) else [BLURRY, SHARP]), *others]
 
 
 def events_on(picture: Picture, counts: Float[np.ndarray, "h w"], box: Box) -> None:

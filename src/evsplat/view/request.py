@@ -10,6 +10,8 @@ Layout = Literal["divided", "side by side"]
 
 BLURRY = "blurry input"
 SHARP = "sharp truth"
+OWN_TRUTH = "recorded picture"
+"""In place of both where the recorded pictures are taken as sharp."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class ViewRequest:
     motion: Motion = Motion()
     look: Look = Look()
     compare: str | None = None
-    """Shown beside the run: `BLURRY`, `SHARP` or another run's name."""
+    """Shown beside the run: `BLURRY`, `SHARP`, `OWN_TRUTH` or another run's name."""
     layout: Layout = "divided"
     divider: float = 0.5
     """Share of the width at which a divided picture changes to the run."""

@@ -37,7 +37,11 @@ _MOST_PIXELS = 24_000_000
 _TRAINING_TERMS = (
     "Training saw the blurry pictures and the events of these times; the sharp truth it never sees."
 )
-_INPUT, _RENDER = "blurry input", "our render"
+_OWN_TRUTH_TERMS = (
+    "Training saw the pictures and the events of these times; the pictures are taken as the sharp "
+    "truth."
+)
+_INPUT, _OWN_TRUTH, _RENDER = "blurry input", "recorded picture, taken as sharp", "our render"
 _REGIONS = {"person_crop": "person crop", "full": "full frame"}
 _MOST_FRAMES = 400
 """Frames whose speed is looked up, evenly spread over a long recording."""
@@ -67,13 +71,19 @@ def test_frames(source: Source) -> str:
     )
     return section(
         words.title,
-        _TRAINING_TERMS
-        if split_of(source.metrics) == "train"
-        else _held_out_terms(policy_of(source.metrics)),
+        _terms(source.metrics, chosen),
         (scale if any("error" in one.pictures for one in chosen) else "")
         + "".join(_test_frame(one, embed) for one in shown)
         + folded(more(len(others), len(entries) - len(shown), words.title.lower()), folds),
     )
+
+
+def _terms(metrics: dict[str, Any], shown: list["FramePictures"]) -> str:
+    """What training could know of the frames that are shown."""
+    if split_of(metrics) != "train":
+        return _held_out_terms(policy_of(metrics))
+    sharp = all(one.recorded == _OWN_TRUTH for one in shown)
+    return _OWN_TRUTH_TERMS if sharp else _TRAINING_TERMS
 
 
 def _held_out_terms(policy: Policy | None) -> str:
@@ -116,6 +126,8 @@ class FramePictures:
     figures: dict[str, dict[str, float | None]]
     """Figures of protocol standard, by region and metric."""
     pictures: Pictures
+    recorded: str
+    """Title of the camera's own picture."""
     human: Box | None
 
     @classmethod
@@ -123,17 +135,20 @@ class FramePictures:
         """Collect the pictures that the evaluation wrote and those of the capture."""
         capture = source.capture
         frame = capture.frame(entry["frame"])
+        recorded = _OWN_TRUTH if capture.is_own_truth(frame) else _INPUT
         pictures = {
-            _INPUT: to_bytes(capture.shown(capture.image(frame))),
+            recorded: to_bytes(capture.shown(capture.image(frame))),
             _RENDER: source.picture(entry["pictures"]["render"]),
         }
         if frame.sharp is not None:
-            pictures["sharp truth"] = to_bytes(capture.shown(capture.sharp(frame)))
+            if recorded == _INPUT:
+                pictures["sharp truth"] = to_bytes(capture.shown(capture.sharp(frame)))
             pictures["error"] = source.picture(entry["pictures"]["error"])
         return cls(
             frame,
             entry["protocols"]["standard"],
             pictures,
+            recorded,
             HumanRegions(capture).crop(frame),
         )
 
@@ -161,18 +176,18 @@ def _test_frame(test: FramePictures, embed: Embedder) -> str:
         f'<article class="frame"><h3>Frame {escape(frame.name)} '
         f"<small>{frame.mid_us / 1e6:.3f} s · exposure {exposure_ms:g} ms"
         f"{frame_figures(test.figures)}</small></h3>"
-        + _row(test.pictures, f"frame {frame.name}", embed)
-        + _row(test.crops(2 / 3), f"person in frame {frame.name}", embed)
+        + _row(test.pictures, test.recorded, f"frame {frame.name}", embed)
+        + _row(test.crops(2 / 3), test.recorded, f"person in frame {frame.name}", embed)
         + "</article>"
     )
 
 
-def _row(pictures: Pictures, place: str, embed: Embedder) -> str:
-    """Input and render behind a slider, truth and error beside them."""
+def _row(pictures: Pictures, recorded: str, place: str, embed: Embedder) -> str:
+    """The ``recorded`` picture and the render behind a slider, truth and error beside them."""
     if not pictures:
         return ""
     images = {title: embed.image(p, f"{title}, {place}") for title, p in pictures.items()}
-    first = compare(images.pop(_INPUT), images.pop(_RENDER), "blurry input | our render")
+    first = compare(images.pop(recorded), images.pop(_RENDER), f"{recorded} | {_RENDER}")
     rest = "".join(figure(image, title) for title, image in images.items())
     return f'<div class="grid shots n{1 + len(images)}">{first}{rest}</div>'
 
