@@ -37,7 +37,7 @@ class EventRecording:
         Memory does not grow with the recording, but for .npz and .npy files, which are one piece.
         Raises `DataError` where the recording is damaged, unless it was opened with ``repair``.
         """
-        self._damage.counts.clear()
+        self._damage.begin()
         return checked(
             self._source.blocks(), self._damage, self.width, self.height, self.has_polarity
         )

@@ -54,6 +54,15 @@ class Damage:
     path: Path
     repair: bool
     counts: dict[str, int] = field(default_factory=dict)
+    details: dict[str, str] = field(default_factory=dict)
+    """Of a kind of repair, how bad it was where it was worst."""
+    warnings: dict[str, str] = field(default_factory=dict)
+    """Of a kind of repair, why what it makes may be wrong."""
+
+    def begin(self) -> None:
+        """Forget what was found: the file is read anew."""
+        for found in (self.counts, self.details, self.warnings):
+            found.clear()
 
     def found(self, what: str, *, repaired_by: str, count: int = 1) -> None:
         """Raise `DataError` that says ``what``, or count it under ``repaired_by``."""
@@ -62,8 +71,12 @@ class Damage:
         self.counts[repaired_by] = self.counts.get(repaired_by, 0) + count
 
     def notes(self) -> list[str]:
-        """One line per kind of repair done so far."""
-        return [f"repaired: {what} ({count:,})" for what, count in self.counts.items()]
+        """One line per kind of repair done so far, and one more where it may have done harm."""
+        lines = []
+        for what, count in self.counts.items():
+            detail = f", {self.details[what]}" if what in self.details else ""
+            lines.append(f"repaired: {what} ({count:,}){detail}")
+        return lines + [f"warning: {why}" for why in self.warnings.values()]
 
 
 class Source(ABC):

@@ -1,12 +1,12 @@
 """Raw blocks become event streams: sorted, on the sensor, of known polarity, or a clear error."""
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
 
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import BLOCK_EVENTS, SAY_UNIT, Damage, RawEvents
+from evsplat.events.formats.base import SAY_UNIT, Damage, RawEvents
+from evsplat.events.formats.order import Block, ascending, in_order
 from evsplat.events.stream import EventStream
 
 _MAX_GAP_AT_WRAP_US = 60_000_000
@@ -15,15 +15,6 @@ _COUNTER_RANGES_US = ((1 << 32, 0), (1 << 31, -(1 << 31)), (1 << 31, 0))
 _MIN_BLOCK_EVENTS = 1 << 16
 _MAX_TIME_US = 1 << 60
 _LONGEST_US = 24 * 3600 * 1_000_000
-_SORTS = "sorts events that are out of order"
-
-
-class _Block(NamedTuple):
-    first: int
-    """Index of its first event in the file."""
-    stream: EventStream
-    rising: bool
-    """True where its times are known to be in order, from the event before it on."""
 
 
 def checked(
@@ -40,7 +31,7 @@ def checked(
     polarity among others that have one are left out. Otherwise the first of these is a `DataError`.
     """
     settled = _Settled(blocks, damage, width, height, has_polarity)
-    ordered = _sorted(settled, damage) if damage.repair else _ascending(settled, damage)
+    ordered = in_order(settled, damage) if damage.repair else ascending(settled, damage)
     return _within_a_day(ordered, damage)
 
 
@@ -80,7 +71,7 @@ class _Settled:
         self._shift_us = 0
         self._last_raw_us: int | None = None
 
-    def __iter__(self) -> Iterator[_Block]:
+    def __iter__(self) -> Iterator[Block]:
         index = 0
         for block in _gathered(self._blocks):
             t, rising = self._unwrapped(block.t.astype(np.int64, copy=False), index)
@@ -90,7 +81,7 @@ class _Settled:
             if keep is not None:
                 t, x, y, p = t[keep], x[keep], y[keep], p[keep]
             x, y = x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False)
-            yield _Block(index, EventStream(t, x, y, p), rising)
+            yield Block(index, EventStream(t, x, y, p), rising)
             index += len(block.t)
 
     def _unwrapped(self, t: np.ndarray, index: int) -> tuple[np.ndarray, bool]:
@@ -190,47 +181,3 @@ def _joined(blocks: list[RawEvents]) -> RawEvents:
     if len(blocks) == 1:
         return blocks[0]
     return RawEvents(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
-
-
-def _ascending(blocks: Iterable[_Block], damage: Damage) -> Iterator[EventStream]:
-    """The blocks as they are; an error where time goes back."""
-    last_us: int | None = None
-    for first, block, rising in blocks:
-        if not rising:
-            previous = np.concatenate([[block.t[0] if last_us is None else last_us], block.t[:-1]])
-            falls = block.t < previous
-            at = int(np.argmax(falls))
-            damage.found(
-                f"event {first + at} is at {block.t[at]} us, after one at {previous[at]} us "
-                f"({int(falls.sum())} steps back among events {first} to {first + len(falls) - 1})",
-                repaired_by=_SORTS,
-            )
-        last_us = int(block.t[-1])
-        yield block
-
-
-def _sorted(blocks: Iterable[_Block], damage: Damage) -> Iterator[EventStream]:
-    """All but the latest `BLOCK_EVENTS` of what was read so far, sorted; then the rest."""
-    held: EventStream | None = None
-    last_us: int | None = None
-    for _, block, _ in blocks:
-        if last_us is not None and len(block) and int(block.t.min()) < last_us:
-            on_time = block.t >= last_us
-            damage.found(
-                "events out of order by more than a block",
-                repaired_by="leaves out events too late to be sorted in",
-                count=len(block) - int(on_time.sum()),
-            )
-            block = block.take(on_time)
-        merged = block if held is None else EventStream.joined([held, block])
-        falls = int((np.diff(merged.t) < 0).sum())
-        if falls:
-            damage.found("events out of order", repaired_by=_SORTS, count=falls)
-            merged = merged.take(np.argsort(merged.t, kind="stable"))
-        ready = max(0, len(merged) - BLOCK_EVENTS)
-        if ready:
-            last_us = int(merged.t[ready - 1])
-            yield merged.take(slice(0, ready))
-        held = merged.take(slice(ready, None))
-    if held is not None and len(held):
-        yield held
