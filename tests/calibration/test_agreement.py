@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evsplat.calibration import answered_share, estimate_disagreement, lost_spans
+from evsplat.calibration import answered_share, came_elsewhere, estimate_disagreement, lost_spans
 from evsplat.events import EventStream
 
 from .synthetic import HEIGHT, WIDTH, Recording, record
@@ -102,6 +102,19 @@ def test_no_gap_is_told_where_nothing_moves_or_nothing_was_recorded() -> None:
     assert lost_spans(still, recording.events.take(slice(0, 0))) == []
     late = [replace(pair, recorded_us=(400_000, 900_000)) for pair in recording.pairs]
     assert lost_spans(late, _without(recording, 0, 400_000)) == []
+
+
+def test_events_that_lie_in_other_pixels_are_told_from_lost_ones() -> None:
+    seed = int(np.random.default_rng().integers(10_000))
+    recording = record(seed, plus=0.2, minus=0.2, still_rows=HEIGHT // 2, noise_hz=1.0)
+    assert not came_elsewhere(recording.pairs, recording.events)
+    # Where nothing moves in the pictures.
+    moved = _changed(recording.events, y=(HEIGHT - 1 - recording.events.y).astype(np.uint16))
+    assert lost_spans(recording.pairs, moved) and came_elsewhere(recording.pairs, moved)
+    silent = _without(recording, 200_000, 325_000)
+    assert lost_spans(recording.pairs, silent) and not came_elsewhere(recording.pairs, silent)
+    few = recording.events.take(np.random.default_rng(seed).random(len(recording.events)) < 0.01)
+    assert lost_spans(recording.pairs, few) and not came_elsewhere(recording.pairs, few)
 
 
 @pytest.mark.parametrize("lag_us", [0, 15_000])

@@ -13,7 +13,7 @@ from evsplat.calibration.brightness import (
     pair_indices,
 )
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
-from evsplat.calibration.lost import answered_share, lost_spans
+from evsplat.calibration.lost import answered_share, came_elsewhere, lost_spans
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
@@ -28,6 +28,7 @@ __all__ = [
     "SensorEstimate",
     "ThresholdEstimate",
     "answered_share",
+    "came_elsewhere",
     "estimate_disagreement",
     "estimate_from_pairs",
     "lost_spans",

@@ -20,6 +20,8 @@ LEAST_PIXELS = 30
 SILENT = 0.1
 """Share of those pixels below which the sensor is taken to have recorded nothing: where it does,
 nearly all of them have events."""
+_AS_EVER = 0.5
+"""Share of their usual rate from which events are taken to have come as ever."""
 VERY_MUCH = 1.5
 """Change that stays above thresholds where linear frames are taken as coded, 2.2 times as large."""
 
@@ -32,18 +34,48 @@ def lost_spans(pairs: Sequence[FramePair], events: EventSource) -> list[Span]:
     be read are passed over.
     """
     found: list[Span] = []
-    for pair in sorted(pairs, key=lambda pair: pair.span_us):
-        moved = pair.usable & (np.abs(pair.change) > MUCH)
-        if moved.sum() < LEAST_PIXELS or not pair.recorded_at(0):
-            continue
-        if _fired(pair, events)[moved].mean() >= SILENT:
-            continue
+    for pair in _unanswered(pairs, events):
         first, last = sum(pair.before_us) // 2, sum(pair.after_us) // 2
         if found and first <= found[-1][1]:
             found[-1] = found[-1][0], max(last, found[-1][1])
         else:
             found.append((first, last))
     return found
+
+
+def came_elsewhere(pairs: Sequence[FramePair], events: EventSource) -> bool:
+    """Whether in `lost_spans` events came as ever, at other pixels than those that changed.
+
+    Such events were not lost: they lie in other pixels than the frames'. A change that is so large
+    makes several at each pixel, and a sensor that loses them falls silent.
+    """
+    lost = _unanswered(pairs, events)
+    changed = sum(int(_much(pair).sum()) for pair in lost)
+    came, rate = _came(lost, events)
+    usual = _came([pair for pair in pairs if pair.recorded_at(0)], events)[1]
+    return changed > 0 and came >= changed and rate >= _AS_EVER * usual
+
+
+def _unanswered(pairs: Sequence[FramePair], events: EventSource) -> list[FramePair]:
+    """Pairs between which much changed and hardly an event came there, in order of time."""
+    return [
+        pair
+        for pair in sorted(pairs, key=lambda pair: pair.span_us)
+        if _much(pair).sum() >= LEAST_PIXELS
+        and pair.recorded_at(0)
+        and _fired(pair, events)[_much(pair)].mean() < SILENT
+    ]
+
+
+def _much(pair: FramePair) -> Bool[np.ndarray, "H W"]:
+    """Pixels that change by more than `MUCH`."""
+    return pair.usable & (np.abs(pair.change) > MUCH)
+
+
+def _came(pairs: Sequence[FramePair], events: EventSource) -> tuple[int, float]:
+    """Number of events during pairs, all pixels together, and their rate per microsecond."""
+    count = sum(len(events.between(*pair.span_us)) for pair in pairs)
+    return count, count / max(1, sum(pair.span_us[1] - pair.span_us[0] for pair in pairs))
 
 
 def answered_share(pairs: Sequence[FramePair], events: EventSource) -> float | None:

@@ -5,6 +5,7 @@ import logging
 from evsplat.calibration import (
     FramePair,
     answered_share,
+    came_elsewhere,
     estimate_disagreement,
     lost_spans,
 )
@@ -52,12 +53,26 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
     if lost:
         where = ", ".join(f"{first / 1e6:.3f} to {last / 1e6:.3f} s" for first, last in lost[:3])
         where += f" and {len(lost) - 3} more" if len(lost) > 3 else ""
-        findings.warning(
-            events.path, "events/t", f"hardly an event where pictures change from {where}",
-            "events wherever the brightness changes",
-            "The sensor lost them: record again with a lower rate of events, or leave out these "
-            "frames. Training takes no event for no change.",
-        )  # fmt: skip
+        if came_elsewhere(pairs, events):
+            findings.warning(
+                events.path, WHICH_WAY[1],
+                f"hardly an event at the pixels that change, and as many as ever at others, from "
+                f"{where}",
+                "events wherever the brightness changes",
+                "Most likely they lie in other pixels than the pictures': cut out, moved or warped "
+                "to another size. events.png of 'evsplat inspect' then shows edges beside those of "
+                "the pictures; warp them there (docs/own-capture.md, two sensors). Where it shows "
+                "none, clocks are apart by more than a frame (events.clock_offset_us), or the "
+                "sensor lost what is no noise.",
+            )  # fmt: skip
+        else:
+            findings.warning(
+                events.path, "events/t", f"hardly an event where pictures change from {where}",
+                "events wherever the brightness changes",
+                "Most likely the sensor lost them, as its rate falls there: record again with a "
+                "lower rate of events, or leave out these frames. Otherwise they were left out or "
+                "thinned when they were written. Training takes no event for no change.",
+            )  # fmt: skip
     answered = None if lost or sign or other_way else answered_share(pairs, events)
     if answered is not None and answered < _FEWEST_ANSWERED:
         findings.warning(
