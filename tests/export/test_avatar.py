@@ -35,7 +35,7 @@ from evsplat.training.reconstruction import GaussianReconstruction
 
 from ..body.helpers import reference_bones
 from ..small_model import built
-from .clouds import covariances, read_ply
+from .clouds import SH_C0, covariances, read_ply
 
 SEEDS = pytest.mark.parametrize("seed", [0, 1, 2])
 
@@ -264,7 +264,9 @@ def _document(capture, source) -> dict:
     avatar = avatar_of(_skinned(source.track, 20, 3))
     clips = [clip_of("again", source.track)]
     camera = capture.camera(capture.frames[0])
-    return avatar_document(avatar, clips, track=source.track, camera=camera, facts={"a": 1})
+    return avatar_document(
+        avatar, clips, track=source.track, camera=camera, transfer="power", facts={"a": 1}
+    )
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's script")
@@ -317,7 +319,9 @@ def test_the_page_shares_correctives_as_we_do(reconstruction, tmp_path):
     assert rest.correctives is not None
     avatar = avatar_of(rest)
     camera = capture.camera(capture.frames[0])
-    document = avatar_document(avatar, [], track=source.track, camera=camera, facts={})
+    document = avatar_document(
+        avatar, [], track=source.track, camera=camera, transfer="power", facts={}
+    )
     rotations = source.pose([frame.mid_us for frame in capture.frames[:3]])[0]
     turns = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix()
     rotations = torch.cat([rotations, rotations @ torch.from_numpy(turns).float()])
@@ -391,6 +395,28 @@ def test_the_package_is_complete_and_needs_no_network(run):
     np.testing.assert_allclose(around[:, :3], cloud_of(scene).means, atol=1e-6)
     with pytest.raises(DataError, match="already"):
         export_run(run.path, "avatar", out=run.path / "dancer")
+
+
+def test_files_of_light_are_coded_and_the_page_is_told(run):
+    described = run.capture.path / "capture.json"
+    document = json.loads(described.read_text(encoding="utf-8"))
+    for camera in document["cameras"].values():
+        camera["transfer"] = "linear"
+    described.write_text(json.dumps(document), encoding="utf-8")
+    run.capture = load_capture(run.capture.path)
+    page = export_run(run.path, "avatar", parts="all", out=run.path / "dancer")
+    text = page.read_text(encoding="utf-8")
+    (data,) = re.findall(r'id="data">(.*?)</script>', text, re.DOTALL)
+    embedded = json.loads(data)
+    assert embedded["transfer"] == "linear"
+    for name, file in (("person", "gaussians.ply"), ("scene", "scene.ply")):
+        rows = np.frombuffer(base64.b64decode(embedded[name]["values"]), "<f4").reshape(-1, 14)
+        light = rows[:, 11:].astype(np.float64).clip(0)
+        # IEC 61966-2-1.
+        want = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        _, columns = read_ply(page.parent / file)
+        got = 0.5 + SH_C0 * np.stack([columns[f"f_dc_{k}"] for k in range(3)], axis=1)
+        np.testing.assert_allclose(got, want, atol=1e-5)
 
 
 def test_the_person_at_rest_is_a_file_too(run):

@@ -25,12 +25,13 @@ from evsplat.files import new_folder, write_json, write_text
 from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.models.correctives import Correctives
 from evsplat.models.discs.shading import SurfaceLight
+from evsplat.pictures import Transfer
 from evsplat.training.reconstruction import GaussianReconstruction
 
 BONES_EACH = 4
 _MOST_JOINTS = 256
 KEYS_PER_SECOND = 60.0
-FORMAT, VERSION = "evsplat-avatar", 4
+FORMAT, VERSION = "evsplat-avatar", 5
 _PLAYER = files("evsplat") / "data" / "player"
 _SCRIPTS = ("splats.js", "skeleton.js", "orbit.js", "player.js")
 _README = """An avatar made by evsplat.
@@ -174,15 +175,19 @@ def write_avatar(
     track: BodyTrack,
     camera: Camera,
     scene: SplatCloud | None,
+    transfer: Transfer,
     facts: Mapping[str, Any],
 ) -> Path:
     """Write one self-contained page where ``path`` ends in .html, else a folder around it.
 
     ``camera`` is where the page starts to look from; ``scene`` stands around the person if given;
-    ``facts`` are shown (``note``) and kept. Returns the page.
+    ``transfer`` is that of the colours of both: the page draws light as light, and codes it to show
+    it, as the .ply files hold it. ``facts`` are shown (``note``) and kept. Returns the page.
     """
     path = Path(path)
-    document = avatar_document(avatar, clips, track=track, camera=camera, facts=facts)
+    document = avatar_document(
+        avatar, clips, track=track, camera=camera, transfer=transfer, facts=facts
+    )
     cloud = cloud_of(avatar.gaussians.at_rest())
     page = _page(document, cloud, scene)
     if path.suffix.lower() in (".html", ".htm"):
@@ -192,9 +197,9 @@ def write_avatar(
         write_text(folder / "index.html", page)
         write_json(folder / "avatar.json", document)
         comments = ["written by evsplat", "unit: metre"]
-        write_ply(folder / "gaussians.ply", cloud, comments=comments)
+        write_ply(folder / "gaussians.ply", cloud.shown(transfer), comments=comments)
         if scene is not None:
-            write_ply(folder / "scene.ply", scene, comments=comments)
+            write_ply(folder / "scene.ply", scene.shown(transfer), comments=comments)
         write_text(folder / "README.txt", _README)
     return path / "index.html"
 
@@ -205,6 +210,7 @@ def avatar_document(
     *,
     track: BodyTrack,
     camera: Camera,
+    transfer: Transfer,
     facts: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Content of avatar.json; arrays are base64 of little-endian numbers, rows after rows."""
@@ -216,6 +222,7 @@ def avatar_document(
         "version": VERSION,
         **facts,
         "unit": "metre",
+        "transfer": transfer,
         "up": [float(v) for v in up_axis(track)],
         "camera": {
             "width": camera.width,

@@ -72,7 +72,14 @@ def export_avatar(
     facts = {**facts_of(run), "note": loss.sentence(), "loss_db": asdict(loss)}
     facts["low_pass_px2"] = source.low_pass
     page = write_avatar(
-        path, avatar, clips, track=track, camera=instant.camera, scene=scene, facts=facts
+        path,
+        avatar,
+        clips,
+        track=track,
+        camera=instant.camera,
+        scene=scene,
+        transfer=capture.transfer(capture.frames[0]),
+        facts=facts,
     )
     logger.info("%s", loss.sentence())
     logger.info(

@@ -41,7 +41,8 @@ const fields = avatar.correctives && {
 
 let renderer = null;
 try {
-  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.low_pass_px2, avatar.light, fields);
+  const linear = avatar.transfer === "linear";
+  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.low_pass_px2, avatar.light, fields, linear);
   find("message").remove();
 } catch (error) {
   find("message").textContent = error.message;

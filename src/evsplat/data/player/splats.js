@@ -10,9 +10,18 @@ const MOST_LAMPS = 16;
 const MOST_CORRECTIVES = 8;
 const CORRECTIVES_WIDTH = 1024; // of their texture, a multiple of MOST_CORRECTIVES
 
+// Light as screens take it (IEC 61966-2-1).
+const CODED = `
+vec3 coded(vec3 light) {
+  light = clamp(light, 0.0, 1.0);
+  return mix(12.92 * light, 1.055 * pow(light, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, light));
+}`;
+
 const VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
+${CODED}
+uniform bool codesEach;    // colours are light, and the picture is blended as it is shown
 uniform highp sampler2D gaussians, bones, correctives;
 uniform int correctiveCount, correctedCount; // fields, and the Gaussians (the first) that have them
 uniform float shares[${MOST_CORRECTIVES}];
@@ -96,6 +105,7 @@ void main() {
   vec3 normal = vec3(c.zw, paint.w);
   colour = vec4(paint.rgb * max(1.0 + change.w, 0.0), a.w);
   if (lit && dot(normal, normal) > 0.5) colour.rgb *= shade(normalize(moved * normal), world);
+  if (codesEach) colour.rgb = coded(colour.rgb);
   float extent = sqrt(2.0 * log(a.w / ${MIN_ALPHA}));
   vec2 reach = ceil(extent * sqrt(vec2(xx, yy)));
   vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
@@ -121,16 +131,21 @@ const COPY_VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0, 1); }`;
 const COPY_FRAGMENT = `#version 300 es
 precision highp float;
+${CODED}
 uniform highp sampler2D picture;
+uniform bool codes;        // what was blended is light
 out vec4 result;
-void main() { result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1); }`;
+void main() {
+  vec3 blended = texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb;
+  result = vec4(codes ? coded(blended) : blended, 1);
+}`;
 
 class SplatRenderer {
   // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with skins (bones, weights and
   // factors on the scales, as many of each cloud) and, where light falls on them, normals. lowPass: px². light: center, radius_m,
   // coefficients (4 x 9 x 3), lamps and their intensities (L x 3), or null. correctives: count of
-  // fields, steps and values (count x Gaussians x 4) for the first cloud, or null.
-  constructor(canvas, clouds, boneCount, lowPass, light, correctives) {
+  // fields, steps and values (count x Gaussians x 4) for the first cloud, or null. linear: RGB are light.
+  constructor(canvas, clouds, boneCount, lowPass, light, correctives, linear) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2, which drawing Gaussians needs.");
     this.gl = gl;
@@ -138,6 +153,7 @@ class SplatRenderer {
     this.boneCount = boneCount;
     this.lowPass = lowPass;
     this.light = light;
+    this.linear = linear;
     // Sixteen bits per channel where the device can blend them: eight add a rounding per Gaussian.
     this.fine = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.count = clouds.reduce((sum, cloud) => sum + cloud.count, 0);
@@ -246,7 +262,9 @@ class SplatRenderer {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 3, this.boneCount, 0, gl.RGBA, gl.FLOAT, bones);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.fine ? this.framebuffer(width, height) : null);
     gl.viewport(0, 0, width, height);
-    gl.clearColor(...background, 1);
+    // Light is blended as the model does, and coded once; eight bits are too few for that.
+    const codesOnce = this.linear && this.fine;
+    gl.clearColor(...(codesOnce ? background.map(lightOf) : background), 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
@@ -257,6 +275,7 @@ class SplatRenderer {
     gl.uniform1i(gl.getUniformLocation(this.program, "correctiveCount"), shares.length);
     gl.uniform1i(gl.getUniformLocation(this.program, "correctedCount"), this.corrected.gaussians);
     if (shares.length) gl.uniform1fv(gl.getUniformLocation(this.program, "shares"), shares);
+    gl.uniform1i(gl.getUniformLocation(this.program, "codesEach"), this.linear && !this.fine ? 1 : 0);
     gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "view"), false, view);
     gl.uniform4fv(gl.getUniformLocation(this.program, "lens"), lens);
     gl.uniform2f(gl.getUniformLocation(this.program, "size"), width, height);
@@ -282,6 +301,7 @@ class SplatRenderer {
     gl.disable(gl.BLEND);
     gl.useProgram(this.copy);
     bind(gl, this.copy, "picture", 0, this.target.picture);
+    gl.uniform1i(gl.getUniformLocation(this.copy, "codes"), codesOnce ? 1 : 0);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
@@ -296,6 +316,11 @@ class SplatRenderer {
     this.target = { width, height, picture, buffer };
     return buffer;
   }
+}
+
+// The light of an sRGB-coded value.
+function lightOf(coded) {
+  return coded <= 0.04045 ? coded / 12.92 : ((coded + 0.055) / 1.055) ** 2.4;
 }
 
 // xx, xy, xz, yy, yz, zz of R S S R^T.
