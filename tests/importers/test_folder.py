@@ -112,6 +112,27 @@ def test_exposures_of_a_list_and_pictures_without_a_pose(
     assert any("2 pictures without a pose" in note for note in capture.provenance["notes"])
 
 
+def test_a_part_of_the_pictures_has_their_poses_masks_and_events(
+    recording: Path, tmp_path: Path, monkeypatch
+) -> None:
+    models = write_smpl(tmp_path / "models")
+    first = int(np.random.default_rng().integers(1, COUNT - 2))
+    options = {"fps": 25.0, "exposure_us": 30_000.0, "start_us": 16_000}
+    frames = (first, first + 2)
+    import_capture("folder", recording, tmp_path / "out", smpl=models, frames=frames, **options)
+    monkeypatch.setenv(ENVIRONMENT, str(models))
+    capture = load_capture(tmp_path / "out")
+    assert [frame.name for frame in capture.frames] == [f"shot{first}", f"shot{first + 1}"]
+    assert capture.frames[0].mid_us == 16_000 + first * PERIOD_US
+    assert worst_miss(capture) < 0.01
+    assert all(capture.mask(frame) is not None for frame in capture.frames)
+    assert len(capture.body_file.times_us) == 2
+    rows = np.loadtxt(recording / "events.csv", delimiter=",", skiprows=1)
+    begin, end = capture.frames[0].exposure_us[0], capture.frames[1].exposure_us[1]
+    assert capture.events is not None
+    assert len(capture.events) == ((rows[:, 0] >= begin) & (rows[:, 0] < end)).sum() > 0
+
+
 def test_pictures_without_a_mask_are_counted(recording: Path, tmp_path: Path) -> None:
     (recording / "masks" / "shot3.png").unlink()
     import_capture("folder", recording, tmp_path / "out", fps=25.0, exposure_us=3e4)

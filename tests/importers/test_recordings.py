@@ -187,6 +187,30 @@ def test_a_video_with_events_beside_it(tmp_path: Path) -> None:
     assert capture.transfer(capture.frames[0]) == "srgb"
 
 
+def test_a_part_of_a_video_keeps_its_clock_and_the_events_of_its_time(tmp_path: Path) -> None:
+    clip, given = tmp_path / "clip.mp4", some_events(500)
+    write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)
+    write_events(tmp_path / "events.h5", given)
+    options = {"events": tmp_path / "events.h5", "exposure_us": 20_000.0, "clock_offset_us": -500}
+    first, stop = sorted(np.random.default_rng().choice(COUNT, 2, replace=False).tolist())
+    part = run("video", clip, tmp_path / "part", frames=(first, stop), **options)
+    whole = run("video", clip, tmp_path / "whole", **options)
+    assert [frame.name for frame in part.frames] == [f"{i:06d}" for i in range(first, stop)]
+    for frame in part.frames:
+        assert frame.exposure_us == whole.frame(frame.name).exposure_us
+        assert np.array_equal(part.image(frame), whole.image(frame.name))
+    begin, end = part.frames[0].exposure_us[0], part.frames[-1].exposure_us[1]
+    assert part.events is not None and whole.events is not None
+    assert len(whole.events) == len(given)
+    assert np.array_equal(
+        part.events.between(-(1 << 40), 1 << 40).t, whole.events.between(begin, end).t
+    )
+    assert part.provenance["frames"] == [first, stop]
+    with pytest.raises(ConfigError, match=f"no frame in 40..49; there are 0..{COUNT - 1}"):
+        import_capture("video", clip, tmp_path / "none", frames=(40, 50), exposure_us=20_000.0)
+    assert not (tmp_path / "none").exists()
+
+
 @pytest.fixture
 def finder(monkeypatch):
     """A stand-in for the search, which takes most of the time; gives what it was asked for."""

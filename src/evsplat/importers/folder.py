@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Int64
-from tqdm import tqdm
 
 from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence
@@ -17,6 +16,7 @@ from evsplat.importers.base import (
     GUIDE,
     Importer,
     check_positive,
+    chosen_frames,
     exposure_around,
     human_mask,
     need,
@@ -30,6 +30,7 @@ from evsplat.importers.option_types import (
     Exposure,
     FileOption,
     Focal,
+    FrameRange,
     Name,
     OwnRate,
     TimeUs,
@@ -39,6 +40,7 @@ from evsplat.importers.recorded import (
     add_recorded_events,
     add_recorded_frame,
     offset_or_levels,
+    pictures_of,
     recorded_camera,
 )
 from evsplat.importers.smpl import chosen_poses
@@ -52,6 +54,8 @@ _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 class Folder(Importer):
     """Your own recording: pictures or a video, an event file, a pose file and a camera."""
 
+    frames: FrameRange = None
+    """First picture and one past the last, counted from 0; by default all."""
     images: FileOption = None
     """Folder of pictures, or a video; by default SOURCE/images or the video in SOURCE."""
     events: FileOption = None
@@ -74,7 +78,7 @@ class Folder(Importer):
     exposure_us: Exposure = None
     """Exposure time, microseconds; not needed with SOURCE/exposures.txt."""
     start_us: TimeUs = 0
-    """Middle of the first exposure."""
+    """Middle of the exposure of picture 0."""
     clock_offset_us: ClockOffset = 0
     """Added to the events' times to get the clock of the pictures; auto finds it."""
     contrast: Contrast = None
@@ -107,19 +111,18 @@ class Folder(Importer):
         if self.transfer is not None:
             camera["transfer"] = self.transfer
         writer.add_camera("main", *size, **camera)
-        seen = frames_with_poses(motion, middles)
+        kept = chosen_frames(self.frames, list(range(len(middles))), source)
+        seen = sorted(frames_with_poses(motion, middles).intersection(kept))
         if not seen:
             raise DataError(
-                f"{path}: has no pose at the middle of any of the {len(middles)} exposures, which "
-                f"are from {middles[0]} to {middles[-1]} us; correct --fps, --start-us or "
-                "exposures.txt, or leave the poses out with --no-poses."
+                f"{path}: has no pose at the middle of any of the {len(kept)} exposures, which "
+                f"are from {middles[kept[0]]} to {middles[kept[-1]]} us; correct --fps, --start-us "
+                "or exposures.txt, or leave the poses out with --no-poses."
             )
         views = _camera_poses(motion)
         masks = _Masks(self._masks(source))
         clock_offset = offset_or_levels(self.clock_offset_us, camera)
-        for index, timed in enumerate(tqdm(footage, "pictures", len(middles), leave=False)):
-            if index not in seen:
-                continue
+        for index, timed in pictures_of(footage, seen):
             exposure = int(exposures[index, 0]), int(exposures[index, 1])
             add_recorded_frame(
                 writer,
@@ -136,19 +139,21 @@ class Folder(Importer):
             clock_offset,
             contrast=self.contrast,
             repair=self.repair,
+            exposed_only=self.frames is not None,
         )
         notes += [*short_exposure(self.exposure_us), *([note] if note else [])]
-        if len(seen) < len(middles):
-            lacking = counted(len(middles) - len(seen), "picture")
+        if len(seen) < len(kept):
+            lacking = counted(len(kept) - len(seen), "picture")
             notes.append(f"left out: {lacking} without a pose")
         writer.provenance |= {"source": "own recording", "focal": focal, "notes": notes}
+        writer.provenance["frames"] = [kept[0], kept[-1] + 1]
         if path is None or motion is None:
             writer.leave_out_body()
             return notes
         writer.provenance["poses"] = path.name
         if isinstance(motion, PoseSequence):
-            motion = chosen_poses(motion, sorted(seen))
-        return notes + add_motion(writer, motion, [int(middles[i]) for i in sorted(seen)], smpl)
+            motion = chosen_poses(motion, seen)
+        return notes + add_motion(writer, motion, [int(middles[i]) for i in seen], smpl)
 
     def _images(self, source: Path) -> Path:
         if self.images is not None:

@@ -1,6 +1,6 @@
 """Parts of importers of your own recordings: camera and events."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
+from tqdm import tqdm
 
 from evsplat.calibration.offset import LEAST_CORRELATION, BlockLevels, TooLong, estimate_offset
 from evsplat.capture.write import CaptureWriter, read_camera
@@ -15,7 +16,7 @@ from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventRecording, EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
-from evsplat.footage import TimedPicture
+from evsplat.footage import Footage, TimedPicture
 from evsplat.importers.base import check_positive, need
 from evsplat.pictures.files import to_unit_range
 
@@ -65,6 +66,15 @@ def offset_or_levels(
     return BlockLevels(camera.get("transfer", "power"))
 
 
+def pictures_of(footage: Footage, wanted: Sequence[int]) -> Iterator[tuple[int, TimedPicture]]:
+    """Number and picture of those that are ``wanted``, ascending; none after them is decoded."""
+    pictures = enumerate(footage)
+    for number in tqdm(wanted, "pictures", leave=False):
+        found = next((one for one in pictures if one[0] == number), None)
+        if found is not None:
+            yield found
+
+
 def add_recorded_frame(
     writer: CaptureWriter,
     picture: TimedPicture,
@@ -95,10 +105,12 @@ def add_recorded_events(
     *,
     contrast: tuple[float, float] | None,
     repair: bool,
+    exposed_only: bool = False,
 ) -> list[str]:
     """Write the events of a recording of any format; gives notes for the user.
 
-    ``clock_offset`` is in us, or the levels of the frames by which it is found.
+    ``clock_offset`` is in us, or the levels of the frames by which it is found. ``exposed_only``
+    leaves out events before the first exposure and after the last.
     """
     if path is None:
         of_events = {"contrast": contrast, "clock-offset-us": clock_offset, "repair": repair}
@@ -122,8 +134,10 @@ def add_recorded_events(
     if isinstance(clock_offset, BlockLevels):
         clock_offset, note = _found_offset(clock_offset, recording, path, size)
         notes.append(note)
+    start, end = (time - clock_offset for time in writer.exposed_us)
+    pieces = passed.watching(recording.chunks())
     writer.set_events(
-        passed.watching(recording.chunks()),
+        (piece.between(start, end) for piece in pieces) if exposed_only else pieces,
         *size,
         contrast_threshold=contrast,
         simulated=False,

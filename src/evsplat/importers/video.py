@@ -3,12 +3,16 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tqdm import tqdm
-
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
 from evsplat.footage import open_footage
-from evsplat.importers.base import Importer, check_positive, exposure_around, short_exposure
+from evsplat.importers.base import (
+    Importer,
+    check_positive,
+    chosen_frames,
+    exposure_around,
+    short_exposure,
+)
 from evsplat.importers.option_types import (
     ClockOffset,
     Contrast,
@@ -16,6 +20,7 @@ from evsplat.importers.option_types import (
     Exposure,
     FileOption,
     Focal,
+    FrameRange,
     OwnRate,
     TimeUs,
 )
@@ -23,6 +28,7 @@ from evsplat.importers.recorded import (
     add_recorded_events,
     add_recorded_frame,
     offset_or_levels,
+    pictures_of,
     recorded_camera,
 )
 from evsplat.options.declare import Flag
@@ -32,6 +38,8 @@ from evsplat.options.declare import Flag
 class Video(Importer):
     """A video of your own, without poses: pictures, an event file if there is one, a camera."""
 
+    frames: FrameRange = None
+    """First picture and one past the last, counted from 0; by default all."""
     events: FileOption = None
     """Event recording of any known format, in the pixels of the video."""
     exposure_us: Exposure = None
@@ -45,7 +53,7 @@ class Video(Importer):
     transfer: Curve = None
     """From the values of the pictures to light: power (2.2), srgb or linear."""
     start_us: TimeUs = 0
-    """Middle of the first exposure."""
+    """Middle of the exposure of picture 0."""
     clock_offset_us: ClockOffset = 0
     """Added to the events' times to get the clock of the pictures; auto finds it."""
     contrast: Contrast = None
@@ -68,7 +76,8 @@ class Video(Importer):
             camera["transfer"] = self.transfer
         writer.add_camera("main", *size, **camera)
         clock_offset = offset_or_levels(self.clock_offset_us, camera)
-        for timed in tqdm(footage, "pictures", len(footage.times_us), leave=False):
+        kept = chosen_frames(self.frames, list(range(len(footage.times_us))), source)
+        for _, timed in pictures_of(footage, kept):
             middle = timed.time_us + self.start_us
             exposure = exposure_around(middle, self.exposure_us)
             add_recorded_frame(writer, timed, exposure, clock_offset)
@@ -79,8 +88,10 @@ class Video(Importer):
             clock_offset,
             contrast=self.contrast,
             repair=self.repair,
+            exposed_only=self.frames is not None,
         )
         notes += [*short_exposure(self.exposure_us), *([note] if note else [])]
         writer.provenance |= {"source": f"video {source.name}", "focal": focal, "notes": notes}
+        writer.provenance["frames"] = [kept[0], kept[-1] + 1]
         writer.leave_out_body()
         return notes
