@@ -38,6 +38,26 @@ def test_summary_states_what_was_recorded(tiny_capture: Factory, tmp_path: Path)
             assert image.width >= 700 and len(np.unique(np.asarray(image.convert("L")))) > 50
 
 
+@pytest.mark.parametrize("longest_us", [32_000, 60_000])
+@pytest.mark.parametrize("skipped", [0, 3])
+def test_summary_tells_times_that_differ_from_frame_to_frame(
+    tiny_capture: Factory, tmp_path: Path, longest_us: int, skipped: int
+) -> None:
+    path = tiny_capture(frames=12)
+    document = json.loads((path / "capture.json").read_text())
+    frames = document["frames"]
+    frames[-1]["exposure_us"][1] = frames[-1]["exposure_us"][0] + longest_us
+    document["frames"] = [*frames[:4], *frames[4 + skipped :]]
+    (path / "capture.json").write_text(json.dumps(document))
+    summary = inspect_capture(path, tmp_path / "out").summary
+    last_ms = 40 + (longest_us - 30_000) / 2000
+    (line,) = (line for line in summary.splitlines() if line.startswith("time "))
+    uneven = skipped or longest_us == 60_000
+    apart = max(last_ms, 40 * (skipped + 1))
+    assert (f"25 frames/s (median; 40 to {apart:.4g} ms apart)" in line) == bool(uneven)
+    assert ("exposure 30 ms (median; 30 to 60 ms)" in line) == (longest_us == 60_000)
+
+
 def test_events_without_polarity_are_told_from_a_scene_that_stands_still(
     tiny_capture: Factory, tmp_path: Path
 ) -> None:
@@ -141,6 +161,33 @@ def test_pictures_of_which_nothing_can_be_learned_are_told(
     findings = inspect_capture(path, tmp_path / "out").findings
     found = [each.found for each in findings if each.file.name == "images"]
     assert len(found) == (words is not None)
+
+
+@pytest.mark.parametrize("longer", [True, False])
+@pytest.mark.parametrize("factor", [1.0, 1.3, 4.0])
+def test_pictures_whose_brightness_changes_are_told_and_no_lost_events_are(
+    tiny_capture: Factory, tmp_path: Path, factor: float, longer: bool
+) -> None:
+    """As of a camera that sets its exposure by itself, or of one beside a lamp that goes on."""
+    path = tiny_capture(frames=20, width=96, height=72, seed=round(10 * factor))
+    document = json.loads((path / "capture.json").read_text())
+    for frame in document["frames"][::2]:
+        file = path / frame["image"]
+        with Image.open(file) as image:
+            light = (np.array(image) / 255) ** 2.2
+        Image.fromarray(np.uint8(255 * (light / factor) ** (1 / 2.2) + 0.5)).save(file)
+        if longer:
+            frame["exposure_us"][0] += 10_000
+            frame["exposure_us"][1] -= 10_000
+    (path / "capture.json").write_text(json.dumps(document))
+    findings = inspect_capture(path, tmp_path / "out").findings
+    told = [finding.found for finding in findings if finding.file.name == "images"]
+    assert len(told) == (factor != 1)
+    for found in told:
+        stated = re.search(r"three quarters of the scene ([\d.]+) times as bright", found)
+        assert stated and float(stated[1]) == pytest.approx(factor, rel=0.05)
+        assert ("longer exposures brighter" in found) == longer
+    assert not [finding for finding in findings if finding.field == "events/t"]
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])

@@ -50,7 +50,7 @@ def came_elsewhere(pairs: Sequence[FramePair], events: EventSource) -> bool:
     makes several at each pixel, and a sensor that loses them falls silent.
     """
     lost = _unanswered(pairs, events)
-    changed = sum(int(_much(pair).sum()) for pair in lost)
+    changed = sum(int(_moved(pair, MUCH).sum()) for pair in lost)
     came, rate = _came(lost, events)
     usual = _came([pair for pair in pairs if pair.recorded_at(0)], events)[1]
     return changed > 0 and came >= changed and rate >= _AS_EVER * usual
@@ -61,15 +61,10 @@ def _unanswered(pairs: Sequence[FramePair], events: EventSource) -> list[FramePa
     return [
         pair
         for pair in sorted(pairs, key=lambda pair: pair.span_us)
-        if _much(pair).sum() >= LEAST_PIXELS
+        if _moved(pair, MUCH).sum() >= LEAST_PIXELS
         and pair.recorded_at(0)
-        and _fired(pair, events)[_much(pair)].mean() < SILENT
+        and _fired(pair, events)[_moved(pair, MUCH)].mean() < SILENT
     ]
-
-
-def _much(pair: FramePair) -> Bool[np.ndarray, "H W"]:
-    """Pixels that change by more than `MUCH`."""
-    return pair.usable & (np.abs(pair.change) > MUCH)
 
 
 def _came(pairs: Sequence[FramePair], events: EventSource) -> tuple[int, float]:
@@ -87,11 +82,22 @@ def answered_share(pairs: Sequence[FramePair], events: EventSource) -> float | N
     """
     changed = answered = 0
     for pair in pairs:
-        moved = pair.usable & (np.abs(pair.change) > VERY_MUCH)
+        moved = _moved(pair, VERY_MUCH)
         if moved.any() and pair.recorded_at(0):
             changed += int(moved.sum())
             answered += int(_fired(pair, events)[moved].sum())
     return answered / changed if changed >= LEAST_PIXELS else None
+
+
+def _moved(pair: FramePair, least: float) -> Bool[np.ndarray, "H W"]:
+    """Pixels that change by more than ``least`` beside what most pixels change by.
+
+    That is the camera's own exposure and gain, of which an event sensor knows nothing.
+    """
+    if not pair.usable.any():
+        return pair.usable
+    camera = np.median(pair.change[pair.usable])
+    return pair.usable & (np.abs(pair.change - camera) > least)
 
 
 def _fired(pair: FramePair, events: EventSource) -> Bool[np.ndarray, "H W"]:

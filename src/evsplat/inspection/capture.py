@@ -42,6 +42,8 @@ logger = logging.getLogger(__name__)
 
 CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
 SHOWN_FINDINGS = 12
+_EVEN = 0.1
+"""Share of the longest by which times differ that are told as one."""
 _OUTLINE, _OUTLINE_ENDS = (60, 255, 120), (255, 225, 80)
 
 
@@ -149,15 +151,14 @@ def _summary(
         for name in sorted({frame.camera for frame in frames})
     )
     start, end = frames[0].exposure_us[0], frames[-1].exposure_us[1]
-    exposure = float(np.median([frame.exposure_us[1] - frame.exposure_us[0] for frame in frames]))
-    starts = [frame.exposure_us[0] for frame in frames]
-    rate = f", {1e6 / np.median(np.diff(starts)):.4g} frames/s" if len(frames) > 1 else ""
+    exposures_ms = np.array([b - a for a, b in (frame.exposure_us for frame in frames)]) / 1000
+    rate = f", {_rate_text(np.diff([frame.mid_us for frame in frames]))}" if frames[1:] else ""
     lines = [
         f"{capture.name}   {capture.path}",
         f"frames     {len(frames)}: {len(capture.train_frames)} train, {len(capture.test_frames)} "
         f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera"
         f"{_transfer_text(capture)}",
-        f"time       {(end - start) / 1e6:.3f} s{rate}, exposure {exposure / 1000:.4g} ms",
+        f"time       {(end - start) / 1e6:.3f} s{rate}, {_exposure_text(exposures_ms)}",
         f"events     {_events_text(capture)}",
         *_sensor_lines(capture, estimate, doubted),
         f"body       {_body_text(capture, track)}",
@@ -179,6 +180,25 @@ def _summary(
     if "text" in capture.provenance:
         lines.append(f"made       {capture.provenance['text']}")
     return "\n".join(lines)
+
+
+def _rate_text(gaps_us: np.ndarray) -> str:
+    """Frames a second; where they are not evenly spaced, how far apart they are as well."""
+    usual = float(np.median(gaps_us))
+    text = f"{1e6 / usual:.4g} frames/s" if usual > 0 else "frames of one time"
+    shortest, longest = gaps_us.min() / 1000, gaps_us.max() / 1000
+    if longest - shortest <= _EVEN * longest:
+        return text
+    return f"{text} (median; {shortest:.4g} to {longest:.4g} ms apart)"
+
+
+def _exposure_text(exposures_ms: np.ndarray) -> str:
+    """The exposure of all frames; the range of theirs where a camera changed it."""
+    shortest, longest = exposures_ms.min(), exposures_ms.max()
+    usual = f"exposure {np.median(exposures_ms):.4g} ms"
+    if longest - shortest <= _EVEN * longest:
+        return usual
+    return f"{usual} (median; {shortest:.4g} to {longest:.4g} ms)"
 
 
 def _transfer_text(capture: Capture) -> str:

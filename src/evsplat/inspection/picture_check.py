@@ -1,9 +1,13 @@
-"""Warnings about pictures of which little can be learned: nearly black, burnt out, all the same."""
+"""Warnings about pictures of which little can be learned: nearly black, burnt out, all the same,
+or of a brightness that changes from one to the next.
+"""
 
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 
+from evsplat.calibration import Exposure, exposure
 from evsplat.capture import TrainingCapture
 from evsplat.capture.finding import Finding, Findings
 from evsplat.pictures.files import to_grey
@@ -18,13 +22,19 @@ _DARK = 1 / 12
 """Values of 12 bits in a file of 16 reach a sixteenth, in 8 bits that many are 21 levels."""
 _BURNT, _MOST_BURNT = 0.98, 0.6
 """Value from which a pixel is clipped, and share of such pixels."""
+_STEADY = 1.15
+"""Factor of light between two pictures up to which a camera counts as one of fixed exposure: the
+flicker of lamps is near it; people who move and their shadows make none, however large."""
+_FEWEST_USABLE = 0.1
+"""Share of pixels, neither dark nor clipped, of which the brightness of a picture is told."""
 
 
 def picture_findings(capture: TrainingCapture) -> list[Finding]:
     """What is wrong with the training pictures, by those of some frames."""
     frames = capture.train_frames
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_LOOKED_AT, len(frames))).astype(int))
-    grey = [to_grey(capture.image(frames[i])).numpy() for i in chosen]
+    looked_at = [frames[i] for i in chosen]
+    grey = [to_grey(capture.image(frame)).numpy() for frame in looked_at]
     brightest = max(float(np.quantile(picture, _BRIGHT)) for picture in grey)
     burnt = float(np.median([(picture > _BURNT).mean() for picture in grey]))
     folder = frames[0].image.parent
@@ -47,7 +57,47 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
             folder, "", f"the same in {len(grey)} pictures spread over the recording",
             "pictures of somebody who moves", "Check how they were exported.",
         )  # fmt: skip
+    elif capture.is_static_camera:
+        light = [
+            exposure(capture.image(frame), frame.exposure_us, transfer=capture.transfer(frame))
+            for frame in looked_at
+        ]
+        factor, follows_exposure = _brightness_changes(light)
+        if factor > _STEADY:
+            findings.warning(
+                folder, "",
+                f"pictures of which some show three quarters of the scene {factor:.2g} times as "
+                f"bright as others{', longer exposures brighter' if follows_exposure else ''}",
+                "one brightness of what stands still",
+                "Film with exposure, gain and white balance that stay the same, or multiply the "
+                "light of each picture by what makes the scene as bright in all: training takes "
+                "it to be, and shows what changes as a mean.",
+            )  # fmt: skip
     return findings.items
+
+
+def _brightness_changes(pictures: Sequence[Exposure]) -> tuple[float, bool]:
+    """Factor from the darkest to the brightest picture by what three quarters of the pixels change
+    by at least, and whether longer exposures are the brighter ones.
+
+    Somebody who moves, however large, makes some pixels brighter and others darker.
+    """
+    light = np.stack([picture.log_luminance for picture in pictures])
+    usable = np.stack([picture.usable for picture in pictures])
+    usual = np.median(light, axis=0)
+    levels, exposures_us = [], []
+    for values, of_use, picture in zip(light, usable, pictures, strict=True):
+        if of_use.mean() < _FEWEST_USABLE:
+            continue
+        low, high = np.quantile((values - usual)[of_use], (0.25, 0.75))
+        levels.append(float(max(low, 0.0) + min(high, 0.0)))
+        exposures_us.append(picture.span_us[1] - picture.span_us[0])
+    if len(levels) < 2:
+        return 1.0, False
+    factor = float(np.exp(max(levels) - min(levels)))
+    if np.ptp(levels) == 0 or np.ptp(exposures_us) == 0:
+        return factor, False
+    return factor, bool(np.corrcoef(levels, np.log(exposures_us))[0, 1] > 0.7)
 
 
 def warn_of_pictures(capture: TrainingCapture) -> None:
