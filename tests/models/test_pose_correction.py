@@ -125,6 +125,18 @@ def test_what_counts_is_said_by_the_state(exact):
     assert not learned.residual([3 * STEP_US // 2])[0].any() and bool(learned.exact) == exact
 
 
+@pytest.mark.parametrize("exact", [True, False])
+def test_one_key_has_no_motion_between_keys_and_a_price_that_is_a_number(exact):
+    whole = dance(1)
+    track = BodyTrack(whole.body, whole.times_us[:1], whole.poses[:1], whole.transl[:1])
+    learned = correction(track, exact=exact)
+    fill(learned, 3)
+    turns, shifts = learned.residual([0, 30_000])
+    assert learned.between is None
+    assert bool(learned.price().isfinite()) and (learned.price() == 0) == exact
+    assert bool(turns.any()) != exact and bool(shifts.any()) != exact
+
+
 def test_prices_are_squares_per_unknown():
     """Control points that are all 2 make a spline that is 2, and nothing where its mean is out."""
     track = dance(0)

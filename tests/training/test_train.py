@@ -75,6 +75,20 @@ def log_without_times(out: Path) -> list[dict]:
     return [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
 
 
+def test_one_frame_trains_in_every_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """There is no motion between its key pose and another, whose price was not a number."""
+    capture = write_tiny_capture(tmp_path / "tiny", frames=1)
+    with caplog.at_level(logging.WARNING):
+        train(
+            capture,
+            out=tmp_path / "run",
+            iterations=3,
+            overrides=small("evsplat", "pose.start=0"),
+        )
+    assert not [message for message in caplog.messages if "not finite" in message]
+    assert all(bool(one.isfinite().all()) for one in final_tensors(tmp_path / "run").values())
+
+
 @pytest.mark.parametrize(
     ("method", "settings"), [("paper", ()), ("evsplat", (FILL,))], ids=["paper", "evsplat"]
 )

@@ -66,7 +66,8 @@ class PoseCorrection(nn.Module):
     ) -> None:
         """``joint_rad`` and ``root_m``: errors expected at the keys, per axis, radians and metres.
 
-        ``between``: error expected of the track's spline between its keys; None: not learned.
+        ``between``: error expected of the track's spline between its keys; None: not learned, nor
+        where there is one key.
         """
         super().__init__()
         times = track.times_us
@@ -83,7 +84,7 @@ class PoseCorrection(nn.Module):
         )
         self.smoothing = PoseSpline(span, gap, joints, learned=False)
         self.between = None
-        if between is not None:
+        if between is not None and len(times) > 1:
             missed = torch.from_numpy(between.rotation_rad), torch.tensor(between.translation_m)
             for name, value in zip(("missed_rad", "missed_m"), missed, strict=True):
                 self.register_buffer(name, value, persistent=False)
