@@ -7,7 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.body.rotations import (
     axis_angle_to_matrix,
+    look_like_degrees,
     matrix_to_quaternion,
+    nearest_axis_angle,
     quaternion_multiply,
     quaternion_to_matrix,
 )
@@ -49,3 +51,22 @@ def test_quaternion_product_composes_right_first():
     )
     assert np.allclose(quaternion_to_matrix(product).numpy(), (a * b).as_matrix(), atol=1e-14)
     assert torch.allclose(quaternion_to_matrix(3.7 * product), quaternion_to_matrix(product))
+
+
+def test_poses_in_degrees_are_told_from_those_that_go_round():
+    rng = np.random.default_rng()
+    poses = 0.5 * rng.normal(size=(40, 24, 3))
+    poses[:, 0, 2] += np.linspace(0, 60, 40)  # a pirouette
+    poses[:, 16] = np.linspace(0, 3 * np.pi, 40)[:, None] * (0.6, 0.0, 0.8)
+    poses = nearest_axis_angle(poses)
+    assert np.linalg.norm(poses[:, 16], axis=-1).max() > 2 * np.pi
+    assert look_like_degrees(poses) is None
+    degrees = np.degrees(poses)
+    largest = np.linalg.norm(degrees[:, 1:], axis=-1).max()
+    assert look_like_degrees(degrees) == (
+        f"joints turned by up to {largest:.0f} radians in 40 of 40 poses"
+    )
+    assert look_like_degrees(degrees[:, :1]) is None
+    spoilt = poses.copy()
+    spoilt[:3] = degrees[:3]
+    assert look_like_degrees(spoilt) is None

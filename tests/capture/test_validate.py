@@ -207,6 +207,14 @@ def test_nan_pose(tiny_capture: Factory) -> None:
     assert "joint 2 'Arm'" in refuses_to_load(path)
 
 
+def test_poses_in_degrees_are_refused_with_that_word(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    # The root of the small body sways and its arm swings by up to 52 degrees.
+    edit_body(path, poses=np.degrees)
+    check(the_only(path), path / "body.npz", "poses", "look like degrees", "in radians")
+    assert "Multiply them by pi / 180" in refuses_to_load(path)
+
+
 # --- capture.json --------------------------------------------------------------------------
 
 

@@ -10,6 +10,9 @@ from torch.autograd.function import once_differentiable
 
 from evsplat.devices import constant
 
+_TOO_FAR_RAD = 4 * np.pi
+"""No joint turns twice round against its parent; vectors that go on beyond half a turn, as those of
+`nearest_axis_angle`, stay below."""
 _IDENTITY = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
@@ -139,3 +142,18 @@ def nearest_axis_angle(poses: Float[np.ndarray, "T *J 3"]) -> Float[np.ndarray, 
         turns = np.round(((before * axis).sum(-1, keepdims=True) - angle) / (2 * np.pi))
         vectors[time] = now + 2 * np.pi * turns * axis
     return vectors
+
+
+def look_like_degrees(poses: Float[np.ndarray, "T J 3"]) -> str | None:
+    """What says that axis-angle vectors are in degrees, in words; None where nothing does.
+
+    Half of the poses then have a joint that is turned further than any joint can be. The root,
+    which may turn round and round, says nothing.
+    """
+    angles = np.linalg.norm(np.asarray(poses, np.float64)[:, 1:], axis=-1)
+    if not angles.size:
+        return None
+    far = int((angles.max(1) > _TOO_FAR_RAD).sum())
+    if 2 * far < len(angles):
+        return None
+    return f"joints turned by up to {angles.max():.0f} radians in {far} of {len(angles)} poses"

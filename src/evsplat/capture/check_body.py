@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from evsplat.body.pose_errors import POSE_SOURCES, PoseSource
+from evsplat.body.rotations import look_like_degrees
 from evsplat.capture.body_file import BodyFile, body_from_arrays
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import Metadata
@@ -171,7 +172,15 @@ class _Check:
         rig_joints = self.arrays.get("rest_joints")
         if joints is None and rig_joints is not None and rig_joints.ndim == 2:
             joints = len(rig_joints)
-        self.array("poses", (count, joints, 3), "f")
+        poses = self.array("poses", (count, joints, 3), "f")
+        degrees = None if poses is None else look_like_degrees(poses)
+        if degrees:
+            self.error(
+                "poses",
+                f"{degrees}: they look like degrees",
+                "axis-angle vectors in radians, of each joint relative to its parent",
+                "Multiply them by pi / 180.",
+            )
         self.array("transl", (count, 3), "f")
         if times is None:
             return

@@ -132,6 +132,16 @@ def test_trams_world_moves_the_body_with_the_camera(tmp_path, models):
     assert np.abs(seen - motion.joints()).max() < 1e-5
 
 
+def test_poses_in_degrees_are_refused_with_that_word(tmp_path):
+    written = write("amass", tmp_path / "amass")
+    with np.load(written.path) as file:
+        arrays = dict(file)
+    arrays["poses"] = np.degrees(arrays["poses"])
+    np.savez(written.path, **arrays)
+    with pytest.raises(DataError, match="they look like degrees, expected axis-angle .* radians"):
+        read_poses(written.path)
+
+
 def test_without_a_model_a_given_pelvis_gives_the_same_root(tmp_path, models, monkeypatch, caplog):
     monkeypatch.delenv(ENVIRONMENT, raising=False)
     written = write("zju", tmp_path / "zju")

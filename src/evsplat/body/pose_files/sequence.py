@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from evsplat.body.pose_errors import PoseSource
-from evsplat.body.rotations import nearest_axis_angle
+from evsplat.body.rotations import look_like_degrees, nearest_axis_angle
 from evsplat.body.smpl_skeleton import JOINTS
 from evsplat.errors import DataError
 
@@ -91,6 +91,12 @@ def make_sequence(
         raise DataError(f"{source}: holds no pose.")
     if gender not in ("neutral", "male", "female"):
         raise DataError(f"{source}: gender is '{gender}', expected neutral, male or female.")
+    degrees = look_like_degrees(poses)
+    if degrees:
+        raise DataError(
+            f"{source}: has {degrees}: they look like degrees, expected axis-angle vectors in "
+            "radians, of each joint relative to its parent; multiply them by pi / 180."
+        )
     order = np.argsort(frames, kind="stable")
     frames = frames[order]
     if (np.diff(frames) == 0).any():
