@@ -1,5 +1,7 @@
 """A recording as a human-only method sees it: black outside of the person."""
 
+from pathlib import Path
+
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -12,6 +14,14 @@ HUMAN_ABOVE = 0.5
 """Share of a pixel above which it is the person's."""
 
 
+def masks_command(capture: Path, *, static_camera: bool) -> str:
+    """The command that finds the person in a capture's pictures, for the user to type.
+
+    The default way compares them with a static background, which moving cameras have none of.
+    """
+    return command("masks", capture, *(() if static_camera else ("--with", "silhouette")))
+
+
 def require_masks(capture: TrainingCapture, method: str) -> None:
     """A `DataError` where a training frame has no mask, a `ConfigError` where none may be seen."""
     if capture.policy.masks == "none":
@@ -22,9 +32,9 @@ def require_masks(capture: TrainingCapture, method: str) -> None:
     frames = capture.train_frames
     without = [frame.name for frame in frames if not capture.has_mask(frame)]
     if without:
-        ways = f"{command('masks', capture.path)}, or pass --set policy.masks=estimated"
-        if not capture.is_static_camera:  # estimates are differences to a static background
-            ways = command("masks", capture.path, "--with", "silhouette")
+        ways = masks_command(capture.path, static_camera=capture.is_static_camera)
+        if capture.is_static_camera:  # estimates are differences to a static background
+            ways += ", or pass --set policy.masks=estimated"
         raise DataError(
             f"{capture.path / 'capture.json'}: {len(without)} of {len(frames)} training frames "
             f"have no mask (the first is {without[0]!r}), and {method} learns the person from "

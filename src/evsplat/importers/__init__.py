@@ -6,6 +6,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+from evsplat.capture.masked import masks_command
 from evsplat.capture.write import CaptureWriter
 from evsplat.commands import command
 from evsplat.errors import ConfigError
@@ -161,8 +162,7 @@ def _import(
             writer.leave_out_body()
         found, frames = writer.with_mask
         if importer.brings_masks and found < frames:
-            how = ("--with", "silhouette") if writer.camera_moves else ()
-            find = command("masks", writer.path, *how)
+            find = masks_command(writer.path, static_camera=not writer.camera_moves)
             notes.append(
                 f"masks: {frames - found} of {frames} pictures have none where the data set keeps "
                 f"them (docs/import.md); find the person with: {find}"

@@ -18,7 +18,7 @@ from scipy.ndimage import (
 from torch import Tensor
 
 from evsplat.capture import Frame, TrainingCapture, load_body_track
-from evsplat.commands import command
+from evsplat.capture.masked import masks_command
 from evsplat.errors import ConfigError, DataError
 from evsplat.masks.silhouette import track_silhouette
 from evsplat.pictures import Transfer, decode
@@ -58,7 +58,7 @@ class BackgroundDifference:
             raise DataError(
                 f"{capture.path}: has a moving camera or several, so there is no static background "
                 "to compare with; find the person otherwise: "
-                f"{command('masks', capture.path, '--with', 'silhouette')}, or --with rvm."
+                f"{masks_command(capture.path, static_camera=False)}, or --with rvm."
             )
         if threshold is not None and not 0 < threshold < 1:
             raise ConfigError(f"threshold {threshold:g}: expected a number between 0 and 1.")
