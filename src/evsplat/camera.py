@@ -36,6 +36,19 @@ class Camera:
         K[0, 0] = K[1, 1] = focal_px
         return replace(self, K=K)
 
+    def smaller(self, step: int, *, whole: bool = True) -> "Camera":
+        """The camera of pictures whose pixels are means over squares of ``step`` pixels.
+
+        What fills no square at the right and below is cut off, or without ``whole`` has pixels of
+        its own.
+        """
+        K = self.K.clone()
+        K[:2] /= step
+        width, height = (
+            size // step if whole else -(-size // step) for size in (self.width, self.height)
+        )
+        return replace(self, width=width, height=height, K=K)
+
     def widened(self, beyond_x: int, beyond_y: int) -> "Camera":
         """The same camera with so many pixels more at the left and right, and above and below."""
         K = self.K.clone()

@@ -47,6 +47,24 @@ def test_projection_agrees_with_opencv(seed: int) -> None:
     assert camera.center().numpy() == pytest.approx(-pose[:3, :3].T @ pose[:3, 3], abs=1e-5)
 
 
+@pytest.mark.parametrize("step", [1, 2, 5, 7])
+def test_a_smaller_camera_sees_points_in_the_squares_of_pixels_that_they_were_in(step: int) -> None:
+    camera = random_camera(int(np.random.default_rng().integers(1000)))
+    in_camera = torch.tensor([[0.3, -0.2, 2.0], [-0.4, 0.1, 1.5]])
+    pose = camera.world_to_camera
+    points = (in_camera - pose[:3, 3]) @ pose[:3, :3]
+    pixels, depth = camera.project(points)
+    for whole, size in (
+        (True, (WIDTH // step, HEIGHT // step)),
+        (False, (-(-WIDTH // step), -(-HEIGHT // step))),
+    ):
+        small = camera.smaller(step, whole=whole)
+        assert (small.width, small.height) == size
+        found, same = small.project(points)
+        assert torch.allclose(step * found, pixels, atol=1e-4) and torch.allclose(same, depth)
+    assert camera.K[0, 0] == 70  # the larger one stays
+
+
 @pytest.mark.parametrize("lens", LENSES)
 def test_distortion_agrees_with_opencv(lens: str) -> None:
     ours = Distortion(WIDTH, HEIGHT, K, LENSES[lens])

@@ -61,13 +61,16 @@ class SourceCamera:
         self,
         writer: CaptureWriter,
         name: str,
-        picture: Path,
+        picture: Path | tuple[int, int],
         shrink: int,
         *,
         transfer: Transfer | None = None,
     ) -> None:
-        """Declare the camera with the size of one of its pictures, made smaller by ``shrink``."""
-        width, height = image_size(picture)
+        """Declare the camera of pictures made smaller by ``shrink`` (`shrunk`).
+
+        ``picture`` is one of them as stored, or its width and height.
+        """
+        width, height = image_size(picture) if isinstance(picture, Path) else picture
         K = self.K.copy()
         K[:2] /= shrink
         writer.add_camera(

@@ -66,16 +66,7 @@ class PeopleSnapshot(Importer):
         count = len(sequence.frames)
         kept = chosen_frames(self.frames, list(range(count)), source)
         camera, width, height = _read_camera(source / "camera.pkl")
-        K = camera.K.copy()
-        K[:2] /= self.shrink
-        writer.add_camera(
-            "main",
-            width // self.shrink,
-            height // self.shrink,
-            K,
-            camera.world_to_camera,
-            distortion=camera.distortion,
-        )
+        camera.add_to(writer, "main", (width, height), self.shrink)
         times = []
         with _Masks(source / "masks.hdf5", count) as masks:
             for index, time_us, pixels in _decode(video, kept, count):

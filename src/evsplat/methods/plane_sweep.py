@@ -8,7 +8,7 @@ Matching and Mutual Information, PAMI 2008).
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -61,7 +61,7 @@ def depth_shares(
     """
     step = max(1, math.ceil(math.sqrt(view.width * view.height / MOST_PIXELS)))
     shots = [_smaller(shot, step) for shot in shots]
-    coarse = _smaller_camera(view, step)
+    coarse = view.smaller(step, whole=False)
     given = _pooled(depth[..., None], step)[..., 0]
     parallax = _parallax_px(coarse, given, shots)
     if parallax < LEAST_PARALLAX_PX:
@@ -184,14 +184,7 @@ def _along(lines: Float[Tensor, "L N M"]) -> Float[Tensor, "L N M"]:
 
 def _smaller(shot: Shot, step: int) -> Shot:
     free = _pooled(shot.free[..., None], step)[..., 0]
-    return Shot(_smaller_camera(shot.camera, step), _pooled(shot.picture, step), free)
-
-
-def _smaller_camera(camera: Camera, step: int) -> Camera:
-    """Of pictures whose pixels are means over ``step`` x ``step``."""
-    K = camera.K.clone()
-    K[:2] /= step
-    return replace(camera, width=-(-camera.width // step), height=-(-camera.height // step), K=K)
+    return Shot(shot.camera.smaller(step, whole=False), _pooled(shot.picture, step), free)
 
 
 def _pooled(values: Float[Tensor, "H W C"], step: int) -> Float[Tensor, "h w C"]:

@@ -134,11 +134,6 @@ class Targets:
 
     def smaller(self, times: int) -> "Targets":
         """Pictures of fewer pixels: means over squares of ``times`` pixels."""
-        camera = self.camera
-        scale = torch.tensor([[1 / times], [1 / times], [1.0]])
-        small = Camera(
-            camera.width // times, camera.height // times, camera.K * scale, camera.world_to_camera
-        )
 
         def pooled(images: Tensor) -> Tensor:
             planar = images.permute(0, 3, 1, 2)
@@ -151,7 +146,7 @@ class Targets:
             behind=pooled(self.behind),
             weight=weight,
             trust=trust,
-            camera=small,
+            camera=self.camera.smaller(times),
         )
 
 
