@@ -36,6 +36,62 @@ def _joints(run) -> np.ndarray:
     return _placed(source.track.body, source.pose(times)[1], turn)
 
 
+def _read_bvh(text: str) -> tuple[list[str], np.ndarray, float]:
+    """Names, joints (T, J, 3) and seconds per key, by the words of the format's description.
+
+    Channels turn about the named axes in the order in which they stand, each one after those
+    before it in the joint's own axes; positions of a joint take the place of its offset.
+    """
+    words = text.split()
+    hierarchy, motion = words[: words.index("MOTION")], words[words.index("MOTION") + 1 :]
+    names, parents, offsets, channels, open_joints = [], [], [], [], []
+    joint = None
+    for place, word in enumerate(hierarchy):
+        if word in ("ROOT", "JOINT"):
+            names.append(hierarchy[place + 1])
+            parents.append(open_joints[-1] if open_joints else None)
+            joint = len(names) - 1
+        elif word == "End":
+            joint = None
+        elif word == "{":
+            open_joints.append(joint)
+        elif word == "}":
+            open_joints.pop()
+        elif word == "OFFSET" and joint is not None:
+            offsets.append([float(value) for value in hierarchy[place + 1 : place + 4]])
+        elif word == "CHANNELS":
+            count = int(hierarchy[place + 1])
+            channels.append(hierarchy[place + 2 : place + 2 + count])
+    count, seconds = int(motion[motion.index("Frames:") + 1]), float(motion[4])
+    rows = np.array(motion[5:], dtype=np.float64).reshape(count, -1)
+    world = np.tile(np.eye(4), (count, len(names), 1, 1))
+    column = 0
+    for joint, above in enumerate(parents):
+        local = np.tile(np.eye(4), (count, 1, 1))
+        local[:, :3, 3] = offsets[joint]
+        for channel in channels[joint]:
+            axis = "XYZ".index(channel[0])
+            if channel.endswith("position"):
+                local[:, axis, 3] = rows[:, column]
+            else:
+                angle = rows[:, column : column + 1]
+                turn = Rotation.from_euler(channel[0].lower(), angle, degrees=True)
+                local[:, :3, :3] = local[:, :3, :3] @ turn.as_matrix()
+            column += 1
+        world[:, joint] = local if above is None else world[:, above] @ local
+    assert column == rows.shape[1]
+    return names, world[..., :3, 3], seconds
+
+
+def test_a_reader_by_the_formats_words_reads_the_bvh(run):
+    path = export_run(run.path, "bvh")
+    names, joints, seconds = _read_bvh(path.read_text(encoding="ascii"))
+    body = run.reconstruction.track.body
+    order = [names.index("_".join(name.split())) for name in body.joint_names]
+    np.testing.assert_allclose(joints[:, order], _joints(run), atol=1e-5)
+    assert seconds == pytest.approx(1 / 60, abs=1e-7)
+
+
 def test_our_reader_reads_the_bvh_back(tmp_path):
     """A kick of a whole body: joints by the file against those by the body."""
     track = load_motion_of("kick", rest_track(default_body()))
