@@ -203,6 +203,7 @@ class Panel:
         self.client.change_playback(
             lambda p, now: p.within(self._start_us, self._end_us, now).moved(self._start_us, now)
         )
+        self._loop()
 
     def _go(self, time_us: float) -> None:
         self.client.change_playback(lambda p, now: p.moved(time_us, now))

@@ -70,7 +70,6 @@ class Viewer:
         self._followers = [
             RunFollower(viewed, submit, lambda: bool(self._clients), self._reloaded)
             for viewed in self.viewed
-            if is_training(viewed.run.path)
         ]
 
     def close(self) -> None:

@@ -34,7 +34,7 @@ from evsplat.view.request import Motion
 
 _DRAFT_SHADOW_STEP_PX = 4
 _POLL_S = 1.0
-"""A run that is being trained is looked at for newer states this often."""
+"""A run is looked at for newer states this often."""
 
 
 class ViewedRun:
@@ -188,7 +188,7 @@ def load_newest(path: Path, device: str) -> Run:
 
 
 class RunFollower:
-    """Looks for newer states of a run that is being trained, in a thread of its own."""
+    """Looks for newer states of a run, which may be trained on at any time, in its own thread."""
 
     def __init__(
         self,
@@ -204,6 +204,7 @@ class RunFollower:
         self._viewed, self._submit = viewed, submit
         self._is_watched, self._changed = is_watched, changed
         self._stop = threading.Event()
+        self._yielded = False
         self._loaded = self._newest()
         threading.Thread(target=self._run, name="evsplat-follow", daemon=True).start()
 
@@ -212,10 +213,10 @@ class RunFollower:
         self._stop.set()
 
     def _run(self) -> None:
-        path, training = self._viewed.run.path, True
-        while training and not self._stop.wait(_POLL_S):
-            # One more look after the end, for the last checkpoint.
-            training = is_training(path)
+        path = self._viewed.run.path
+        while not self._stop.wait(_POLL_S):
+            # Not asked whether it trains: that takes the lock for a moment, and a training that
+            # begins just then would be refused.
             if self._is_watched():
                 watch(path)
             newest = self._newest()
@@ -236,6 +237,9 @@ class RunFollower:
             self._viewed.reload(self._loaded[0])
         except (DataError, OSError):
             return  # replaced or removed before it was read; there will be another one
+        if not self._yielded and is_training(self._viewed.run.path):
+            self._yielded = True
+            yield_to_training()
         self._changed()
 
 
