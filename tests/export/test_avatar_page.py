@@ -24,42 +24,42 @@ _ARGUMENTS = (
     "--headless --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--ignore-gpu-blocklist --disable-background-networking --no-first-run --dump-dom"
 ).split()
-_SHOT = """
+_PROBE = """
 <script type="module">
-const shown = document.createElement("pre");
-try {
-  avatarPlayer.seek(0.1);
-  avatarPlayer.look(CAMERA);
-  shown.textContent = document.getElementById("picture").toDataURL().split(",")[1];
-} catch (error) { shown.textContent = String(error); }
-shown.id = "shot";
-document.body.replaceChildren(shown);
+const said = document.createElement("pre");
+try { said.textContent = (() => {SCRIPT})(); } catch (error) { said.textContent = String(error); }
+said.id = "said";
+document.body.replaceChildren(said);
 </script>
 """
+_SHOT = """
+  avatarPlayer.seek(0.1);
+  avatarPlayer.look(CAMERA);
+  return document.getElementById("picture").toDataURL().split(",")[1];
+"""
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="needs Chromium to show the page")
+
+
+def _said_by_browser(page, script: str, folder) -> str:
+    """What a script returns that runs in the page, once the page has started."""
+    text = page.read_text(encoding="utf-8")
+    probe = folder / "probe.html"
+    probe.write_text(text.replace("</html>", _PROBE.replace("SCRIPT", script)), encoding="utf-8")
+    command = [BROWSER, *_ARGUMENTS, f"--user-data-dir={folder / 'profile'}", probe.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    return done.stdout.partition('<pre id="said">')[2].partition("</pre>")[0]
 
 
 def _drawn_by_browser(page, camera, folder) -> torch.Tensor:
     """The picture of a page at 0.1 s as a camera sees it, sRGB in [0, 1]."""
     given = {"width": camera.width, "height": camera.height}
     given |= {"K": camera.K.tolist(), "world_to_camera": camera.world_to_camera.tolist()}
-    probe = page.read_text(encoding="utf-8").replace(
-        "</html>", _SHOT.replace("CAMERA", json.dumps(given)) + "</html>"
-    )
-    (folder / "probe.html").write_text(probe, encoding="utf-8")
-    command = [BROWSER, *_ARGUMENTS, f"--user-data-dir={folder / 'profile'}"]
-    done = subprocess.run(
-        [*command, (folder / "probe.html").as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=True,
-    )
-    text = done.stdout.partition('<pre id="shot">')[2].partition("</pre>")[0]
-    picture = Image.open(BytesIO(base64.b64decode(text, validate=True)))
+    data = _said_by_browser(page, _SHOT.replace("CAMERA", json.dumps(given)), folder)
+    picture = Image.open(BytesIO(base64.b64decode(data, validate=True)))
     return torch.from_numpy(np.asarray(picture.convert("RGB"), dtype=np.float32) / 255)
 
 
-@pytest.mark.skipif(BROWSER is None, reason="needs Chromium to show the page")
+@needs_browser
 @pytest.mark.parametrize("transfer", ["power", "linear"])
 def test_the_page_shows_what_our_rasteriser_draws(run, tmp_path, transfer):
     """Pictures that hold light are coded for the screen, of which the page said nothing."""
@@ -83,3 +83,26 @@ def test_the_page_shows_what_our_rasteriser_draws(run, tmp_path, transfer):
     assert want.std() > 0.05
     # Half floats and eight bits; a picture that is not coded is below 20 dB.
     assert psnr(got, want) > 45
+
+
+@needs_browser
+def test_keys_turn_the_view_and_a_lost_drawing_is_told(run, tmp_path):
+    page = export_run(run.path, "avatar", out=tmp_path / "dancer.html")
+    script = """
+      const picture = document.getElementById("picture"), { orbit } = avatarPlayer;
+      const press = (key) => picture.dispatchEvent(new KeyboardEvent("keydown", { key }));
+      const before = [orbit.heading, orbit.pitch, orbit.distance];
+      picture.focus();
+      const focused = document.activeElement === picture;
+      for (const key of ["ArrowLeft", "ArrowUp", "+", "x"]) press(key);
+      const after = [orbit.heading, orbit.pitch, orbit.distance];
+      const message = document.getElementById("message"), hidden = message.hidden;
+      picture.dispatchEvent(new Event("webglcontextlost"));
+      const told = message.hidden ? "" : message.textContent;
+      return JSON.stringify({ before, after, focused, hidden, told });
+    """
+    said = json.loads(_said_by_browser(page, script, tmp_path))
+    heading, pitch, distance = said["before"]
+    assert said["focused"] and said["hidden"]
+    np.testing.assert_allclose(said["after"], [heading + 0.1, pitch + 0.1, 0.9 * distance])
+    assert "reload the page" in said["told"]

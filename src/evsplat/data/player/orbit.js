@@ -1,5 +1,5 @@
 // A camera that circles a point: drag turns, the second button or two fingers shift, the wheel or a
-// pinch comes nearer. Camera axes are x right, y down, z forward.
+// pinch comes nearer; arrow keys, + and - do the same for what has the focus. Camera axes are x right, y down, z forward.
 
 const V = {
   dot: (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
@@ -29,6 +29,19 @@ class Orbit {
       event.preventDefault();
       this.distance *= Math.exp(0.001 * event.deltaY);
     }, { passive: false });
+    element.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || !this.pressed(event.key)) return;
+      event.preventDefault();
+    });
+  }
+
+  // Whether a key means something here.
+  pressed(key) {
+    const turns = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
+    const nearer = { "+": 0.9, "=": 0.9, "-": 1 / 0.9 };
+    if (turns[key]) this.turn(...turns[key]);
+    if (nearer[key]) this.distance *= nearer[key];
+    return Boolean(turns[key] || nearer[key]);
   }
 
   moved(event, height) {

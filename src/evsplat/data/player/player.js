@@ -43,11 +43,15 @@ let renderer = null;
 try {
   const linear = avatar.transfer === "linear";
   renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.low_pass_px2, avatar.light, fields, linear);
-  find("message").remove();
+  find("message").hidden = true;
 } catch (error) {
   find("message").textContent = error.message;
   throw error;
 }
+canvas.addEventListener("webglcontextlost", () => {
+  find("message").textContent = "The browser has stopped drawing here; reload the page to go on.";
+  find("message").hidden = false;
+});
 const orbit = new Orbit(canvas, avatar.up);
 
 function pose() {

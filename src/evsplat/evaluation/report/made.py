@@ -26,7 +26,8 @@ def films_and_pages(source: Source) -> str:
             uri = data_uri(file.read(), _MEDIA[path.suffix])
         name = escape(path.stem)
         picture = (
-            f'<video autoplay loop muted playsinline controls src="{uri}"></video>'
+            f'<video autoplay loop muted playsinline controls aria-label="{name}" src="{uri}">'
+            "</video>"
             if path.suffix == ".mp4"
             else f'<img src="{uri}" alt="{name}">'
         )

@@ -132,7 +132,9 @@ def _clip(source: Source) -> str:
     return (
         '<section class="hero"><div class="halves"><span>what the camera recorded</span>'
         "<span>reconstruction</span></div>"
-        f'<video autoplay loop muted playsinline controls src="{data_uri(clip.mp4, "video/mp4")}">'
+        "<video autoplay loop muted playsinline controls "
+        'aria-label="what the camera recorded beside the reconstruction" '
+        f'src="{data_uri(clip.mp4, "video/mp4")}">'
         "</video>"
         f'<p class="note">{seconds:.2f} s of the recording, {clip.slower:.1f} times slower than '
         f"life: {clip.pictures} pictures drawn, where the camera kept only the average of each "
