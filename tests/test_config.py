@@ -317,6 +317,13 @@ def test_any_configuration_in_range_survives_yaml(tmp_path_factory, config):
             "deform.lamps.blur is 1.0, but nothing reads it unless deform.lamps.width is above 1; "
             "leave it out or set deform.lamps.width.",
         ),
+        (  # all at once
+            {"deform": {"lamps": {"colour": "red", "width": 0.3}}, "extra": {}},
+            "deform.lamps.width is 0.3 and deform.lamps.colour is 'red', but nothing reads them "
+            "unless deform.lamps.lights is above 0; leave them out or set deform.lamps.lights. "
+            "extra is given, but nothing reads it unless deform.shading is true; leave it out or "
+            "set deform.shading.",
+        ),
         (
             {"extra": {}},
             "extra is given, but nothing reads it unless deform.shading is true; leave it out or "
@@ -349,7 +356,7 @@ def test_settings_are_taken_where_they_are_read():
 
 def test_a_setting_is_unread_where_what_it_depends_on_is():
     values = {"deform": {"lamps": {"width": 2.0, "blur": 0.5}}}
-    with pytest.raises(ConfigError, match="nothing reads it unless deform.lamps.lights is above 0"):
+    with pytest.raises(ConfigError, match="nothing reads them unless deform.lamps.lights is"):
         from_dict(Method, values, where="here")
 
 

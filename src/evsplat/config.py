@@ -98,19 +98,26 @@ def check(config: Any, where: str) -> None:
 
 
 def check_read(config: Any, where: str) -> None:
-    """Raise a `ConfigError` where a setting that nothing reads is not at its default."""
+    """Raise a `ConfigError` that names all settings that nothing reads and are not at defaults."""
     every = {setting.name: setting for setting in settings(config)}
+    unread: dict[tuple[str, str], list[str]] = {}
     for setting in every.values():
         if setting.is_section or setting.value == setting.default:
             continue
         if missed := _missed(setting, every):
             name, condition = missed
-            is_section = dataclasses.is_dataclass(setting.value)
-            raise ConfigError(
-                f"{where}: {setting.name} is {'given' if is_section else repr(setting.value)}, but "
-                f"nothing reads it unless {name} is {condition.condition}; leave it out or set "
-                f"{name}."
-            )
+            value = "given" if dataclasses.is_dataclass(setting.value) else repr(setting.value)
+            told = unread.setdefault((name, condition.condition), [])
+            told.append(f"{setting.name} is {value}")
+    reasons = []
+    for (name, asked), told in unread.items():
+        them = "it" if len(told) == 1 else "them"
+        reasons.append(
+            f"{' and '.join(told)}, but nothing reads {them} unless {name} is {asked}; leave "
+            f"{them} out or set {name}."
+        )
+    if reasons:
+        raise ConfigError(f"{where}: {' '.join(reasons)}")
 
 
 def _missed(setting: Setting, every: dict[str, Setting]) -> tuple[str, ReadIf] | None:

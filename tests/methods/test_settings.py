@@ -1,7 +1,9 @@
 """Settings of the methods: what nothing reads, what is out of range, what earlier versions had."""
 
+import json
 from typing import Any
 
+import numpy as np
 import pytest
 
 from evsplat.capture import load_capture
@@ -9,7 +11,7 @@ from evsplat.config import override, settings
 from evsplat.errors import ConfigError
 from evsplat.methods import TRAINABLE, method_config
 
-from ..small_model import built
+from ..small_model import built, small
 
 PERSON = [("human.count=100", "human.count=null", "human.spacing_px=9")]
 SCENE = [
@@ -227,3 +229,21 @@ def test_a_configuration_of_the_version_before_is_refused(method):
         method_config(method, old, where="config.yaml")
     said = str(error.value)
     assert [one for one in told if one not in said] == []
+
+
+@pytest.mark.parametrize("method", ["paper", "avatar3dgs_semantic"])
+def test_a_moving_camera_is_refused_with_all_that_has_to_change(tiny_capture, method):
+    path = tiny_capture()
+    document = json.loads((path / "capture.json").read_text())
+    for number, frame in enumerate(document["frames"]):
+        pose = np.array(document["cameras"]["main"]["world_to_camera"])
+        pose[0, 3] += 0.01 * number
+        frame["world_to_camera"] = pose.tolist()
+    (path / "capture.json").write_text(json.dumps(document))
+    given = [one.partition("=") for one in small(method) if one.startswith("scene.")]
+    with pytest.raises(ConfigError, match=r"--set scene.kind=random_cube") as refusal:
+        built(method, path)
+    names = str(refusal.value).partition("leave out what only backdrops read: ")[2]
+    assert given and all(name in names for name, _, _ in given)
+    # They are left out where the kind is another.
+    assert built(method, path, "scene.kind=random_cube", "scene.cube_count=50")

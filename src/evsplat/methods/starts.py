@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from evsplat.body import BodyTrack, skin, up_axis
 from evsplat.capture import Camera, Frame, TrainingCapture
+from evsplat.config import settings
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM
 from evsplat.gaussians.flip import carry
@@ -197,7 +198,7 @@ def scene_start(
         scales = nearest_spacing(points)[:, None].repeat(1, 3)
         opacity = CUBE_OPACITY
     else:
-        backdrop = background or _median(capture)
+        backdrop = background or _median(capture, start)
         camera, picture = backdrop.camera, backdrop.picture
         beyond = margins(camera)
         wide = camera.widened(*beyond)
@@ -231,13 +232,18 @@ def scene_start(
     }, colours
 
 
-def _median(capture: TrainingCapture) -> Backdrop:
+def _median(capture: TrainingCapture, start: SceneStart) -> Backdrop:
     """The median of the training frames, of a camera that stands still."""
     if not capture.is_static_camera:
+        of_backdrops = " and ".join(
+            f"scene.{setting.name}"
+            for setting in settings(start)
+            if any(condition is _BACKDROP for _, condition in setting.conditions)
+        )
         raise ConfigError(
             f"{capture.path}: scene.kind is median_backdrop, which needs one static camera; "
-            "this capture's camera moves. Pass --set scene.kind=random_cube, or train method "
-            "evsplat."
+            "this capture's camera moves. Train method evsplat, or pass --set "
+            f"scene.kind=random_cube and leave out what only backdrops read: {of_backdrops}."
         )
     return Backdrop(capture.camera(capture.train_frames[0]), capture.median_background())
 
