@@ -79,6 +79,7 @@ def test_pairs_are_forgotten_afterwards_also_after_a_failure(capture) -> None:
         first = frame_pairs(capture)
         assert frame_pairs(capture) is first
         raise KeyError("in between")
+    assert capture.shared_pairs is None  # nor does anything else hold them
     again = frame_pairs(capture)
     assert again is not first
     assert all(map(_same, again, first))

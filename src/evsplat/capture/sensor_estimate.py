@@ -28,9 +28,6 @@ power curve make them look 2.2 times as large."""
 _KEPT_BYTES = 128 << 20
 """Of shared pairs, which are there while a model is built: 60 of 512 x 512 pixels take 79 MB."""
 
-_shared: dict[TrainingCapture, list[FramePair] | None] = {}
-"""Pairs of captures within `shared_pairs`; None before they were asked for."""
-
 
 def looks_linear(capture: Capture | TrainingCapture, estimate: SensorEstimate | None) -> bool:
     """True where fitted thresholds are so large that the frames are likely to hold linear light."""
@@ -72,11 +69,11 @@ def estimate_sensor(capture: TrainingCapture) -> SensorEstimate | None:
 @contextmanager
 def shared_pairs(capture: TrainingCapture) -> Iterator[None]:
     """Within it `frame_pairs` are made once for all who ask, unless they are too large to keep."""
-    _shared[capture] = None
+    capture.shared_pairs = []
     try:
         yield
     finally:
-        del _shared[capture]
+        capture.shared_pairs = None
 
 
 def frame_pairs(capture: TrainingCapture) -> list[FramePair]:
@@ -84,13 +81,12 @@ def frame_pairs(capture: TrainingCapture) -> list[FramePair]:
 
     Not to be written to, as others may share them.
     """
-    kept = _shared.get(capture)
-    if kept is not None:
-        return kept
+    if capture.shared_pairs:
+        return capture.shared_pairs
     pairs = _made_pairs(capture)
     size = sum(one.change.nbytes + one.usable.nbytes for one in pairs)
-    if capture in _shared and size <= _KEPT_BYTES:
-        _shared[capture] = pairs
+    if capture.shared_pairs is not None and size <= _KEPT_BYTES:
+        capture.shared_pairs = pairs
     return pairs
 
 

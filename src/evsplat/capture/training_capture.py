@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from evsplat.calibration import FramePair
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
 from evsplat.capture.metadata import Frame, NovelView
@@ -57,6 +58,9 @@ class TrainingCapture:
         self._masker = masker
         self._masks: OrderedDict[str, Tensor] = OrderedDict()
         self.policy = policy
+        self.shared_pairs: list[FramePair] | None = None
+        """Pairs of frames that who asks next may have, empty until somebody does; None: they are
+        made anew for everybody. See `evsplat.capture.shared_pairs`."""
         self.path: Path = source.path
         self.name: str = source.name
         self.frames: tuple[Frame, ...] = tuple(self._redacted(f) for f in self._source.frames)
