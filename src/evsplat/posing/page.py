@@ -174,15 +174,16 @@ def _lines(made: Mapping[str, Any], under: str = "") -> list[tuple[str, str]]:
 
 
 def _table(rows: Sequence[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
-    """A table whose rows begin with a name."""
-    tags = [("th", head)] if head else []
+    """A table whose rows begin with a name; it scrolls where the window is narrower."""
+    heads = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
     lines = "".join(
-        f"<tr><th>{escape(first)}</th>"
-        + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells)
+        f'<tr><th scope="row">{escape(first)}</th>'
+        + "".join(f"<td>{escape(cell)}</td>" for cell in cells)
         + "</tr>"
-        for tag, (first, *cells) in [*tags, *(("td", row) for row in rows)]
+        for first, *cells in rows
     )
-    return f"<table>{lines}</table>"
+    above = f"<thead><tr>{heads}</tr></thead>" if heads else ""
+    return f'<div class="scroll plain"><table>{above}<tbody>{lines}</tbody></table></div>'
 
 
 def _doubts(fitted: PoseFit, landmarks: Landmarks) -> str:
