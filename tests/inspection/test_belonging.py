@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -103,6 +104,11 @@ def test_late_body_is_told_by_frames(path: Path, frames: int, side: str) -> None
     found = judge_body(seen(late(path, frames)))
     assert found.verdict == "off" and found.delay_frames == pytest.approx(frames, abs=0.5)
     assert found.place.endswith(side) and found.delay_us == 40_000 * found.delay_frames
+    # The figures are those by which it is told, and differ as printed.
+    here, there = map(float, re.findall(r"-?\d\.\d\d", found.sentence.rpartition("(")[2]))
+    assert found.change_lost is not None and found.change_score is not None
+    assert there - here == pytest.approx(found.change_lost * found.change_score, abs=0.01)
+    assert there > 1.1 * here
 
 
 def test_anothers_body_follows_nothing(path: Path) -> None:

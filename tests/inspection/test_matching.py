@@ -109,14 +109,17 @@ def test_what_changes_in_time_tells_delays_of_somebody_who_stays():
 
 def test_delays_are_told_where_both_halves_say_so():
     def peaks(*at: int, top: float = 0.4) -> BestPlace:
-        curves = np.full((3, len(DELAYS)), 0.1)
-        curves[range(3), np.array(at) + NOW] = top
-        return BestPlace(changing=curves)
+        """Curves that fall by 0.075 a step, down to 0.1."""
+        away = np.abs(np.arange(len(DELAYS)) - NOW - np.array(at)[:, None])
+        return BestPlace(changing=np.maximum(top - 0.075 * away, 0.1))
 
     delay, lost = peaks(4, 3, 5).changed
     assert (delay, lost) == (NOW + 4, pytest.approx(0.75))
     assert peaks(0, 0, 0).changed == (NOW, pytest.approx(0))
     assert peaks(4, -3, 5).changed is None
     assert peaks(4, 0, 5).changed is None
+    # The second half is better without the delay of both together, so that it is noise.
+    assert peaks(6, 7, 2).changed is None
+    assert peaks(6, 7, 4).changed == (NOW + 6, pytest.approx(0.75))
     faint = BestPlace(changing=np.full((3, len(DELAYS)), 0.05))
     assert faint.changed is None and BestPlace().changed is None

@@ -81,6 +81,8 @@ class Belonging:
     change_lost: float | None
     """Share of the correlation of what changes in time that is lost for want of the delay, which is
     then the one at which it is highest; None where it tells nothing, or the shift does."""
+    change_score: float | None
+    """That correlation at the delay; None as ``change_lost``."""
     standing_camera: bool
     in_no_training_frame: bool
     """The posed body is out of view in every training frame."""
@@ -159,6 +161,10 @@ class Belonging:
         if self.verdict == "belongs":
             return f"the posed body fits what moves: {self.where} ({fit})"
         if self.verdict == "off":
+            if not self._is_far and self.change_lost is not None and self.change_score is not None:
+                # What told the delay: most of somebody who stays is the same with and without it.
+                here = self.change_score * (1 - self.change_lost)
+                fit = f"correlation of what changes {here:.2f}, {self.change_score:.2f}"
             return f"the posed body is {self.place} what moves: {self.where} ({fit} elsewhere)"
         if self.area == 0:
             return f"{self.where}; check camera and poses"
@@ -209,9 +215,11 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
     )
     shift_px = best.right * coarse.pixel, best.down * coarse.pixel
     tolerance_px = _OFF_PX * coarse.pixel
-    delay, change_lost = best.delay, None
+    delay, change_lost, change_score = best.delay, None, None
     if float(np.hypot(*shift_px)) < tolerance_px and stands(frames) and best.changed is not None:
         delay, change_lost = best.changed
+        assert best.changing is not None
+        change_score = float(best.changing[0, delay])
     return Belonging(
         frames,
         shares={name: float(maps[now].sum() / maps.sum()) for name, maps in found.items()},
@@ -225,6 +233,7 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
         order=None if best.own_times is None else best.own_times.order,
         follows=None if best.own_times is None else best.own_times.follows,
         change_lost=change_lost,
+        change_score=change_score,
         parting=best.parting,
         standing_camera=stands(frames),
         in_no_training_frame=not now.any() and _in_none(capture, figure, capture.train_frames),

@@ -93,12 +93,16 @@ class BestPlace:
         """The delay, as an index in `DELAYS`, at which what changes in time fits best, and the
         share of its correlation that is lost without it.
 
-        None where too little changes, or where the halves of the recording contradict each other.
+        None where too little changes, or where the gain is no more than its noise: the mean of two
+        halves' gains is above its standard error, half of their difference, if both gain there.
         """
         if self.changing is None or self.changing[0].max() < _CHANGES:
             return None
         delay, *halves = self.changing.argmax(1).tolist()
         if any(np.sign(half - NOW) != np.sign(delay - NOW) for half in halves):
+            return None
+        gains = self.changing[1:, delay] - self.changing[1:, NOW]
+        if delay != NOW and gains.min() <= 0:
             return None
         return delay, float(1 - self.changing[0, NOW] / self.changing[0, delay])
 
