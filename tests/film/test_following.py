@@ -139,6 +139,26 @@ def test_a_background_is_a_colour_or_a_picture(tmp_path, recorded):
     assert picture[:, :40].max() < 0.1 and picture[:, 56:].min() > 0.9
     with pytest.raises(ConfigError, match="neither a colour"):
         Painted.of("no such colour")
+    Image.fromarray(halves).convert("RGBA").save(tmp_path / "opaque.png")
+    assert torch.equal(Painted.of(str(tmp_path / "opaque.png")).behind(camera, 0), picture)
+
+
+@pytest.mark.parametrize("kind", ["alpha", "palette", "deep"])
+def test_a_background_that_would_be_black_or_white_in_silence_is_refused(tmp_path, kind):
+    from PIL import Image
+
+    path = tmp_path / "a.png"
+    if kind == "deep":
+        Image.fromarray(np.full((8, 8), 30_000, np.uint16)).save(path)
+    elif kind == "alpha":
+        Image.new("RGBA", (8, 8), (200, 30, 30, 0)).save(path)
+    else:
+        few = Image.new("RGB", (8, 8), (200, 30, 30)).quantize(4)
+        few.save(path, transparency=few.getpixel((0, 0)))
+    with pytest.raises(
+        ConfigError, match="of more than 8 bits" if kind == "deep" else "transparent"
+    ):
+        Painted.of(str(path))
 
 
 def test_a_wall_stands_behind_all_that_the_filmed_person_does_and_looks_the_same(recorded):
