@@ -152,6 +152,11 @@ ODD = {
         {},
         "all 260 of events.csv are brighter, as no scene makes them",
     ),
+    "no polarity, of a sensor of another size": (
+        "".join(f"{t % 60},{t % 50},{t * 1000},0,0\n" for t in range(240)),
+        {},
+        "events.csv has no polarity, so it was left out",
+    ),
     "an exposure in milliseconds": (
         "t,x,y,p\n" + "".join(f"{t * 1000},1,2,{t % 2}\n" for t in range(-20, 240)),
         {"exposure_us": 30.0},

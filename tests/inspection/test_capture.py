@@ -11,8 +11,11 @@ import pytest
 from PIL import Image
 
 from evsplat.capture import load_body_track, load_capture
+from evsplat.errors import DataError
 from evsplat.inspection import body_mask_overlap, inspect_capture, warn_of_events, warn_of_pictures
+from evsplat.training.sound import check_events_reach
 
+from ..conftest import write_event_file
 from ..seen import seen
 
 Factory = Callable[..., Path]
@@ -67,6 +70,18 @@ def test_events_without_polarity_are_told_from_a_scene_that_stands_still(
     summary = inspect_capture(path, tmp_path / "out").summary
     assert "not estimated: events without polarity" in summary
     assert "too little moves, or" not in summary and "--clock-offset-us" not in summary
+
+
+def test_no_event_and_one_frame_are_not_blamed_on_what_moves(
+    tiny_capture: Factory, tmp_path: Path
+) -> None:
+    path = tiny_capture(frames=4)
+    write_event_file(path / "events.h5", *[np.zeros(0, np.int64)] * 4)
+    assert "not estimated: there is no event" in inspect_capture(path, tmp_path / "out").summary
+    with pytest.raises(DataError, match=r"holds no event that .* event_weight=0\.$"):
+        check_events_reach(seen(path))
+    one = inspect_capture(tiny_capture("one", frames=1), tmp_path / "of one").summary
+    assert "not estimated: one frame shows no change" in one
 
 
 def test_one_frame_has_no_delay(

@@ -119,6 +119,8 @@ def add_recorded_events(
                 raise ConfigError(f"--{name}: there are no events; give --events, or leave it out.")
         return ["events: none; simulate them, or give --events"]
     sensor = open_recording(need(path, "the events"), repair=repair)
+    if not sensor.has_polarity:  # asked first: nobody needs to warp what is left out
+        return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
     if sensor.width is not None and (sensor.width, sensor.height) != size:
         width, height = map(str, size)
         said = command("convert", path, "NEW.h5", "--width", width, "--height", height)
@@ -128,8 +130,6 @@ def add_recorded_events(
             f"there first (docs/own-capture.md, two sensors). If they do already, say so: {said}"
         )
     recording = open_recording(path, width=size[0], height=size[1], repair=repair)
-    if not recording.has_polarity:
-        return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
     passed, notes = _Passed(), []
     if isinstance(clock_offset, BlockLevels):
         clock_offset, note = _found_offset(clock_offset, recording, path, size)

@@ -211,6 +211,10 @@ def _sensor_lines(capture: Capture, estimate: SensorEstimate | None, doubted: bo
     events = capture.events
     if events is None:
         return []
+    if not len(events):
+        return ["clock      not estimated: there is no event"]
+    if len(capture.frames) == 1:
+        return ["clock      not estimated: one frame shows no change"]
     if estimate is None and doubted:
         return ["clock      not estimated: events do not tell what the frames show (findings)"]
     return sensor_lines(estimate, capture.clock_offset_us, has_polarity=events.has_polarity)

@@ -10,6 +10,11 @@ def check_events_reach(capture: TrainingCapture) -> None:
     events = capture.events
     if events is None:
         return
+    if not len(events):
+        raise DataError(
+            f"{events.path}: holds no event that training may see (those of held-out frames are "
+            "hidden); record or export it again, or train by the blur alone: --set event_weight=0."
+        )
     frames = capture.train_frames
     exposures = [frame.exposure_us for frame in frames]
     first, last = min(start for start, _ in exposures), max(end for _, end in exposures)
