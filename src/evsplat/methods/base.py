@@ -77,7 +77,8 @@ class Composition:
     """Terms that compare pictures: how their weighted sum falls tells when little more is to come,
     and a new run that was given no number of steps ends earlier then. None: it never does."""
     recording: Camera | None = None
-    """The camera at rest beside which the scene goes on; None: what was not recorded is black."""
+    """The camera at rest, which sees no depth: the scene stays as far away from it as it starts,
+    and goes on beside the recorded picture. None: it moves anywhere, and black is beside it."""
     fill: Callable[[Seen], dict[str, Tensor]] | None = None
     """Parameters by their names in the model's state, as a prior decides them at the end where
     little was seen; None: as they were learned."""

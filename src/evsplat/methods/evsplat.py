@@ -15,6 +15,7 @@ from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
+from evsplat.gaussians.depth_order import set_apart
 from evsplat.methods.background import background_without
 from evsplat.methods.base import (
     Composition,
@@ -101,6 +102,8 @@ def build(
     still = config.scene.kind != "random_cube" and capture.is_static_camera
     recording = capture.camera(frames[0]) if still else None
     gaussians = _start(config, capture, poses.track, generator, background)
+    if recording is not None:
+        set_apart(gaussians, recording)
     model = _model(config, capture, poses, gaussians, recording).to(device)
     if fit:
         _fit_colours(config, capture, model, background)

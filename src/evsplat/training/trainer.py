@@ -14,6 +14,7 @@ from torch import Tensor
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.devices import DeviceCache, default_cache_bytes, send
 from evsplat.gaussians import GaussianSet, Part, Rows, ScreenStatistics, densify, flip_labels
+from evsplat.gaussians.depth_order import depths_kept
 from evsplat.methods.base import Composition
 from evsplat.methods.settings import weight_at
 from evsplat.models.drawing import Drawing
@@ -101,6 +102,8 @@ class Trainer:
         self.data = DeviceCache(
             self.device, default_cache_bytes(self.device) if cache_bytes is None else cache_bytes
         )
+        recording = composition.recording
+        self._recording = None if recording is None else recording.to(self.device)
         self._sent: dict[str, tuple[Camera, Camera]] = {}
         self.queue: list[int] = []
         self.outlook = Outlook({name: composition.weights[name] for name in composition.watched})
@@ -130,7 +133,8 @@ class Trainer:
             return None
         # None where the host knows that the step is sound; else a GPU will know it.
         unsound = self.bad.count(sound)
-        self.optimiser.step(nominal, unsound)
+        with depths_kept(self.model.sets.values(), self._recording):
+            self.optimiser.step(nominal, unsound)
         self._count(step.drawing, nominal, None if unsound is None else sound)
         self._edit(nominal)
         self._learn_held_out(nominal)
