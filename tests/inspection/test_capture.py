@@ -178,6 +178,39 @@ def test_pictures_of_which_nothing_can_be_learned_are_told(
     assert len(found) == (words is not None)
 
 
+@pytest.mark.parametrize(
+    ("shown", "repeated"),
+    [
+        (lambda i: i, 0),
+        (lambda i: i // 2 * 2, 10),
+        (lambda i: i // 4 * 4, 15),
+        (lambda i: i - (i % 5 in (1, 3)), 8),  # 3 of 5, as 24 frames a second as 40
+        (lambda i: max(i, 9), 0),  # stands still at first
+        (lambda i: min(i, 18), 0),  # one repeat may be chance
+    ],
+)
+def test_a_video_exported_with_more_frames_than_were_taken_is_told(
+    tiny_capture: Factory,
+    caplog: pytest.LogCaptureFixture,
+    shown: Callable[[int], int],
+    repeated: int,
+) -> None:
+    path = tiny_capture(frames=20)
+    document = json.loads((path / "capture.json").read_text())
+    files = [path / frame["image"] for frame in document["frames"]]
+    for frame in document["frames"]:
+        frame["split"] = "train"
+    (path / "capture.json").write_text(json.dumps(document))
+    pictures = [file.read_bytes() for file in files]
+    assert len(set(pictures)) == 20
+    for i, file in enumerate(files):
+        file.write_bytes(pictures[shown(i)])
+    with caplog.at_level("WARNING"):
+        warn_of_pictures(seen(path))
+    told = [message for message in caplog.messages if "the one before once more" in message]
+    assert [f"{repeated} of 20 pictures" in message for message in told] == [True] * bool(repeated)
+
+
 @pytest.mark.parametrize("longer", [True, False])
 @pytest.mark.parametrize("factor", [1.0, 1.3, 4.0])
 def test_pictures_whose_brightness_changes_are_told_and_no_lost_events_are(

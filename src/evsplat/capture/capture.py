@@ -10,6 +10,7 @@ from evsplat.capture.training_capture import HumanFinder, TrainingCapture
 from evsplat.capture.validate import check_capture
 from evsplat.commands import command
 from evsplat.errors import DataError
+from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +46,8 @@ def load_capture(path: Path | str, *, needs_body: bool = True) -> Capture:
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors or metadata is None:
         more = (
-            f"\n{len(errors) - 1} more errors, which this lists: {command('inspect', path)}"
+            f"\n{counted(len(errors) - 1, 'more error')}, which this lists: "
+            f"{command('inspect', path)}"
             if len(errors) > 1
             else ""
         )

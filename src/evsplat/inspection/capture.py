@@ -37,6 +37,7 @@ from evsplat.inspection.event_check import WHICH_WAY, event_findings, warn_of_ev
 from evsplat.inspection.picture_check import picture_findings, warn_of_pictures
 from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings, contrast_findings, sensor_lines
+from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -241,7 +242,8 @@ def _body_text(capture: Capture, track: BodyTrack | None) -> str:
     body, times, dense = track.body, capture.body_file.times_us, capture.dense_body_file
     return (
         f"{capture.body_file.model}: {len(body.parents)} joints, {len(body.rest_vertices):,} "
-        f"vertices; {len(times)} key poses from {times[0] / 1e6:.3f} to {times[-1] / 1e6:.3f} s"
+        f"vertices; {counted(len(times), 'key pose')} from {times[0] / 1e6:.3f} to "
+        f"{times[-1] / 1e6:.3f} s"
         + ("" if track.errors is None else f", {track.errors.source}")
         + (f"; {len(dense.times_us)} dense true poses" if dense is not None else "")
     )

@@ -1,9 +1,11 @@
 """Warnings about pictures of which little can be learned: nearly black, burnt out, all the same,
-or of a brightness that changes from one to the next.
+repeated, or of a brightness that changes from one to the next.
 """
 
+import filecmp
 import logging
 from collections.abc import Sequence
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -25,6 +27,9 @@ _BURNT, _MOST_BURNT = 0.98, 0.6
 _STEADY = 1.15
 """Factor of light between two pictures up to which a camera counts as one of fixed exposure: the
 flicker of lamps is near it; people who move and their shadows make none, however large."""
+_MOST_REPEATS, _FEWEST_REPEATED = 3, 0.1
+"""Times that a picture is repeated at most, 30 frames of a second as 120, and share of repeats from
+which it is the export that made them."""
 _FEWEST_USABLE = 0.1
 """Share of pixels, neither dark nor clipped, of which the brightness of a picture is told."""
 
@@ -57,6 +62,14 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
             folder, "", f"the same in {len(grey)} pictures spread over the recording",
             "pictures of somebody who moves", "Check how they were exported.",
         )  # fmt: skip
+    elif repeated := _repeated(capture):
+        findings.warning(
+            folder, "", f"{repeated} of {len(frames)} pictures that are the one before once more",
+            "a picture of its own of each exposure",
+            "Leave repeats out, as in a video that was exported with more frames a second than "
+            "the camera took: of a repeat the person is where they were, and events say that they "
+            "moved. Whatever is told of clock and thresholds is wrong until then.",
+        )  # fmt: skip
     elif capture.is_static_camera:
         light = [
             exposure(capture.image(frame), frame.exposure_us, transfer=capture.transfer(frame))
@@ -74,6 +87,19 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
                 "it to be, and shows what changes as a mean.",
             )  # fmt: skip
     return findings.items
+
+
+def _repeated(capture: TrainingCapture) -> int:
+    """Pictures whose file is that of the one before, byte for byte, again and again.
+
+    Whoever stands still before a camera without noise makes long runs of equal pictures, and
+    exports with too many frames a second short ones throughout. 0 where they are no such pattern.
+    """
+    files = [frame.image for frame in capture.train_frames]
+    same = [filecmp.cmp(one, other, shallow=False) for one, other in pairwise(files)]
+    runs = [len(list(run)) for equal, run in groupby(same) if equal]
+    short = sum(run for run in runs if run <= _MOST_REPEATS)
+    return short if short >= max(3, _FEWEST_REPEATED * len(files)) else 0
 
 
 def _brightness_changes(pictures: Sequence[Exposure]) -> tuple[float, bool]:
