@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -55,6 +56,14 @@ class FramePair:
     def span_us(self) -> tuple[int, int]:
         """Time in which events contribute to the change."""
         return min(self.before_us[0], self.after_us[0]), max(self.before_us[1], self.after_us[1])
+
+    @cached_property
+    def camera_change(self) -> float:
+        """What most usable pixels change by, the camera's own exposure and gain; 0 where none is.
+
+        An event sensor knows nothing of that.
+        """
+        return float(np.median(self.change[self.usable])) if self.usable.any() else 0.0
 
     @property
     def gap_us(self) -> float:

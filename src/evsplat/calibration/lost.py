@@ -58,13 +58,14 @@ def came_elsewhere(pairs: Sequence[FramePair], events: EventSource) -> bool:
 
 def _unanswered(pairs: Sequence[FramePair], events: EventSource) -> list[FramePair]:
     """Pairs between which much changed and hardly an event came there, in order of time."""
-    return [
-        pair
-        for pair in sorted(pairs, key=lambda pair: pair.span_us)
-        if _moved(pair, MUCH).sum() >= LEAST_PIXELS
-        and pair.recorded_at(0)
-        and _fired(pair, events)[_moved(pair, MUCH)].mean() < SILENT
-    ]
+    found = []
+    for pair in sorted(pairs, key=lambda pair: pair.span_us):
+        moved = _moved(pair, MUCH)
+        if moved.sum() < LEAST_PIXELS or not pair.recorded_at(0):
+            continue
+        if _fired(pair, events)[moved].mean() < SILENT:
+            found.append(pair)
+    return found
 
 
 def _came(pairs: Sequence[FramePair], events: EventSource) -> tuple[int, float]:
@@ -90,14 +91,8 @@ def answered_share(pairs: Sequence[FramePair], events: EventSource) -> float | N
 
 
 def _moved(pair: FramePair, least: float) -> Bool[np.ndarray, "H W"]:
-    """Pixels that change by more than ``least`` beside what most pixels change by.
-
-    That is the camera's own exposure and gain, of which an event sensor knows nothing.
-    """
-    if not pair.usable.any():
-        return pair.usable
-    camera = np.median(pair.change[pair.usable])
-    return pair.usable & (np.abs(pair.change - camera) > least)
+    """Pixels that change by more than ``least`` beside what the camera itself changed."""
+    return pair.usable & (np.abs(pair.change - pair.camera_change) > least)
 
 
 def _fired(pair: FramePair, events: EventSource) -> Bool[np.ndarray, "H W"]:

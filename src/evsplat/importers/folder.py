@@ -145,8 +145,12 @@ class Folder(Importer):
         if len(seen) < len(kept):
             lacking = counted(len(kept) - len(seen), "picture")
             notes.append(f"left out: {lacking} without a pose")
-        writer.provenance |= {"source": "own recording", "focal": focal, "notes": notes}
-        writer.provenance["frames"] = [kept[0], kept[-1] + 1]
+        writer.provenance |= {
+            "source": "own recording",
+            "focal": focal,
+            "notes": notes,
+            "frames": [kept[0], kept[-1] + 1],
+        }
         if path is None or motion is None:
             writer.leave_out_body()
             return notes

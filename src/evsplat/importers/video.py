@@ -91,7 +91,11 @@ class Video(Importer):
             exposed_only=self.frames is not None,
         )
         notes += [*short_exposure(self.exposure_us), *([note] if note else [])]
-        writer.provenance |= {"source": f"video {source.name}", "focal": focal, "notes": notes}
-        writer.provenance["frames"] = [kept[0], kept[-1] + 1]
+        writer.provenance |= {
+            "source": f"video {source.name}",
+            "focal": focal,
+            "notes": notes,
+            "frames": [kept[0], kept[-1] + 1],
+        }
         writer.leave_out_body()
         return notes

@@ -187,19 +187,20 @@ def _rate_text(gaps_us: np.ndarray) -> str:
     """Frames a second; where they are not evenly spaced, how far apart they are as well."""
     usual = float(np.median(gaps_us))
     text = f"{1e6 / usual:.4g} frames/s" if usual > 0 else "frames of one time"
-    shortest, longest = gaps_us.min() / 1000, gaps_us.max() / 1000
-    if longest - shortest <= _EVEN * longest:
-        return text
-    return f"{text} (median; {shortest:.4g} to {longest:.4g} ms apart)"
+    return text + _range_text(gaps_us / 1000, " apart")
 
 
 def _exposure_text(exposures_ms: np.ndarray) -> str:
     """The exposure of all frames; the range of theirs where a camera changed it."""
-    shortest, longest = exposures_ms.min(), exposures_ms.max()
-    usual = f"exposure {np.median(exposures_ms):.4g} ms"
+    return f"exposure {np.median(exposures_ms):.4g} ms" + _range_text(exposures_ms)
+
+
+def _range_text(times_ms: np.ndarray, words: str = "") -> str:
+    """From the shortest to the longest, of which the median was told; "" where they are alike."""
+    shortest, longest = times_ms.min(), times_ms.max()
     if longest - shortest <= _EVEN * longest:
-        return usual
-    return f"{usual} (median; {shortest:.4g} to {longest:.4g} ms)"
+        return ""
+    return f" (median; {shortest:.4g} to {longest:.4g} ms{words})"
 
 
 def _transfer_text(capture: Capture) -> str:
