@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, default_body, up_axis
 from evsplat.camera import Camera
-from evsplat.errors import ConfigError
+from evsplat.errors import ConfigError, DataError
 from evsplat.film.following import (
     aimed,
     follow,
@@ -23,6 +23,7 @@ from evsplat.film.motion import load_motion_of
 from evsplat.film.surroundings import Painted, Room
 from evsplat.gaussians.initialise import pixel_rays
 from evsplat.models.layers import Layers
+from evsplat.pictures.files import write_image
 from evsplat.render import Splats
 from evsplat.staging.assets import motions
 
@@ -143,22 +144,37 @@ def test_a_background_is_a_colour_or_a_picture(tmp_path, recorded):
     assert torch.equal(Painted.of(str(tmp_path / "opaque.png")).behind(camera, 0), picture)
 
 
-@pytest.mark.parametrize("kind", ["alpha", "palette", "deep"])
-def test_a_background_that_would_be_black_or_white_in_silence_is_refused(tmp_path, kind):
+@pytest.mark.parametrize("kind", ["alpha", "palette"])
+def test_a_background_that_is_clear_in_places_is_refused(tmp_path, kind):
     from PIL import Image
 
     path = tmp_path / "a.png"
-    if kind == "deep":
-        Image.fromarray(np.full((8, 8), 30_000, np.uint16)).save(path)
-    elif kind == "alpha":
+    if kind == "alpha":
         Image.new("RGBA", (8, 8), (200, 30, 30, 0)).save(path)
     else:
         few = Image.new("RGB", (8, 8), (200, 30, 30)).quantize(4)
         few.save(path, transparency=few.getpixel((0, 0)))
-    with pytest.raises(
-        ConfigError, match="of more than 8 bits" if kind == "deep" else "transparent"
-    ):
+    with pytest.raises(ConfigError, match="transparent"):
         Painted.of(str(path))
+
+
+@pytest.mark.parametrize("colour", [False, True])
+def test_a_background_of_16_bits_is_as_bright_as_its_values_say(tmp_path, recorded, colour):
+    values = np.random.default_rng().integers(0, 65_536, (64, 96, 3)[: 2 + colour], dtype=np.uint16)
+    write_image(tmp_path / "a.png", values)
+    shown = Painted.of(str(tmp_path / "a.png")).behind(camera_before(recorded), 0)
+    expected = torch.from_numpy(values / 65_535).float()
+    if not colour:
+        expected = expected[..., None].expand(-1, -1, 3)
+    torch.testing.assert_close(shown, expected, atol=0.51 / 255, rtol=0)  # shown in 8 bits
+
+
+def test_a_background_of_32_bits_is_refused(tmp_path):
+    from PIL import Image
+
+    Image.fromarray(np.full((8, 8), 0.5, np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(DataError, match=r"a\.tif: .* expected 8 or 16"):
+        Painted.of(str(tmp_path / "a.tif"))
 
 
 def test_a_wall_stands_behind_all_that_the_filmed_person_does_and_looks_the_same(recorded):

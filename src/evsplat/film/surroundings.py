@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image, ImageColor
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -30,6 +30,7 @@ from evsplat.models.beyond import (
     wall_m,
 )
 from evsplat.models.layers import Layers
+from evsplat.pictures.files import read_image, to_rgb, to_unit_range
 from evsplat.untrusted.pictures import read_picture
 
 _FLOOR, _HORIZON, _TOP = (0.60, 0.58, 0.56), (0.83, 0.83, 0.82), (0.66, 0.69, 0.73)
@@ -159,13 +160,8 @@ class Painted:
     def of(cls, asked: str) -> "Painted":
         """By a colour's name, ``#rrggbb``, or the path of a picture; else a `ConfigError`."""
         if Path(asked).is_file():
-            rgb8 = read_picture(
-                Path(asked),
-                lambda image: _opaque_rgb(asked, image),
-                fault="not readable",
-                remedy="give a PNG or JPEG picture",
-            )
-            return cls(torch.from_numpy(rgb8.astype(np.float32) / 255))
+            read_picture(Path(asked), lambda image: _require_opaque(asked, image))
+            return cls(to_rgb(to_unit_range(read_image(Path(asked)))))
         try:
             rgb = ImageColor.getrgb(asked)[:3]
         except ValueError:
@@ -186,19 +182,13 @@ class Painted:
         return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
 
 
-def _opaque_rgb(asked: str, image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
-    """Colours of a picture that has 8 bits and covers what is behind it."""
-    if image.mode.startswith(("I", "F")):
-        raise ConfigError(
-            f"--background {asked}: has grey values of more than 8 bits, expected 8; save it as an "
-            "ordinary PNG or JPEG."
-        )
+def _require_opaque(asked: str, image: Image.Image) -> None:
+    """A `ConfigError` where something else would be seen behind the picture."""
     if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
         raise ConfigError(
             f"--background {asked}: is transparent in places, where nothing would be behind the "
             "person; fill them with a colour."
         )
-    return np.asarray(image.convert("RGB"))
 
 
 def _mixed(
