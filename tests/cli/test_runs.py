@@ -33,9 +33,12 @@ def test_table_has_the_run_above_the_trivial_rows_and_the_cameras_own_picture():
     assert "30.00 / 0.900" in lines[2]
     assert "26.12 / 0.900" in lines[4] or "26.13 / 0.900" in lines[4]
     assert len({len(line) for line in lines[1:-1]}) == 1
-    assert lines[-1] == Policy(held_out_events=True).sentence
+    assert lines[-1] == Policy(held_out_events=True).sentence(2)
     metrics |= {"frames": {"test": 0}, "policy": asdict(Policy(use="everything"))}
     assert summary_table(metrics).startswith("No test figures. Every frame and every event trained")
+    metrics |= {"policy": asdict(Policy())}
+    assert "nothing was held out" in summary_table(metrics)
+    assert "hidden" not in summary_table(metrics)
 
 
 def test_without_a_sharp_truth_a_sentence_stands_in_place_of_dashes():

@@ -346,7 +346,7 @@ def test_page_of_a_run_without_a_policy_claims_nothing_of_its_training(tiny_capt
     assert text.count("does not tell what training saw") == 2
     source = evaluated(path, tmp_path / "new", policy=Policy())
     text = " ".join(Page(page(source)).text)
-    assert Policy().sentence in text and "no event of the intervals around them" in text
+    assert Policy().sentence(3) in text and "no event of the intervals around them" in text
     assert "does not tell" not in text
 
 

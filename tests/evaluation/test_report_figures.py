@@ -170,7 +170,7 @@ def test_what_training_saw_is_told_beside_the_figures_and_the_test_frames(
     policy = Policy(held_out_events=held_out_events, held_out_poses=held_out_poses)
     metrics = MIXED | {"policy": to_dict(policy)}
     ((_, intro),) = Text(figures(SimpleNamespace(metrics=metrics))).of("intro")
-    assert policy.sentence in intro
+    assert policy.sentence(metrics["frames"]["test"]) in intro
     told = frames._held_out_terms(policy_of(metrics))
     assert "neither picture nor mask" in told
     assert ("and no event of the intervals" in told) == (not held_out_events)

@@ -93,9 +93,10 @@ def _lines(records: Records, cell: Cell, folder: BenchFolder) -> str:
         for name, path in files.items()
         if path.exists()
     )
-    policy = policy_of(record)
-    terms = policy.sentence if policy else "Nothing is known of what it saw."
+    terms = "Nothing is known of what it saw."
     if record["status"] == DONE:
+        if policy := policy_of(record):
+            terms = policy.sentence(record["frames"]["test"])
         regions = record["protocols"]["standard"]
         psnr = [regions.get(region, {}).get("psnr") for region in REGION_TITLES]
         figures = ["–" if value is None else f"{value:.2f}" for value in psnr]

@@ -56,9 +56,8 @@ class Policy:
         names = [name for name in said if getattr(self, name) != getattr(strict, name)]
         return tuple(said[name] for name in names)
 
-    @property
-    def sentence(self) -> str:
-        """The whole policy, for a reader of figures."""
+    def sentence(self, held_out: int) -> str:
+        """The whole policy with ``held_out`` test frames, for a reader of figures."""
         if self.use == "everything":
             return "Every frame and every event trained; nothing was held out."
         events = (
@@ -79,7 +78,10 @@ class Policy:
             "given": "poses at test times given",
             "interpolated": "poses at test times interpolated",
         }[self.held_out_poses]
-        return f"Held-out pictures were hidden from training, {events}; {thresholds}, {masks}, " + (
+        if not held_out:
+            return f"No frame is a test frame, so nothing was held out; {thresholds}, {masks}."
+        return (
+            f"Held-out pictures were hidden from training, {events}; {thresholds}, {masks}, "
             f"{poses}."
         )
 

@@ -189,8 +189,9 @@ def input_is_truth(metrics: dict[str, Any]) -> bool:
 
 def terms(metrics: dict[str, Any]) -> str:
     """Terms of the run: a sentence on what training saw, and one on poses that were not given."""
-    policy = policy_of(metrics)
-    seen = "The run does not tell what training saw." if policy is None else policy.sentence
+    policy, seen = policy_of(metrics), "The run does not tell what training saw."
+    if policy is not None:
+        seen = policy.sentence(metrics["frames"]["test"])
     return " ".join(filter(None, (seen, metrics.get("poses"))))
 
 

@@ -181,7 +181,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
         if fitting is not None and fitting.verdict != "belongs":
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
         logger.debug("%s", schedule_table(start.settings, composition.weights))
-        logger.info("%s", seen.terms.sentence)
+        logger.info("%s", seen.terms.sentence(len(seen.held_out_frames)))
     return trainer
 
 
