@@ -45,6 +45,15 @@ def test_events_without_polarity_are_told_from_others(tmp_path: Path) -> None:
     assert not unsigned.p.any() and np.array_equal(unsigned.t, events.t)
 
 
+def test_what_was_decoded_is_not_looked_up_again(tmp_path: Path, monkeypatch) -> None:
+    """HDF5 forgets the chunks of a data set that is closed, as one is that is opened to be read."""
+    write_events(tmp_path / "events.h5", random_events(0, 500, 60_000))
+    store = EventStore(tmp_path / "events.h5", WIDTH, HEIGHT)
+    first = store.between(10_000, 20_000)
+    monkeypatch.setattr(h5py.Group, "__getitem__", lambda *_: pytest.fail("opened again"))
+    assert len(first) and same(store.between(10_000, 20_000), first)
+
+
 def same(a: EventStream, b: EventStream) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("t", "x", "y", "p"))
 

@@ -29,7 +29,8 @@ Span = tuple[int, int]
 ALWAYS: Span = (-(1 << 62), 1 << 62)
 """All of time."""
 
-# HDF5 keeps decoded chunks per dataset; 4 MiB hold eight chunks of int64 times.
+# HDF5 keeps decoded chunks of a data set as long as that is open; 4 MiB hold eight chunks of int64
+# times.
 _CHUNK_CACHE_BYTES = 4 << 20
 _COLUMNS = ("events/t", "events/x", "events/y", "events/p")
 _POLARITY_BLOCK = 1 << 16
@@ -75,12 +76,14 @@ class EventStore:
         self._kept: OrderedDict[int, EventStream] = OrderedDict()
         self._checked_rows: dict[int, int] = {}
         self._file: h5py.File | None = None
+        self._data: dict[str, h5py.Dataset] = {}
         self._owner_pid = -1
         self._shift_us = 0
         self._has_polarity: bool | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None, "_owner_pid": -1, "_kept": OrderedDict()}
+        closed: dict[str, Any] = {"_file": None, "_data": {}, "_owner_pid": -1, "_kept": OrderedDict()}
+        return self.__dict__ | closed
 
     def __len__(self) -> int:
         """Count of events, without held-out ones."""
@@ -122,21 +125,20 @@ class EventStore:
         """The same recording, for slices that overlap: up to so many bytes of it stay decoded."""
         kept = copy.copy(self)
         kept._keep_bytes, kept._kept = limit_bytes, OrderedDict()
-        kept._file = None
+        kept._file, kept._data = None, {}
         return kept
 
     @property
     def has_polarity(self) -> bool:
         """False where every stored polarity is 0: the sensor did not say, and slices have p = 0."""
         if self._has_polarity is None:
-            file = self._open()
             blocks = [
                 (start, min(start + _POLARITY_BLOCK, last))
                 for first, last in self._readable_rows
                 for start in range(first, last, _POLARITY_BLOCK)
             ]
             self._has_polarity = not blocks or any(
-                bool(self._read(file, "events/p", *block).any()) for block in blocks
+                bool(self._read("events/p", *block).any()) for block in blocks
             )
         return self._has_polarity
 
@@ -149,12 +151,10 @@ class EventStore:
         interval.
         """
         self._check_readable(start_us, end_us)
-        file = self._open()
+        self._open()  # the shift stands in the file
         start, end = start_us - self._shift_us, end_us - self._shift_us
         if not self._keep_bytes:
-            return self._decoded(
-                *self._times_around(file, start, max(start, end)), start_us, end_us
-            )
+            return self._decoded(*self._times_around(start, max(start, end)), start_us, end_us)
         first = self._checked_index_at_ms(start // 1000)
         last = self._checked_index_at_ms(-(-max(start, end) // 1000))
         blocks = (self._block(*rows) for rows in self._block_rows(first, last))
@@ -178,7 +178,7 @@ class EventStore:
 
     def _block(self, first: int, last: int) -> EventStream:
         if first not in self._kept:
-            t = self._read(self._open(), "events/t", first, last).astype(np.int64)
+            t = self._read("events/t", first, last).astype(np.int64)
             self._kept[first] = self._decoded(first, t, *ALWAYS)
             most = max(1, self._keep_bytes // (_KEPT_BLOCK * _EVENT_BYTES))
             while len(self._kept) > most:
@@ -188,7 +188,6 @@ class EventStore:
 
     def _decoded(self, first: int, t: np.ndarray, start_us: int, end_us: int) -> EventStream:
         """The events within two times, of the rows from ``first`` on whose times are ``t``."""
-        file = self._open()
         if len(t) and (np.diff(t) < 0).any():
             index = first + int(np.argmax(np.diff(t) < 0)) + 1
             raise DataError(
@@ -198,7 +197,7 @@ class EventStore:
         start, end = start_us - self._shift_us, end_us - self._shift_us
         low, high = np.searchsorted(t, [start, end], side="left")
         high = max(low, high)
-        x, y, p = (self._read(file, f"events/{name}", first + low, first + high) for name in "xyp")
+        x, y, p = (self._read(f"events/{name}", first + low, first + high) for name in "xyp")
         self._check(x, y, p, first + low)
         signs = np.where(p > 0, np.int8(1), np.int8(-1)) if self.has_polarity else 0 * p
         pixels = x.astype(np.uint16), y.astype(np.uint16)
@@ -224,17 +223,17 @@ class EventStore:
         """Close the file; the next read opens it again."""
         if self._file is not None and self._owner_pid == os.getpid():
             self._file.close()
-        self._file = None
+        self._file, self._data = None, {}
 
-    def _open(self) -> h5py.File:
+    def _open(self) -> dict[str, h5py.Dataset]:
         if self._file is None or self._owner_pid != os.getpid():
             file = open_hdf5(self.path, rdcc_nbytes=_CHUNK_CACHE_BYTES)
-            self._check_layout(file)
-            self._shift_us = self.clock_offset_us + int(file["t_offset"][()])
-            self._file, self._owner_pid = file, os.getpid()
-        return self._file
+            data = self._checked_layout(file)
+            self._shift_us = self.clock_offset_us + int(data["t_offset"][()])
+            self._file, self._data, self._owner_pid = file, data, os.getpid()
+        return self._data
 
-    def _check_layout(self, file: h5py.File) -> None:
+    def _checked_layout(self, file: h5py.File) -> dict[str, h5py.Dataset]:
         found = {name: data_set(file, name) for name in (*_COLUMNS, "ms_to_idx", "t_offset")}
         wrong = [
             name
@@ -253,6 +252,7 @@ class EventStore:
                 f"{self.path}: its columns differ in length ({lengths}), expected one number per "
                 "event in each; write the file anew."
             )
+        return found
 
     @functools.cached_property
     def _readable_rows(self) -> list[tuple[int, int]]:
@@ -263,9 +263,10 @@ class EventStore:
 
     def _row_at(self, time_us: int) -> int:
         """Row of the first event at or after a time."""
-        file, time = self._open(), time_us - self._shift_us
+        self._open()
+        time = time_us - self._shift_us
         first = self._index_at_ms(time // 1000)
-        near = self._read(file, "events/t", first, self._index_at_ms(-(-time // 1000)))
+        near = self._read("events/t", first, self._index_at_ms(-(-time // 1000)))
         return first + int(np.searchsorted(near, time))
 
     def _readable_from(self, time_us: int) -> Span | None:
@@ -285,13 +286,13 @@ class EventStore:
 
     def _index_at_ms(self, millisecond: int) -> int:
         """Index of the first event at or after a millisecond of the file's clock."""
-        file = self._open()
-        count = int(file["events/t"].shape[0])
+        data = self._open()
+        count = int(data["events/t"].shape[0])
         if millisecond < 0:
             return 0
-        if millisecond >= file["ms_to_idx"].shape[0]:
+        if millisecond >= data["ms_to_idx"].shape[0]:
             return count
-        row = int(self._read(file, "ms_to_idx", millisecond, millisecond + 1)[0])
+        row = int(self._read("ms_to_idx", millisecond, millisecond + 1)[0])
         if not 0 <= row <= count:
             raise self._wrong_index(millisecond)
         return row
@@ -300,7 +301,7 @@ class EventStore:
         """`_index_at_ms`, compared with the times of the event there and the one before, once."""
         if millisecond not in self._checked_rows:
             row = self._index_at_ms(millisecond)
-            t = self._read(self._open(), "events/t", max(row - 1, 0), row + 1)
+            t = self._read("events/t", max(row - 1, 0), row + 1)
             before = min(row, 1)
             if (t[:before] >= 1000 * millisecond).any() or (t[before:] < 1000 * millisecond).any():
                 raise self._wrong_index(millisecond)
@@ -309,7 +310,7 @@ class EventStore:
             self._checked_rows[millisecond] = row
         return self._checked_rows[millisecond]
 
-    def _times_around(self, file: h5py.File, start: int, end: int) -> tuple[int, np.ndarray]:
+    def _times_around(self, start: int, end: int) -> tuple[int, np.ndarray]:
         """Times of the milliseconds from ``start`` to ``end``, and the row of the first of them.
 
         With the event before and the one after: they show whether the index leads where it should.
@@ -319,7 +320,7 @@ class EventStore:
         if last < first:
             raise self._wrong_index(last_ms)
         row = max(first - 1, 0)
-        t = self._read(file, "events/t", row, last + 1).astype(np.int64)
+        t = self._read("events/t", row, last + 1).astype(np.int64)
         if first > 0 and t[0] >= 1000 * first_ms:
             raise self._wrong_index(first_ms)
         if len(t) > last - row and t[-1] < 1000 * last_ms:
@@ -334,11 +335,11 @@ class EventStore:
         )
 
     def _time_of(self, row: int) -> int:
-        return int(self._read(self._open(), "events/t", row, row + 1)[0])
+        return int(self._read("events/t", row, row + 1)[0])
 
-    def _read(self, file: h5py.File, key: str, first: int, last: int) -> np.ndarray:
+    def _read(self, key: str, first: int, last: int) -> np.ndarray:
         with broken_as(self.path, f"{key}[{first}:{last}] cannot be read", "copy the file again"):
-            return file[key][first:last]
+            return self._open()[key][first:last]
 
     def _check(self, x: np.ndarray, y: np.ndarray, p: np.ndarray, first: int) -> None:
         neither = (p != 0) & (p != 1)
