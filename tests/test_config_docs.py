@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evsplat import field_docs
 from evsplat.cli import main
 from evsplat.config import from_dict, load_yaml
 from evsplat.config_docs import explained, explained_yaml, save_yaml
@@ -128,6 +129,7 @@ def test_a_configuration_is_written_where_there_is_no_source(tmp_path, monkeypat
         raise OSError("could not get source code")
 
     monkeypatch.setattr(inspect, "getsource", gone)
+    monkeypatch.setattr(field_docs, "_READ", {})
     save_yaml(tmp_path / "c.yaml", Config())
     assert from_dict(Config, load_yaml(tmp_path / "c.yaml"), where="c") == Config()
 

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -47,7 +48,7 @@ def explained(config: Any) -> list[Explained]:
     return [_explained(setting, docs[setting.owner], every) for setting in every]
 
 
-def _explained(setting: Setting, docs: dict[str, str], every: list[Setting]) -> Explained:
+def _explained(setting: Setting, docs: Mapping[str, str], every: list[Setting]) -> Explained:
     is_section = dataclasses.is_dataclass(setting.value)
     doc = docs.get(setting.name.rpartition(".")[2], "")
     if is_section and not doc:
