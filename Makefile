@@ -16,6 +16,9 @@ SET_UP_INPUTS := pyproject.toml constraints.txt CMakeLists.txt \
 # Byte code is made of what is imported, as it is imported: of all of PyTorch, three quarters of an
 # installation from the cache would go into it.
 export PIP_COMPILE := no
+# And it is kept, whatever the surroundings say: without it every process compiles PyTorch again, six
+# seconds of each start.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo view test fuzz kill robustness lint types docs setup clean
 

@@ -26,6 +26,20 @@ def _plan(target, venv):
     return done.stdout
 
 
+def test_what_was_compiled_as_it_was_imported_is_kept():
+    """pip compiles nothing (`PIP_COMPILE`), so each start would compile PyTorch again."""
+    shown = "shown: ; @echo kept$$PYTHONDONTWRITEBYTECODE"
+    done = subprocess.run(
+        ["make", "-s", f"--eval={shown}", "shown"],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "kept\n"
+
+
 def _make_venv(target, **environment):
     done = subprocess.run(
         ["sh", str(ROOT / "tools" / "make_venv.sh"), str(target)],
