@@ -82,8 +82,8 @@ class EventStore:
         self._has_polarity: bool | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        closed: dict[str, Any] = {"_file": None, "_data": {}, "_owner_pid": -1, "_kept": OrderedDict()}
-        return self.__dict__ | closed
+        closed: dict[str, Any] = {"_file": None, "_data": {}, "_owner_pid": -1}
+        return self.__dict__ | closed | {"_kept": OrderedDict()}
 
     def __len__(self) -> int:
         """Count of events, without held-out ones."""
