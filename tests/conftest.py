@@ -1,9 +1,11 @@
 """Captures that tests share: those on disk, the one that ships, and a tiny one made on the fly."""
 
+import functools
 import json
 import os
 import shutil
 import signal
+import tempfile
 import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -89,6 +91,23 @@ def write_tiny_capture(
     path: Path, *, frames: int = 10, width: int = 32, height: int = 24, seed: int = 0
 ) -> Path:
     """Write a valid capture with truth, masks, a novel view and events that fit the pictures."""
+    for name, content in _tiny_files(frames, width, height, seed).items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(content)
+    document = json.loads((path / "capture.json").read_text())
+    (path / "capture.json").write_text(json.dumps(document | {"name": path.name}))
+    return path
+
+
+@functools.lru_cache(maxsize=16)  # tests ask for few kinds, hundreds of times
+def _tiny_files(frames: int, width: int, height: int, seed: int) -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        _draw_tiny_capture(Path(folder), frames, width, height, seed)
+        files = (file for file in Path(folder).rglob("*") if file.is_file())
+        return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
+
+
+def _draw_tiny_capture(path: Path, frames: int, width: int, height: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     for folder in ("images", "sharp", "masks", "novel/side"):
         (path / folder).mkdir(parents=True)
@@ -128,7 +147,7 @@ def write_tiny_capture(
     document = {
         "format": "evsplat-capture",
         "version": 1,
-        "name": path.name,
+        "name": "tiny",
         "cameras": cameras,
         "frames": entries,
         "novel_views": views,
@@ -143,7 +162,6 @@ def write_tiny_capture(
         "provenance": {"text": "made by the tests", "gamma": 2.2},
     }
     (path / "capture.json").write_text(json.dumps(document))
-    return path
 
 
 def write_event_file(
@@ -247,8 +265,9 @@ def _draw(
     cover = []
     for part in (rig["faces"][:12], rig["faces"][12:]):
         mask = Image.new("L", size)
+        draw = ImageDraw.Draw(mask)
         for triangle in part:
-            ImageDraw.Draw(mask).polygon([tuple(pixels[v]) for v in triangle], fill=255)
+            draw.polygon([tuple(pixels[v]) for v in triangle], fill=255)
         small = mask.resize((camera["width"], camera["height"]), Image.Resampling.BOX)
         cover.append(np.asarray(small, dtype=np.float32) / 255)
     picture = background
