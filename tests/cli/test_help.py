@@ -24,12 +24,19 @@ class Entry:
     """Columns of a line."""
 
 
+_PAGES: dict[tuple[str, int], str] = {}
+"""What was shown, by words and columns: several tests read one page."""
+
+
 def page_of(capsys, monkeypatch, words: list[str], columns: int) -> str:
-    monkeypatch.setenv("COLUMNS", str(columns))
-    with pytest.raises(SystemExit) as stop:
-        main([*words, "--help"])
-    assert stop.value.code == 0
-    return capsys.readouterr().out
+    shown = " ".join(words), columns
+    if shown not in _PAGES:
+        monkeypatch.setenv("COLUMNS", str(columns))
+        with pytest.raises(SystemExit) as stop:
+            main([*words, "--help"])
+        assert stop.value.code == 0
+        _PAGES[shown] = capsys.readouterr().out
+    return _PAGES[shown]
 
 
 def entries(page: str) -> Iterator[Entry]:

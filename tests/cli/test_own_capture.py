@@ -22,7 +22,7 @@ from evsplat.pictures.video import write_video
 
 from ..conftest import EXPOSURE_US, PERIOD_US, write_event_file
 from ..events.formats.encoders import aedat4, evt3
-from ..small_model import small
+from ..small_model import few_descent_steps, small
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-capture.md"
 WIDTH, HEIGHT, FRAMES = 48, 32, 10
@@ -112,6 +112,7 @@ def stand_ins(tiny_capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert load_capture(capture).frames and file == Path("gvhmr.pt")
         return out
 
+    few_descent_steps(monkeypatch)
     monkeypatch.setattr(posing, "find_poses", found)
     monkeypatch.setattr("evsplat.view.view_run", shown)
     monkeypatch.setattr("evsplat.importers.attach_poses", attached)

@@ -71,6 +71,11 @@ def prepared(capture: TrainingCapture, **settings) -> Poses:
     return prepare_poses(replace(EvsplatConfig().pose, **settings), capture, fit=True)
 
 
+def without_drawing(monkeypatch) -> None:
+    """As before a long recording; what is asked here is decided without."""
+    monkeypatch.setattr(poses, "MOST_PIXELS", 0)
+
+
 def noted_corrections(monkeypatch) -> list[BodyTrack]:
     """The motions that are corrected by drawing from here on."""
     noted: list[BodyTrack] = []
@@ -140,15 +145,18 @@ def test_poses_that_were_corrected_when_found_are_not_drawn_again(captures, monk
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("source", ["exact", "markers", "estimated"])
-def test_what_a_capture_says_of_its_poses_counts_whatever_their_curve(seed, source, tiny_capture):
+def test_what_a_capture_says_of_its_poses_counts_whatever_their_curve(
+    seed, source, tiny_capture, monkeypatch
+):
     """Fast exact motions stay as they are, smooth ones that are estimated are corrected."""
+    without_drawing(monkeypatch)
     frames = 40 if source == "exact" else 20  # fast ones need the keys
     path, rng = tiny_capture(frames=frames), np.random.default_rng(seed)
     count, *joints = load_capture(path).body_file.poses.shape
     cycles, jitter = (8.0, 0.01) if source == "exact" else (0.5, 0.0)
     phase = 2 * np.pi * (np.linspace(0, cycles, count)[:, None, None] + rng.random(joints))
-    poses = 0.3 * np.sin(phase) + jitter * rng.normal(size=(count, *joints))
-    with_errors(path, source=source, poses=poses.astype(np.float32))
+    turns = 0.3 * np.sin(phase) + jitter * rng.normal(size=(count, *joints))
+    with_errors(path, source=source, poses=turns.astype(np.float32))
     found = prepared(seen(path))
     assert np.array_equal(found.track.poses, load_body_track(load_capture(path)).poses)
     assert bool(found.correction.exact) == (source == "exact")
@@ -188,9 +196,10 @@ def test_joints_whose_errors_nobody_told_are_smoothed_by_less(captures, monkeypa
 
 @pytest.mark.parametrize(("said", "largest"), [(0.02, 0.02), (0.05, 0.05), (0.2, 0.05)])
 def test_steps_of_large_errors_are_no_larger_than_those_of_poses_nobody_knows(
-    said, largest, captures
+    said, largest, captures, monkeypatch
 ):
     """A first step of Adam is the learning rate, in units of the error that is expected."""
+    without_drawing(monkeypatch)
     path = captures[1].path
     with np.load(path / "body.npz") as archive:
         std = np.full_like(archive["pose_std_rad"], said)
