@@ -105,7 +105,7 @@ def test_large_pictures_are_halved_until_enough_of_them_fit(tiny_capture, monkey
 
 
 def test_pictures_of_one_piece_are_there_at_once_and_all_of_them_count(tiny_capture, monkeypatch):
-    capture = seen(tiny_capture(frames=60))
+    capture = seen(tiny_capture(frames=40))
     track = load_body_track(capture)
     camera = capture.camera(capture.frames[0])
     monkeypatch.setattr(cutting, "_MOST_PIXELS", 24 * 3 * camera.width * camera.height)
@@ -135,7 +135,7 @@ def test_pictures_of_one_piece_are_there_at_once_and_all_of_them_count(tiny_capt
 def test_where_nobody_is_in_view_the_motion_stays_and_the_rest_is_corrected(
     tiny_capture, monkeypatch
 ):
-    capture = seen(tiny_capture(frames=60))
+    capture = seen(tiny_capture(frames=40))
     track = load_body_track(capture)
     camera = capture.camera(capture.frames[0])
     monkeypatch.setattr(cutting, "_MOST_PIXELS", 24 * 3 * camera.width * camera.height)

@@ -18,12 +18,12 @@ def test_a_short_training_beats_both_trivial_answers_in_full_frame_and_on_the_pe
     train(
         demo_capture_path,
         out=tmp_path / "run",
-        iterations=20,
+        iterations=10,
         # What no picture shows is filled in tests/models/discs/test_fill.py.
         overrides=(
-            "human.count=4000",
-            "densify.max_human=4000",
-            "scene.prefit_steps=100",
+            "human.count=2500",
+            "densify.max_human=2500",
+            "scene.prefit_steps=40",
             "fill=0",
         ),
     )
