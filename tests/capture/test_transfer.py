@@ -1,5 +1,6 @@
 """Frames that hold light as the camera measured it: the same recording, coded or not."""
 
+import functools
 import json
 import shutil
 from dataclasses import replace
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from evsplat.capture import Capture, Policy, estimate_sensor, load_capture
+from evsplat.capture.sensor_estimate import SensorEstimate
 from evsplat.inspection.sensor import contrast_findings
 from evsplat.objectives.base import Step
 from evsplat.objectives.exposure import Exposure
@@ -50,8 +52,13 @@ def recordings(tmp_path_factory, demo_capture_path) -> dict[str, Capture]:
     return made
 
 
+@functools.cache  # a capture is equal to itself alone
+def estimated(capture: Capture) -> tuple[Capture, SensorEstimate | None]:
+    return capture, estimate_sensor(capture.for_training(Policy(use="everything")))
+
+
 def thresholds(capture: Capture) -> np.ndarray:
-    estimate = estimate_sensor(capture.for_training(Policy(use="everything")))
+    _, estimate = estimated(capture)
     assert estimate is not None and estimate.thresholds is not None
     return np.array([estimate.thresholds.plus, estimate.thresholds.minus])
 
@@ -63,10 +70,6 @@ def test_fitted_thresholds_do_not_depend_on_how_frames_are_coded(recordings):
     assert linear == pytest.approx(coded, rel=0.12)
     assert linear == pytest.approx(0.2, abs=0.02) and coded == pytest.approx(0.2, abs=0.02)
     assert contrast_findings(*estimated(recordings["linear"])) == []
-
-
-def estimated(capture: Capture):
-    return capture, estimate_sensor(capture.for_training(Policy(use="everything")))
 
 
 def test_linear_frames_that_are_taken_as_coded_are_noticed(recordings, tmp_path):
