@@ -123,13 +123,15 @@ def test_a_run_on_poses_that_err_makes_all_its_steps(tiny_capture, tmp_path, mon
 
 def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(ended, tmp_path, monkeypatch):
     module = sys.modules["evsplat.training.train"]  # its name in the package is the function
-    monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
-    step, turn = Trainer.step, load_run(ended.out).iteration - round(STEPS * REST)
+    step, usual = Trainer.step, module.CHECKPOINT_SECONDS
+    turn = load_run(ended.out).iteration - round(STEPS * REST)
     for kill_at in (turn - 1, turn + 3):
 
         def killed(self: Trainer, kill_at: int = kill_at):
             if self.clock.iteration == kill_at:
                 raise Killed
+            if self.clock.iteration == kill_at - 1:  # saved behind the last step, not behind each
+                monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
             return step(self)
 
         out = tmp_path / f"killed{kill_at}"
@@ -137,6 +139,8 @@ def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(ended, tmp_path, 
         with pytest.raises(Killed):
             train(ended.capture, out=out, overrides=ended.settings)
         monkeypatch.setattr(Trainer, "step", step)
+        monkeypatch.setattr(module, "CHECKPOINT_SECONDS", usual)
+        assert int(latest_checkpoint(out / "checkpoints").stem) == kill_at
         train(ended.capture, out=out, resume=True)
         ends = [load_checkpoint(latest_checkpoint(run / "checkpoints")) for run in (ended.out, out)]
         (expected, state), (found, again) = ends
