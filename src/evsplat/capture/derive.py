@@ -49,6 +49,11 @@ class Derivation:
     def set_picture(self, frame: Frame, key: str, picture: Float[Tensor, "..."]) -> None:
         """Write an ``image``, ``sharp`` or ``mask`` in [0, 1] of a frame, seen without lens."""
         entry = self.entry(frame)
+        if key != "mask" and entry.pop("gain", None) is not None:
+            # What is read is evened out, and so is what is made of it: the other one has to be too.
+            readers = {"image": self.source.image, "sharp": self.source.sharp}
+            for other in readers.keys() & entry.keys() - {key}:
+                self.set_picture(frame, other, readers[other](frame))
         entry[key] = f"{_FOLDERS[key]}/{self._stems[frame.name]}.png"
         write_picture(self.folder / entry[key], picture)
 

@@ -31,6 +31,9 @@ class Frame:
     mask: Path | None = None
     world_to_camera: Float[Tensor, "4 4"] | None = None
     """Pose of a moving camera at mid-exposure; None where the camera stands."""
+    gain: tuple[float, ...] | None = None
+    """Light of red, green and blue (or of all) in picture and truth against other frames' pictures;
+    None where it is the same."""
 
     @property
     def image(self) -> Path:

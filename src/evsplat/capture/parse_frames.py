@@ -9,8 +9,10 @@ from evsplat.camera import Camera
 from evsplat.capture.fields import Fields, is_whole
 from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.parse_cameras import rigid
+from evsplat.untrusted.faults import brief
 
 _LONGEST_EXPOSURE_US = 60_000_000
+_MOST_GAIN = 100
 _USUAL_GAP_US = (500, 10_000_000)
 """From one frame to the next: no camera of blurry video takes 2,000 a second, and a person in one
 frame every ten seconds is another one in each."""
@@ -97,7 +99,7 @@ def at_rest(
 
 
 def _frame(top: Fields, index: int, value: Any, cameras: dict[str, Camera]) -> Frame | None:
-    keys = ("name", "camera", "image", "exposure_us", "split", "sharp", "mask")
+    keys = ("name", "camera", "image", "exposure_us", "split", "sharp", "mask", "gain")
     entry = top.inner(f"frames[{index}]", value, (*keys, "world_to_camera"))
     name, camera = entry.name("name"), entry.text("camera")
     _check_camera(entry, camera, cameras)
@@ -109,10 +111,11 @@ def _frame(top: Fields, index: int, value: Any, cameras: dict[str, Camera]) -> F
     sharp = entry.path("sharp", required=False)
     mask = entry.path("mask", required=False)
     pose = rigid(entry, "world_to_camera", None)
+    gain = _gain(entry)
     if not entry.valid or image is None or exposure is None:
         return None
     kind: Literal["train", "test"] = "train" if split == "train" else "test"
-    return Frame(name, index, camera, str(image), exposure, kind, sharp, mask, pose)
+    return Frame(name, index, camera, str(image), exposure, kind, sharp, mask, pose, gain)
 
 
 def _check_camera(entry: Fields, camera: str, cameras: dict[str, Camera]) -> None:
@@ -152,6 +155,25 @@ def _exposure(entry: Fields) -> tuple[int, int] | None:
         )
         return None
     return start, end
+
+
+def _gain(entry: Fields) -> tuple[float, ...] | None:
+    if entry.get("gain", None) is None:
+        return None
+    shape = (3,) if isinstance(entry.get("gain"), list) else ()
+    gain = entry.numbers("gain", shape)
+    if gain is None:
+        return None
+    if not ((gain >= 1 / _MOST_GAIN) & (gain <= _MOST_GAIN)).all():
+        entry.fail(
+            "gain",
+            brief(gain.tolist()),
+            f"factors of light from 1/{_MOST_GAIN} to {_MOST_GAIN}",
+            "Give how bright the picture shows the scene against the brightest ones, or leave it "
+            "out.",
+        )
+        return None
+    return tuple(gain.reshape(-1).tolist())
 
 
 def _check_frames(top: Fields, frames: list[Frame]) -> None:

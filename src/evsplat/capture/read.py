@@ -21,12 +21,14 @@ from evsplat.capture.points import read_points
 from evsplat.errors import DataError
 from evsplat.events import EventStore
 from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_rgb, to_unit_range
-from evsplat.pictures.light import Transfer, shown
+from evsplat.pictures.light import Transfer, evened, shown
 from evsplat.untrusted.arrays import read_plain_npz
 
 IMAGE_CACHE_BYTES = 192 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
 _MEDIAN_FRAMES = 255
+
+Gain = tuple[float, ...] | None
 
 
 class CaptureReader:
@@ -124,7 +126,7 @@ class CaptureReader:
     def image(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
         """The blurry picture of a frame."""
         frame = self._frame(frame)
-        return to_rgb(self._picture(frame.image, frame.camera))
+        return to_rgb(self._picture(frame.image, frame.camera, frame.gain))
 
     def sharp(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
         """The sharp truth at mid-exposure; for evaluation only, nothing else opens these files."""
@@ -134,7 +136,7 @@ class CaptureReader:
                 f"{self.path / 'capture.json'}: frame {frame.name!r} names no sharp picture; "
                 "evaluate against frames that do."
             )
-        return to_rgb(self._picture(frame.sharp, frame.camera))
+        return to_rgb(self._picture(frame.sharp, frame.camera, frame.gain))
 
     def is_own_truth(self, frame: Frame | str) -> bool:
         """Whether a frame's own picture is its sharp truth, as in data sets of sharp video."""
@@ -246,7 +248,10 @@ class CaptureReader:
             )
         train = self.train_frames
         chosen = np.unique(np.linspace(0, len(train) - 1, min(len(train), _MEDIAN_FRAMES)).round())
-        stored = [self._stored(train[int(i)].image, train[int(i)].camera) for i in chosen]
+        frames = [train[int(i)] for i in chosen]
+        stored = [self._stored(frame.image, frame.camera, frame.gain) for frame in frames]
+        if any(frame.gain for frame in frames):  # those without are still as they are stored
+            stored = [to_unit_range(picture).numpy() for picture in stored]
         stack = np.stack(stored)
         rows = [np.median(stack[:, row], axis=0) for row in range(stack.shape[1])]
         scale = 1.0 if stack.dtype == np.float32 else float(np.iinfo(stack.dtype).max)
@@ -263,13 +268,13 @@ class CaptureReader:
     def _frame(self, frame: Frame | str) -> Frame:
         return self.frame(frame if isinstance(frame, str) else frame.name)
 
-    def _picture(self, path: Path, camera: str) -> Tensor:
-        return to_unit_range(self._stored(path, camera))
+    def _picture(self, path: Path, camera: str, gain: Gain = None) -> Tensor:
+        return to_unit_range(self._stored(path, camera, gain))
 
-    def _stored(self, path: Path, camera: str) -> np.ndarray:
-        return self._images.get(path, lambda: self._decode(path, camera))
+    def _stored(self, path: Path, camera: str, gain: Gain) -> np.ndarray:
+        return self._images.get((path, gain), lambda: self._decode(path, camera, gain))
 
-    def _decode(self, path: Path, camera: str) -> np.ndarray:
+    def _decode(self, path: Path, camera: str, gain: Gain) -> np.ndarray:
         pixels = read_image(path)
         expected = self.cameras[camera]
         if pixels.shape[:2] != (expected.height, expected.width):
@@ -281,4 +286,12 @@ class CaptureReader:
         distortion = self._metadata.distortions.get(camera)
         if distortion is not None:
             pixels = distortion.undistort_image(to_unit_range(pixels).numpy())
+        if gain is not None:
+            if pixels.ndim == 2 and len(gain) > 1:
+                raise DataError(
+                    f"{path}: is grey and has a gain of {len(gain)} colours in capture.json, "
+                    "expected one number; correct it."
+                )
+            curve = self._metadata.transfers.get(camera, "power")
+            pixels = evened(to_unit_range(pixels), torch.tensor(gain), curve).numpy()
         return planar(pixels)

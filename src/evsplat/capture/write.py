@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import PoseSource
+from evsplat.calibration.gain import GainMeter
 from evsplat.capture.body_file import key_poses, save_arrays, write_body
 from evsplat.capture.distortion import are_coefficients
 from evsplat.capture.parse import FORMAT, VERSION
@@ -70,6 +71,7 @@ class CaptureWriter:
         self._events: dict[str, Any] | None = None
         self._folder: Path | None = None
         self._overwrite = overwrite
+        self._gains = GainMeter()
         self._making = new_folder(self.path, replace=overwrite)
         self._check_target()
 
@@ -135,20 +137,23 @@ class CaptureWriter:
         sharp: np.ndarray | Path | str | Literal[True] | None = None,
         mask: np.ndarray | Path | str | None = None,
         world_to_camera: ArrayLike | None = None,
+        gain: float | Sequence[float] | None = None,
     ) -> str:
         """Add the next frame and give its split; frames of a camera come in the order of time.
 
         Pictures are arrays (H, W) or (H, W, 3), coded as the camera says: uint8, uint16 or floats
         in [0, 1] (stored as 8 bit), or the path of a PNG, JPEG or WebP file that is copied as it
         is. ``sharp`` is the truth at mid-exposure; True: ``image`` is taken as sharp and is its own
-        truth. ``mask`` is (H, W), the share of the person; booleans will do. Without ``split``,
-        frames whose index modulo 10 is 7, 8 or 9 are test.
+        truth. ``mask`` is (H, W), the share of the person; booleans will do. ``gain`` is how much
+        light the camera made of the scene's against other pictures, of all colours or of red,
+        green and blue; see `find_gains`. Without ``split``, frames whose index modulo 10 is 7, 8
+        or 9 are test.
         """
         checked_name(name, "a frame")
         index = len(self._frames)
         start, end = exposure_us
         entry: dict[str, Any] = {"name": name, "camera": camera}
-        entry["image"] = self._store(f"images/{name}", camera, image)
+        entry["image"] = self._store(f"images/{name}", camera, image, self._gains)
         entry["exposure_us"] = [int(start), int(end)]
         entry["split"] = split or default_split(index)
         if sharp is True:
@@ -161,6 +166,8 @@ class CaptureWriter:
             entry["mask"] = self._store(f"masks/{name}", camera, mask)
         if world_to_camera is not None:
             entry["world_to_camera"] = _numbers(world_to_camera)
+        if gain is not None:
+            entry["gain"] = _numbers(gain)
         self._frames.append(entry)
         return entry["split"]
 
@@ -172,6 +179,22 @@ class CaptureWriter:
         self._novel_views.append(
             {"camera": camera, "frame": frame, "time_us": int(time_us), "image": stored}
         )
+
+    def find_gains(self) -> float:
+        """Find what light each picture shows against the others, as automatic exposure changes it.
+
+        For one camera that stands still, by what its pictures show of the scene. Gives the factor
+        from the darkest to the brightest picture: 1 where the camera's brightness is one, or where
+        frames were given a gain, and then nothing is written.
+        """
+        given = any("gain" in frame for frame in self._frames)
+        several = len({frame["camera"] for frame in self._frames}) > 1
+        gains = None if given or several or self.camera_moves else self._gains.gains()
+        if gains is None:
+            return 1.0
+        for frame, gain in zip(self._frames, gains.round(4).tolist(), strict=True):
+            frame["gain"] = gain if len(gain) > 1 else gain[0]
+        return float((gains.max(axis=0) / gains.min(axis=0)).max())
 
     def set_body(
         self,
@@ -296,8 +319,14 @@ class CaptureWriter:
                 f"{self.path}: exists and is not a capture, so it stays; choose another name."
             )
 
-    def _store(self, stem: str, camera: str, image: np.ndarray | Path | str) -> str:
-        """Write or copy a picture of a camera; gives its path in the capture."""
+    def _store(
+        self,
+        stem: str,
+        camera: str,
+        image: np.ndarray | Path | str,
+        meter: GainMeter | None = None,
+    ) -> str:
+        """Write or copy a picture of a camera, looked at by ``meter``; its path in the capture."""
         if camera not in self._cameras:
             raise DataError(
                 f"{self.path}: {stem} is of camera {camera!r}, expected one of "
@@ -305,11 +334,12 @@ class CaptureWriter:
             )
         expected = self._cameras[camera]["width"], self._cameras[camera]["height"]
         if isinstance(image, np.ndarray):
-            source, suffix, size = f"{self.path}: {stem}", ".png", image.shape[1::-1]
+            source, suffix, pixels = f"{self.path}: {stem}", ".png", image
         else:
             # Decoded whole: a copy of a picture that ends too early would be found much later.
             source, suffix = str(image), Path(image).suffix.lower()
-            size = read_image(Path(image)).shape[1::-1]
+            pixels = read_image(Path(image))
+        size = pixels.shape[1::-1]
         if suffix not in _PICTURE_SUFFIXES:
             raise DataError(f"{source}: expected a PNG, JPEG or WebP picture; save it as PNG.")
         if size != expected:
@@ -323,6 +353,8 @@ class CaptureWriter:
             write_image(target, image, source=source)
         else:
             copy_file(Path(image), target)
+        if meter is not None:
+            meter.add(pixels, self._cameras[camera].get("transfer", "power"))
         return stem + suffix
 
     def _finish(self) -> None:

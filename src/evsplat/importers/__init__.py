@@ -160,6 +160,12 @@ def _import(
         if importer.no_poses and writer.has_body:
             notes = [note for note in notes if not note.startswith("body:")]
             writer.leave_out_body()
+        factor = writer.find_gains()
+        if factor > 1:
+            notes.append(
+                f"light: the camera made some pictures {factor:.2f} times as bright as others; "
+                "each has its gain in capture.json, and is read as if the camera had not"
+            )
         found, frames = writer.with_mask
         if importer.brings_masks and found < frames:
             find = masks_command(writer.path, static_camera=not writer.camera_moves)

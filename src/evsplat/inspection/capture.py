@@ -160,6 +160,7 @@ def _summary(
         f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera"
         f"{_transfer_text(capture)}",
         f"time       {(end - start) / 1e6:.3f} s{rate}, {_exposure_text(exposures_ms)}",
+        *_gain_lines(frames),
         f"events     {_events_text(capture)}",
         *_sensor_lines(capture, estimate, doubted),
         f"body       {_body_text(capture, track)}",
@@ -181,6 +182,17 @@ def _summary(
     if "text" in capture.provenance:
         lines.append(f"made       {capture.provenance['text']}")
     return "\n".join(lines)
+
+
+def _gain_lines(frames: tuple[Frame, ...]) -> list[str]:
+    """From what to what gains of the frames go, of all colours; no line where none is said."""
+    gains = [gain for frame in frames for gain in frame.gain or ()]
+    if not gains:
+        return []
+    return [
+        f"gain       {min(gains):.2f} to {max(gains):.2f} of the brightest pictures' light, evened "
+        "out on reading"
+    ]
 
 
 def _rate_text(gaps_us: np.ndarray) -> str:

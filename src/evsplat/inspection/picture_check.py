@@ -82,9 +82,9 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
                 f"pictures of which some show three quarters of the scene {factor:.2g} times as "
                 f"bright as others{', longer exposures brighter' if follows_exposure else ''}",
                 "one brightness of what stands still",
-                "Film with exposure, gain and white balance that stay the same, or multiply the "
-                "light of each picture by what makes the scene as bright in all: training takes "
-                "it to be, and shows what changes as a mean.",
+                "Import the recording again, which gives each picture its gain, or give it in "
+                "capture.json (docs/capture-format.md): training takes the scene to be as bright "
+                "in all, and shows what changes as a mean.",
             )  # fmt: skip
     return findings.items
 

@@ -83,6 +83,13 @@ def stored(coded: Float[Tensor, "*shape"], transfer: Transfer) -> Float[Tensor, 
     return decode(coded, "srgb") if transfer == "linear" else coded
 
 
+def evened(
+    coded: Float[Tensor, "*shape"], gain: Float[Tensor, "..."], transfer: Transfer
+) -> Float[Tensor, "*shape"]:
+    """Values in [0, 1] of a picture had its camera not made all light ``gain`` times as much."""
+    return encode(decode(coded, transfer) / gain, transfer).clamp_max(1.0)
+
+
 def luminance(linear_rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
     """Rec. 709 luminance of linear RGB, the quantity that an event pixel sees."""
     red, green, blue = linear_rgb.unbind(-1)

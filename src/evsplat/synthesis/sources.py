@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Int64
 
 from evsplat.body import PoseSource
@@ -17,8 +18,8 @@ from evsplat.capture.write import read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture
-from evsplat.pictures.files import read_image
-from evsplat.pictures.light import Transfer
+from evsplat.pictures.files import read_image, to_unit_range
+from evsplat.pictures.light import Transfer, evened
 
 logger = logging.getLogger(__name__)
 
@@ -172,7 +173,7 @@ class CaptureSource(Source):
 
 
 class _CaptureFootage:
-    """The sharp pictures of a capture as they are stored (`Footage`)."""
+    """The sharp pictures of a capture as they are stored, but for their gain (`Footage`)."""
 
     def __init__(self, capture: Capture) -> None:
         self.path = capture.path
@@ -187,11 +188,17 @@ class _CaptureFootage:
         self.width, self.height = camera.width, camera.height
         self.times_us = np.array([frame.mid_us for frame in capture.frames], dtype=np.int64)
         self._files = _sharp_files(capture)
+        self._transfer = capture.transfer(capture.frames[0])
 
     def __iter__(self) -> Iterator[TimedPicture]:
         """See `Footage`."""
         for frame, file in zip(self._frames, self._files, strict=True):
-            yield TimedPicture(frame.name, frame.mid_us, read_image(file))
+            pixels = read_image(file)
+            if frame.gain is not None:
+                light = evened(to_unit_range(pixels), torch.tensor(frame.gain), self._transfer)
+                levels = np.iinfo(pixels.dtype).max
+                pixels = (light.numpy() * levels + 0.5).astype(pixels.dtype)
+            yield TimedPicture(frame.name, frame.mid_us, pixels)
 
 
 def _sharp_files(capture: Capture) -> list[Path]:
