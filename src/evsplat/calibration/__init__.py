@@ -1,4 +1,6 @@
-"""Clock offset, contrast thresholds and noise of an event sensor, from what it recorded."""
+"""Clock offset, contrast thresholds and noise of an event sensor, and gains of the frames beside it,
+from what was recorded.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
