@@ -1,6 +1,7 @@
 """The validator: one test per kind of fault; good captures have no findings."""
 
 import json
+import math
 import os
 import struct
 import zlib
@@ -383,6 +384,21 @@ def test_overlapping_exposures_are_a_warning(tiny_capture: Factory) -> None:
     finding = the_only(path, "warning")
     check(finding, path / "capture.json", "frames[4].exposure_us", "1 exposures", "do not overlap")
     load_capture(path)
+
+
+def test_exposures_as_long_as_the_interval_do_not_overlap_by_rounding(
+    tiny_capture: Factory,
+) -> None:
+    path = tiny_capture()
+    fps = np.random.default_rng().uniform(20, 60)
+    document = json.loads((path / "capture.json").read_text())
+    shift = document["frames"][0]["exposure_us"][0]
+    for index, frame in enumerate(document["frames"]):
+        start, end = index * 1e6 / fps, (index + 1) * 1e6 / fps
+        frame["exposure_us"] = [shift + math.floor(start), shift + math.ceil(end)]
+    (path / "capture.json").write_text(json.dumps(document))
+    found = validate_capture(path)
+    assert not any("overlap" in finding.expected for finding in found)
 
 
 def test_half_floats_are_compared_with_the_limit(

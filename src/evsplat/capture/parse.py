@@ -110,7 +110,7 @@ def _events(top: Fields) -> EventsEntry | None:
             "events",
             "no events",
             "the event recording",
-            "Method 'evsplat' does without; others need event_weight=0.",
+            "Method 'paper' needs event_weight=0 then; all others do without.",
         )
         return None
     keys = ("file", "width", "height", "contrast_threshold", "simulated", "clock_offset_us")

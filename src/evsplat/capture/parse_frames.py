@@ -16,6 +16,8 @@ _MOST_GAIN = 100
 _USUAL_GAP_US = (500, 10_000_000)
 """From one frame to the next: no camera of blurry video takes 2,000 a second, and a person in one
 frame every ten seconds is another one in each."""
+_ROUNDING_US = 2
+"""By so much exposures as long as the interval of their frames overlap in whole microseconds."""
 _SAME_POSE = 1e-6
 """Largest difference of entries, metres or none, up to which poses count as one."""
 
@@ -205,7 +207,7 @@ def _check_frames(top: Fields, frames: list[Frame]) -> None:
                 "frames of a camera in order of time",
                 "Sort the frames, or correct the exposure.",
             )
-        elif frame.exposure_us[0] < before.exposure_us[1]:
+        elif frame.exposure_us[0] < before.exposure_us[1] - _ROUNDING_US:
             overlaps.append(frame)
     if overlaps:
         top.findings.warning(
