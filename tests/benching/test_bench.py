@@ -191,7 +191,7 @@ def test_a_cell_is_made_by_its_own_policy_and_says_so(tiny_capture, tmp_path):
             ("interpolated", ("policy.held_out_poses=interpolated",)),
         )
     ]
-    path = tiny_capture("one", frames=20, width=96, height=72)
+    path = tiny_capture("one", frames=20, width=64, height=48)
     suite = write_suite(tmp_path / "suite.yaml", {"one": path}, *rows, iterations=2)
     folder = BenchFolder(tmp_path / "out")
     cells = make_plan(read_suite(suite), folder).cells
