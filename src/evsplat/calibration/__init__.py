@@ -1,5 +1,5 @@
-"""Clock offset, contrast thresholds and noise of an event sensor, and gains of the frames beside it,
-from what was recorded.
+"""Clock offset, contrast thresholds and noise of an event sensor, and gains of the frames beside
+it, from what was recorded.
 """
 
 from collections.abc import Sequence
