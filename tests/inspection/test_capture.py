@@ -21,6 +21,15 @@ from ..seen import seen
 Factory = Callable[..., Path]
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what is said: a third of the time goes into drawings, of which other tests ask."""
+    module = "evsplat.inspection.capture"
+    for drawing in ("_contact_sheet", "_body_sheet", "_events_sheet", "draw_timeline", "fit_sheet"):
+        monkeypatch.setattr(f"{module}.{drawing}", lambda *_: None)
+    monkeypatch.setattr(f"{module}.save_drawings", lambda drawings, out: ())
+
+
 def test_summary_states_what_was_recorded(tiny_capture: Factory, tmp_path: Path) -> None:
     path = tiny_capture(frames=12)
     report = inspect_capture(path, tmp_path / "out")
@@ -41,6 +50,7 @@ def test_summary_states_what_was_recorded(tiny_capture: Factory, tmp_path: Path)
             assert image.width >= 700 and len(np.unique(np.asarray(image.convert("L")))) > 50
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("longest_us", [32_000, 60_000])
 @pytest.mark.parametrize("skipped", [0, 3])
 def test_summary_tells_times_that_differ_from_frame_to_frame(
@@ -115,6 +125,7 @@ def test_posed_body_falls_on_the_person_of_shared_captures(captures_root: Path, 
     assert min(body_mask_overlap(capture, load_body_track(capture), capture.frames[::6])) > 0.8
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("spoilt", ["nothing", "mirrored", "inverted", "one sign"])
 def test_events_that_say_otherwise_than_the_frames_are_told(
     tiny_capture: Factory, tmp_path: Path, spoilt: str, caplog: pytest.LogCaptureFixture
@@ -149,6 +160,7 @@ def test_events_that_say_otherwise_than_the_frames_are_told(
     assert "not estimated: events do not tell what the frames show" in report.summary
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -211,6 +223,7 @@ def test_a_video_exported_with_more_frames_than_were_taken_is_told(
     assert [f"{repeated} of 20 pictures" in message for message in told] == [True] * bool(repeated)
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("longer", [True, False])
 @pytest.mark.parametrize("factor", [1.0, 1.3, 4.0])
 def test_pictures_whose_brightness_changes_are_told_and_no_lost_events_are(
@@ -238,6 +251,7 @@ def test_pictures_whose_brightness_changes_are_told_and_no_lost_events_are(
     assert not [finding for finding in findings if finding.field == "events/t"]
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("factor", [1.0, 2.0])
 def test_given_thresholds_that_are_not_the_fitted_are_told(
     tiny_capture: Factory, tmp_path: Path, factor: float
