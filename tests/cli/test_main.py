@@ -132,6 +132,28 @@ def test_the_demo_trains_on_poses_that_were_found(capsys, monkeypatch, tmp_path)
     assert f"--out {stdout.split()[1]} --resume" in stderr
 
 
+def test_the_demo_reads_its_run_once_for_films_avatar_and_figures(capsys, monkeypatch, tmp_path):
+    import evsplat.evaluation.run
+    import evsplat.export
+    import evsplat.training
+
+    loaded, given = object(), []
+    monkeypatch.setattr(evsplat.training, "train", lambda capture, options, **_: tmp_path)
+    monkeypatch.setattr(evsplat.training, "load_run", lambda run, **_: loaded)
+    for name in ("render_run", "export_run"):
+        monkeypatch.setattr(evsplat.export, name, lambda run, *_, **__: given.append(run))
+
+    def measured(run, **_):
+        given.append(run)
+        return {"frames": {"train": 1, "test": 0}, "per_frame": []}, tmp_path / "report.html"
+
+    monkeypatch.setattr(evsplat.evaluation.run, "evaluate_and_report", measured)
+    code, stdout, _ = _outcome(capsys, "demo")
+    assert code == 0
+    assert given == [loaded] * 4
+    assert f"run:    {tmp_path}\nreport: {tmp_path / 'report.html'}" in stdout
+
+
 def test_ctrl_c_during_evaluation_says_that_the_training_is_safe(capsys, monkeypatch, tmp_path):
     import evsplat.evaluation.run
     import evsplat.training

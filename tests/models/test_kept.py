@@ -1,6 +1,7 @@
 """What is kept of pictures of a model that nobody trains, and when it is not."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,13 +9,14 @@ from torch import nn
 
 from evsplat.capture import load_capture
 from evsplat.models.kept import Kept
+from evsplat.training.reconstruction import GaussianReconstruction
 
 from ..small_model import built
 
 
-def counted(kept, given):
+def counted(kept, given, **asked):
     made = []
-    kept.of(given, lambda: made.append(1))
+    kept.of(given, lambda: made.append(1), **asked)
     return len(made)
 
 
@@ -30,6 +32,18 @@ def test_it_is_made_anew_when_a_tensor_is_another_or_was_written_to():
     assert counted(kept, [values]) == 1
     assert counted(kept, [values, values]) == 1
     assert counted(kept, [values]) == 1
+
+
+def test_it_is_made_anew_when_something_else_is_asked_for_or_it_was_not_made_to_the_end():
+    kept, values = Kept(), torch.arange(6.0)
+    assert [counted(kept, [values], asked=times) for times in ([1], [1], [2], [2])] == [1, 0, 1, 0]
+    with pytest.raises(KeyboardInterrupt):
+        kept.of([values], _stopped, asked=[3])
+    assert kept.of([values], lambda: "made", asked=[2]) == "made"
+
+
+def _stopped():
+    raise KeyboardInterrupt
 
 
 def test_nothing_is_kept_of_what_is_learned():
@@ -72,3 +86,25 @@ def test_pictures_of_a_model_at_rest_are_those_of_one_that_keeps_nothing(tiny_ca
     assert not same(moved, learning)
     assert same(moved, shown(copy.deepcopy(model)))
     assert same(moved, shown(model.requires_grad_(True)))
+
+
+@pytest.mark.parametrize("method", ["evsplat", "paper"])
+def test_while_time_stands_still_a_moving_camera_sees_what_it_would_see_anew(tiny_capture, method):
+    capture = load_capture(tiny_capture())
+    model = built(method, capture).model.requires_grad_(False)
+    keeping = GaussianReconstruction(method, model, posed=Kept())
+    camera = capture.camera(capture.train_frames[0])
+    one, other = (frame.mid_us for frame in capture.train_frames[:2])
+    posed = []
+    at = model.at
+    model.at = lambda *given, **asked: (posed.append(1), at(*given, **asked))[1]
+    for time, shift in [(one, 0.0), (one, 0.2), (other, 0.2), (one, 0.1), (one, 0.3)]:
+        pose = camera.world_to_camera.clone()
+        pose[0, 3] += shift
+        moved = replace(camera, world_to_camera=pose)
+        with_kept, anew = (
+            made.render(moved, [time]).rgb for made in (keeping, replace(keeping, posed=None))
+        )
+        assert torch.equal(with_kept, anew)
+    # Of `paper`, whose colours depend on the direction, nothing can be kept.
+    assert len(posed) == (8 if method == "evsplat" else 10)

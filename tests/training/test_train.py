@@ -19,6 +19,8 @@ from evsplat.cli import main
 from evsplat.config import load_yaml, to_dict
 from evsplat.config_docs import save_yaml
 from evsplat.errors import BackendError, ConfigError, DataError
+from evsplat.evaluation.run import evaluate_and_report
+from evsplat.export import export_run, render_run
 from evsplat.methods import TRAINABLE, method_config
 from evsplat.training import load_run, train
 from evsplat.training.bad_steps import MAX_BAD_STEPS
@@ -70,6 +72,25 @@ def final_tensors(out: Path) -> dict[str, torch.Tensor]:
 def log_without_times(out: Path) -> list[dict]:
     lines = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     return [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+
+
+def test_a_run_that_is_read_once_gives_the_files_that_its_folder_gives(trained, tmp_path):
+    _, run = trained
+    held = {"at": 0.1, "path": "swing", "seconds": 0.2, "fps": 20, "size": 48}
+    moving = {"path": "orbit", "seconds": 0.2, "fps": 20, "size": 48}
+
+    def made(given, folder):
+        for name, film in (("held", held), ("moving", moving)):
+            render_run(given, out=folder / name, **film)
+        export_run(given, "avatar", out=folder / "avatar.html")
+        metrics, report = evaluate_and_report(given)
+        metrics.pop("evaluate_seconds")
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        return [path.read_bytes() for path in files], metrics, report
+
+    from_folder = made(run, tmp_path / "folder")
+    assert len(from_folder[0]) == 11
+    assert made(load_run(run), tmp_path / "loaded") == from_folder
 
 
 def test_one_frame_trains_in_every_step(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

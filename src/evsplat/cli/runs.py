@@ -4,7 +4,7 @@ import sys
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional
 
@@ -25,6 +25,9 @@ from evsplat.options.declare import (
 from evsplat.options.inputs import Input, check_run_folder, check_run_or_training
 from evsplat.options.runs import Kind, Split
 from evsplat.shipped import demo_capture
+
+if TYPE_CHECKING:
+    from evsplat.training import Run
 
 _REGIONS = ("full", "person_crop", "person_mask")
 
@@ -116,7 +119,7 @@ class Train:
             ) from None
 
     def _finish(self, run: Path) -> None:
-        Evaluate(run=run, device=self.options.device)()
+        _measure(run, device=self.options.device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,12 +128,14 @@ class _Demo(Train):
 
     def _finish(self, run: Path) -> None:
         from evsplat.export import export_run, render_run
+        from evsplat.training import load_run
 
-        device, threads = self.options.device, self.options.threads
+        device = self.options.device
+        loaded = load_run(run, device=device)
         for film in _DEMO_FILMS:
-            render_run(run, film, device=device, threads=threads)
-        export_run(run, "avatar", out=run / "exports" / "avatar.html", device=device)
-        super()._finish(run)
+            render_run(loaded, film, threads=self.options.threads)
+        export_run(loaded, "avatar", out=run / "exports" / "avatar.html")
+        _measure(loaded, device=device)
 
 
 _DEMO_FILMS = (
@@ -153,12 +158,7 @@ class Evaluate:
     """Device that draws and compares."""
 
     def __call__(self) -> None:
-        from evsplat.evaluation.run import evaluate_and_report
-
-        metrics, report = evaluate_and_report(
-            self.run, lpips_weights=self.lpips_weights, device=self.device, split=self.split
-        )
-        _print_summary(metrics, run=self.run, report=report)
+        _measure(self.run, device=self.device, lpips_weights=self.lpips_weights, split=self.split)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,10 +287,21 @@ class Bench:
         print(f"tables: {folder / 'tables.md'}\npage:   {folder / 'index.html'}")
 
 
-def _print_summary(metrics: dict[str, Any], *, run: Path, report: Path) -> None:
-    """Print the run's figures above the trivial rows, where the report is and how to view it."""
+def _measure(
+    run: "Run | Path",
+    *,
+    device: Device,
+    lpips_weights: Path | None = None,
+    split: Split = "test",
+) -> None:
+    """Measure a run and report it; print its figures, where the report is and how to view it."""
+    from evsplat.evaluation.run import evaluate_and_report
+
+    metrics, report = evaluate_and_report(
+        run, lpips_weights=lpips_weights, device=device, split=split
+    )
     print(summary_table(metrics))
-    print(f"run:    {run}\nreport: {report}\nview:   {command('view', run)}")
+    print(f"run:    {report.parent}\nreport: {report}\nview:   {command('view', report.parent)}")
 
 
 def summary_table(metrics: dict[str, Any]) -> str:

@@ -43,17 +43,17 @@ def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
 
 
 def evaluate_and_report(
-    run_dir: Path | str,
+    run: Run | Path | str,
     *,
     lpips_weights: Path | str | None = None,
     device: str = "auto",
     split: Split = "test",
 ) -> tuple[dict[str, Any], Path]:
-    """`evaluate_run` and `write_report` of a run that is read once."""
+    """`evaluate_run` and `write_report` of a run that is read once, here or before."""
     device = choose_device(device)
-    run = load_run(Path(run_dir), device=device)
-    metrics = _measured(run, device, lpips_weights, split)
-    return metrics, _reported(run, Path(run_dir), split)
+    loaded = run if isinstance(run, Run) else load_run(Path(run), device=device)
+    metrics = _measured(loaded, device, lpips_weights, split)
+    return metrics, _reported(loaded, loaded.path, split)
 
 
 def _measured(

@@ -30,7 +30,7 @@ from evsplat.options import Film
 from evsplat.options.declare import given
 from evsplat.pictures import signed_map, to_bytes
 from evsplat.pictures.video import write_animation, write_pictures, write_video
-from evsplat.training.run import load_run
+from evsplat.training.run import Run, load_run
 
 FILM_HEIGHT = 720
 """Least height of videos where none is asked for."""
@@ -48,7 +48,7 @@ Picture = UInt8[np.ndarray, "H W C"]
 
 
 def render_run(
-    run: Path | str,
+    run: Run | Path | str,
     film: Film | None = None,
     *,
     out: Path | str | None = None,
@@ -59,6 +59,7 @@ def render_run(
 ) -> Path:
     """Draw a run's reconstruction and return the file or folder that was written.
 
+    ``run``: its folder, or what `load_run` read of it, on whose device it is then drawn.
     The `Film` to draw can be given by its fields, as ``changes``. An ``out`` that ends in
     .mp4, .webp or .gif becomes a video or animation, any other a folder of PNG files; without it
     ``run/renders/`` receives it. ``events_out`` takes the simulated events of ``show="events"``,
@@ -69,14 +70,15 @@ def render_run(
     same call goes on from there.
     """
     film = given(Film, film, changes)
-    out = Path(run) / "renders" / film.file_name() if out is None else Path(out)
-    ours = out.parent == Path(run) / "renders"
+    ours_at = (run.path if isinstance(run, Run) else Path(run)) / "renders"
+    out = ours_at / film.file_name() if out is None else Path(out)
+    ours = out.parent == ours_at
     _check_output(film, out, events_out, ours=ours)
     for target in (out, events_out):
         if target is not None:
             try_target(target)
     use_threads(threads)
-    loaded = load_run(Path(run), device=device)
+    loaded = run if isinstance(run, Run) else load_run(Path(run), device=device)
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)
     if _is_made_larger(film, out):

@@ -42,10 +42,11 @@ _SUFFIXES: dict[Kind, tuple[str, ...]] = {
 
 
 def export_run(
-    run: Path | str, kind: Kind, options: ExportOptions | None = None, **changes: Any
+    run: Run | Path | str, kind: Kind, options: ExportOptions | None = None, **changes: Any
 ) -> Path:
     """Write a run as ``kind`` and return the file; ``changes`` are fields of `ExportOptions`.
 
+    ``run``: its folder, or what `load_run` read of it.
     ``ply``, ``spz``, ``splat`` and ``gltf`` hold the Gaussians of one instant: ``time_s`` (seconds
     from the first mid-exposure) or the mid-exposure of ``frame``, else the middle of the recording;
     with ``canonical`` the person at rest. Colours are a network's, which sees the direction of
@@ -70,9 +71,9 @@ def export_run(
     parts, camera = options.parts, options.camera
     _check_use(kind, options)
     target = _checked(options.out, kind)
-    try_target(target or Path(run) / "exports")
-    loaded = load_run(Path(run), device=options.device)
-    folder = loaded.path / "exports"
+    folder = (run.path if isinstance(run, Run) else Path(run)) / "exports"
+    try_target(target or folder)
+    loaded = run if isinstance(run, Run) else load_run(Path(run), device=options.device)
     if kind == "avatar":
         page = target or folder / "avatar"
         return export_avatar(loaded, page, parts or "human", camera, options.motion)

@@ -1,6 +1,6 @@
 """What follows from tensors that nobody learns: made once, and kept for the next picture."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 from torch import Tensor
@@ -31,18 +31,29 @@ class Unchanged:
 
 
 class Kept:
-    """One value, with the tensors that it follows from."""
+    """One value, with what it follows from."""
 
     def __init__(self) -> None:
         """No value yet."""
         self._given = Unchanged()
+        self._made = False
+        self._asked: Any = None
         self._value: Any = None
 
-    def of(self, given: Sequence[Tensor], make: Callable[[], Value]) -> Value:
-        """What ``make`` gives, made anew unless ``given`` is as it was the last time."""
+    def of(
+        self, given: Iterable[Tensor], make: Callable[[], Value], *, asked: object = None
+    ) -> Value:
+        """What ``make`` gives, made anew unless ``given`` is as it was the last time.
+
+        ``asked``: what else it follows from, which is compared with ``==``.
+        """
+        given = list(given)
         if any(tensor.requires_grad for tensor in given):
             return make()
-        if not self._given.again(given):
+        if not self._given.again(given) or asked != self._asked or not self._made:
+            # The old value goes first, so that there are never two, and none where this is stopped.
+            self._made, self._value = False, None
             self._value = make()
+            self._made, self._asked = True, asked
         value: Value = self._value
         return value

@@ -1,6 +1,6 @@
 """Contract of a model of person and scene, and the base of those that follow a body track."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -55,6 +55,10 @@ class Model(Protocol):
     def low_pass(self) -> float:
         """Variance of the filter of a pixel, px^2; see `evsplat.render.render`."""
 
+    @property
+    def depends_on_view(self) -> bool:
+        """Whether what `at` gives depends on where the camera is."""
+
     def training_drawing(
         self,
         times_us: Sequence[int],
@@ -83,6 +87,10 @@ class Model(Protocol):
 
         What was learned of single frames does not belong to another motion and is left out.
         """
+        ...
+
+    def parameters(self) -> Iterator[Tensor]:
+        """All that is learned."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -149,6 +157,11 @@ class PosedModel(nn.Module):
     def residual_active(self) -> bool:
         """Whether training has reached the start of the pose residual."""
         return self.residual is not None and float(self.nominal) >= self.residual_start
+
+    @property
+    def depends_on_view(self) -> bool:
+        """True, as colours are a network's that sees the direction."""
+        return True
 
     def stay_together(self) -> None:
         """Nothing; for models whose weights are tied to single points of the surface."""

@@ -14,6 +14,7 @@ from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.models.at_rest import Skinned, SkinnedGaussians, mean_at_rest, with_correctives
 from evsplat.models.beyond import Beyond
 from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_scene
+from evsplat.models.kept import Kept
 from evsplat.models.layers import Layers
 from evsplat.models.seen import Seen, draw_values
 from evsplat.render import Backdrop, Splats, render
@@ -29,6 +30,8 @@ class GaussianReconstruction:
     """What training saw of the person; None in checkpoints from before its end."""
     backdrop: Backdrop | None = None
     """What the scene looked like to the picture before, for a camera that mostly stands still."""
+    posed: Kept | None = None
+    """The Gaussians at the times drawn last, for a camera that moves while time stands still."""
     shadow_step_px: int = SHADOW_STEP_PX
     """Shadows are looked up so far apart."""
     changes: tuple[Callable[[Layers, Camera], Layers], ...] = ()
@@ -103,7 +106,15 @@ class GaussianReconstruction:
 
     def _posed(self, camera: Camera, times_us: Sequence[int]) -> tuple[Camera, Layers]:
         camera = camera.to(self.model.device)
-        layers = self.model.at(list(times_us), camera.center(), hard_semantics=True)
+        times = list(times_us)
+
+        def pose() -> Layers:
+            return self.model.at(times, camera.center(), hard_semantics=True)
+
+        if self.posed is None or self.model.depends_on_view:
+            layers = pose()
+        else:
+            layers = self.posed.of(self.model.parameters(), pose, asked=times)
         for change in self.changes:
             layers = change(layers, camera)
         return camera, layers

@@ -21,6 +21,7 @@ from evsplat.files import write_json, write_text
 from evsplat.masks import MASKERS
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
 from evsplat.models.beyond import Beyond
+from evsplat.models.kept import Kept
 from evsplat.models.model import Model
 from evsplat.models.seen import roughness
 from evsplat.options.inputs import check_run_folder
@@ -261,7 +262,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         method=method,
         policy=shown.terms,
         capture=capture,
-        reconstruction=GaussianReconstruction(method, composition.model, seen, Backdrop()),
+        reconstruction=GaussianReconstruction(method, composition.model, seen, Backdrop(), Kept()),
         device=facts["device"],
         human_only=isinstance(composition.capture, MaskedCapture),
         recording=composition.recording,

@@ -160,7 +160,8 @@ class ViewedRun:
 def _cached(reconstruction: GaussianReconstruction) -> GaussianReconstruction:
     assert isinstance(reconstruction.model, nn.Module)
     model: Any = with_cached_networks(reconstruction.model)
-    return replace(reconstruction, model=model, backdrop=Backdrop())
+    # No `posed`: a draft of the same times is another.
+    return replace(reconstruction, model=model, backdrop=Backdrop(), posed=None)
 
 
 def load_newest(path: Path, device: str) -> Run:

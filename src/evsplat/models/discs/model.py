@@ -157,6 +157,11 @@ class DiscModel(PosedModel):
         exact = self.residual is None or bool(self.residual.exact)
         return None if exact else self.deformation
 
+    @property
+    def depends_on_view(self) -> bool:
+        """Whether the scene's colours are a network's; own colours are those of every camera."""
+        return self.scene_colour is not None
+
     def skinning_weights(self, centers: Float[Tensor, "N 3"]) -> Float[Tensor, "N J"]:
         """Weights of the bones that `at` draws the person's Gaussians with, for any centres."""
         return self.surface.weights(self.gaussians.means[self.gaussians.human])
