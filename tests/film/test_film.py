@@ -9,7 +9,7 @@ from PIL import Image, ImageSequence
 
 from evsplat.body import BodyTrack, up_axis
 from evsplat.capture import load_body_track, load_capture
-from evsplat.errors import ConfigError, DataError
+from evsplat.errors import ConfigError, DataError, OutputError
 from evsplat.events import open_recording
 from evsplat.export import render_run, rendering
 from evsplat.film import Film, FilmPlan, Look, plan
@@ -238,6 +238,42 @@ def test_the_camera_turns_about_the_vertical_of_the_recording_whatever_the_motio
     frames = FilmPlan.of(film, capture, _Lamp(recorded)).frames
     heights = torch.stack([frame.camera.center() for frame in frames]).double() @ up.double()
     assert len(frames) > 5 and float(heights.max() - heights.min()) < 1e-4
+
+
+def test_a_film_stops_at_the_first_picture_that_cannot_be_kept(lamp, tmp_path, monkeypatch):
+    """Pictures are written beside the drawing of the next ones, which must not go on for hours."""
+    whole = render_run(lamp.run, fps=200, out=tmp_path / "whole")
+    count, lamp.lamp.drawn = len(list(whole.iterdir())), []
+
+    def full(self, frame, exposure):
+        raise OutputError(f"{self.file(frame)}: no room left on the disk.")
+
+    monkeypatch.setattr(FrameCache, "_write", full)
+    with pytest.raises(OutputError, match=r"partial/00000\.png: no room left"):
+        render_run(lamp.run, fps=200, out=tmp_path / "film")
+    assert len(lamp.lamp.drawn) <= 16 < count
+    assert not (tmp_path / "film").exists()
+
+
+def test_frames_in_memory_are_those_on_the_disk_which_memory_does_not_hold(
+    lamp, tmp_path, monkeypatch
+):
+    camera = lamp.capture.cameras["main"]
+    monkeypatch.setattr(
+        "evsplat.film.frame_cache._KEPT_BYTES", 5 * camera.width * camera.height * 3
+    )
+    times = [1_000 * k for k in range(12)]
+    frames = [FilmFrame(f"{k:05d}", time, time, camera) for k, time in enumerate(times)]
+    cache = FrameCache(tmp_path / "kept", "digest")
+    cache.fill(lamp.lamp, Look(), frames)
+    shown = [cache.read(frame) for frame in frames]
+    on_disk = FrameCache(tmp_path / "kept", "digest")
+    assert all((one == on_disk.read(f)).all() for one, f in zip(shown, frames, strict=True))
+    for frame in frames:
+        cache.file(frame).unlink()
+    assert all(cache.read(frame) is one for frame, one in zip(frames[:5], shown, strict=False))
+    with pytest.raises(DataError, match="00005"):
+        cache.read(frames[5])
 
 
 @pytest.mark.parametrize("name", ["../a", "/tmp/evsplat-a", "a/b"])

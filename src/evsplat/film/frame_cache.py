@@ -3,6 +3,7 @@
 import hashlib
 import logging
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby, islice
 from pathlib import Path
@@ -24,6 +25,8 @@ from evsplat.untrusted.text import read_json
 logger = logging.getLogger(__name__)
 
 _TIMES_AT_ONCE = 8
+_KEPT_BYTES = 64 << 20
+"""Of a film's first frames, which are not read back from the disk."""
 _PLAN = "plan.json"
 
 
@@ -50,6 +53,8 @@ class FrameCache:
 
     def __init__(self, path: Path, digest: str) -> None:
         self.path = path
+        self._drawn: dict[Path, Exposure] = {}
+        self._left_bytes = _KEPT_BYTES
         plan = path / _PLAN
         if path.exists() and not plan.is_file() and (path.is_file() or any(path.iterdir())):
             raise DataError(f"{path}: is in the way of pictures to be kept; move it elsewhere.")
@@ -68,8 +73,11 @@ class FrameCache:
         return self.path / f"{checked_name(frame.name, 'a picture')}.png"
 
     def read(self, frame: FilmFrame) -> Exposure:
-        """The picture of a frame that was drawn."""
-        return read_picture(self.file(frame), np.asarray, remedy="remove it")
+        """The picture of a frame that was drawn; not to be written to."""
+        file = self.file(frame)
+        if file in self._drawn:
+            return self._drawn[file]
+        return read_picture(file, np.asarray, remedy="remove it")
 
     def remove(self) -> None:
         """Delete the folder with all frames."""
@@ -81,34 +89,55 @@ class FrameCache:
     ) -> None:
         """Draw what is missing, several times at once where the camera stands still.
 
+        While some are drawn those before are written. What was drawn is kept where it is stopped.
         A film that goes on is, bit for bit, the one that was never stopped.
         """
         missing = {frame for frame in frames if not self.file(frame).is_file()}
         try:
-            with tqdm(
-                total=len(frames),
-                initial=len(frames) - len(missing),
-                unit="picture",
-                desc="render",
-                dynamic_ncols=True,
-            ) as progress:
+            with (
+                tqdm(
+                    total=len(frames),
+                    initial=len(frames) - len(missing),
+                    unit="picture",
+                    desc="render",
+                    dynamic_ncols=True,
+                ) as progress,
+                ThreadPoolExecutor(1, thread_name_prefix="frame-cache") as writer,
+            ):
+                written: list[Future[None]] = []
                 for batch in _of_one_camera(frames):
                     if not any(frame in missing for frame in batch):
                         continue
                     # All of them: one drawn beside fewer others differs in its last bits.
                     times = [frame.time_us for frame in batch]
                     exposures = look.expose(reconstruction, batch[0].camera, times)
-                    for frame, exposure in zip(batch, exposures, strict=True):
-                        if frame not in missing:
-                            continue
-                        with atomic_path(self.file(frame)) as temporary:
-                            Image.fromarray(exposure).save(temporary, compress_level=1)
-                        progress.update()
+                    _finish(written)
+                    written = [
+                        writer.submit(self._write, frame, exposure)
+                        for frame, exposure in zip(batch, exposures, strict=True)
+                        if frame in missing
+                    ]
+                    progress.update(len(written))
+                _finish(written)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"Stopped; {len(self)} of {len(frames)} pictures are kept in {self.path}. "
                 "The same command goes on from there."
             ) from None
+
+    def _write(self, frame: FilmFrame, exposure: Exposure) -> None:
+        file = self.file(frame)
+        with atomic_path(file) as temporary:
+            Image.fromarray(exposure).save(temporary, compress_level=1)
+        if exposure.nbytes <= self._left_bytes:
+            self._left_bytes -= exposure.nbytes
+            self._drawn[file] = exposure
+
+
+def _finish(written: Iterable[Future[None]]) -> None:
+    """Wait until all is written; the first error of it."""
+    for one in written:
+        one.result()
 
 
 def film_digest(frames: Iterable[FilmFrame], *rest: object) -> str:
