@@ -288,7 +288,7 @@ def test_held_out_frames_move_their_poses_only(captures):
     assert torch.equal(count, trainer.statistics["gaussians"].seen)
 
 
-def test_without_being_asked_held_out_events_teach_nothing(captures, tmp_path):
+def test_without_being_asked_held_out_events_teach_nothing(captures, tmp_path, monkeypatch):
     """With other events in held-out intervals the corrected poses are the same to the last bit."""
     noisy = captures[1]
     others = scrambled(noisy.path, tmp_path / "others", 0, has_polarity=True, masks=False)
@@ -307,11 +307,13 @@ def test_without_being_asked_held_out_events_teach_nothing(captures, tmp_path):
     assert ours["residual.errors.fast.rotations"].abs().max() > 0
     assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
     # where they are asked for they do teach
+    without_drawing(monkeypatch)
     asked = [learned(capture, *INTERPOLATION) for capture in (noisy, load_capture(others))]
     assert not torch.equal(*(each["residual.errors.fast.rotations"] for each in asked))
 
 
-def test_events_of_held_out_frames_need_a_policy_that_shows_them(captures):
+def test_events_of_held_out_frames_need_a_policy_that_shows_them(captures, monkeypatch):
+    without_drawing(monkeypatch)
     with pytest.raises(ConfigError, match="policy.held_out_events=true as well"):
         composed(captures[1], "pose.events_of_held_out=true")
 
@@ -322,7 +324,8 @@ def test_events_of_held_out_frames_need_a_pose_that_is_learned(captures):
 
 
 @pytest.mark.parametrize("setting", ["pose.std_rad=0.1", "pose.std_m=0.1"])
-def test_errors_expected_of_exact_poses_are_refused(captures, setting):
+def test_errors_expected_of_exact_poses_are_refused(captures, monkeypatch, setting):
+    without_drawing(monkeypatch)
     exact, noisy = captures
     name = setting.partition("=")[0]
     with pytest.raises(ConfigError, match=f"{name} is 0.1, and nothing reads it: .* as exact"):
@@ -332,7 +335,8 @@ def test_errors_expected_of_exact_poses_are_refused(captures, setting):
     assert float(found.max()) == pytest.approx(0.1)
 
 
-def test_a_correction_is_learned_where_it_is_asked_for(captures):
+def test_a_correction_is_learned_where_it_is_asked_for(captures, monkeypatch):
+    without_drawing(monkeypatch)
     composition = composed(captures[1])
     assert composition.held_out is None
     assert composition.model.residual is not None
