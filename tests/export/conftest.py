@@ -32,5 +32,5 @@ def run(reconstruction, tmp_path, monkeypatch):
     loaded = SimpleNamespace(
         path=path, capture=capture, reconstruction=model, method="evsplat", iteration=7
     )
-    monkeypatch.setattr(exporting, "load_run", lambda *_, **__: loaded)
+    monkeypatch.setattr(exporting, "opened", lambda *_, **__: loaded)
     return loaded

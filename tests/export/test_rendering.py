@@ -99,7 +99,7 @@ def run(tmp_path, monkeypatch):
     loaded = SimpleNamespace(
         capture=_Recording(), reconstruction=_Clock(), method="clock", iteration=1, train_seconds=1
     )
-    monkeypatch.setattr(rendering, "load_run", lambda path, **_: loaded)
+    monkeypatch.setattr(rendering, "opened", lambda path, **_: loaded)
     path = tmp_path / "run"
     path.mkdir()
     return path

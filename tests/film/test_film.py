@@ -58,7 +58,7 @@ def lamp(tiny_capture, tmp_path, monkeypatch):
     loaded = SimpleNamespace(
         capture=capture, reconstruction=lamp, method="lamp", iteration=1, train_seconds=1.0
     )
-    monkeypatch.setattr(rendering, "load_run", lambda path, **_: loaded)
+    monkeypatch.setattr(rendering, "opened", lambda path, **_: loaded)
     return SimpleNamespace(run=tmp_path / "run", capture=capture, lamp=lamp, loaded=loaded)
 
 

@@ -31,6 +31,10 @@ _MOST_ROUNDS, _SETTLED = 30, 1e-3
 most so often, until no level changes by more."""
 
 
+QUARTERS = (0.25, 0.75)
+"""Quantiles for `common_change`."""
+
+
 class GainMeter:
     """Gathers the pictures of a camera that stands still; tells how bright each shows the scene.
 
@@ -66,9 +70,9 @@ class GainMeter:
         if not told.any(0).all():
             return None
         logs[~told] = torch.nan
-        low, high = _changes(logs, logs).nanquantile(torch.tensor([0.25, 0.75]), dim=2)
-        steady = (low.clamp_min(0.0) + high.clamp_max(0.0)).nan_to_num()
-        if float((steady.amax(0) - steady.amin(0)).max()) <= math.log(_STEADY):
+        low, high = _changes(logs, logs).nanquantile(torch.tensor(QUARTERS), dim=2).numpy()
+        changed = np.nan_to_num(common_change(low, high))
+        if np.ptp(changed, axis=0).max() <= math.log(_STEADY):
             return None
         level = torch.zeros(told.shape)
         for _ in range(_MOST_ROUNDS):
@@ -81,6 +85,18 @@ class GainMeter:
         brightest = np.quantile(levels, 1 - _BRIGHTER, axis=0, method="lower")
         gains: Float[np.ndarray, "N C"] = np.exp(levels - brightest)
         return gains
+
+
+def common_change(
+    low: Float[np.ndarray, "*shape"], high: Float[np.ndarray, "*shape"]
+) -> Float[np.ndarray, "*shape"]:
+    """What three quarters of the changes of a picture are at least, brighter or darker; else 0.
+
+    ``low`` and ``high`` are the changes' `QUARTERS`. Somebody who moves, however large, makes some
+    places brighter and others darker.
+    """
+    change: Float[np.ndarray, "*shape"] = np.maximum(low, 0.0) + np.minimum(high, 0.0)
+    return change
 
 
 def _changes(logs: Float[Tensor, "N C B"], usual: Float[Tensor, "N C B"]) -> Float[Tensor, "N C B"]:

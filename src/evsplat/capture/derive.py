@@ -51,11 +51,18 @@ class Derivation:
         entry = self.entry(frame)
         if key != "mask" and entry.pop("gain", None) is not None:
             # What is read is evened out, and so is what is made of it: the other one has to be too.
-            readers = {"image": self.source.image, "sharp": self.source.sharp}
-            for other in readers.keys() & entry.keys() - {key}:
-                self.set_picture(frame, other, readers[other](frame))
+            for other in {"image", "sharp"} & entry.keys() - {key}:
+                self.set_as_read(frame, other)
         entry[key] = f"{_FOLDERS[key]}/{self._stems[frame.name]}.png"
         write_picture(self.folder / entry[key], picture)
+
+    def set_as_read(self, frame: Frame, key: str) -> None:
+        """`set_picture` with what is read of the source's, which has no lens and no gain."""
+        source = self.source
+        readers = {"image": source.image, "sharp": source.sharp, "mask": source.mask}
+        picture = readers[key](frame)
+        assert picture is not None, "asked of pictures that the frame has"
+        self.set_picture(frame, key, picture)
 
     def set_body(
         self, model: str, times_us: ArrayLike, poses: ArrayLike, transl: ArrayLike, **details: Any
@@ -158,14 +165,11 @@ def _undistort(making: Derivation) -> None:
     bent = {name for name, camera in cameras.items() if source.is_distorted(name)}
     for name in bent:
         cameras[name]["distortion"] = None
-    readers = {"image": source.image, "sharp": source.sharp, "mask": source.mask}
     for frame in source.frames:
         entry = making.entry(frame)
         for key in set(_PICTURES) & set(entry) if frame.camera in bent else ():
-            picture = readers[key](frame)
-            assert picture is not None
             remove_file(making.folder / entry[key])
-            making.set_picture(frame, key, picture)
+            making.set_as_read(frame, key)
     for view in source.novel_views:
         entry = making.document["novel_views"][view.index]
         if view.camera in bent:

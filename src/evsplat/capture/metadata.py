@@ -12,6 +12,9 @@ from evsplat.camera import Camera
 from evsplat.capture.distortion import Distortion
 from evsplat.pictures.light import Transfer
 
+Gain = tuple[float, ...]
+"""Factor of light, of all colours or of red, green and blue."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)  # an hour has 45,000
 class Frame:
@@ -31,9 +34,8 @@ class Frame:
     mask: Path | None = None
     world_to_camera: Float[Tensor, "4 4"] | None = None
     """Pose of a moving camera at mid-exposure; None where the camera stands."""
-    gain: tuple[float, ...] | None = None
-    """Light of red, green and blue (or of all) in picture and truth against other frames' pictures;
-    None where it is the same."""
+    gain: Gain | None = None
+    """Light in picture and truth against other frames' pictures; None where it is the same."""
 
     @property
     def image(self) -> Path:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from evsplat.camera import Camera
 from evsplat.capture.fields import Fields, is_whole
-from evsplat.capture.metadata import Frame, NovelView
+from evsplat.capture.metadata import Frame, Gain, NovelView
 from evsplat.capture.parse_cameras import rigid
 from evsplat.untrusted.faults import brief
 
@@ -159,7 +159,7 @@ def _exposure(entry: Fields) -> tuple[int, int] | None:
     return start, end
 
 
-def _gain(entry: Fields) -> tuple[float, ...] | None:
+def _gain(entry: Fields) -> Gain | None:
     if entry.get("gain", None) is None:
         return None
     shape = (3,) if isinstance(entry.get("gain"), list) else ()

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from evsplat.camera import Camera
@@ -16,7 +16,7 @@ from evsplat.capture.body_file import BodyFile, body_from_arrays
 from evsplat.capture.camera_track import CameraTrack
 from evsplat.capture.check_body import check_dense
 from evsplat.capture.finding import Findings
-from evsplat.capture.metadata import Frame, Metadata, NovelView
+from evsplat.capture.metadata import Frame, Gain, Metadata, NovelView
 from evsplat.capture.points import read_points
 from evsplat.errors import DataError
 from evsplat.events import EventStore
@@ -27,8 +27,6 @@ from evsplat.untrusted.arrays import read_plain_npz
 IMAGE_CACHE_BYTES = 192 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
 _MEDIAN_FRAMES = 255
-
-Gain = tuple[float, ...] | None
 
 
 class CaptureReader:
@@ -268,13 +266,13 @@ class CaptureReader:
     def _frame(self, frame: Frame | str) -> Frame:
         return self.frame(frame if isinstance(frame, str) else frame.name)
 
-    def _picture(self, path: Path, camera: str, gain: Gain = None) -> Tensor:
+    def _picture(self, path: Path, camera: str, gain: Gain | None = None) -> Tensor:
         return to_unit_range(self._stored(path, camera, gain))
 
-    def _stored(self, path: Path, camera: str, gain: Gain) -> np.ndarray:
+    def _stored(self, path: Path, camera: str, gain: Gain | None) -> np.ndarray:
         return self._images.get((path, gain), lambda: self._decode(path, camera, gain))
 
-    def _decode(self, path: Path, camera: str, gain: Gain) -> np.ndarray:
+    def _decode(self, path: Path, camera: str, gain: Gain | None) -> np.ndarray:
         pixels = read_image(path)
         expected = self.cameras[camera]
         if pixels.shape[:2] != (expected.height, expected.width):
@@ -287,11 +285,18 @@ class CaptureReader:
         if distortion is not None:
             pixels = distortion.undistort_image(to_unit_range(pixels).numpy())
         if gain is not None:
-            if pixels.ndim == 2 and len(gain) > 1:
-                raise DataError(
-                    f"{path}: is grey and has a gain of {len(gain)} colours in capture.json, "
-                    "expected one number; correct it."
-                )
             curve = self._metadata.transfers.get(camera, "power")
-            pixels = evened(to_unit_range(pixels), torch.tensor(gain), curve).numpy()
+            pixels = without_gain(path, pixels, gain, curve)
         return planar(pixels)
+
+
+def without_gain(
+    path: Path, pixels: np.ndarray, gain: Gain, transfer: Transfer
+) -> Float32[np.ndarray, "..."]:
+    """Pixels of the file ``path`` in [0, 1], as if the camera had not changed their light."""
+    if pixels.ndim == 2 and len(gain) > 1:
+        raise DataError(
+            f"{path}: is grey and has a gain of {len(gain)} colours in capture.json, expected one "
+            "number; correct it."
+        )
+    return evened(to_unit_range(pixels), torch.tensor(gain), transfer).numpy()

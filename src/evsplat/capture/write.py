@@ -41,9 +41,9 @@ class CaptureWriter:
     """Builds a capture folder that appears under its name only when it is whole and valid.
 
     A context manager: pictures and events go to a hidden folder beside ``path`` as they come, so
-    that memory does not grow with the recording. When the block ends well, the quick checks of
-    `load_capture` run and the folder is renamed; on an error or Ctrl-C it is removed and ``path``
-    stays as it was.
+    that memory grows by no more than a few KB with each picture. When the block ends well, the
+    quick checks of `load_capture` run and the folder is renamed; on an error or Ctrl-C it is
+    removed and ``path`` stays as it was.
 
         with CaptureWriter("my_capture") as writer:
             writer.add_camera("main", 640, 480, K, world_to_camera)

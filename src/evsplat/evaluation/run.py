@@ -13,7 +13,7 @@ from evsplat.evaluation.tables import write_tables
 from evsplat.files import try_target, write_json, write_text
 from evsplat.options.runs import Split
 from evsplat.render import choose_device
-from evsplat.training.run import Run, load_run
+from evsplat.training.run import Run, load_run, opened
 from evsplat.untrusted.faults import MISFITS, broken_as
 
 
@@ -51,7 +51,7 @@ def evaluate_and_report(
 ) -> tuple[dict[str, Any], Path]:
     """`evaluate_run` and `write_report` of a run that is read once, here or before."""
     device = choose_device(device)
-    loaded = run if isinstance(run, Run) else load_run(Path(run), device=device)
+    loaded = opened(run, device=device)
     metrics = _measured(loaded, device, lpips_weights, split)
     return metrics, _reported(loaded, loaded.path, split)
 

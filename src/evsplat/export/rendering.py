@@ -30,7 +30,7 @@ from evsplat.options import Film
 from evsplat.options.declare import given
 from evsplat.pictures import signed_map, to_bytes
 from evsplat.pictures.video import write_animation, write_pictures, write_video
-from evsplat.training.run import Run, load_run
+from evsplat.training.run import Run, folder_of, opened
 
 FILM_HEIGHT = 720
 """Least height of videos where none is asked for."""
@@ -70,7 +70,7 @@ def render_run(
     same call goes on from there.
     """
     film = given(Film, film, changes)
-    ours_at = (run.path if isinstance(run, Run) else Path(run)) / "renders"
+    ours_at = folder_of(run) / "renders"
     out = ours_at / film.file_name() if out is None else Path(out)
     ours = out.parent == ours_at
     _check_output(film, out, events_out, ours=ours)
@@ -78,7 +78,7 @@ def render_run(
         if target is not None:
             try_target(target)
     use_threads(threads)
-    loaded = run if isinstance(run, Run) else load_run(Path(run), device=device)
+    loaded = opened(run, device=device)
     if film.camera is not None:
         check_camera(loaded.capture, film.camera)
     if _is_made_larger(film, out):

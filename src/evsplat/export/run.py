@@ -24,7 +24,7 @@ from evsplat.files import try_target
 from evsplat.options import ExportOptions
 from evsplat.options.declare import given
 from evsplat.options.runs import FileKind, Kind
-from evsplat.training.run import Run, load_run
+from evsplat.training.run import Run, folder_of, opened
 
 logger = logging.getLogger(__name__)
 
@@ -71,9 +71,9 @@ def export_run(
     parts, camera = options.parts, options.camera
     _check_use(kind, options)
     target = _checked(options.out, kind)
-    folder = (run.path if isinstance(run, Run) else Path(run)) / "exports"
+    folder = folder_of(run) / "exports"
     try_target(target or folder)
-    loaded = run if isinstance(run, Run) else load_run(Path(run), device=options.device)
+    loaded = opened(run, device=options.device)
     if kind == "avatar":
         page = target or folder / "avatar"
         return export_avatar(loaded, page, parts or "human", camera, options.motion)

@@ -10,6 +10,7 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from evsplat.calibration import Exposure, exposure
+from evsplat.calibration.gain import QUARTERS, common_change
 from evsplat.capture import TrainingCapture
 from evsplat.capture.finding import Finding, Findings
 from evsplat.pictures.files import to_grey
@@ -104,9 +105,7 @@ def _repeated(capture: TrainingCapture) -> int:
 
 def _brightness_changes(pictures: Sequence[Exposure]) -> tuple[float, bool]:
     """Factor from the darkest to the brightest picture by what three quarters of the pixels change
-    by at least, and whether longer exposures are the brighter ones.
-
-    Somebody who moves, however large, makes some pixels brighter and others darker.
+    by at least (`common_change`), and whether longer exposures are the brighter ones.
     """
     light = np.stack([picture.log_luminance for picture in pictures])
     usable = np.stack([picture.usable for picture in pictures])
@@ -115,8 +114,7 @@ def _brightness_changes(pictures: Sequence[Exposure]) -> tuple[float, bool]:
     for values, of_use, picture in zip(light, usable, pictures, strict=True):
         if of_use.mean() < _FEWEST_USABLE:
             continue
-        low, high = np.quantile((values - usual)[of_use], (0.25, 0.75))
-        levels.append(float(max(low, 0.0) + min(high, 0.0)))
+        levels.append(float(common_change(*np.quantile((values - usual)[of_use], QUARTERS))))
         exposures_us.append(picture.span_us[1] - picture.span_us[0])
     if len(levels) < 2:
         return 1.0, False

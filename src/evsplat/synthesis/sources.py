@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from jaxtyping import Int64
 
 from evsplat.body import PoseSource
 from evsplat.capture import BodyFile, Capture, CaptureWriter, Frame, load_capture
 from evsplat.capture.check_body import stated_body
+from evsplat.capture.read import without_gain
 from evsplat.capture.write import read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture
-from evsplat.pictures.files import read_image, to_unit_range
-from evsplat.pictures.light import Transfer, evened
+from evsplat.pictures.files import read_image
+from evsplat.pictures.light import Transfer
 
 logger = logging.getLogger(__name__)
 
@@ -195,9 +195,8 @@ class _CaptureFootage:
         for frame, file in zip(self._frames, self._files, strict=True):
             pixels = read_image(file)
             if frame.gain is not None:
-                light = evened(to_unit_range(pixels), torch.tensor(frame.gain), self._transfer)
-                levels = np.iinfo(pixels.dtype).max
-                pixels = (light.numpy() * levels + 0.5).astype(pixels.dtype)
+                even = without_gain(file, pixels, frame.gain, self._transfer)
+                pixels = (even * np.iinfo(pixels.dtype).max + 0.5).astype(pixels.dtype)
             yield TimedPicture(frame.name, frame.mid_us, pixels)
 
 

@@ -270,6 +270,16 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     )
 
 
+def opened(run: Run | Path | str, *, device: str) -> Run:
+    """A run that was read already as it is, on its device; else what `load_run` reads."""
+    return run if isinstance(run, Run) else load_run(run, device=device)
+
+
+def folder_of(run: Run | Path | str) -> Path:
+    """The folder of a run, read already or not."""
+    return run.path if isinstance(run, Run) else Path(run)
+
+
 def reload_run(run: Run, state: Path) -> Run:
     """The run at another checkpoint or snapshot of it; its model gets other parameters in place."""
     model = run.reconstruction.model
