@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from evsplat.training.watching import training_in
+from evsplat.training_sign import training_in
 
 pytest.importorskip("viser", reason="needs the extra view: pip install 'evsplat[view]'")
 

@@ -19,7 +19,7 @@ from evsplat.errors import ConfigError, DataError, MachineError, OutputError
 from evsplat.training import Stopped, load_run, train
 from evsplat.training.checkpoint import checkpoints
 from evsplat.training.trainer import Trainer
-from evsplat.training.watching import is_training
+from evsplat.training_sign import is_training
 from evsplat.view.viewed_run import load_newest
 
 from ..small_model import small

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from evsplat.training.checkpoint import load_checkpoint
-from evsplat.training.watching import Showcase, is_training, newest_state, training_in, watch
+from evsplat.training.watching import Showcase, newest_state, watch
+from evsplat.training_sign import is_training, training_in
 
 CLOCK = {"iteration": 1, "iterations": 9, "fraction": 0.1, "seconds": 1.0, "step_seconds": 1.0}
 STATE = {"clock": CLOCK, "human_count": 4}

@@ -16,7 +16,7 @@ from evsplat.film import Look
 from evsplat.film.surroundings import Room
 from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.training.run import Run
-from evsplat.training.watching import training_in
+from evsplat.training_sign import training_in
 from evsplat.view import viewed_run
 from evsplat.view.compositor import comparisons
 from evsplat.view.posing import HeldPose, PoseSlider, turned

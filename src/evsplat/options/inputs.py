@@ -6,11 +6,9 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from evsplat.disk import is_held
 from evsplat.errors import DataError
+from evsplat.training_sign import is_training
 
-TRAINING_SIGN = ".watch"
-"""File in a run folder that is there while it trains, and whose lock the training holds."""
 _NAMED_RUNS = 5
 
 
@@ -71,7 +69,7 @@ def check_run_folder(path: Path) -> None:
     """
     if (path / "config.yaml").exists():
         return
-    if is_held(path / TRAINING_SIGN):
+    if is_training(path):
         raise DataError(
             f"{path}: its training is still being prepared, expected one that has made a step; "
             "wait for the first one, or open 'evsplat view', which waits by itself."
@@ -81,7 +79,7 @@ def check_run_folder(path: Path) -> None:
 
 def check_run_or_training(path: Path) -> None:
     """As `check_run_folder`, where a training that prepares its first step will do as well."""
-    if not is_held(path / TRAINING_SIGN):
+    if not is_training(path):
         check_run_folder(path)
 
 

@@ -47,7 +47,8 @@ from evsplat.training.run import (
 )
 from evsplat.training.sound import check_events_reach, check_learned
 from evsplat.training.trainer import StepReport, Trainer
-from evsplat.training.watching import Showcase, is_unused, training_in
+from evsplat.training.watching import Showcase, is_unused
+from evsplat.training_sign import training_in
 from evsplat.untrusted.records import misfit
 
 logger = logging.getLogger(__name__)

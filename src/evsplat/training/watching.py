@@ -16,11 +16,10 @@ from typing import Any
 
 from torch import Tensor
 
-from evsplat.disk import is_held
 from evsplat.errors import TRACEBACK, OutputError
-from evsplat.files import held_folder, remove_file
-from evsplat.options.inputs import TRAINING_SIGN
+from evsplat.files import remove_file
 from evsplat.training.checkpoint import latest_checkpoint, write_state
+from evsplat.training_sign import TRAINING_SIGN
 
 SNAPSHOT_SECONDS = 3.0
 """Time between snapshots."""
@@ -80,23 +79,6 @@ class Showcase:
             return
         self._shown = self._clock()
         self._pause = max(SNAPSHOT_SECONDS, (self._shown - now) / LARGEST_SHARE)
-
-
-@contextmanager
-def training_in(run: Path) -> Iterator[None]:
-    """Be the only process that trains in a run folder, which is made where it is missing.
-
-    Raises:
-        ConfigError: Another process does.
-    """
-    busy = "is training in this folder; wait for it or choose another --out."
-    with held_folder(run, TRAINING_SIGN, busy):
-        yield
-
-
-def is_training(run: Path) -> bool:
-    """Whether a process trains in a run folder now: whether it holds the lock."""
-    return is_held(run / TRAINING_SIGN)
 
 
 def is_unused(run: Path) -> bool:

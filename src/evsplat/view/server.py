@@ -17,7 +17,7 @@ from evsplat.body import up_axis
 from evsplat.errors import ConfigError, DataError
 from evsplat.film.plan import recorded_by
 from evsplat.training.run import Run
-from evsplat.training.watching import is_training
+from evsplat.training_sign import is_training
 from evsplat.view.camera import forward, vertical_fov
 from evsplat.view.client import Client, view_of
 from evsplat.view.compositor import Compositor

@@ -27,7 +27,8 @@ from evsplat.pictures import Transfer
 from evsplat.render import Backdrop
 from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.training.run import Run, load_run, reload_run
-from evsplat.training.watching import is_training, newest_state, watch
+from evsplat.training.watching import newest_state, watch
+from evsplat.training_sign import is_training
 from evsplat.view.network_cache import set_draft, with_cached_networks
 from evsplat.view.posing import HeldPose, PoseSlider, pose_sliders, turned
 from evsplat.view.request import Motion
