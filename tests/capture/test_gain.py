@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from evsplat.calibration.gain import GainMeter
 from evsplat.capture import Capture, CaptureWriter, load_capture
 from evsplat.capture.derive import derived_capture
 from evsplat.errors import DataError
@@ -123,7 +124,7 @@ def test_import_finds_gains_and_says_so(
 def test_a_gain_that_is_given_is_kept(tiny_capture: Factory, tmp_path: Path) -> None:
     source = load_capture(tiny_capture())
     camera = source.camera(source.frames[0])
-    with CaptureWriter(tmp_path / "given") as writer:
+    with CaptureWriter(tmp_path / "given", gains=True) as writer:
         writer.add_camera("main", camera.width, camera.height, camera.K)
         for i, frame in enumerate(source.frames):
             pixels = np.uint8(read_image(frame.image) * (1 - 0.3 * (i % 2)))
@@ -132,6 +133,20 @@ def test_a_gain_that_is_given_is_kept(tiny_capture: Factory, tmp_path: Path) -> 
         writer.leave_out_body()
     kept = load_capture(tmp_path / "given", needs_body=False)
     assert {frame.gain for frame in kept.frames} == {(0.5, 1.0, 1.0)}
+
+
+def test_only_a_writer_that_is_asked_to_looks_at_pictures(
+    tiny_capture: Factory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked = []
+    monkeypatch.setattr(GainMeter, "add", lambda *given: looked.append(given))
+    tiny_capture()
+    with (
+        pytest.raises(DataError, match=r"other: the pictures were not looked .* gains=True"),
+        CaptureWriter(tmp_path / "other") as writer,
+    ):
+        writer.find_gains()
+    assert not looked and not (tmp_path / "other").exists()
 
 
 def test_blur_is_synthesized_of_evened_pictures(pair, tmp_path: Path) -> None:

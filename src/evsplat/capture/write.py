@@ -50,7 +50,8 @@ class CaptureWriter:
             writer.add_frame("0000", "main", picture, exposure_us=(0, 30_000))
             writer.set_body("default", times_us, poses, transl, betas=betas)
 
-    ``provenance`` is a dictionary that may be added to at any time (docs/capture-format.md).
+    ``provenance`` is a dictionary that may be added to at any time (docs/capture-format.md). With
+    ``gains`` each picture is looked at as it comes, for `find_gains`.
 
     Raises:
         DataError: ``path`` exists (with ``overwrite`` only a capture is replaced), something does
@@ -58,7 +59,12 @@ class CaptureWriter:
     """
 
     def __init__(
-        self, path: Path | str, name: str | None = None, *, overwrite: bool = False
+        self,
+        path: Path | str,
+        name: str | None = None,
+        *,
+        overwrite: bool = False,
+        gains: bool = False,
     ) -> None:
         self.path = Path(path)
         self.name = checked_name(name or self.path.resolve().name, "a capture")
@@ -71,7 +77,7 @@ class CaptureWriter:
         self._events: dict[str, Any] | None = None
         self._folder: Path | None = None
         self._overwrite = overwrite
-        self._gains = GainMeter()
+        self._gains = GainMeter() if gains else None
         self._making = new_folder(self.path, replace=overwrite)
         self._check_target()
 
@@ -186,7 +192,15 @@ class CaptureWriter:
         For one camera that stands still, by what its pictures show of the scene. Gives the factor
         from the darkest to the brightest picture: 1 where the camera's brightness is one, or where
         frames were given a gain, and then nothing is written.
+
+        Raises:
+            DataError: The writer was not made with ``gains``, so that nothing is known of them.
         """
+        if self._gains is None:
+            raise DataError(
+                f"{self.path}: the pictures were not looked at as they came; "
+                "use CaptureWriter(..., gains=True) to have their gains found."
+            )
         given = any("gain" in frame for frame in self._frames)
         several = len({frame["camera"] for frame in self._frames}) > 1
         gains = None if given or several or self.camera_moves else self._gains.gains()

@@ -141,7 +141,7 @@ def run_importer(
     elif blur is not None:
         _import_and_blur(importer, source, out, smpl, blur, overwrite=overwrite)
     else:
-        _import(importer, source, CaptureWriter(out, overwrite=overwrite), smpl)
+        _import(importer, source, CaptureWriter(out, overwrite=overwrite, gains=True), smpl)
     warn_of_capture(out, smpl)
     return out
 
@@ -193,7 +193,7 @@ def _import_and_blur(
     from evsplat.synthesis import synthesize
 
     sharp = out.with_name(f"{out.name}_sharp")
-    _import(importer, source, CaptureWriter(sharp, overwrite=overwrite), smpl)
+    _import(importer, source, CaptureWriter(sharp, overwrite=overwrite, gains=True), smpl)
     recipe = importer.blur_recipe
     assert recipe is not None, "run_importer refuses kinds without one"
     try:
@@ -228,7 +228,7 @@ def _import_and_pose(
     from evsplat.posing import find_poses
 
     unposed = out.with_name(f"{out.name}_unposed")
-    writer = CaptureWriter(unposed, out.name, overwrite=overwrite)
+    writer = CaptureWriter(unposed, out.name, overwrite=overwrite, gains=True)
     _import(importer, source, writer, smpl, going_on=True)
     try:
         search = PoseSearch(**vars(poses))
