@@ -1,7 +1,9 @@
 """A bench that is killed, fails in places or is asked again ends with the same table."""
 
 import importlib
+import json
 import random
+import shlex
 import signal
 import subprocess
 import sys
@@ -133,6 +135,32 @@ def test_failures_are_recorded_kept_and_tried_again_only_when_asked(tiny_capture
     message = capsys.readouterr().err
     assert "was made with method 'median_background', and 'nearest_frame' is asked for" in message
     assert records(out) == first
+
+
+def test_masks_that_rows_lack_are_told_before_anything_is_trained(tiny_capture, tmp_path, capsys):
+    """With the command after which the suite reads the capture with masks."""
+    path = tiny_capture("bare")
+    document = json.loads((path / "capture.json").read_text())
+    for frame in document["frames"]:
+        del frame["mask"]
+    (path / "capture.json").write_text(json.dumps(document))
+    hugs = {"name": "hugs", "method": "hugs", "settings": list(SMALL["hugs"])}
+    captures = {"bare": path, "masked": tiny_capture("masked")}
+    suite = write_suite(tmp_path / "suite.yaml", captures, MEDIAN, hugs, iterations=1)
+
+    def bench(out: str) -> tuple[list[str], str]:
+        with cells_in_this_process():
+            assert main(["bench", str(suite), "--out", str(tmp_path / out), "--only", "hugs"]) == 0
+        told = capsys.readouterr().err
+        return [line for line in told.splitlines() if "make masks first" in line], told
+
+    (sentence,), _ = bench("before")
+    assert sentence.startswith(f"{path / 'capture.json'}: 7 of 7 training frames have no mask")
+    assert "these rows fail: hugs." in sentence
+    words = shlex.split(sentence.partition("make masks first: ")[2])
+    assert main(words[1:]) == 0
+    told, said = bench("after")
+    assert not told and "failed" not in said
 
 
 def test_a_person_without_scene_can_be_measured_before_the_background(tiny_capture, tmp_path):

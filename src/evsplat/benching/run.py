@@ -24,6 +24,7 @@ from evsplat.benching.ray_cluster import RayCluster
 from evsplat.benching.strips import write_strips
 from evsplat.benching.suite import read_suite
 from evsplat.benching.tables import SPREAD, make_tables
+from evsplat.benching.unmasked import unmasked
 from evsplat.errors import ConfigError
 from evsplat.evaluation.tables import LEGEND, latex, markdown
 from evsplat.files import try_target, write_json, write_text
@@ -152,7 +153,7 @@ class Progress:
             f"{counted(len(todo), 'cell')} to do, {done} done before; "
             f"logs in {folder.path / 'logs'}"
         )
-        for sentence in plan.missing.values():
+        for sentence in (*plan.missing.values(), *unmasked(todo)):
             _print(sentence)
         self._bar = tqdm(
             total=len(todo),

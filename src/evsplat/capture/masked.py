@@ -14,12 +14,26 @@ HUMAN_ABOVE = 0.5
 """Share of a pixel above which it is the person's."""
 
 
-def masks_command(capture: Path, *, static_camera: bool) -> str:
+def masks_command(capture: Path, *, static_camera: bool, in_place: bool = False) -> str:
     """The command that finds the person in a capture's pictures, for the user to type.
 
     The default way compares them with a static background, which moving cameras have none of.
+    ``in_place`` adds them to the capture itself, else a new one has them.
     """
-    return command("masks", capture, *(() if static_camera else ("--with", "silhouette")))
+    way = () if static_camera else ("--with", "silhouette")
+    return command("masks", capture, *way, *(("--in-place",) if in_place else ()))
+
+
+def command_for_lacking_masks(capture: TrainingCapture) -> str:
+    """`masks_command`, into the capture itself where that can be: whatever reads it has them."""
+    return masks_command(
+        capture.path, static_camera=capture.is_static_camera, in_place=capture.takes_masks
+    )
+
+
+def frames_without_masks(capture: TrainingCapture) -> list[Frame]:
+    """Training frames without a mask that is seen."""
+    return [frame for frame in capture.train_frames if not capture.has_mask(frame)]
 
 
 def require_masks(capture: TrainingCapture, method: str) -> None:
@@ -29,16 +43,14 @@ def require_masks(capture: TrainingCapture, method: str) -> None:
             f"policy.masks is none, and {method} learns the person from masks; pass --set "
             "policy.masks=given, or estimated."
         )
-    frames = capture.train_frames
-    without = [frame.name for frame in frames if not capture.has_mask(frame)]
-    if without:
-        ways = masks_command(capture.path, static_camera=capture.is_static_camera)
+    if without := frames_without_masks(capture):
+        ways = command_for_lacking_masks(capture)
         if capture.is_static_camera:  # estimates are differences to a static background
             ways += ", or pass --set policy.masks=estimated"
         raise DataError(
-            f"{capture.path / 'capture.json'}: {len(without)} of {len(frames)} training frames "
-            f"have no mask (the first is {without[0]!r}), and {method} learns the person from "
-            f"masks; make them with: {ways}."
+            f"{capture.path / 'capture.json'}: {len(without)} of {len(capture.train_frames)} "
+            f"training frames have no mask (the first is {without[0].name!r}), and {method} learns "
+            f"the person from masks; make them with: {ways}."
         )
 
 

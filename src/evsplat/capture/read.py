@@ -116,6 +116,16 @@ class CaptureReader:
         return camera in self._metadata.distortions
 
     @property
+    def has_others_masks(self) -> bool:
+        """True where a frame has a mask that `evsplat masks` did not make."""
+        return any(frame.mask for frame in self.frames) and "masks" not in self.provenance
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether `evsplat masks --in-place` may add masks; they are made without distortion."""
+        return not self.has_others_masks and not any(map(self.is_distorted, self.cameras))
+
+    @property
     def is_static_camera(self) -> bool:
         """True where all frames come from one camera that stands still."""
         one = len({frame.camera for frame in self.frames}) == 1

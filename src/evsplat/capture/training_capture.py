@@ -135,6 +135,11 @@ class TrainingCapture:
             return own.split == "train"
         return own.mask is not None  # redacted where it is not seen
 
+    @property
+    def takes_masks(self) -> bool:
+        """Whether masks can be added to the capture itself (`Capture.takes_masks`)."""
+        return self._source.takes_masks
+
     def mask(self, frame: Frame | str) -> Float[Tensor, "H W"] | None:
         """Share of the person per pixel in a training frame, in [0, 1]; None where it has none."""
         name = self._seen(frame, "mask")

@@ -67,12 +67,12 @@ def mask_capture(
 
 
 def _check_in_place(capture: Capture) -> None:
-    if any(frame.mask for frame in capture.frames) and "masks" not in capture.provenance:
+    if capture.has_others_masks:
         raise DataError(
             f"{capture.path}: has masks already that evsplat did not make, so they stay; write a "
             "new capture with --out."
         )
-    if any(capture.is_distorted(name) for name in capture.cameras):
+    if not capture.takes_masks:
         raise DataError(
             f"{capture.path}: its lens distorts, and masks are made without distortion; write a "
             "new capture with --out."
