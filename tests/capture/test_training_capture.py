@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evsplat.capture import Frame, Policy, load_body_track, load_capture
+from evsplat.capture.policy import Terms
 from evsplat.capture.training_capture import held_out_spans, readable_spans
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS
@@ -211,12 +212,15 @@ def test_estimated_masks_are_the_maskers_own(tiny_capture):
 
 def test_terms_say_what_the_recording_could_not_give(tiny_capture):
     path = tiny_capture()
-    assert seen(path, masks="given").terms == Policy(masks="given")
+    assert seen(path, masks="given").terms == Terms(masks="given")
     document = json.loads((path / "capture.json").read_text())
     document["events"]["contrast_threshold"] = None
     document["provenance"]["masks"] = {"with": "background"}
     (path / "capture.json").write_text(json.dumps(document))
-    assert seen(path, masks="given").terms == Policy(masks="estimated", thresholds="estimated")
+    assert seen(path, masks="given").terms == Terms(masks="estimated", thresholds="estimated")
+    del document["events"]
+    (path / "capture.json").write_text(json.dumps(document))
+    assert not seen(path).terms.events
 
 
 def test_neighbours_end_at_held_out_frames(tiny_capture):

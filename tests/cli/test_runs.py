@@ -3,6 +3,7 @@
 from dataclasses import asdict
 
 from evsplat.capture import Policy
+from evsplat.capture.policy import Terms
 from evsplat.cli.runs import summary_table
 
 
@@ -33,7 +34,7 @@ def test_table_has_the_run_above_the_trivial_rows_and_the_cameras_own_picture():
     assert "30.00 / 0.900" in lines[2]
     assert "26.12 / 0.900" in lines[4] or "26.13 / 0.900" in lines[4]
     assert len({len(line) for line in lines[1:-1]}) == 1
-    assert lines[-1] == Policy(held_out_events=True).sentence(2)
+    assert lines[-1] == Terms(held_out_events=True).sentence(2)
     metrics |= {"frames": {"test": 0}, "policy": asdict(Policy(use="everything"))}
     assert summary_table(metrics).startswith("No test figures. Every frame and every event trained")
     metrics |= {"policy": asdict(Policy())}
@@ -56,4 +57,4 @@ def test_what_was_not_measured_is_a_dash():
     metrics = {"method": "paper", "protocols": {"standard": regions}, "trivial": {}}
     metrics |= {"frames": {"test": 2}, "blurry_input": regions}
     lines = summary_table(metrics).splitlines()
-    assert lines[-2].endswith("- / -") and "does not tell what training saw" in lines[-1]
+    assert lines[-2].endswith("- / -") and "othing tells what training saw" in lines[-1]

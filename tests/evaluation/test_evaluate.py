@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from evsplat.capture import Policy, load_capture
-from evsplat.capture.policy import policy_of
+from evsplat.capture.policy import Terms, terms_of
 from evsplat.cli.runs import summary_table
 from evsplat.errors import DataError
 from evsplat.evaluation import evaluate
@@ -305,7 +305,7 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
     assert json.loads((out / "metrics.json").read_text()) == metrics
     facts = ["capture", "method", "iteration", "train_seconds", "device", "gaussians"]
     assert list(metrics)[:6] == facts and metrics["iteration"] == 1200
-    assert policy_of(metrics) == Policy(held_out_events=True)
+    assert terms_of(metrics) == Terms(held_out_events=True)
     psnr = f"{metrics['protocols']['standard']['full']['psnr']:.2f}"
     for name in ("metrics.md", "metrics.tex"):
         text = (out / name).read_text()

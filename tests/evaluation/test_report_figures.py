@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from evsplat.capture import Policy
-from evsplat.capture.policy import policy_of
+from evsplat.capture.policy import Terms, terms_of
 from evsplat.config import to_dict
 from evsplat.evaluation.protocols import METRICS, REGIONS
 from evsplat.evaluation.report import frames
@@ -167,11 +167,11 @@ def test_without_truth_there_are_neither_cards_nor_a_table():
 def test_what_training_saw_is_told_beside_the_figures_and_the_test_frames(
     held_out_events, held_out_poses
 ):
-    policy = Policy(held_out_events=held_out_events, held_out_poses=held_out_poses)
-    metrics = MIXED | {"policy": to_dict(policy)}
+    terms = Terms(held_out_events=held_out_events, held_out_poses=held_out_poses)
+    metrics = MIXED | {"policy": to_dict(terms)}
     ((_, intro),) = Text(figures(SimpleNamespace(metrics=metrics))).of("intro")
-    assert policy.sentence(metrics["frames"]["test"]) in intro
-    told = frames._held_out_terms(policy_of(metrics))
+    assert terms.sentence(metrics["frames"]["test"]) in intro
+    told = frames._held_out_terms(terms_of(metrics))
     assert "neither picture nor mask" in told
     assert ("and no event of the intervals" in told) == (not held_out_events)
     assert ("but the events of the intervals" in told) == held_out_events
@@ -179,11 +179,23 @@ def test_what_training_saw_is_told_beside_the_figures_and_the_test_frames(
     assert ("poses there were interpolated" in told) == (held_out_poses == "interpolated")
 
 
+@pytest.mark.parametrize("use", ["training", "everything"])
+def test_of_events_that_were_not_recorded_nothing_else_is_said(use):
+    terms = Terms(use=use, thresholds="estimated", events=False)
+    metrics = MIXED | {"policy": to_dict(terms)}
+    said = [terms.sentence(held_out) for held_out in (0, 3)]
+    said += [frames._held_out_terms(terms_of(metrics)), *terms.departures]
+    said += [text for _, text in Text(figures(SimpleNamespace(metrics=metrics))).of("intro")]
+    assert not [text for text in said if "threshold" in text or "interval" in text]
+    assert not [text for text in said if "event" in text and "has no events" not in text]
+    assert any("the recording has no events" in text for text in said) == (use == "training")
+
+
 def test_a_run_that_does_not_tell_what_training_saw_is_said_not_to():
     ((_, intro),) = Text(figures(SimpleNamespace(metrics=MIXED))).of("intro")
-    assert "The run does not tell what training saw." in intro
-    told = frames._held_out_terms(policy_of(MIXED))
-    assert "does not tell what training saw" in told
+    assert "Nothing tells what training saw." in intro
+    told = frames._held_out_terms(terms_of(MIXED))
+    assert "nothing tells what training saw" in told
     for claim in ("picture", "mask", "event", "pose"):
         assert claim not in told
 

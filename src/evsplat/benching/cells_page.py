@@ -7,8 +7,7 @@ from urllib.parse import quote
 from evsplat.benching.cell import DONE, Cell
 from evsplat.benching.figures import Record, Records
 from evsplat.benching.folder import BenchFolder
-from evsplat.capture.policy import policy_of
-from evsplat.evaluation.tables import REGION_TITLES
+from evsplat.evaluation.tables import REGION_TITLES, terms
 from evsplat.pages import folded, section
 from evsplat.wording import counted
 
@@ -93,22 +92,20 @@ def _lines(records: Records, cell: Cell, folder: BenchFolder) -> str:
         for name, path in files.items()
         if path.exists()
     )
-    terms = "Nothing is known of what it saw."
     if record["status"] == DONE:
-        if policy := policy_of(record):
-            terms = policy.sentence(record["frames"]["test"])
+        told = terms(record)
         regions = record["protocols"]["standard"]
         psnr = [regions.get(region, {}).get("psnr") for region in REGION_TITLES]
         figures = ["–" if value is None else f"{value:.2f}" for value in psnr]
         seconds = record.get("train_seconds")
         figures.append("–" if seconds is None else f"{seconds / 60:.1f}")
     else:
-        terms = f"failed: {record['reason']}"
+        told = f"failed: {record['reason']}"
         figures = ["–"] * (len(REGION_TITLES) + 1)
     values = "".join(f"<td>{figure}</td>" for figure in (cell.seed, *figures))
     command = escape(repeat_command(records, cell, record))
     return (
         f'<tr><th scope="row">{escape(title)}</th>{values}<td>{links}</td></tr>'
-        f'<tr class="terms"><td colspan="{len(_HEADS)}">{escape(terms)}<br>'
+        f'<tr class="terms"><td colspan="{len(_HEADS)}">{escape(told)}<br>'
         f"<code>{command}</code></td></tr>"
     )

@@ -9,7 +9,7 @@ from typing import Any
 from evsplat.benching.figures import Record, Records, metric
 from evsplat.benching.given_pictures import OWN_PICTURE
 from evsplat.benching.suite import PublishedTable, SuiteRow
-from evsplat.capture.policy import STRICT_TERMS, policy_of
+from evsplat.capture.policy import STRICT_TERMS, terms_of
 from evsplat.evaluation.protocols import PROTOCOLS
 from evsplat.evaluation.tables import METRIC_TITLES, REGION_TITLES, Figure, Heading, Row, Table
 from evsplat.methods import NOMINAL_ITERATIONS
@@ -206,8 +206,8 @@ def _terms(records: Records, captures: Sequence[str]) -> str:
 
 def title_of(records: Records, row: SuiteRow, captures: Sequence[str]) -> str:
     """A row's title, and behind it where its policy departs from the strict terms."""
-    policies = [policy_of(r) for c in captures for r in records.of(c, row.name)]
-    departures = dict.fromkeys(text for p in policies if p for text in p.departures)
+    known = [terms_of(r) for c in captures for r in records.of(c, row.name)]
+    departures = dict.fromkeys(text for terms in known if terms for text in terms.departures)
     return "; ".join([row.label, *departures])
 
 

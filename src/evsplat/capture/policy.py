@@ -11,7 +11,7 @@ Masks = Literal["given", "estimated", "none"]
 
 @dataclass(frozen=True)
 class Policy:
-    """The data that a method may see; written to config.yaml, metrics.json, reports and tables.
+    """The data that a method may see; written to config.yaml, and as `Terms` beside figures.
 
     A held-out interval runs from the end of the last training exposure before a held-out frame to
     the start of the next training exposure after it. Of it nothing is seen but the frame's camera,
@@ -42,13 +42,27 @@ class Policy:
                 "that it wants; pass --set policy.held_out_events=true as well."
             )
 
+
+@dataclass(frozen=True)
+class Terms(Policy):
+    """A policy as a recording meets it, in words: what it does not give is estimated, or missing.
+
+    Written to metrics.json, reports and tables.
+    """
+
+    events: bool = True
+    """False: it has none, so that there is nothing to say of thresholds and held-out events."""
+
     @property
     def departures(self) -> tuple[str, ...]:
         """Differences from `STRICT_TERMS`, in words for the title of a row."""
-        said = {
-            "use": "trained on everything",
+        of_events = {
             "held_out_events": "events of held-out intervals seen",
             "thresholds": "contrast thresholds estimated",
+        }
+        said = {
+            "use": "trained on everything",
+            **(of_events if self.events else {}),
             "masks": f"masks {self.masks}",
             "held_out_poses": "poses at test times interpolated",
         }
@@ -57,18 +71,10 @@ class Policy:
         return tuple(said[name] for name in names)
 
     def sentence(self, held_out: int) -> str:
-        """The whole policy with ``held_out`` test frames, for a reader of figures."""
+        """All of them with ``held_out`` test frames, for a reader of figures."""
         if self.use == "everything":
-            return "Every frame and every event trained; nothing was held out."
-        events = (
-            "events of held-out intervals were seen"
-            if self.held_out_events
-            else "no event of a held-out interval was seen"
-        )
-        thresholds = {
-            "given": "contrast thresholds as the capture gives them",
-            "estimated": "contrast thresholds estimated from training frames",
-        }[self.thresholds]
+            events = " and every event" if self.events else ""
+            return f"Every frame{events} trained; nothing was held out."
         masks = {
             "given": "masks of training frames given",
             "estimated": "masks of training frames estimated",
@@ -78,12 +84,26 @@ class Policy:
             "given": "poses at test times given",
             "interpolated": "poses at test times interpolated",
         }[self.held_out_poses]
+        seen = [self._thresholds, masks]
         if not held_out:
-            return f"No frame is a test frame, so nothing was held out; {thresholds}, {masks}."
-        return (
-            f"Held-out pictures were hidden from training, {events}; {thresholds}, {masks}, "
-            f"{poses}."
-        )
+            return f"No frame is a test frame, so nothing was held out; {', '.join(seen)}."
+        events = ""
+        if self.events:
+            events = (
+                ", events of held-out intervals were seen"
+                if self.held_out_events
+                else ", no event of a held-out interval was seen"
+            )
+        return f"Held-out pictures were hidden from training{events}; {', '.join([*seen, poses])}."
+
+    @property
+    def _thresholds(self) -> str:
+        if not self.events:
+            return "the recording has no events"
+        return {
+            "given": "contrast thresholds as the capture gives them",
+            "estimated": "contrast thresholds estimated from training frames",
+        }[self.thresholds]
 
 
 STRICT_TERMS = (
@@ -93,7 +113,7 @@ STRICT_TERMS = (
 """Terms that all rows of a table share."""
 
 
-def policy_of(metrics: dict[str, Any]) -> Policy | None:
-    """The policy in a metrics.json or a bench record; None where it has none."""
+def terms_of(metrics: dict[str, Any]) -> Terms | None:
+    """The terms in a metrics.json or a bench record; None where it has none."""
     values = metrics.get("policy")
-    return None if values is None else Policy(**values)
+    return None if values is None else Terms(**values)

@@ -17,7 +17,7 @@ from evsplat.calibration import FramePair
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
 from evsplat.capture.metadata import Frame, NovelView
-from evsplat.capture.policy import Policy
+from evsplat.capture.policy import Policy, Terms
 from evsplat.capture.read import CaptureReader
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS, EventStore, Span
@@ -80,14 +80,15 @@ class TrainingCapture:
         return tuple(frame for frame in self.frames if frame.split != "train")
 
     @property
-    def terms(self) -> Policy:
-        """The policy as this recording meets it: what it does not give is estimated."""
-        policy, source = self.policy, self._source
+    def terms(self) -> Terms:
+        """The policy as this recording meets it: what it does not give is estimated, or missing."""
+        source = self._source
+        terms = Terms(**vars(self.policy), events=source.events is not None)
         if source.contrast_threshold is None:
-            policy = replace(policy, thresholds="estimated")
-        if policy.masks == "given" and "masks" in source.provenance:
-            policy = replace(policy, masks="estimated")
-        return policy
+            terms = replace(terms, thresholds="estimated")
+        if terms.masks == "given" and "masks" in source.provenance:
+            terms = replace(terms, masks="estimated")
+        return terms
 
     def frame(self, name: str) -> Frame:
         """The frame of that name."""

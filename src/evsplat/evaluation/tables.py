@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from evsplat.capture.policy import policy_of
+from evsplat.capture.policy import terms_of
 from evsplat.evaluation.splits import count_of, name_of, split_of, words_of
 from evsplat.files import write_text
 
@@ -188,10 +188,12 @@ def input_is_truth(metrics: dict[str, Any]) -> bool:
 
 
 def terms(metrics: dict[str, Any]) -> str:
-    """Terms of the run: a sentence on what training saw, and one on poses that were not given."""
-    policy, seen = policy_of(metrics), "The run does not tell what training saw."
-    if policy is not None:
-        seen = policy.sentence(metrics["frames"]["test"])
+    """Terms of a run, or of a bench's cell: a sentence on what training saw, and one on poses that
+    were not given.
+    """
+    seen = "Nothing tells what training saw."
+    if (known := terms_of(metrics)) is not None:
+        seen = known.sentence(metrics["frames"]["test"])
     return " ".join(filter(None, (seen, metrics.get("poses"))))
 
 

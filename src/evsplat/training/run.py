@@ -11,8 +11,9 @@ from typing import Any
 
 import torch
 
-from evsplat.capture import Camera, Capture, Policy, TrainingCapture, load_capture
+from evsplat.capture import Camera, Capture, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
+from evsplat.capture.policy import Terms
 from evsplat.commands import command
 from evsplat.config import load_yaml, to_dict
 from evsplat.devices import hardware
@@ -120,7 +121,7 @@ class Run:
     path: Path
     config: MethodConfig
     method: str
-    policy: Policy
+    policy: Terms
     """What training saw, as the capture could meet it."""
     capture: Capture
     """All of it, for evaluation and looking; without test frames where everything trained."""

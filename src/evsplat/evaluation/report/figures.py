@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from evsplat.capture.policy import policy_of
+from evsplat.capture.policy import terms_of
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import count_of, split_of, words_of
 from evsplat.evaluation.tables import (
@@ -52,13 +52,14 @@ def figures(source: Source) -> str:
 
 def no_test_figures(metrics: dict[str, Any]) -> str | None:
     """The reason for no test figures, as HTML that continues a sentence; None where there are."""
-    policy = policy_of(metrics)
     if split_of(metrics) == "train":
         return None
-    if policy is not None and policy.use == "everything":
+    known = terms_of(metrics)
+    if known is not None and known.use == "everything":
+        events = " and every event" if known.events else ""
         return (
-            "trained on every frame and every event (<code>--use everything</code>): nothing was "
-            "held out, so there are no test figures."
+            f"trained on every frame{events} (<code>--use everything</code>): nothing was held "
+            "out, so there are no test figures."
         )
     if not metrics["per_frame"]:
         return "no frame has split “test”, so there are no test figures."

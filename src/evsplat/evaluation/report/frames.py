@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from evsplat.capture import Frame, Policy, load_body_track
-from evsplat.capture.policy import policy_of
+from evsplat.capture import Frame, load_body_track
+from evsplat.capture.policy import Terms, terms_of
 from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.figures import frame_figures, no_test_figures
@@ -81,24 +81,26 @@ def test_frames(source: Source) -> str:
 def _terms(metrics: dict[str, Any], shown: list["FramePictures"]) -> str:
     """What training could know of the frames that are shown."""
     if split_of(metrics) != "train":
-        return _held_out_terms(policy_of(metrics))
+        return _held_out_terms(terms_of(metrics))
     sharp = all(one.recorded == _OWN_TRUTH for one in shown)
     return _OWN_TRUTH_TERMS if sharp else _TRAINING_TERMS
 
 
-def _held_out_terms(policy: Policy | None) -> str:
+def _held_out_terms(terms: Terms | None) -> str:
     """Sentences on what training could know of the intervals in which the test frames lie."""
-    if policy is None:
-        return "Held out; the run does not tell what training saw of these times."
-    events = (
-        "but the events of the intervals around them"
-        if policy.held_out_events
-        else "and no event of the intervals around them"
-    )
-    given = policy.held_out_poses == "given"
+    if terms is None:
+        return "Held out; nothing tells what training saw of these times."
+    events = ""
+    if terms.events:
+        events = (
+            ", but the events of the intervals around them"
+            if terms.held_out_events
+            else ", and no event of the intervals around them"
+        )
+    given = terms.held_out_poses == "given"
     poses = "given" if given else "interpolated from those of training frames"
     return (
-        f"Held out: training saw neither picture nor mask of these times, {events}. The body’s "
+        f"Held out: training saw neither picture nor mask of these times{events}. The body’s "
         f"poses there were {poses}."
     )
 
