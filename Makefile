@@ -20,7 +20,7 @@ export PIP_COMPILE := no
 # seconds of each start.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo view test fuzz kill robustness lint types docs setup clean
+.PHONY: demo view test fuzz kill robustness lint types docs setup dependencies package clean
 
 demo: $(STAMP)
 	$(BIN)/evsplat demo $(DEMO_OPTIONS)
@@ -57,8 +57,20 @@ setup: $(DEV_STAMP)
 
 $(STAMP): $(SET_UP_INPUTS)
 	@PYTHON="$(PYTHON)" sh tools/make_venv.sh "$(VENV)"
-	$(INSTALL) --editable .
+	@$(MAKE) --no-print-directory -j2 dependencies package || { cat "$(VENV)/package.log" >&2; exit 1; }
 	@touch $@
+
+# Packages are fetched and unpacked while the native module is compiled; pip alone does one after the
+# other. What the compiler has to say comes last, where nothing else hides it.
+dependencies:
+	@$(BIN)/python -c 'import tomllib; \
+	print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"], sep="\n")' \
+	> "$(VENV)/dependencies.txt"
+	$(INSTALL) --requirement "$(VENV)/dependencies.txt"
+
+package:
+	@echo "Compiling the native module beside it, a minute or two on two cores"
+	$(INSTALL) --quiet --no-deps --editable . >"$(VENV)/package.log" 2>&1
 
 # The extras of what is installed, which pip then neither builds again nor looks for elsewhere.
 $(VIEW_STAMP): $(STAMP)
