@@ -1,5 +1,8 @@
 """Pictures that were made elsewhere are measured as a method is, and wrong ones are refused."""
 
+import json
+from shutil import copy
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -49,6 +52,22 @@ def test_given_pictures_are_measured_by_the_one_evaluator_and_again_when_they_ch
         assert record["protocols"]["standard"]["full"]["psnr"] == pytest.approx(expected, abs=1e-3)
         # Nobody knows what a program of somebody else saw: no policy is claimed.
         assert record["policy"] is None
+
+
+@pytest.mark.parametrize("gain", [0.6, [0.9, 0.7, 0.5]])
+def test_a_picture_in_place_of_the_truth_has_the_gain_of_its_frame(bench, gain):
+    """Copies of the sharp pictures are exact."""
+    capture, theirs, run = bench
+    path = capture.path / "capture.json"
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        frame["gain"] = gain
+    path.write_text(json.dumps(document))
+    for frame in capture.test_frames:
+        copy(frame.sharp, theirs / f"{frame.name}.png")
+    exact = run()["protocols"]["standard"]["full"]
+    assert exact["ssim"] == pytest.approx(1.0, abs=1e-6)
+    assert exact["psnr"] is None or exact["psnr"] > 90
 
 
 def test_the_page_says_how_to_repeat_a_cell_and_links_its_files(bench, tmp_path):

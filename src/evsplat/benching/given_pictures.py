@@ -10,11 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.camera import Camera
-from evsplat.capture import Capture
+from evsplat.capture import Capture, Frame
 from evsplat.errors import DataError
 from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.methods.trivial import same_view
 from evsplat.pictures.files import read_image, to_rgb, to_unit_range
+from evsplat.pictures.light import evened
 from evsplat.untrusted.faults import open_bytes
 from evsplat.untrusted.pictures import image_size
 
@@ -43,9 +44,10 @@ class _OfTestFrames(ABC):
 class GivenPictures(_OfTestFrames):
     """Test frames as somebody else's program drew them.
 
-    ``folder`` holds ``FRAME.png`` for every test frame, of the frame's own size, coded as the
-    capture's sharp pictures are (sRGB unless the capture says linear). What that program was given
-    to see is not known.
+    ``folder`` holds ``FRAME.png`` for every test frame, of the frame's own size, which stands in
+    place of the capture's sharp picture: coded as that is, and of the same brightness, so that
+    light is divided by the frame's gain here as it is there. What that program was given to see is
+    not known.
 
     Raises:
         DataError: A picture is missing, unreadable or of another size.
@@ -54,7 +56,8 @@ class GivenPictures(_OfTestFrames):
     name = PICTURES
 
     def __init__(self, folder: Path, capture: Capture) -> None:
-        self._places: list[tuple[Camera, int, Path]] = []
+        self._capture = capture
+        self._places: list[tuple[Camera, Frame, Path]] = []
         frames = capture.test_frames
         paths = [folder / f"{frame.name}.png" for frame in frames]
         missing = [path.name for path in paths if not path.is_file()]
@@ -72,12 +75,15 @@ class GivenPictures(_OfTestFrames):
                     f"{path}: has {found[0]}x{found[1]} pixels, expected the frame's "
                     f"{camera.width}x{camera.height}."
                 )
-            self._places.append((camera, frame.mid_us, path))
+            self._places.append((camera, frame, path))
 
     def _picture(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
-        for view, time, path in self._places:
-            if time == time_us and same_view(view, camera):
-                return to_rgb(to_unit_range(read_image(path)))
+        for view, frame, path in self._places:
+            if frame.mid_us == time_us and same_view(view, camera):
+                picture = to_rgb(to_unit_range(read_image(path)))
+                if frame.gain is None:
+                    return picture
+                return evened(picture, torch.tensor(frame.gain), self._capture.transfer(frame))
         raise DataError(f"no picture was given of this view at {time_us} us.")
 
 
