@@ -17,7 +17,7 @@ _DARKEST, _BRIGHTEST = 0.04, 0.98
 """Coded values: blocks darker than that in the mean are mostly noise, brighter pixels clipped."""
 _STEADY = 1.02
 """Factor of light between two pictures up to which a camera counts as one of fixed exposure."""
-_LOOKED_AT_PX = 256
+LOOKED_AT_PX = 256
 """Of larger pictures every n-th row and column is looked at."""
 _BLOCKS = 16
 """Blocks along the longer side; each is a mean over its pixels, of whose noise little is left."""
@@ -46,7 +46,7 @@ class GainMeter:
 
     def add(self, pixels: np.ndarray, transfer: Transfer) -> None:
         """The next picture, (H, W) or (H, W, 3), as stored or in [0, 1], by its camera's curve."""
-        step = math.ceil(max(pixels.shape[:2]) / _LOOKED_AT_PX)
+        step = math.ceil(max(pixels.shape[:2]) / LOOKED_AT_PX)
         pixels = np.ascontiguousarray(pixels[::step, ::step])
         coded = to_unit_range(pixels.astype(np.float32) if pixels.dtype.kind in "fb" else pixels)
         channels = coded[None] if coded.ndim == 2 else coded.movedim(-1, 0)

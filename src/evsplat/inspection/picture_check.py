@@ -4,14 +4,18 @@ repeated, or of a brightness that changes from one to the next.
 
 import filecmp
 import logging
+import math
 from collections.abc import Sequence
 from itertools import groupby, pairwise
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from evsplat.calibration import Exposure, exposure
-from evsplat.calibration.gain import QUARTERS, common_change
-from evsplat.capture import TrainingCapture
+from evsplat.calibration.gain import LOOKED_AT_PX, QUARTERS, common_change
+from evsplat.capture import Frame, TrainingCapture
 from evsplat.capture.finding import Finding, Findings
 from evsplat.pictures.files import to_grey
 
@@ -40,7 +44,8 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
     frames = capture.train_frames
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_LOOKED_AT, len(frames))).astype(int))
     looked_at = [frames[i] for i in chosen]
-    grey = [to_grey(capture.image(frame)).numpy() for frame in looked_at]
+    pictures = [_thinned(capture.image(frame)) for frame in looked_at]
+    grey = [to_grey(picture).numpy() for picture in pictures]
     brightest = max(float(np.quantile(picture, _BRIGHT)) for picture in grey)
     burnt = float(np.median([(picture > _BURNT).mean() for picture in grey]))
     folder = frames[0].image.parent
@@ -58,7 +63,7 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
             "pictures that are not burnt out",
             "Film with less light: no blur is known of what is clipped.",
         )  # fmt: skip
-    elif len(grey) > 1 and all(np.array_equal(grey[0], other) for other in grey[1:]):
+    elif len(grey) > 1 and _are_one(capture, looked_at):
         findings.warning(
             folder, "", f"the same in {len(grey)} pictures spread over the recording",
             "pictures of somebody who moves", "Check how they were exported.",
@@ -73,8 +78,8 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
         )  # fmt: skip
     elif capture.is_static_camera:
         light = [
-            exposure(capture.image(frame), frame.exposure_us, transfer=capture.transfer(frame))
-            for frame in looked_at
+            exposure(picture, frame.exposure_us, transfer=capture.transfer(frame))
+            for picture, frame in zip(pictures, looked_at, strict=True)
         ]
         factor, follows_exposure = _brightness_changes(light)
         if factor > _STEADY:
@@ -88,6 +93,18 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
                 "in all, and shows what changes as a mean.",
             )  # fmt: skip
     return findings.items
+
+
+def _thinned(picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
+    """Every n-th row and column of a large picture: quantiles need no more."""
+    step = math.ceil(max(picture.shape[:2]) / LOOKED_AT_PX)
+    return picture[::step, ::step]
+
+
+def _are_one(capture: TrainingCapture, frames: Sequence[Frame]) -> bool:
+    """Whether pictures are the same in every pixel."""
+    first = capture.image(frames[0])
+    return all(torch.equal(first, capture.image(frame)) for frame in frames[1:])
 
 
 def _repeated(capture: TrainingCapture) -> int:
