@@ -9,8 +9,11 @@ import pytest
 from evsplat.calibration import ClockEstimate, SensorEstimate, ThresholdEstimate
 from evsplat.capture import TrainingCapture, load_capture
 from evsplat.methods import Purpose, sensor
+from evsplat.methods.evsplat import CLOSED_SURFACE
+from evsplat.methods.evsplat_settings import EvsplatConfig
+from evsplat.methods.starts import MOST_SAMPLES
 from evsplat.objectives import EventChange, EventWindows
-from evsplat.training import train
+from evsplat.training import load_run, train
 
 from ..small_model import built, small
 
@@ -107,3 +110,26 @@ def test_the_event_term_is_chosen(tiny_capture, term):
     objectives = built("evsplat", tiny_capture(), f"event_term={term}").objectives
     assert any(isinstance(one, EventWindows) for one in objectives) == (term == "windows")
     assert any(isinstance(one, EventChange) for one in objectives) == (term == "paper")
+
+
+def test_as_many_discs_as_pixels_tell_apart(tiny_capture):
+    """At half the distance four times as many, between what shapes a body and what is drawn."""
+    path = tiny_capture()
+
+    def count(spacing_px: float) -> int:
+        settings = ("human.count=null", f"human.spacing_px={spacing_px}")
+        return built("evsplat", path, *settings).model.gaussians.human_count
+
+    assert CLOSED_SURFACE.fewest < count(0.4) < count(0.2) < MOST_SAMPLES
+    assert count(0.2) == pytest.approx(4 * count(0.4), abs=4)
+    assert count(40.0) == CLOSED_SURFACE.fewest and count(0.01) == MOST_SAMPLES
+
+
+def test_the_person_grows_where_that_is_asked_for(tiny_capture, tmp_path):
+    path, counts = tiny_capture(), {}
+    most = {"by default": EvsplatConfig().densify.max_human, "asked for": 150}
+    for name, largest in most.items():
+        settings = small("evsplat", "densify.gradient=1e-12", f"densify.max_human={largest}")
+        run = train(path, out=tmp_path / name, iterations=12, overrides=settings)
+        counts[name] = load_run(run).reconstruction.model.gaussians.human_count
+    assert counts["by default"] <= 120 < counts["asked for"] <= 150

@@ -120,7 +120,7 @@ OUT_OF_RANGE = {
 }
 EVERYWHERE = (
     "iterations=0 human.count=0 human.spacing_px=0 densify.start=-1 densify.end=15001 "
-    "densify.gradient=0 densify.max_human=0 l1_weight=-1 dssim_weight=-1 policy.masks=all"
+    "densify.gradient=0 densify.max_human=-1 l1_weight=-1 dssim_weight=-1 policy.masks=all"
 )
 
 

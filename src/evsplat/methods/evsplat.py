@@ -56,7 +56,7 @@ from evsplat.objectives import (
 
 logger = logging.getLogger(__name__)
 
-CLOSED_SURFACE = Surface(opacity=0.88, width=0.8, flatness=0.3)
+CLOSED_SURFACE = Surface(opacity=0.88, width=0.8, flatness=0.3, fewest=250)
 """Flat discs that hide what is behind them from the first step on: light and shadow need that."""
 LABEL = 2.0
 """Logits of the semantic attribute start at + and - this (A1)."""

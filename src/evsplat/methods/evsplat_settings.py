@@ -73,8 +73,9 @@ class EvsplatConfig:
     fill: NotNegative = 0.001
     """How strongly neighbours along the surface, and the other side's, decide at the end of
     training about colours of the person that were little seen; 0 leaves them as they are."""
-    densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=10_000)
-    """Growth and pruning."""
+    densify: Densify = Densify(start=1_000, end=10_000, gradient=2e-4, max_human=0)
+    """Growth and pruning. The person does not grow: it starts with as many discs as there are
+    pixels to tell them apart, and the more lie in one, the farther they reach past the outline."""
 
     width: Annotated[int, AtLeast(1)] = 64
     """Hidden width of the network of what poses do to the person's brightness."""

@@ -48,8 +48,8 @@ class Densify:
     """Last nominal iteration."""
     gradient: Positive
     """A Gaussian is cloned or split above this mean screen-space gradient (NDC units, as 3DGS)."""
-    max_human: Annotated[int, AtLeast(1)]
-    """No clone or split of the person beyond this number of Gaussians."""
+    max_human: Annotated[int, AtLeast(0)]
+    """No clone or split of the person beyond this number of Gaussians; 0: none at all."""
 
     def limits(self, *, cube_max_count: int | None = None) -> dict[Part, DensifyLimits]:
         """Limits of the person as 3DGS-Avatar's, and of a random cube as 3DGS's (A20).

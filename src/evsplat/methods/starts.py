@@ -61,6 +61,8 @@ class Surface:
     """Standard deviation along the surface as a share of the distance between neighbours."""
     flatness: float = 1.0
     """Standard deviation along the normal as a share of the one along the surface."""
+    fewest: int = 2_000
+    """Lower bound of the automatic number of samples, of a person who is small in the picture."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ def human_start(
     feature_dim: int | None = FEATURE_DIM,
 ) -> dict[str, Tensor]:
     """Start values of the person's Gaussians, see `gaussians_at`."""
-    count = config.count or _automatic_count(config, capture, track)
+    count = config.count or _automatic_count(config, surface.fewest, capture, track)
     samples = track.body.sample_surface(count, generator)
     scales = surface.width * nearest_spacing(samples.points)[:, None].repeat(1, 3)
     scales[:, 2] *= surface.flatness
@@ -144,7 +146,9 @@ def human_start(
     )
 
 
-def _automatic_count(config: HumanStart, capture: TrainingCapture, track: BodyTrack) -> int:
+def _automatic_count(
+    config: HumanStart, fewest: int, capture: TrainingCapture, track: BodyTrack
+) -> int:
     """Surface samples so that neighbours lie ``spacing_px`` apart at the person's distance."""
     vertices = track.body.canonical_vertices()
     corners = vertices[track.body.faces]
@@ -155,7 +159,7 @@ def _automatic_count(config: HumanStart, capture: TrainingCapture, track: BodyTr
     _, depth = camera.project(track.vertices(frame.mid_us))
     pixels_per_metre = float(camera.K[0, 0] / depth.median().clamp_min(0.1))
     count = area_m2 * (pixels_per_metre / config.spacing_px) ** 2
-    return int(min(max(count, 2_000), MOST_SAMPLES))
+    return int(min(max(count, fewest), MOST_SAMPLES))
 
 
 def cube(start: SceneStart, capture: TrainingCapture, track: BodyTrack) -> tuple[Tensor, float]:
