@@ -13,6 +13,7 @@ from PIL import Image
 from evsplat.capture import load_body_track, load_capture
 from evsplat.errors import DataError
 from evsplat.inspection import body_mask_overlap, inspect_capture, warn_of_events, warn_of_pictures
+from evsplat.inspection.picture_check import picture_findings
 from evsplat.training.sound import check_events_reach
 
 from ..conftest import write_event_file
@@ -199,6 +200,7 @@ def test_pictures_of_which_nothing_can_be_learned_are_told(
         (lambda i: i - (i % 5 in (1, 3)), 8),  # 3 of 5, as 24 frames a second as 40
         (lambda i: max(i, 9), 0),  # stands still at first
         (lambda i: min(i, 18), 0),  # one repeat may be chance
+        (lambda i: min(i, 16), 0),  # left shortly before the end
     ],
 )
 def test_a_video_exported_with_more_frames_than_were_taken_is_told(
@@ -221,6 +223,31 @@ def test_a_video_exported_with_more_frames_than_were_taken_is_told(
         warn_of_pictures(seen(path))
     told = [message for message in caplog.messages if "the one before once more" in message]
     assert [f"{repeated} of 20 pictures" in message for message in told] == [True] * bool(repeated)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_equal_pictures_without_events_between_them_are_of_somebody_who_stands_still(
+    tiny_capture: Factory, moves: bool
+) -> None:
+    """Pauses of three pictures before a camera without noise look like an export's repeats."""
+    path = tiny_capture(frames=20)
+    document = json.loads((path / "capture.json").read_text())
+    for frame in document["frames"]:
+        frame["split"] = "train"
+    (path / "capture.json").write_text(json.dumps(document))
+    files = [path / frame["image"] for frame in document["frames"]]
+    middles = [sum(frame["exposure_us"]) / 2 for frame in document["frames"]]
+    with h5py.File(path / "events.h5") as file:
+        t, x, y, p = (file[f"events/{name}"][:] for name in "txyp")
+    kept = np.full(len(t), True)
+    for first in (4, 12):
+        for file in files[first + 1 : first + 4]:
+            file.write_bytes(files[first].read_bytes())
+        kept &= (t < middles[first]) | (t > middles[first + 3])
+    if not moves:
+        write_event_file(path / "events.h5", t[kept], x[kept], y[kept], p[kept])
+    told = [found.found for found in picture_findings(seen(path))]
+    assert [text.startswith("6 of 20 pictures") for text in told] == [True] * moves
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -10,7 +10,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from evsplat.calibration import Exposure, exposure
@@ -35,6 +35,9 @@ flicker of lamps is near it; people who move and their shadows make none, howeve
 _MOST_REPEATS, _FEWEST_REPEATED = 3, 0.1
 """Times that a picture is repeated at most, 30 frames of a second as 120, and share of repeats from
 which it is the export that made them."""
+_FEW_EVENTS = 0.25
+"""Share of the events between other pictures below which nothing moved between two: of an export's
+repeats there are as many as ever."""
 _FEWEST_USABLE = 0.1
 """Share of pixels, neither dark nor clipped, of which the brightness of a picture is told."""
 
@@ -111,13 +114,34 @@ def _repeated(capture: TrainingCapture) -> int:
     """Pictures whose file is that of the one before, byte for byte, again and again.
 
     Whoever stands still before a camera without noise makes long runs of equal pictures, and
-    exports with too many frames a second short ones throughout. 0 where they are no such pattern.
+    exports with too many frames a second short ones throughout. 0 where they are no such pattern,
+    as where somebody left shortly before the end, or where events say that nothing moved.
     """
-    files = [frame.image for frame in capture.train_frames]
-    same = [filecmp.cmp(one, other, shallow=False) for one, other in pairwise(files)]
+    pairs = list(pairwise(capture.train_frames))
+    same = [filecmp.cmp(one.image, other.image, shallow=False) for one, other in pairs]
     runs = [len(list(run)) for equal, run in groupby(same) if equal]
-    short = sum(run for run in runs if run <= _MOST_REPEATS)
-    return short if short >= max(3, _FEWEST_REPEATED * len(files)) else 0
+    short = [run for run in runs if run <= _MOST_REPEATS]
+    if len(short) < 2 or sum(short) < max(3, _FEWEST_REPEATED * (len(pairs) + 1)):
+        return 0
+    return 0 if _is_still(capture, pairs, np.array(same)) else sum(short)
+
+
+def _is_still(
+    capture: TrainingCapture, pairs: Sequence[tuple[Frame, Frame]], same: Bool[np.ndarray, "P"]
+) -> bool:
+    """Whether hardly an event came between pictures that are equal, beside others."""
+    events = capture.events
+    if events is None or not len(events):
+        return False
+    counts = np.full(len(pairs), np.nan)
+    for index, (one, other) in enumerate(pairs):
+        stretch = events.readable_around(one.mid_us)
+        if stretch == events.readable_around(other.mid_us):
+            counts[index] = len(events.between(one.mid_us, other.mid_us))
+    between_equal, between_others = (counts[part & ~np.isnan(counts)] for part in (same, ~same))
+    if not len(between_equal) or not len(between_others):
+        return False
+    return bool(np.median(between_equal) < _FEW_EVENTS * np.median(between_others))
 
 
 def _brightness_changes(pictures: Sequence[Exposure]) -> tuple[float, bool]:
