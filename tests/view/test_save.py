@@ -85,7 +85,7 @@ def _run(tiny_capture):
     return Run(Path("none"), config, "evsplat", config.policy, *facts)
 
 
-def in_browser(run, port, act):
+def in_browser(run, port, act, size=(SIDE, SIDE)):
     """Let ``act`` use the viewer of a run as a browser does."""
 
     async def visit(viewer):
@@ -103,8 +103,8 @@ def in_browser(run, port, act):
                     "fov": 0.8,
                     "near": 0.01,
                     "far": 100.0,
-                    "image_height": SIDE,
-                    "image_width": SIDE,
+                    "image_height": size[1],
+                    "image_width": size[0],
                     "look_at": (0.0, 0.0, 0.0),
                     "up_direction": (0.0, -1.0, 0.0),
                 }
@@ -122,6 +122,21 @@ def test_the_picture_comes_with_all_pixels_of_the_window(run):
     name, content = in_browser(run, 18650, lambda browser: browser.download("Picture (PNG)"))
     assert name.startswith(f"{run.capture.name}-") and name.endswith("ms.png")
     assert Image.open(io.BytesIO(content)).size == (SIDE, SIDE)
+
+
+@pytest.mark.parametrize(("size", "opened"), [((390, 844), False), ((844, 390), True)])
+def test_folders_are_folded_where_the_panel_would_lie_over_the_person(run, size, opened):
+    async def act(browser):
+        found = {}
+        while "Save" not in found:
+            for message in await browser.messages():
+                if "expand_by_default" in (message.get("props") or {}):
+                    found[message["props"]["label"]] = message["props"]["expand_by_default"]
+        return found
+
+    found = in_browser(run, 18790 + opened, act, size)
+    outer = ("Time", "Camera", "Show", "Motion and pose", "Save")
+    assert {name: found[name] for name in outer} == dict.fromkeys(outer, opened)
 
 
 def test_a_camera_path_of_key_frames_is_one_that_films_are_made_with(run, tmp_path):

@@ -31,6 +31,8 @@ _SHOWN: dict[str, Shown] = {
 _WHOLE, _EXPOSURE = "the recording", "this exposure"
 _NOTHING = "nothing"
 _RECORDED = "as recorded"
+_UPRIGHT = 0.75
+"""Width by height of a window up to which it is a phone's, held upright."""
 _SLIDER_S = 0.1
 """The time slider follows the picture this often."""
 
@@ -52,15 +54,18 @@ class Panel:
         self._recording_us = self._frames[0].mid_us, self._frames[-1].mid_us
         self._start_us, self._end_us = self._recording_us
         self._motion: str | None = None
-        with self.gui.add_folder("Time"):
+        camera = client.handle.camera
+        # On a phone held upright the panel lies over the picture: opened it hides the person.
+        open_at_first = camera.image_width > _UPRIGHT * camera.image_height
+        with self.gui.add_folder("Time", expand_by_default=open_at_first):
             self._build_time()
-        with self.gui.add_folder("Camera"):
+        with self.gui.add_folder("Camera", expand_by_default=open_at_first):
             self._build_camera()
-        with self.gui.add_folder("Show"):
+        with self.gui.add_folder("Show", expand_by_default=open_at_first):
             self._build_show()
-        with self.gui.add_folder("Motion and pose"):
+        with self.gui.add_folder("Motion and pose", expand_by_default=open_at_first):
             self._build_pose()
-        with self.gui.add_folder("Save"):
+        with self.gui.add_folder("Save", expand_by_default=open_at_first):
             SavePanel(client)
         client.on_drawn = self._follow
 
