@@ -1,5 +1,6 @@
 """Bodies and tracks from body.npz, and the spline's error between real key poses."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,11 +9,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from evsplat.body import default_body, skin
+from evsplat.body import default_body, skin, up_axis
 from evsplat.body.smpl import ENVIRONMENT
 from evsplat.capture import BodyFile, load_body_track, load_capture
 from evsplat.capture.body_track import load_body
 from evsplat.errors import DataError
+from evsplat.inspection import inspect_capture
 
 from ..body.helpers import random_rig, reference_bones, reference_skin
 from ..body.test_smpl import smpl_like
@@ -52,6 +54,31 @@ def test_broken_bodies_are_refused_by_name(change, message):
         load_body(body_file(**{**random_rig(0, joints=4), **change}))
 
 
+@pytest.mark.parametrize("bad", [[0, 0, 0], [0, 1], "z", [0, float("nan"), 1]])
+def test_a_direction_that_cannot_be_up_is_named(tiny_capture, bad):
+    path = tiny_capture()
+    write_up(path, bad)
+    with pytest.raises(DataError, match=r"capture\.json: up: found .*, expected"):
+        load_capture(path)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_what_a_capture_says_is_up_is_up_and_told(tiny_capture, tmp_path, axis):
+    path = tiny_capture()
+    assert "\nup  " not in inspect_capture(path, tmp_path / "before").summary
+    said = np.full(3, 0.2)
+    said[axis] = -3.0
+    write_up(path, said.tolist())
+    assert up_axis(load_body_track(load_capture(path))).tolist() == (-np.eye(3)[axis]).tolist()
+    summary = inspect_capture(path, tmp_path / "out").summary
+    assert f"\nup         -{'xyz'[axis]}, as capture.json says\n" in summary
+
+
+def write_up(path, value):
+    document = json.loads((path / "capture.json").read_text())
+    (path / "capture.json").write_text(json.dumps(document | {"up": value}))
+
+
 def test_unsorted_joints_and_their_poses_move_together():
     rig = random_rig(4, joints=9, shuffled=True)
     rng = np.random.default_rng(4)
@@ -63,6 +90,7 @@ def test_unsorted_joints_and_their_poses_move_together():
     views = [torch.eye(4), torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))]
     capture = SimpleNamespace(
         body_file=file,
+        up=None,
         frames=[0, 1, 1, 1],
         camera=lambda frame: SimpleNamespace(world_to_camera=views[frame]),
     )

@@ -12,7 +12,7 @@ from evsplat.body.rotations import (
 )
 from evsplat.body.silhouette import body_box, silhouette
 from evsplat.body.surface import SurfaceSamples
-from evsplat.body.track import BodyTrack, up_axis
+from evsplat.body.track import BodyTrack, nearest_axis, up_axis
 
 __all__ = [
     "POSE_SOURCES",
@@ -28,6 +28,7 @@ __all__ = [
     "default_body",
     "make_body",
     "matrix_to_quaternion",
+    "nearest_axis",
     "quaternion_multiply",
     "quaternion_to_matrix",
     "retarget",

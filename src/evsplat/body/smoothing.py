@@ -89,6 +89,7 @@ def smoothed(track: BodyTrack, noise: MotionNoise) -> BodyTrack:
         transl,
         errors=track.errors,
         camera_up=track.camera_up,
+        up=track.up,
     )
 
 

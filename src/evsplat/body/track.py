@@ -45,6 +45,7 @@ class BodyTrack:
         source: str = "body track",
         errors: PoseErrors | None = None,
         camera_up: Float[Tensor, "3"] | None = None,
+        up: Float[Tensor, "3"] | None = None,
     ) -> None:
         times = np.asarray(times_us, dtype=np.int64)
         # As they are given: an hour's are kept once, in the file's float32.
@@ -62,6 +63,8 @@ class BodyTrack:
         self.camera_up = camera_up
         """Mean of the unit vectors in the world that lie upwards in the pictures of the cameras
         that recorded the body; None where none did."""
+        self.up = up
+        """Upwards in the world, of any length; None where nobody says, and `up_axis` finds it."""
         self.times_us = times
         self.transl = transl
         seconds = (times - times[0]) * 1e-6
@@ -167,11 +170,17 @@ class BodyTrack:
 
 
 def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
-    """The signed world axis nearest to the body's own up direction, on average over the track.
+    """The signed world axis nearest to ``track.up``; without it, to the body's own up direction.
 
-    Somebody who turns cartwheels points nowhere on average; so what the cameras show upwards counts
-    as well, half as much, since cameras may be turned by 90 degrees.
+    That is on average over the track. Somebody who turns cartwheels points nowhere on average; so
+    what the cameras show upwards counts as well, half as much, since cameras may be turned by 90
+    degrees. Somebody who lies in all of the recording looks to a level camera as somebody who
+    stands looks to one on its side, contact with the floor included (on one's side as standing with
+    closed legs): no motion of theirs tells which it is, and cameras on their side are the more
+    usual ones. Hence ``track.up``.
     """
+    if track.up is not None:
+        return nearest_axis(track.up)
     body = track.body
     legs = find_legs(body.parents.tolist(), body.joint_names)
     rest = body.canonical_vertices()
@@ -186,10 +195,15 @@ def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
     direction = torch.nn.functional.normalize(directions, dim=1).mean(0)
     if track.camera_up is not None:
         direction = direction + _CAMERA_UP_WEIGHT * track.camera_up.to(direction)
-    up = torch.zeros(3)
+    return nearest_axis(direction)
+
+
+def nearest_axis(direction: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """The signed world axis that is nearest to a direction."""
+    nearest = torch.zeros(3)
     axis = int(direction.abs().argmax())
-    up[axis] = direction[axis].sign()
-    return up
+    nearest[axis] = direction[axis].sign()
+    return nearest
 
 
 def _rates(

@@ -54,6 +54,7 @@ def load_body_track(
         source=str(file.path),
         errors=errors,
         camera_up=_camera_up(capture),
+        up=None if capture.up is None else torch.tensor(capture.up),
     )
 
 

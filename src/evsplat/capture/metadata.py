@@ -93,4 +93,6 @@ class Metadata:
     body_source: PoseSource | None
     """Where its poses come from; None where the capture does not say."""
     events: EventsEntry | None
+    up: tuple[float, float, float] | None
+    """Upwards in the world, of any length; None where capture.json does not say."""
     provenance: dict[str, Any]

@@ -57,7 +57,7 @@ def read_metadata(path: Path, findings: Findings) -> Metadata | None:
 
 def _parse(file: Path, document: dict[str, Any], findings: Findings) -> Metadata:
     known = ("format", "version", "name", "cameras", "frames", "novel_views", "body", "events")
-    top = Fields(file, "", document, (*known, "provenance"), findings)
+    top = Fields(file, "", document, (*known, "up", "provenance"), findings)
     cameras, distortions, transfers = parse_cameras(top)
     frames = parse_frames(top, cameras)
     novel_views = parse_novel_views(top, cameras, frames)
@@ -77,8 +77,25 @@ def _parse(file: Path, document: dict[str, Any], findings: Findings) -> Metadata
         body_model=_body_model(body) if body else "",
         body_source=body.choice("source", POSE_SOURCES) if body else None,
         events=_events(top),
+        up=_up(top),
         provenance=provenance if isinstance(provenance, dict) else {"text": str(provenance)},
     )
+
+
+def _up(top: Fields) -> tuple[float, float, float] | None:
+    value = top.numbers("up", (3,), None)
+    if value is None:
+        return None
+    if not value.any():
+        top.fail(
+            "up",
+            str(value.tolist()),
+            "the direction of the world that is upwards, such as [0, 0, 1]",
+            "Correct it, or leave it out to have it found.",
+        )
+        return None
+    x, y, z = value.tolist()
+    return x, y, z
 
 
 def _body(top: Fields) -> Fields | None:

@@ -186,6 +186,11 @@ class CaptureReader:
         return 0 if self._metadata.events is None else self._metadata.events.clock_offset_us
 
     @property
+    def up(self) -> tuple[float, float, float] | None:
+        """Upwards in the world, of any length; None where capture.json does not say."""
+        return self._metadata.up
+
+    @property
     def has_body(self) -> bool:
         """True where body and poses are given."""
         return bool(self._metadata.body_model)

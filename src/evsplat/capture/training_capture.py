@@ -172,6 +172,11 @@ class TrainingCapture:
         return self._source.contrast_threshold if self.policy.thresholds == "given" else None
 
     @property
+    def up(self) -> tuple[float, float, float] | None:
+        """Upwards in the world, of any length; None where nobody says."""
+        return self._source.up
+
+    @property
     def has_body(self) -> bool:
         """True where body and poses are given."""
         return self._source.has_body

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
-from evsplat.body import BodyTrack, silhouette
+from evsplat.body import BodyTrack, nearest_axis, silhouette, up_axis
 from evsplat.calibration import SensorEstimate
 from evsplat.camera import Camera
 from evsplat.capture import estimate_sensor, load_body_track, shared_pairs
@@ -164,6 +166,7 @@ def _summary(
         f"events     {_events_text(capture)}",
         *_sensor_lines(capture, estimate, doubted),
         f"body       {_body_text(capture, track)}",
+        *_up_lines(track),
         f"truth      {_truth_text(capture)}",
     ]
     shown = _spread(frames, DETAIL_FRAMES)
@@ -260,6 +263,28 @@ def _body_text(capture: Capture, track: BodyTrack | None) -> str:
         + ("" if track.errors is None else f", {track.errors.source}")
         + (f"; {len(dense.times_us)} dense true poses" if dense is not None else "")
     )
+
+
+def _up_lines(track: BodyTrack | None) -> list[str]:
+    """Which way is up, where capture.json says so, or the person's body and the cameras differ."""
+    if track is None:
+        return []
+    up = _axis_text(up_axis(track))
+    if track.up is not None:
+        return [f"up         {up}, as capture.json says"]
+    pictures = up if track.camera_up is None else _axis_text(nearest_axis(track.camera_up))
+    if up == pictures:
+        return []
+    return [
+        f"up         {up}, where the person's head mostly is, and not {pictures}, which is up in "
+        'the pictures; somebody who lies needs "up" in capture.json (docs/capture-format.md)'
+    ]
+
+
+def _axis_text(axis: Float[Tensor, "3"]) -> str:
+    """Such as ``-y``."""
+    index = int(axis.abs().argmax())
+    return f"{'-' if axis[index] < 0 else '+'}{'xyz'[index]}"
 
 
 def _truth_text(capture: Capture) -> str:

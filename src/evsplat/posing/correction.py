@@ -95,6 +95,7 @@ class Correction(nn.Module):
             source="corrected motion",
             errors=errors,
             camera_up=self.track.camera_up,
+            up=self.track.up,
         )
 
     @property

@@ -88,6 +88,7 @@ def between(track: BodyTrack, start_us: int, end_us: int) -> BodyTrack:
         source="piece of a motion",
         errors=errors,
         camera_up=track.camera_up,
+        up=track.up,
     )
 
 
@@ -126,6 +127,7 @@ def joined(pieces: Sequence[Piece], tracks: Sequence[BodyTrack]) -> BodyTrack:
         source="joined motion",
         errors=errors,
         camera_up=first.camera_up,
+        up=first.up,
     )
 
 
