@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from evsplat.inspection.event_check import event_findings
+from evsplat.inspection.event_check import event_findings, flicker_findings
 
 from ..conftest import write_event_file
 from ..seen import seen
@@ -39,3 +39,25 @@ def test_events_warped_to_half_the_size_are_not_called_lost(
     write_event_file(path / "events.h5", *changed(*columns))
     (finding,) = event_findings(seen(path))
     assert finding.field == field and likeliest in str(finding)
+
+
+@pytest.mark.parametrize("hertz", [100, 120])
+def test_lamps_that_flicker_are_told(tiny_capture: Callable[..., Path], hertz: int) -> None:
+    width, height = 64, 48
+    path = tiny_capture(frames=12, width=width, height=height)
+    assert flicker_findings(seen(path)) == []
+    with h5py.File(path / "events.h5") as file:
+        t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
+    y_all, x_all = (places.ravel() for places in np.mgrid[:height, :width])
+    halves = np.arange(t[0], t[-1], 5e5 / hertz).astype(np.int64)
+    more = (
+        np.repeat(halves, len(x_all)),
+        np.tile(x_all, len(halves)),
+        np.tile(y_all, len(halves)),
+        np.repeat(np.arange(len(halves)) % 2, len(x_all)),
+    )
+    t, x, y, p = (np.concatenate(both) for both in zip((t, x, y, p), more, strict=True))
+    order = np.argsort(t, kind="stable")
+    write_event_file(path / "events.h5", *(column[order] for column in (t, x, y, p)))
+    (finding,) = flicker_findings(seen(path))
+    assert f"in turns, {hertz} times a second" in str(finding)

@@ -133,3 +133,17 @@ def test_the_person_grows_where_that_is_asked_for(tiny_capture, tmp_path):
         run = train(path, out=tmp_path / name, iterations=12, overrides=settings)
         counts[name] = load_run(run).reconstruction.model.gaussians.human_count
     assert counts["by default"] <= 120 < counts["asked for"] <= 150
+
+
+@pytest.mark.parametrize(
+    ("found_us", "purpose"), [(None, "train"), (9_990, "train"), (9_990, "resume")]
+)
+def test_counts_are_averaged_over_the_period_of_lamps_that_flicker(
+    tiny_capture, monkeypatch, found_us, purpose
+):
+    monkeypatch.setattr("evsplat.methods.sensor.flicker_period_us", lambda *_: found_us)
+    objectives = built("evsplat", tiny_capture(), purpose=purpose).objectives
+    (windows,) = (each for each in objectives if isinstance(each, EventWindows))
+    assert windows.flicker_us == (found_us or 0)
+    # All of such a picture would count as noise.
+    assert windows.noise.aware == (found_us is None)

@@ -85,10 +85,12 @@ def step_at(times: tuple[int, ...], linear: torch.Tensor) -> StepAt:
     return StepAt(times_us=times, linear=linear, nominal=5_000.0, frame=frame)
 
 
-def make(capture, on: float, off: float, ramp_us: int = 0, **learned) -> EventWindows:
+def make(
+    capture, on: float, off: float, ramp_us: int = 0, flicker_us: int = 0, **learned
+) -> EventWindows:
     sensor = EventSensor(on, off, **learned).double()
     generator = torch.Generator().manual_seed(0)
-    options = {"start": 750, "eps": EPS, "reach": 0.5}
+    options = {"start": 750, "eps": EPS, "reach": 0.5, "flicker_us": flicker_us}
     noise = EventNoise(capture.events, aware=False)
     return EventWindows(capture, sensor, generator, noise=noise, ramp_us=ramp_us, **options)
 
@@ -375,3 +377,68 @@ def test_the_compiled_comparison_and_its_gradients_are_those_of_the_plain_one(ra
     for plain, compiled in zip(*results, strict=True):
         assert plain.abs().max() > 0
         assert (compiled - plain).abs().max() < 1e-5 * plain.abs().max()
+
+
+def flickering(seed: int, period_us: int):
+    """`scene`, and each pixel once brighter and once darker in every period, when it pleases."""
+    capture, step = scene(seed)
+    rng = np.random.default_rng(seed + 100)
+    y, x = (places.ravel() for places in np.mgrid[:HEIGHT, :WIDTH])
+    starts = np.arange(-20 * period_us, 30_000, period_us)
+    # Whole tenths of a period, at which the mean over ten instants is exact.
+    tenths = period_us // 10
+    first, later = (tenths * rng.integers(0, 10, len(x)) for _ in range(2))
+    columns = [[events] for events in (capture.events.stream.t, *_places(capture.events.stream))]
+    for start in starts:
+        for shift, sign in ((first, 1), (later, -1)):
+            for column, values in zip(columns, (start + shift, x, y, 0 * x + sign), strict=True):
+                column.append(values)
+    t, x, y, p = (np.concatenate(column) for column in columns)
+    order = np.argsort(t, kind="stable")
+    stream = EventStream(
+        t[order].astype(np.int64),
+        x[order].astype(np.uint16),
+        y[order].astype(np.uint16),
+        p[order].astype(np.int8),
+    )
+    capture.events.stream = stream
+    capture.events.time_range_us = (int(stream.t[0]), int(stream.t[-1]) + 1)
+    return capture, step
+
+
+def _places(stream: EventStream) -> tuple[np.ndarray, ...]:
+    return stream.x, stream.y, stream.p
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_over_whole_periods_lamps_change_nothing(seed):
+    """What flickers adds exactly nothing; what else is reported is its mean over the period."""
+    period_us, lit = 800, 0.25
+    with_it, step = flickering(seed, period_us)
+    without, _ = scene(seed)
+    without.events.time_range_us = with_it.events.time_range_us
+    given, expected = (
+        make(capture, lit, lit, flicker_us=period_us).differences(step, slice(None))
+        for capture in (with_it, without)
+    )
+    assert float((given - expected).abs().max()) < 1e-6
+    as_they_are = make(with_it, lit, lit).differences(step, slice(None))
+    true = make(without, lit, lit).differences(step, slice(None))
+    assert float((as_they_are - true).abs().mean()) > 0.05
+
+
+@pytest.mark.parametrize("reach_us", [0, 40_000])
+def test_a_mean_over_a_period_asks_for_no_event_that_is_held_out(reach_us):
+    """Instants whose whole period may not be read are not compared."""
+    period_us = 800
+    capture, step = flickering(0, period_us)
+    objective = make(capture, 0.3, 0.2, ramp_us=reach_us, flicker_us=period_us)
+    capture.events.readable_us = ((0, 8_000),)
+    step.frame = SimpleNamespace(mid_us=5_000)
+    step.times_us = (300, 2_500, 7_000, 7_700)
+    assert objective.readable(step) == slice(1, 3)
+    assert set(objective.loss(step)) == {"event", "contrast"}
+    frame = SimpleNamespace(mid_us=5_000, exposure_us=(1_000, 7_000))
+    for _ in range(50):
+        (time,) = objective.times(frame, 1_000)
+        assert 400 <= time <= 7_600

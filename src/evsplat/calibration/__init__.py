@@ -15,6 +15,7 @@ from evsplat.calibration.brightness import (
     pair_indices,
 )
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
+from evsplat.calibration.flicker import flicker_period_us
 from evsplat.calibration.lost import answered_share, came_elsewhere, lost_spans
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
@@ -33,6 +34,7 @@ __all__ = [
     "came_elsewhere",
     "estimate_disagreement",
     "estimate_from_pairs",
+    "flicker_period_us",
     "lost_spans",
     "noise_of",
     "exposure",

@@ -35,7 +35,12 @@ from evsplat.inspection.drawing import (
     short_number,
     to_picture,
 )
-from evsplat.inspection.event_check import WHICH_WAY, event_findings, warn_of_events
+from evsplat.inspection.event_check import (
+    WHICH_WAY,
+    event_findings,
+    flicker_findings,
+    warn_of_events,
+)
 from evsplat.inspection.picture_check import picture_findings, warn_of_pictures
 from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings, contrast_findings, sensor_lines
@@ -89,6 +94,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
         *found,
         *picture_findings(seen),
         *of_events,
+        *flicker_findings(seen),
         *clock_findings(capture, estimate),
         *contrast_findings(capture, estimate),
     )

@@ -7,6 +7,7 @@ from evsplat.calibration import (
     answered_share,
     came_elsewhere,
     estimate_disagreement,
+    flicker_period_us,
     lost_spans,
 )
 from evsplat.capture import TrainingCapture
@@ -87,9 +88,26 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
     return findings.items
 
 
+def flicker_findings(capture: TrainingCapture) -> list[Finding]:
+    """A warning where lamps flicker, of which a camera with long exposures shows nothing."""
+    findings = Findings()
+    period_us = None if capture.events is None else flicker_period_us(capture.events)
+    if capture.events is not None and period_us is not None:
+        findings.warning(
+            capture.events.path, "",
+            f"all of the picture brighter and darker in turns, {1e6 / period_us:.0f} times a "
+            "second, as lamps flicker",
+            "light that is even",
+            "Method evsplat counts events over whole periods, which costs little; other methods, "
+            "restore and the estimate of noise take them as they are. Better is light that does "
+            "not flicker.",
+        )  # fmt: skip
+    return findings.items
+
+
 def warn_of_events(capture: TrainingCapture) -> None:
-    """Log what `event_findings` finds, before a training that learns from these events."""
-    for finding in event_findings(capture):
+    """Log what is found about events, before a training that learns from them."""
+    for finding in event_findings(capture) + flicker_findings(capture):
         logger.warning("%s", finding)
 
 

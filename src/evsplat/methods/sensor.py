@@ -4,7 +4,7 @@ import logging
 
 import torch
 
-from evsplat.calibration import SensorEstimate
+from evsplat.calibration import SensorEstimate, flicker_period_us
 from evsplat.capture import TrainingCapture, estimate_sensor, warn_of_linear_frames
 from evsplat.methods.base import Purpose
 from evsplat.methods.evsplat_settings import EvsplatConfig
@@ -45,7 +45,12 @@ def event_windows(
     sensor = EventSensor(*known, late_us=late_us).to(device)
     model.sensor = sensor
     around_us = minute_around([frame.exposure_us for frame in capture.train_frames])
-    noise = EventNoise(capture.events, during_us=around_us, aware=config.event_noise_aware)
+    events, flicker_us = capture.events, 0
+    if purpose != "draw":
+        flicker_us = flicker_period_us(events, around_us) or 0
+    # All of a flickering picture sends events that nothing moves; they are averaged out instead.
+    aware = config.event_noise_aware and not flicker_us
+    noise = EventNoise(events, during_us=around_us, aware=aware)
     if purpose != "draw":
         noise.measure()
     return EventWindows(
@@ -58,6 +63,7 @@ def event_windows(
         reach=config.event_reach,
         ramp_us=config.event_ramp_us,
         hue_from=config.event_hue_from,
+        flicker_us=flicker_us,
     )
 
 

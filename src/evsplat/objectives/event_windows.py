@@ -2,8 +2,9 @@
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import accumulate
 from typing import Any
 
@@ -22,6 +23,8 @@ from evsplat.objectives.event_sensor import EventNoise, EventSensor
 
 _RATE_US = 1_000
 """Time before and after an instant in which events are counted for their rate there."""
+_PARTS = 10
+"""Of a period of flicker, over which counts are averaged."""
 RENDERS = 3
 """Rendered times around a held-out frame."""
 _SILENT_FRAMES = 2
@@ -46,6 +49,9 @@ class EventWindows(Objective):
     blue, and the frames pull back at all channels alike: what comes of it is a tint. From nominal
     iteration ``hue_from`` on all channels are pulled at alike (`evsplat.pictures.log_luminance`).
 
+    Where lamps flicker, counts up to a time are the mean over a period about it: in that every
+    pixel is as often brighter as darker.
+
     Where events have no polarity the size of the change is compared with their number, between
     neighbouring times only: over a longer span what went up and down again is in the number alone.
     """
@@ -62,11 +68,13 @@ class EventWindows(Objective):
         reach: float = 0.5,
         ramp_us: int = 0,
         hue_from: float = math.inf,
+        flicker_us: int = 0,
     ) -> None:
         """``start`` in nominal iterations; ``eps`` is added to linear luminance.
 
         Between events of one polarity at most ``ramp_us`` apart brightness changes evenly
-        (`begun_counts`); 0: all at once, when the second one tells.
+        (`begun_counts`); 0: all at once, when the second one tells. ``flicker_us``: the period in
+        which lamps flicker; 0: they do not.
         """
         assert capture.events is not None
         self.events = capture.events
@@ -79,7 +87,7 @@ class EventWindows(Objective):
         self.range_us = (min(mids), max(mids))
         self.recorded_us = _recorded(self.events, capture.train_frames, self.interval_us)
         self.noise = noise
-        self.ramp_us = ramp_us
+        self.ramp_us, self.flicker_us = ramp_us, flicker_us
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """One time outside of the exposure; none where there is no room on either side."""
@@ -87,7 +95,7 @@ class EventWindows(Objective):
             return ()
         draw = torch.rand(2, generator=self.generator).tolist()
         start, end = frame.exposure_us
-        low, high = self._known_around(frame)
+        low, high = self._told_around(frame)
         if end <= low or start >= high:
             return ()
         before = min(self.reach_us, start - max(low, self.range_us[0]))
@@ -103,7 +111,7 @@ class EventWindows(Objective):
         if nominal < self.start or data.device.type == "cpu":
             return
         low, high = self._known_around(frame)
-        reach = int(self.reach_us) + max(_RATE_US, self.ramp_us)
+        reach = int(self.reach_us) + self._looks_around_us
         start, end = (time + self._late_us for time in frame.exposure_us)
         self.blocks.prefetch(data, max(start - reach, low), min(end + reach, high))
 
@@ -124,7 +132,7 @@ class EventWindows(Objective):
 
     def readable(self, step: Step) -> slice:
         """The part of a step's times between which events are known, by the events' clock."""
-        low, high = self._known_around(step.frame)
+        low, high = self._told_around(step.frame)
         late = [time + self._late_us for time in step.times_us]
         return slice(bisect_left(late, low), bisect_right(late, high))
 
@@ -135,6 +143,21 @@ class EventWindows(Objective):
         """
         low, high = self.events.readable_around(frame.mid_us)
         return max(low, self.recorded_us[0]), min(high, self.recorded_us[1])
+
+    def _told_around(self, frame: Frame) -> Span:
+        """The part of it at whose times all events are known that count for them."""
+        low, high = self._known_around(frame)
+        return low + self.flicker_us // 2, high - self.flicker_us // 2
+
+    @property
+    def _looks_around_us(self) -> int:
+        """Time before and after an instant whose events say something of it."""
+        return max(self._rate_us, self.ramp_us + self.flicker_us // 2)
+
+    @property
+    def _rate_us(self) -> int:
+        """Time before and after an instant in which events are counted for their rate there."""
+        return max(_RATE_US, self.flicker_us // 2)
 
     @property
     def _late_us(self) -> int:
@@ -156,10 +179,10 @@ class EventWindows(Objective):
         # A sensor compares logarithms of light, before any transfer curve of a camera.
         pulls_at_all = step.nominal >= self.hue_from
         brightness = step.pictures.log_luminance(self.eps, kept, keeps_hue=pulls_at_all)
-        reach = max(_RATE_US, self.ramp_us)
+        reach, rate_us = self._looks_around_us, self._rate_us
         within = max(late[0] - reach, low), min(late[-1] + reach, high)
         # Events per microsecond at each instant tell what a later clock would have counted.
-        around = [(max(time - _RATE_US, low), min(time + _RATE_US, high)) for time in late]
+        around = [(max(time - rate_us, low), min(time + rate_us, high)) for time in late]
         drifts = self.sensor.offset_us is not None and self.events.has_polarity
         counts, maps = self._counted(step.data, late, within, around if drifts else [])
         drift = None
@@ -182,13 +205,27 @@ class EventWindows(Objective):
         ramp_us = self.ramp_us if self.events.has_polarity else 0
         if data.device.type != "cpu":
             events = self.blocks.between(data, *within_us)
-            counts = events.window_counts(late_us, within_us, reach_us=ramp_us)
+            counts = self._averaged(
+                lambda times: events.window_counts(times, within_us, reach_us=ramp_us), late_us
+            )
             return counts, events.counts_around(around_us) if around_us else None
         size = self.events.height, self.events.width
         stream = self.events.between(*within_us)
-        counts = window_counts(stream, late_us, *size, reach_us=ramp_us)
+        counts = self._averaged(
+            lambda times: window_counts(stream, times, *size, reach_us=ramp_us), late_us
+        )
         maps = [polarity_counts(stream.between(*span), *size) for span in around_us]
         return counts, torch.stack(maps) if maps else None
+
+    def _averaged(
+        self, count: Callable[[Sequence[int]], Tensor], times_us: Sequence[int]
+    ) -> Tensor:
+        """What is counted between times, on average over a period of flicker about each."""
+        if not self.flicker_us:
+            return count(times_us)
+        shifts = [round(self.flicker_us * ((k + 0.5) / _PARTS - 0.5)) for k in range(_PARTS)]
+        maps = (count([time + shift for time in times_us]) for shift in shifts)
+        return reduce(torch.add, maps) / _PARTS
 
     def _differences(self, seen: "_Seen") -> Float[Tensor, "T-1 H W"]:
         changes = seen.brightness[1:] - seen.brightness[:-1]
