@@ -232,6 +232,18 @@ def test_an_empty_room_is_refused_after_a_few_pictures(training, network, monkey
     assert len(looked) == 2
 
 
+def test_pictures_before_somebody_enters_have_no_landmarks(training, network):
+    room, enters = training.median_background(), 14
+    late = Changed(training, lambda picture, index: picture if index >= enters else room)
+    late.events = None
+    pictures = blurry(late, 3)
+    indices = [picture.frame.index for picture in pictures]
+    assert 3 <= sum(index < enters for index in indices) < len(indices) - 2
+    found = find_landmarks(late, pictures, network=network, progress=False)
+    expected = [p.time_us for p in pictures if p.frame.index >= enters]
+    assert found.times_us.tolist() == expected
+
+
 @pytest.mark.parametrize("shown", [1, 2])
 def test_furniture_that_is_once_taken_for_somebody_is_nobody(training, middles, shown):
     answers = iter([True] * shown + [False] * 6)

@@ -76,6 +76,46 @@ def test_a_capture_without_poses_gets_some(unposed, tmp_path):
     assert (path / "capture.json").read_bytes() == before
 
 
+@pytest.mark.parametrize(("entered", "left"), [(0, 10), (3, 10), (0, 6), (2, 7)])
+def test_frames_without_the_person_at_either_end_are_left_out(
+    unposed, tmp_path, monkeypatch, caplog, entered, left
+):
+    path, points = unposed
+    frames = load_capture(path, needs_body=False).frames
+    found = find._landmarks
+
+    def of_somebody(capture, pictures, keypoints):
+        points = found(capture, pictures, keypoints)
+        rows = [
+            frames[entered].mid_us <= time <= frames[left - 1].mid_us for time in points.times_us
+        ]
+        return replace(
+            points,
+            times_us=points.times_us[rows],
+            places=points.places[rows],
+            sigma_px=points.sigma_px[rows],
+            seen=points.seen[rows],
+        )
+
+    monkeypatch.setattr(find, "_landmarks", of_somebody)
+    out = tmp_path / "new"
+    find_poses(path, out, keypoints=points, height_m=1.8, refine_s=0)
+    new = load_capture(out)
+    # Of held-out frames nothing is known where no training frame after them is empty.
+    known = any(frame.split == "train" for frame in frames[left:])
+    kept = frames[entered : left if known else None]
+    assert [(frame.name, frame.split) for frame in new.frames] == [
+        (frame.name, frame.split) for frame in kept
+    ]
+    times = load_body_track(new).times_us
+    assert times[0] == kept[0].exposure_us[0] and times[-1] == kept[-1].exposure_us[1]
+    assert not [finding for finding in validate_capture(out) if finding.severity == "error"]
+    pictures = {file.name for file in (out / "images").iterdir()}
+    assert pictures == {frame.image.name for frame in new.frames}
+    said = f"in {entered} frames before" if entered != 1 else "in 1 frame before"
+    assert (said in caplog.text) == (len(kept) < len(frames))
+
+
 def test_pictures_and_key_points_of_held_out_frames_change_nothing(unposed, tmp_path, fits):
     path, points = unposed
     first = find_poses(path, tmp_path / "first", keypoints=points, refine_s=0)

@@ -51,6 +51,14 @@ class CaptureReader:
         frames = tuple(replace(frame, split="train") for frame in self.frames)
         return type(self)(replace(self._metadata, frames=frames))
 
+    def of_frames(self, frames: Sequence[Frame]) -> Self:
+        """The same recording without its other frames, and the novel views at their times."""
+        kept = tuple(replace(frame, index=index) for index, frame in enumerate(frames))
+        names = {frame.name for frame in kept}
+        views = [view for view in self.novel_views if view.frame in names]
+        numbered = tuple(replace(view, index=index) for index, view in enumerate(views))
+        return type(self)(replace(self._metadata, frames=kept, novel_views=numbered))
+
     def with_focal(self, focal_px: float) -> Self:
         """The same recording by cameras of another focal length, but for those of novel views."""
         cameras = dict(self.cameras)

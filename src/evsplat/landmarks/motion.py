@@ -22,6 +22,8 @@ JOINED = 3
 _EVENT_SHARE = 0.25
 """A pixel moves where it has this share of the events of the busiest percent of pixels."""
 _SMOOTHING_PX = 1.5
+_STILL, _USUAL = 0.2, 75
+"""Less than this share of the pixels that move in a frame of this percentile is next to nothing."""
 _LEAST_AREA = 0.002
 """Pieces smaller than this share of the picture are noise."""
 
@@ -58,11 +60,12 @@ class Motion:
         self.frames: list[Frame] = sorted(capture.train_frames, key=lambda frame: frame.mid_us)
         self.background: Float[Tensor, "H W 3"] = capture.median_background()
         self._mids = np.array([frame.mid_us for frame in self.frames])
-        maps = [self._moving(capture, frame) for frame in self.frames]
+        own = [self._moving(capture, frame) for frame in self.frames]
         self._maps = [
-            np.logical_or.reduce(maps[max(0, k - JOINED) : k + JOINED + 1])
-            for k in range(len(maps))
+            np.logical_or.reduce(own[max(0, k - JOINED) : k + JOINED + 1]) for k in range(len(own))
         ]
+        shares = np.array([one.mean() for one in own])
+        self._still = shares < _STILL * np.percentile(shares, _USUAL)
         self._pieces: dict[int, list[Box]] = {}
 
     def nearest(self, time_us: int) -> int:
@@ -79,6 +82,13 @@ class Motion:
         if index not in self._pieces:
             self._pieces[index] = pieces(self._maps[index])
         return self._pieces[index]
+
+    def is_still(self, time_us: int) -> bool:
+        """Whether next to nothing moves in the training frame nearest in time, beside others.
+
+        The median of a recording in which the person is half of the time holds some of them.
+        """
+        return bool(self._still[self.nearest(time_us)])
 
     def _moving(self, capture: TrainingCapture, frame: Frame) -> Bool[np.ndarray, "H W"]:
         """Differences to the background, and pixels with many events during the exposure."""

@@ -54,7 +54,10 @@ def find_landmarks(
     network: LandmarkNetwork,
     progress: bool = True,
 ) -> Landmarks:
-    """The person's 33 landmarks in each picture (of `sharp_pictures`), in order of time.
+    """The person's 33 landmarks in pictures (of `sharp_pictures`), in order of time.
+
+    In all but those in which nobody is recognised and nothing but the background is seen: somebody
+    may enter late, or leave.
 
     Raises:
         DataError: nobody is found in most pictures, there are two people, most of the person is
@@ -67,7 +70,9 @@ def find_landmarks(
     capture = coded(capture)
     motion = Motion(capture)
     tracker = _Tracker(network, motion)
-    refuse_empty(capture, _spread(pictures), lambda picture: tracker.search_anew(picture).is_person)
+    busy = [picture for picture in pictures if not motion.is_still(picture.time_us)]
+    first = _spread(busy or pictures)
+    refuse_empty(capture, first, lambda picture: tracker.search_anew(picture).is_person)
     found = [
         tracker.find(picture)
         for picture in tqdm(
@@ -75,6 +80,13 @@ def find_landmarks(
         )
     ]
     tracker.look_back(pictures, found)
+    shown = [
+        (picture, person)
+        for picture, person in zip(pictures, found, strict=True)
+        if person.is_person or not motion.is_still(picture.time_us)
+    ]
+    if shown:
+        pictures, found = ([*each] for each in zip(*shown, strict=True))
     refuse_nobody(capture, pictures, found)
     places = np.stack([person.places for person in found])
     refuse_moving_camera(capture, (pictures, places))

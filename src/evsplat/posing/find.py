@@ -37,6 +37,7 @@ from evsplat.posing.page import poses_page
 from evsplat.posing.problem import FitSettings
 from evsplat.posing.refine import FOUND_STEPS, Refined, refine
 from evsplat.posing.rig import Rig, default_rig, make_rig
+from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +95,8 @@ def find_poses(
 
     Landmarks on sharpened pictures (`evsplat.landmarks`; or the key points of a file), and a motion
     fitted to them (`fit_landmarks`), corrected by drawing the person (`refine`), which is taken
-    where it explains pictures better that it has not seen. Of the capture is seen what its policy
+    where it explains pictures better that it has not seen. Frames before the person enters and
+    after they have left are left out. Of the capture is seen what its policy
     shows: by default no picture, mask or event of a held-out interval. Poses that the capture has
     are ignored; its true poses between keys, of another body, are left out of the new one.
     ``poses.html`` in the new capture shows what was found. ``overwrite`` replaces a folder that is
@@ -123,6 +125,9 @@ def find_poses(
     }
     landmarks, fitted, track = motion.landmarks, motion.fitted, motion.track
     with derived_capture(capture, out, replace=overwrite) as making:
+        shown = {frame.name for frame in motion.seen.frames}
+        if len(shown) < len(capture.frames):
+            making.keep([frame for frame in capture.frames if frame.name in shown])
         _write_body(making, track, fitted, motion.dressed)
         if motion.focal_px is not None:
             _set_focal(making, motion.focal_px)
@@ -189,6 +194,8 @@ def _found(
         with stages(bar, "landmarks"):
             pictures = sharp_pictures(seen)
             landmarks = _landmarks(seen, pictures, keypoints)
+            capture = _with_somebody(capture, pictures, landmarks)
+            seen = _seen(capture, policy, focal_px)
         with stages(bar, "fit"):
             fitted = _fit(seen, landmarks, rig, search)
             if search.focal == "auto":
@@ -233,6 +240,36 @@ def _landmarks(
         sigma_px=points.sigma_px[shown],
         seen=points.seen[shown],
     )
+
+
+def _with_somebody(
+    capture: Capture, pictures: Sequence[SharpPicture], landmarks: Landmarks
+) -> Capture:
+    """Without the frames before the person enters and after they have left.
+
+    Those in between stay: their poses follow from the rest.
+    """
+    looked_at = {picture.frame.name for picture in pictures}
+    told = set(landmarks.times_us.tolist())
+    mids = [picture.frame.mid_us for picture in pictures if picture.time_us in told]
+    before = [frame for frame in capture.frames if mids and frame.mid_us < min(mids)]
+    after = [frame for frame in capture.frames if mids and frame.mid_us > max(mids)]
+    empty = {
+        frame.name
+        for side in (before, after)
+        if any(frame.name in looked_at for frame in side)
+        for frame in side
+    }
+    if not empty:
+        return capture
+    logger.warning(
+        "%s: nobody is in the picture in %s before the person enters and %s after they have left, "
+        "which are left out.",
+        capture.path,
+        counted(sum(frame.name in empty for frame in before), "frame"),
+        counted(sum(frame.name in empty for frame in after), "frame"),
+    )
+    return capture.of_frames([frame for frame in capture.frames if frame.name not in empty])
 
 
 def key_times(capture: TrainingCapture) -> list[int]:
