@@ -18,7 +18,8 @@ from evsplat.benching.cell import run_cell
 from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.benching.plan import make_plan
 from evsplat.benching.suite import read_suite
-from evsplat.capture import Policy, load_capture
+from evsplat.capture import load_capture
+from evsplat.capture.policy import Terms
 from evsplat.cli import main
 from evsplat.errors import ConfigError
 from evsplat.evaluation import evaluate
@@ -229,10 +230,10 @@ def test_a_cell_is_made_by_its_own_policy_and_says_so(tiny_capture, tmp_path):
         record = read_json(folder.record_of(cell.id))
         assert record["status"] == "done", record
         found[cell.row] = record["policy"]
-        assert record["cell"]["policy"] == found[cell.row]
-    assert found["strict"] == asdict(Policy())
-    assert found["estimated"] == asdict(Policy(thresholds="estimated"))
-    assert found["interpolated"] == asdict(Policy(held_out_poses="interpolated"))
+        assert found[cell.row] == {**record["cell"]["policy"], "events": True}
+    assert found["strict"] == asdict(Terms())
+    assert found["estimated"] == asdict(Terms(thresholds="estimated"))
+    assert found["interpolated"] == asdict(Terms(held_out_poses="interpolated"))
     # EDI's thresholds are part of what it may see; poses are not
     names = {restored.name for restored in folder.captures.iterdir() if restored.is_dir()}
     assert names == {"one-edi", "one-edi-thresholds-estimated"}

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from evsplat.landmarks.refusals import (
     refuse_half_out_of_view,
     refuse_moving_camera,
 )
-from evsplat.landmarks.track import _seen, _sigma, _Tracker
+from evsplat.landmarks.track import _of_somebody, _seen, _sigma, _Tracker
 from evsplat.shipped import demo_capture
 
 JOINTS = {"shoulder": "upper_arm", "elbow": "forearm", "knee": "shin", "ankle": "foot"}
@@ -242,6 +243,30 @@ def test_pictures_before_somebody_enters_have_no_landmarks(training, network):
     found = find_landmarks(late, pictures, network=network, progress=False)
     expected = [p.time_us for p in pictures if p.frame.index >= enters]
     assert found.times_us.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("moves", "recognised", "kept"),
+    [
+        ("0000 1111", "0000 1111", "0000 1111"),
+        ("0000 1111", "0100 1101", "0000 1111"),  # furniture; somebody hardly recognised
+        ("0000 1111", "1101 1111", "1111 1111"),  # somebody who stands still at first
+        ("1100 0011", "1100 0011", "1100 0011"),
+        ("1111 0000", "1110 0010", "1111 0000"),
+        ("0000 0000", "0100 0000", "1111 1111"),  # nobody at all, which is refused
+    ],
+)
+def test_stretches_that_show_nobody_are_left_out(moves, recognised, kept):
+    moves, recognised, kept = (
+        [mark == "1" for mark in marks if mark != " "] for marks in (moves, recognised, kept)
+    )
+    motion = SimpleNamespace(is_still=lambda time: not moves[time])
+    pictures = [SimpleNamespace(time_us=index) for index in range(len(moves))]
+    found = [SimpleNamespace(is_person=person) for person in recognised]
+    of_somebody, persons = _of_somebody(motion, pictures, found)
+    expected = [index for index, keep in enumerate(kept) if keep]
+    assert [picture.time_us for picture in of_somebody] == expected
+    assert persons == [found[index] for index in expected]
 
 
 @pytest.mark.parametrize("shown", [1, 2])

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 
 import numpy as np
 from jaxtyping import Float
@@ -56,8 +57,8 @@ def find_landmarks(
 ) -> Landmarks:
     """The person's 33 landmarks in pictures (of `sharp_pictures`), in order of time.
 
-    In all but those in which nobody is recognised and nothing but the background is seen: somebody
-    may enter late, or leave.
+    In all but stretches in which nothing moves and hardly anybody is recognised: somebody may
+    enter late, or leave.
 
     Raises:
         DataError: nobody is found in most pictures, there are two people, most of the person is
@@ -80,13 +81,7 @@ def find_landmarks(
         )
     ]
     tracker.look_back(pictures, found)
-    shown = [
-        (picture, person)
-        for picture, person in zip(pictures, found, strict=True)
-        if person.is_person or not motion.is_still(picture.time_us)
-    ]
-    if shown:
-        pictures, found = ([*each] for each in zip(*shown, strict=True))
+    pictures, found = _of_somebody(motion, pictures, found)
     refuse_nobody(capture, pictures, found)
     places = np.stack([person.places for person in found])
     refuse_moving_camera(capture, (pictures, places))
@@ -108,6 +103,23 @@ def find_landmarks(
         np.stack([person.world for person in found]),
         BLAZEPOSE_33,
     )
+
+
+def _of_somebody(
+    motion: Motion, pictures: Sequence[SharpPicture], found: Sequence[Found]
+) -> tuple[list[SharpPicture], list[Found]]:
+    """Without stretches in which nothing moves and most pictures show nobody; all if none is left.
+
+    Most, since furniture may once be taken for somebody.
+    """
+    shown: list[tuple[SharpPicture, Found]] = []
+    both = list(zip(pictures, found, strict=True))
+    for still, stretch in groupby(both, lambda one: motion.is_still(one[0].time_us)):
+        part = list(stretch)
+        if not still or 2 * sum(person.is_person for _, person in part) >= len(part):
+            shown += part
+    kept = shown or both
+    return [picture for picture, _ in kept], [person for _, person in kept]
 
 
 def _spread(pictures: Sequence[SharpPicture]) -> list[SharpPicture]:
