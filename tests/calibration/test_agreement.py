@@ -119,13 +119,21 @@ def test_events_that_lie_in_other_pixels_are_told_from_lost_ones() -> None:
 
 @pytest.mark.parametrize("lag_us", [0, 15_000])
 def test_pixels_that_change_very_much_have_events_unless_the_sensor_is_coarser(lag_us) -> None:
-    """As of a sensor with a third of the pixels' columns and rows, warped to the frames."""
-    seed = int(np.random.default_rng().integers(10_000))
-    recording = record(seed, plus=0.35, minus=0.4, lag_us=lag_us, noise_hz=1.0)
-    share = answered_share(recording.pairs, recording.events)
-    assert share is not None and share > 0.85
-    x, y = recording.events.x, recording.events.y
-    coarse = recording.events.take((x % 3 == 1) & (y % 3 == 1))
-    assert answered_share(recording.pairs, coarse) == pytest.approx(share / 9, abs=0.06)
+    """As of a sensor with a third of the pixels' columns and rows, warped to the frames.
+
+    How many of the few pixels that change so much lie on them varies by 0.03 from one recording to
+    the next: in the mean of six by 0.012.
+    """
+    off = []
+    for seed in np.random.default_rng().integers(10_000, size=6):
+        recording = record(int(seed), plus=0.35, minus=0.4, lag_us=lag_us, noise_hz=1.0)
+        share = answered_share(recording.pairs, recording.events)
+        assert share is not None and share > 0.85
+        x, y = recording.events.x, recording.events.y
+        coarse = recording.events.take((x % 3 == 1) & (y % 3 == 1))
+        answered = answered_share(recording.pairs, coarse)
+        assert answered is not None
+        off.append(answered - share / 9)
+    assert np.mean(off) == pytest.approx(0, abs=0.06)
     still = [replace(pair, change=np.zeros_like(pair.change)) for pair in recording.pairs]
     assert answered_share(still, recording.events) is None
