@@ -20,6 +20,7 @@ import argparse
 import json
 import tempfile
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,7 @@ def main() -> None:
             if options.without_events:
                 capture = blurry_alone(capture, Path(spare) / path.name)
             results += measure(capture, policy, options.keypoints_px, options.refine, options.out)
-    print(json.dumps({"policy": policy.sentence, "rows": results}))
+    print(json.dumps({"policy": asdict(policy), "rows": results}))
 
 
 def blurry_alone(capture: Capture, folder: Path) -> Capture:
