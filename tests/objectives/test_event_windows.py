@@ -52,16 +52,21 @@ def scene(seed: int, on: float = 0.3, off: float = 0.2):
         p = np.sign(count[y, x])
         parts.append((t, *(np.repeat(v, repeats) for v in (x, y, p))))
     t, x, y, p = (np.concatenate(values) for values in zip(*parts, strict=True))
+    stream = in_order(t, x, y, p)
+    frames = [SimpleNamespace(mid_us=mid) for mid in (0, 10_000, 20_000)]
+    capture = SimpleNamespace(events=Recording(stream), frames=frames, train_frames=frames)
+    return capture, step_at(times, linear)
+
+
+def in_order(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> EventStream:
+    """A stream of events that came in any order."""
     order = np.argsort(t, kind="stable")
-    stream = EventStream(
+    return EventStream(
         t[order].astype(np.int64),
         x[order].astype(np.uint16),
         y[order].astype(np.uint16),
         p[order].astype(np.int8),
     )
-    frames = [SimpleNamespace(mid_us=mid) for mid in (0, 10_000, 20_000)]
-    capture = SimpleNamespace(events=Recording(stream), frames=frames, train_frames=frames)
-    return capture, step_at(times, linear)
 
 
 class StepAt(SimpleNamespace):
@@ -394,13 +399,7 @@ def flickering(seed: int, period_us: int):
             for column, values in zip(columns, (start + shift, x, y, 0 * x + sign), strict=True):
                 column.append(values)
     t, x, y, p = (np.concatenate(column) for column in columns)
-    order = np.argsort(t, kind="stable")
-    stream = EventStream(
-        t[order].astype(np.int64),
-        x[order].astype(np.uint16),
-        y[order].astype(np.uint16),
-        p[order].astype(np.int8),
-    )
+    stream = in_order(t, x, y, p)
     capture.events.stream = stream
     capture.events.time_range_us = (int(stream.t[0]), int(stream.t[-1]) + 1)
     return capture, step

@@ -86,15 +86,9 @@ def test_frames_without_the_person_at_either_end_are_left_out(
 
     def of_somebody(capture, pictures, keypoints):
         points = found(capture, pictures, keypoints)
-        rows = [
-            frames[entered].mid_us <= time <= frames[left - 1].mid_us for time in points.times_us
-        ]
-        return replace(
-            points,
-            times_us=points.times_us[rows],
-            places=points.places[rows],
-            sigma_px=points.sigma_px[rows],
-            seen=points.seen[rows],
+        times = points.times_us
+        return points.of_pictures(
+            (times >= frames[entered].mid_us) & (times <= frames[left - 1].mid_us)
         )
 
     monkeypatch.setattr(find, "_landmarks", of_somebody)

@@ -4,11 +4,11 @@ Left and right are the person's own. Points that several sets share have one nam
 (``left_knee``), so that whoever reads landmarks looks them up by name.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 
 
 def _sides(*names: str) -> tuple[str, ...]:
@@ -98,6 +98,17 @@ class Landmarks:
     def __len__(self) -> int:
         """Count of pictures."""
         return len(self.times_us)
+
+    def of_pictures(self, chosen: Bool[np.ndarray, "N"]) -> "Landmarks":
+        """Those in some of the pictures."""
+        return replace(
+            self,
+            times_us=self.times_us[chosen],
+            places=self.places[chosen],
+            sigma_px=self.sigma_px[chosen],
+            seen=self.seen[chosen],
+            world=None if self.world is None else self.world[chosen],
+        )
 
     def index(self, name: str) -> int | None:
         """The place of a point in ``names``; None where this set lacks it."""

@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -194,8 +194,9 @@ def _found(
         with stages(bar, "landmarks"):
             pictures = sharp_pictures(seen)
             landmarks = _landmarks(seen, pictures, keypoints)
-            capture = _with_somebody(capture, pictures, landmarks)
-            seen = _seen(capture, policy, focal_px)
+            shown = _with_somebody(capture, pictures, landmarks)
+            if shown is not capture:
+                capture, seen = shown, _seen(shown, policy, focal_px)
         with stages(bar, "fit"):
             fitted = _fit(seen, landmarks, rig, search)
             if search.focal == "auto":
@@ -232,14 +233,7 @@ def _landmarks(
     frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
     points = read_keypoints(keypoints, [frame.mid_us for frame in frames])
     # Those of held-out frames were found in pictures that are not to be seen.
-    shown = np.array([frame.split == "train" for frame in frames])
-    return replace(
-        points,
-        times_us=points.times_us[shown],
-        places=points.places[shown],
-        sigma_px=points.sigma_px[shown],
-        seen=points.seen[shown],
-    )
+    return points.of_pictures(np.array([frame.split == "train" for frame in frames]))
 
 
 def _with_somebody(
