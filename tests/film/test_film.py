@@ -1,5 +1,8 @@
 """Films from start to end: options that contradict, stopping and going on, light and events."""
 
+import signal
+import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -253,6 +256,25 @@ def test_a_film_stops_at_the_first_picture_that_cannot_be_kept(lamp, tmp_path, m
         render_run(lamp.run, fps=200, out=tmp_path / "film")
     assert len(lamp.lamp.drawn) <= 16 < count
     assert not (tmp_path / "film").exists()
+
+
+def test_pictures_being_written_are_finished_before_a_second_ctrl_c_is_heard(
+    lamp, tmp_path, monkeypatch
+):
+    write, main = FrameCache._write, threading.main_thread().ident
+
+    def again(self, frame, exposure):
+        if frame.name == "00004":
+            signal.pthread_kill(main, signal.SIGINT)
+        time.sleep(0.05)
+        write(self, frame, exposure)
+
+    monkeypatch.setattr(FrameCache, "_write", again)
+    lamp.lamp.stop_after = 8
+    with pytest.raises(KeyboardInterrupt, match=r"Stopped; 8 of \d\d pictures"):
+        render_run(lamp.run, fps=100, out=tmp_path / "film")
+    kept = sorted(path.name for path in (tmp_path / "film.partial").iterdir())
+    assert kept == [*(f"{k:05d}.png" for k in range(8)), "plan.json"]
 
 
 def test_frames_in_memory_are_those_on_the_disk_which_memory_does_not_hold(

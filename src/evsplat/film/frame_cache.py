@@ -2,8 +2,9 @@
 
 import hashlib
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby, islice
 from pathlib import Path
@@ -14,6 +15,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from evsplat.camera import Camera
+from evsplat.disk import uninterrupted
 from evsplat.errors import DataError
 from evsplat.files import atomic_path, make_folder, remove_folder, write_json
 from evsplat.film.looks import Exposure, Look
@@ -102,7 +104,7 @@ class FrameCache:
                     desc="render",
                     dynamic_ncols=True,
                 ) as progress,
-                ThreadPoolExecutor(1, thread_name_prefix="frame-cache") as writer,
+                _writer() as writer,
             ):
                 written: list[Future[None]] = []
                 for batch in _of_one_camera(frames):
@@ -132,6 +134,17 @@ class FrameCache:
         if exposure.nbytes <= self._left_bytes:
             self._left_bytes -= exposure.nbytes
             self._drawn[file] = exposure
+
+
+@contextmanager
+def _writer() -> Iterator[ThreadPoolExecutor]:
+    """A thread that writes; what it was given is written whole, whoever stops it, once or twice."""
+    writer = ThreadPoolExecutor(1, thread_name_prefix="frame-cache")
+    try:
+        yield writer
+    finally:
+        with uninterrupted():
+            writer.shutdown()
 
 
 def _finish(written: Iterable[Future[None]]) -> None:
