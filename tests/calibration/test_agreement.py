@@ -1,13 +1,21 @@
 """Events that lie or count otherwise than the frames are told, and those that fit are not."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evsplat.calibration import answered_share, came_elsewhere, estimate_disagreement, lost_spans
-from evsplat.events import EventStream
+from evsplat.calibration import (
+    answered_share,
+    came_elsewhere,
+    estimate_disagreement,
+    lost_spans,
+    untold_spans,
+)
+from evsplat.events import ALWAYS, EventStore, EventStream, Span
 
+from ..conftest import write_event_file
 from .synthetic import HEIGHT, WIDTH, Recording, record
 
 
@@ -94,6 +102,30 @@ def test_a_gap_in_the_events_is_found_where_it_is() -> None:
     # frames are 40 ms apart: those of 200.5 to 280.5 and 280.5 to 320.5 ms saw no event
     found = lost_spans(recording.pairs, _without(recording, 200_000, 325_000))
     assert found == [(200_500, 320_500)]
+
+
+def test_of_lost_events_all_the_silence_tells_nothing_across_held_out_intervals_too(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng()
+    recording = record(int(rng.integers(10_000)), plus=0.2, minus=0.2)
+    start, end = int(rng.integers(130_000, 200_000)), int(rng.integers(430_000, 500_000))
+    rest, readable = _without(recording, start, end), [(ALWAYS[0], 220_000), (300_000, ALWAYS[1])]
+    events = _stored(rest, tmp_path / "gap.h5", readable)
+    before, after = int(rest.t[rest.t < start][-1]) + 1, int(rest.t[rest.t >= end][0])
+    pairs = [
+        replace(pair, recorded_us=span)
+        for span in readable
+        for pair in recording.pairs
+        if span[0] <= pair.span_us[0] and pair.span_us[1] <= span[1]
+    ]
+    assert untold_spans(pairs, events) == [(before, after)]
+    assert untold_spans(pairs, _stored(recording.events, tmp_path / "whole.h5", readable)) == []
+
+
+def _stored(events: EventStream, path: Path, readable_us: list[Span]) -> EventStore:
+    write_event_file(path, events.t, events.x, events.y, events.p > 0)
+    return EventStore(path, WIDTH, HEIGHT, readable_us=readable_us)
 
 
 def test_no_gap_is_told_where_nothing_moves_or_nothing_was_recorded() -> None:

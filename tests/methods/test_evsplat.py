@@ -15,6 +15,7 @@ from evsplat.methods.starts import MOST_SAMPLES
 from evsplat.objectives import EventChange, EventWindows
 from evsplat.training import load_run, train
 
+from ..conftest import write_event_file
 from ..small_model import built, small
 
 
@@ -135,6 +136,26 @@ def test_the_person_grows_where_that_is_asked_for(tiny_capture, tmp_path):
     assert counts["by default"] <= 120 < counts["asked for"] <= 150
 
 
+@pytest.mark.parametrize("purpose", ["train", "resume"])
+def test_a_sensor_that_lost_its_events_for_a_while_says_nothing_of_that_time(
+    tiny_capture, purpose: Purpose
+):
+    path = tiny_capture(frames=12, width=64, height=48)
+    assert event_windows(path, purpose).untold_us == ()
+    with h5py.File(path / "events.h5") as file:
+        t, *columns = (file[f"events/{key}"][:] for key in "txyp")
+    kept = (t < 120_000) | (t > 220_000)
+    write_event_file(path / "events.h5", t[kept], *(column[kept] for column in columns))
+    ((start, end),) = event_windows(path, purpose).untold_us
+    assert start == t[t < 120_000][-1] + 1 and end == t[t > 220_000][0]
+
+
+def event_windows(path, purpose: Purpose) -> EventWindows:
+    objectives = built("evsplat", path, purpose=purpose).objectives
+    (windows,) = (each for each in objectives if isinstance(each, EventWindows))
+    return windows
+
+
 @pytest.mark.parametrize(
     ("found_us", "purpose"), [(None, "train"), (9_990, "train"), (9_990, "resume")]
 )
@@ -142,8 +163,7 @@ def test_counts_are_averaged_over_the_period_of_lamps_that_flicker(
     tiny_capture, monkeypatch, found_us, purpose
 ):
     monkeypatch.setattr("evsplat.methods.sensor.flicker_period_us", lambda *_: found_us)
-    objectives = built("evsplat", tiny_capture(), purpose=purpose).objectives
-    (windows,) = (each for each in objectives if isinstance(each, EventWindows))
+    windows = event_windows(tiny_capture(), purpose)
     assert windows.flicker_us == (found_us or 0)
     # All of such a picture would count as noise.
     assert windows.noise.aware == (found_us is None)

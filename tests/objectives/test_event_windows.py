@@ -114,6 +114,27 @@ def test_right_thresholds_explain_every_window_and_wrong_ones_by_how_much(seed):
     assert wrong.sensor.logs.grad[0] > 0  # a smaller threshold fits better
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_asked_of_times_at_which_events_were_lost(seed):
+    capture, step = scene(seed)
+    stream, lost_us = capture.events.stream, (2_600, 6_900)
+    kept = (stream.t < lost_us[0]) | (stream.t >= lost_us[1])
+    capture.events = Recording(stream.take(kept))
+    as_it_is, told = make(capture, 0.3, 0.2), make(capture, 0.3, 0.2)
+    told.untold_us = (lost_us,)
+    # Frames of 2 ms within the loss, before it and after it.
+    for middle, asked in ((4_000, ()), (1_500, (0, 2_600)), (8_500, (6_900, 14_500))):
+        step.frame = SimpleNamespace(mid_us=middle, exposure_us=(middle - 1_000, middle + 1_000))
+        times = [time for _ in range(40) for time in told.times(step.frame, 5_000)]
+        assert bool(times) == bool(asked)
+        assert all(asked[0] <= time <= asked[1] for time in times)
+        wrong = told.loss(step)
+        assert ("event" in wrong) == bool(asked) and float(
+            wrong.get("event", torch.zeros(())).detach()
+        ) < 1e-6
+        assert float(as_it_is.loss(step)["event"].detach()) > 0.01
+
+
 @pytest.mark.parametrize(("hue_from", "alike"), [(5_000, True), (5_001, False)])
 def test_from_its_start_on_events_pull_at_all_channels_alike(hue_from, alike):
     capture, step = scene(0)

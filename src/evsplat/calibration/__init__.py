@@ -16,7 +16,7 @@ from evsplat.calibration.brightness import (
 )
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
 from evsplat.calibration.flicker import flicker_period_us
-from evsplat.calibration.lost import answered_share, came_elsewhere, lost_spans
+from evsplat.calibration.lost import answered_share, came_elsewhere, lost_spans, untold_spans
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
@@ -40,6 +40,7 @@ __all__ = [
     "exposure",
     "pair",
     "pair_indices",
+    "untold_spans",
 ]
 
 MOST_PAIRS = 60

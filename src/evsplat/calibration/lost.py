@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from evsplat.calibration.brightness import EventSource, FramePair
-from evsplat.events import Span
+from evsplat.events import EventStore, Span
 from evsplat.events.maps import event_pixels
 
 MUCH = 0.7
@@ -22,6 +22,8 @@ SILENT = 0.1
 nearly all of them have events."""
 _AS_EVER = 0.5
 """Share of their usual rate from which events are taken to have come as ever."""
+_LOOK_US = 20_000
+"""Read at first in search of the next event; then twice as long each time."""
 VERY_MUCH = 1.5
 """Change that stays above thresholds where linear frames are taken as coded, 2.2 times as large."""
 
@@ -41,6 +43,53 @@ def lost_spans(pairs: Sequence[FramePair], events: EventSource) -> list[Span]:
         else:
             found.append((first, last))
     return found
+
+
+def untold_spans(pairs: Sequence[FramePair], events: EventStore) -> list[Span]:
+    """Times, in order and apart, of which events say nothing: `lost_spans` and the silence about
+    each, from the last event before it to the first one after.
+
+    A sensor begins and ends to lose events within exposures, and beside held-out intervals, where
+    no pair tells. If silence was honest there, that nothing moved is all that is not learned from
+    it. Empty where events were not lost but lie in other pixels.
+    """
+    lost = lost_spans(pairs, events)
+    if not lost or came_elsewhere(pairs, events):
+        return []
+    found: list[Span] = []
+    for first, last in lost:
+        start, end = _event_before(first, events), _event_after(last, events)
+        if found and start <= found[-1][1]:
+            start, end = found[-1][0], max(end, found[-1][1])
+            found.pop()
+        found.append((start, end))
+    return found
+
+
+def _event_before(time_us: int, events: EventStore) -> int:
+    """When the last readable event before a time has passed; ``time_us`` where none has."""
+    for start, end in reversed(events.stretches_us):
+        high, step = min(end, time_us), _LOOK_US
+        while high > start:
+            low = max(start, high - step)
+            found = events.between(low, high).t
+            if len(found):
+                return int(found[-1]) + 1
+            high, step = low, 2 * step
+    return time_us
+
+
+def _event_after(time_us: int, events: EventStore) -> int:
+    """When the first readable event from a time on comes; ``time_us`` where none does."""
+    for start, end in events.stretches_us:
+        low, step = max(start, time_us), _LOOK_US
+        while low < end:
+            high = min(end, low + step)
+            found = events.between(low, high).t
+            if len(found):
+                return int(found[0])
+            low, step = high, 2 * step
+    return time_us
 
 
 def came_elsewhere(pairs: Sequence[FramePair], events: EventSource) -> bool:

@@ -72,7 +72,8 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
                 "events wherever the brightness changes",
                 "Most likely the sensor lost them, as its rate falls there: record again with a "
                 "lower rate of events, or leave out these frames. Otherwise they were left out or "
-                "thinned when they were written. Training takes no event for no change.",
+                "thinned when they were written. Method evsplat learns from frames alone there; "
+                "other methods and restore take no event for no change.",
             )  # fmt: skip
     answered = None if lost or sign or other_way else answered_share(pairs, events)
     if answered is not None and answered < _FEWEST_ANSWERED:

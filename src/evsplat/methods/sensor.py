@@ -4,8 +4,10 @@ import logging
 
 import torch
 
-from evsplat.calibration import SensorEstimate, flicker_period_us
+from evsplat.calibration import SensorEstimate, flicker_period_us, untold_spans
 from evsplat.capture import TrainingCapture, estimate_sensor, warn_of_linear_frames
+from evsplat.capture.sensor_estimate import frame_pairs
+from evsplat.events import EventStore, Span
 from evsplat.methods.base import Purpose
 from evsplat.methods.evsplat_settings import EvsplatConfig
 from evsplat.models.discs import DiscModel
@@ -64,7 +66,19 @@ def event_windows(
         ramp_us=config.event_ramp_us,
         hue_from=config.event_hue_from,
         flicker_us=flicker_us,
+        untold_us=[] if purpose == "draw" else _untold_us(capture, capture.events),
     )
+
+
+def _untold_us(capture: TrainingCapture, events: EventStore) -> list[Span]:
+    """When the sensor lost its events."""
+    spans = untold_spans(frame_pairs(capture), events)
+    for start, end in spans:
+        logger.info(
+            "no event from %.3f to %.3f s, where pictures change: learned from frames alone there",
+            start / 1e6, end / 1e6,
+        )  # fmt: skip
+    return spans
 
 
 def _late_us(config: EvsplatConfig, estimate: SensorEstimate | None) -> float | None:

@@ -40,7 +40,8 @@ class EventWindows(Objective):
     All pixels count: where there is no event, nothing changed. Nothing is asked of times whose
     events may not be read (`EventStore.readable_around`): there the gap is on one side only, and
     what is looked at around a window ends with it. The same holds for times before and after a
-    recording that does not cover the frames: it says nothing of them, not that nothing changed.
+    recording that does not cover the frames, and of those in which the sensor lost its events: it
+    says nothing of them, not that nothing changed.
 
     Events that nothing caused are allowed for: differences weigh by the noise of their time
     (`EventNoise`), and hot pixels do not count.
@@ -69,12 +70,13 @@ class EventWindows(Objective):
         ramp_us: int = 0,
         hue_from: float = math.inf,
         flicker_us: int = 0,
+        untold_us: Sequence[Span] = (),
     ) -> None:
         """``start`` in nominal iterations; ``eps`` is added to linear luminance.
 
         Between events of one polarity at most ``ramp_us`` apart brightness changes evenly
         (`begun_counts`); 0: all at once, when the second one tells. ``flicker_us``: the period in
-        which lamps flicker; 0: they do not.
+        which lamps flicker; 0: they do not. ``untold_us``: when, in order, events were lost.
         """
         assert capture.events is not None
         self.events = capture.events
@@ -88,6 +90,7 @@ class EventWindows(Objective):
         self.recorded_us = _recorded(self.events, capture.train_frames, self.interval_us)
         self.noise = noise
         self.ramp_us, self.flicker_us = ramp_us, flicker_us
+        self.untold_us = tuple(untold_us)
 
     def times(self, frame: Frame, nominal: float) -> Sequence[int]:
         """One time outside of the exposure; none where there is no room on either side."""
@@ -139,10 +142,18 @@ class EventWindows(Objective):
     def _known_around(self, frame: Frame) -> Span:
         """The stretch of the events' clock about a frame in which events are readable and recorded.
 
-        It is empty, its end before its start, for a frame that lies wholly beside the recording.
+        It is empty, its end before its start, for a frame that lies wholly beside the recording
+        or in the middle of whose exposure events were lost.
         """
-        low, high = self.events.readable_around(frame.mid_us)
-        return max(low, self.recorded_us[0]), min(high, self.recorded_us[1])
+        middle = frame.mid_us
+        low, high = self.events.readable_around(middle)
+        low, high = max(low, self.recorded_us[0]), min(high, self.recorded_us[1])
+        for start, end in self.untold_us:
+            if start < middle < end:
+                return middle, middle - 1
+            low = max(low, end) if end <= middle else low
+            high = min(high, start) if start >= middle else high
+        return low, high
 
     def _told_around(self, frame: Frame) -> Span:
         """The part of it at whose times all events are known that count for them."""
