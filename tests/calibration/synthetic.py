@@ -31,10 +31,11 @@ def record(
     noise_hz: float = 0.0,
     start_us: int = 0,
     still_rows: int = 0,
+    moving_frames: int | None = None,
 ) -> Recording:
     """Ideal pixels with random first reference levels; stamps are ``lag_us`` late.
 
-    Nothing changes in the last ``still_rows`` rows.
+    Nothing changes in the last ``still_rows`` rows, nor after the first ``moving_frames`` frames.
     """
     rng = np.random.default_rng(seed)
     mean = rng.uniform(-2.0, -1.2, (HEIGHT, WIDTH))
@@ -43,8 +44,10 @@ def record(
     hertz = rng.uniform(4.0, 9.0, (HEIGHT, WIDTH))
     phase = rng.uniform(0, 2 * np.pi, (HEIGHT, WIDTH))
     end_us = start_us + frames * period_us
+    still_us = start_us + (frames if moving_frames is None else moving_frames) * period_us
 
     def level(time_us: float) -> np.ndarray:
+        time_us = min(time_us, still_us)
         return mean + amplitude * np.sin(2 * np.pi * hertz * time_us * 1e-6 + phase)
 
     reference = level(start_us) + rng.uniform(-minus, plus, (HEIGHT, WIDTH))

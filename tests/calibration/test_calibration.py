@@ -58,7 +58,19 @@ def test_one_pair_of_frames_leaves_doubt_of_the_clock(seed) -> None:
     assert of_all is not None and of_all.clock.differs
     assert of_one is not None and not of_one.clock.differs
     line = sensor_lines(of_one, 0, has_polarity=True)[0]
-    assert "too few frames" in line and "nan" not in line
+    assert "too little moves" in line and "nan" not in line
+
+
+@pytest.mark.parametrize("noise_hz", [0.0, 10.0])
+@pytest.mark.parametrize("seed", np.random.SeedSequence().generate_state(2))
+def test_a_step_in_a_still_recording_leaves_doubt_of_the_clock(seed, noise_hz) -> None:
+    """The error was that of leaving out pairs of noise alone, which changes nothing."""
+    noisy = {"noise_hz": noise_hz, "frame_noise": 0.003 if noise_hz else 0.0}
+    options = {"plus": 0.2, "minus": 0.2, "lag_us": 6_000, "frames": 40} | noisy
+    of_a_step = _estimate(seed, moving_frames=2, **options).clock
+    assert np.isnan(of_a_step.spread_us) and not of_a_step.differs
+    of_a_while = _estimate(seed, moving_frames=8, **options).clock
+    assert 5 < of_a_while.spread_us < 500 and of_a_while.differs
 
 
 @pytest.mark.parametrize("seed", [4, 5])

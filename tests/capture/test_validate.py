@@ -16,6 +16,9 @@ from PIL import Image
 
 from evsplat.capture import Finding, load_capture, validate_capture
 from evsplat.errors import DataError
+from evsplat.pictures.files import read_image
+
+from ..conftest import write_event_file
 
 Factory = Callable[..., Path]
 
@@ -795,6 +798,31 @@ def test_events_that_cover_only_a_part_are_a_warning(tiny_capture: Factory) -> N
     finding = the_only(path, "warning")
     check(finding, path / "events.h5", "events/t", "events from 12", "over 0..390000 us")
     assert "clock_offset_us" in finding.remedy
+
+
+@pytest.mark.parametrize("end", ["first", "last"])
+@pytest.mark.parametrize("noise", [0, 2])
+def test_a_sensor_that_is_silent_while_nothing_moves_is_no_fault(
+    tiny_capture: Factory, end: str, noise: int
+) -> None:
+    """Somebody enters in the fifth frame, or left before it; the camera has noise or has none.
+
+    Where they move in the other frames as well, events of those were lost, or have another clock.
+    """
+    path = tiny_capture(frames=10, width=64, height=48)
+    still = range(4) if end == "first" else range(4, 10)
+    with h5py.File(path / "events.h5") as file:
+        t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
+    kept = t >= 160_000 if end == "first" else t < 160_000
+    write_event_file(path / "events.h5", *(column[kept] for column in (t, x, y, p)))
+    check(the_only(path, "warning"), path / "events.h5", "events/t", "events from", "over 0..")
+    rng = np.random.default_rng()
+    empty = read_image(path / "images" / f"{still[0]:04d}.png").astype(int)
+    for index in still:
+        picture = empty + rng.normal(0, noise, empty.shape).round().astype(int)
+        name = path / "images" / f"{index:04d}.png"
+        Image.fromarray(picture.clip(0, 255).astype(np.uint8)).save(name)
+    assert validate_capture(path, deep=False) == []
 
 
 # --- anything ------------------------------------------------------------------------------

@@ -17,6 +17,9 @@ LEAST_CORRELATION = 0.3
 MOST_LAG_US = 4_000
 """Events are late by a few ms by their nature; clocks that differ by more are reported."""
 _GROUPS = 8
+_FEWEST_MOVING = 4
+"""Pairs of frames, counted by what each tells, below which they say nothing of an error: a step
+that somebody makes in a still recording is a single observation, however much is compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +30,7 @@ class ClockEstimate:
     """Events are stamped this much later than the frames: subtract it from their times."""
     spread_us: float
     """Standard error of ``lag_us`` over the recording (jackknife over groups of frames); NaN where
-    too few frames tell it."""
+    something moves in too few frames to tell it."""
     correlation: float
     """Pearson's, of log luminance change and signed event count at ``lag_us``."""
     lags_us: Float[np.ndarray, "L"]
@@ -130,12 +133,27 @@ def _vertex(lags_us: Float[np.ndarray, "L"], correlations: Float[np.ndarray, "L"
 
 
 def _jackknife(lags_us: Float[np.ndarray, "L"], sums: Float[np.ndarray, "P L 6"]) -> float:
-    """Standard error of the vertex when one group of neighbouring pairs at a time is left out."""
-    groups = [part for part in np.array_split(np.arange(len(sums)), _GROUPS) if len(part)]
+    """Standard error of the vertex when one group of neighbouring pairs at a time is left out.
+
+    Groups tell as much as each other: of such with an equal number of pairs, all but one may hold
+    noise alone, and agree with each other on what that one says.
+    """
     total = sums.sum(0)
-    found = [_vertex(lags_us, _correlation(total - sums[part].sum(0))) for part in groups]
+    told = _told(sums[:, np.nanargmax(_correlation(total))])
+    if told.sum() ** 2 < _FEWEST_MOVING * (told**2).sum():
+        return float("nan")
+    group = (_GROUPS * (np.cumsum(told) - told / 2) / told.sum()).astype(int)
+    found = [
+        _vertex(lags_us, _correlation(total - sums[group == g].sum(0))) for g in np.unique(group)
+    ]
     values = np.array([value for value in found if value is not None])
     if len(values) < 2:
         return float("nan")
     count = len(values)
     return float(np.sqrt((count - 1) / count * ((values - values.mean()) ** 2).sum()))
+
+
+def _told(sums: Float[np.ndarray, "P 6"]) -> Float[np.ndarray, "P"]:
+    """What each pair adds to the correlation; next to nothing where noise alone sent events."""
+    count, n, d, _, _, nd = sums.T
+    return np.maximum(0.0, nd - n * d / np.maximum(count, 1))

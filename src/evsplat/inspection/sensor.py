@@ -26,7 +26,7 @@ def sensor_lines(
         ]
     clock, contrast = estimate.clock, estimate.thresholds
     unknown = math.isnan(clock.spread_us)
-    doubt = "by too few frames for an error" if unknown else f"+-{clock.spread_us / 1000:.1f} ms"
+    doubt = "too little moves to tell an error" if unknown else f"+-{clock.spread_us / 1000:.1f} ms"
     text = f"clock      events {_lag_text(clock)} ({doubt}; correlation {clock.correlation:.2f})"
     if clock.differs:
         text += f"; clock_offset_us {_aligning_us(clock, clock_offset_us)} would align them"

@@ -1,0 +1,41 @@
+"""Whether nothing moves in some frames' pictures, of which a sensor without noise tells nothing."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from evsplat.calibration.offset import BlockLevels
+from evsplat.capture.metadata import Frame, Metadata
+from evsplat.errors import DataError
+from evsplat.pictures.files import read_image, to_unit_range
+
+_MOST = 16
+"""Pictures that are looked at, spread over the frames."""
+_CHANGED = 0.03
+"""Change of a block's mean log luminance: a person 20 px high who moves makes more in pictures of
+256 px, and noise much less."""
+
+
+def nothing_moves(metadata: Metadata, frames: Sequence[Frame]) -> bool:
+    """True where the pictures of at least two training frames show the same.
+
+    What all of a picture changes by, a camera's gain, does not count. False where a picture cannot
+    be read, or has another size.
+    """
+    frames = [frame for frame in frames if frame.split == "train"]
+    if len(frames) < 2:
+        return False
+    chosen = np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).round().astype(int)
+    camera = metadata.cameras[frames[0].camera]
+    seen = BlockLevels(metadata.transfers.get(frames[0].camera, "power"))
+    for frame in (frames[index] for index in chosen):
+        try:
+            pixels = read_image(frame.image)
+        except DataError:  # a check of its own speaks of the picture
+            return False
+        if pixels.shape[:2] != (camera.height, camera.width):
+            return False
+        seen.add(to_unit_range(pixels), frame.exposure_us)
+    levels = seen.levels
+    change = levels - levels[0]
+    return bool(np.abs(change - np.median(change, axis=1, keepdims=True)).max() < _CHANGED)
