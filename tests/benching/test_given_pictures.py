@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from evsplat.benching.given_pictures import GivenPictures
 from evsplat.capture import load_capture
 from evsplat.cli.main import main
+from evsplat.errors import DataError
 from evsplat.untrusted.text import read_json
 
 from .helpers import MEDIAN, cells_in_this_process, write_suite
@@ -54,20 +56,43 @@ def test_given_pictures_are_measured_by_the_one_evaluator_and_again_when_they_ch
         assert record["policy"] is None
 
 
-@pytest.mark.parametrize("gain", [0.6, [0.9, 0.7, 0.5]])
-def test_a_picture_in_place_of_the_truth_has_the_gain_of_its_frame(bench, gain):
-    """Copies of the sharp pictures are exact."""
-    capture, theirs, run = bench
+def with_gain(capture, gain) -> None:
+    """Give all frames of the capture that gain."""
     path = capture.path / "capture.json"
     document = json.loads(path.read_text())
     for frame in document["frames"]:
         frame["gain"] = gain
     path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("gain", [0.6, [0.9, 0.7, 0.5]])
+def test_a_picture_in_place_of_the_truth_has_the_gain_of_its_frame(bench, gain):
+    """Copies of the sharp pictures are exact."""
+    capture, theirs, run = bench
+    with_gain(capture, gain)
     for frame in capture.test_frames:
         copy(frame.sharp, theirs / f"{frame.name}.png")
     exact = run()["protocols"]["standard"]["full"]
     assert exact["ssim"] == pytest.approx(1.0, abs=1e-6)
     assert exact["psnr"] is None or exact["psnr"] > 90
+
+
+def test_grey_pictures_are_not_divided_by_gains_of_three_colours(bench):
+    """They would become coloured."""
+    capture, theirs, _ = bench
+    for frame in capture.test_frames:
+        Image.open(frame.sharp).convert("L").save(theirs / f"{frame.name}.png")
+    for gain in (0.6, [0.9, 0.7, 0.5]):
+        with_gain(capture, gain)
+        loaded = load_capture(capture.path)
+        frame = loaded.test_frames[0]
+        given = GivenPictures(theirs, loaded)
+        if gain == 0.6:
+            rgb = given.render(loaded.camera(frame), [frame.mid_us]).rgb
+            assert (rgb == rgb[..., :1]).all() and rgb.mean() > 0
+        else:
+            with pytest.raises(DataError, match=f"{frame.name}.png: is grey and has a gain of 3"):
+                given.render(loaded.camera(frame), [frame.mid_us])
 
 
 def test_the_page_says_how_to_repeat_a_cell_and_links_its_files(bench, tmp_path):

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.capture import Capture, Frame
+from evsplat.capture.read import without_gain
 from evsplat.errors import DataError
 from evsplat.methods.reconstruction import Parts, Rendering
 from evsplat.methods.trivial import same_view
 from evsplat.pictures.files import read_image, to_rgb, to_unit_range
-from evsplat.pictures.light import evened
 from evsplat.untrusted.faults import open_bytes
 from evsplat.untrusted.pictures import image_size
 
@@ -50,7 +50,8 @@ class GivenPictures(_OfTestFrames):
     not known.
 
     Raises:
-        DataError: A picture is missing, unreadable or of another size.
+        DataError: A picture is missing, unreadable or of another size, or is grey and its frame's
+            gain is that of three colours.
     """
 
     name = PICTURES
@@ -80,10 +81,11 @@ class GivenPictures(_OfTestFrames):
     def _picture(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
         for view, frame, path in self._places:
             if frame.mid_us == time_us and same_view(view, camera):
-                picture = to_rgb(to_unit_range(read_image(path)))
-                if frame.gain is None:
-                    return picture
-                return evened(picture, torch.tensor(frame.gain), self._capture.transfer(frame))
+                pixels = read_image(path)
+                if frame.gain is not None:
+                    transfer = self._capture.transfer(frame)
+                    pixels = without_gain(path, pixels, frame.gain, transfer)
+                return to_rgb(to_unit_range(pixels))
         raise DataError(f"no picture was given of this view at {time_us} us.")
 
 

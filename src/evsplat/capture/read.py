@@ -320,6 +320,6 @@ def without_gain(
     if pixels.ndim == 2 and len(gain) > 1:
         raise DataError(
             f"{path}: is grey and has a gain of {len(gain)} colours in capture.json, expected one "
-            "number; correct it."
+            "number; correct it, or give the picture in colours."
         )
     return evened(to_unit_range(pixels), torch.tensor(gain), transfer).numpy()
