@@ -30,8 +30,7 @@ from evsplat.models.beyond import (
     wall_m,
 )
 from evsplat.models.layers import Layers
-from evsplat.pictures.files import read_image, to_rgb, to_unit_range
-from evsplat.untrusted.pictures import read_picture
+from evsplat.pictures.files import read_opaque, to_rgb, to_unit_range
 
 _FLOOR, _HORIZON, _TOP = (0.60, 0.58, 0.56), (0.83, 0.83, 0.82), (0.66, 0.69, 0.73)
 """sRGB."""
@@ -160,8 +159,13 @@ class Painted:
     def of(cls, asked: str) -> "Painted":
         """By a colour's name, ``#rrggbb``, or the path of a picture; else a `ConfigError`."""
         if Path(asked).is_file():
-            read_picture(Path(asked), lambda image: _require_opaque(asked, image))
-            return cls(to_rgb(to_unit_range(read_image(Path(asked)))))
+            pixels = read_opaque(Path(asked))
+            if pixels is None:
+                raise ConfigError(
+                    f"--background {asked}: is transparent in places, where nothing would be "
+                    "behind the person; fill them with a colour."
+                )
+            return cls(to_rgb(to_unit_range(pixels)))
         try:
             rgb = ImageColor.getrgb(asked)[:3]
         except ValueError:
@@ -180,15 +184,6 @@ class Painted:
         left, top = (size[0] - camera.width) // 2, (size[1] - camera.height) // 2
         image = image.crop((left, top, left + camera.width, top + camera.height))
         return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
-
-
-def _require_opaque(asked: str, image: Image.Image) -> None:
-    """A `ConfigError` where something else would be seen behind the picture."""
-    if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
-        raise ConfigError(
-            f"--background {asked}: is transparent in places, where nothing would be behind the "
-            "person; fill them with a colour."
-        )
 
 
 def _mixed(

@@ -27,6 +27,21 @@ def read_image(path: Path) -> np.ndarray:
     return read_16_bit_colour(path) if pixels is None else pixels
 
 
+def read_opaque(path: Path) -> np.ndarray | None:
+    """As `read_image`; None where the picture is transparent in places."""
+
+    def looked_at(image: Image.Image) -> tuple[bool, np.ndarray | None]:
+        pixels = _pixels(path, image)
+        if not image.has_transparency_data:
+            return False, pixels
+        return bool(np.asarray(image.convert("RGBA"))[..., 3].min() < 255), pixels
+
+    clear, pixels = read_picture(path, looked_at)
+    if clear:
+        return None
+    return read_16_bit_colour(path) if pixels is None else pixels
+
+
 def to_unit_range(pixels: np.ndarray) -> Float[Tensor, "..."]:
     """Float32 in [0, 1] of stored pixels; float pixels are taken to be in that range already."""
     if pixels.dtype == np.float32:
