@@ -42,7 +42,9 @@ def test_events_warped_to_half_the_size_are_not_called_lost(
 
 
 @pytest.mark.parametrize("hertz", [100, 120])
-def test_lamps_that_flicker_are_told(tiny_capture: Callable[..., Path], hertz: int) -> None:
+def test_lamps_that_flicker_are_told(
+    tiny_capture: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, hertz: int
+) -> None:
     width, height = 64, 48
     path = tiny_capture(frames=12, width=width, height=height)
     assert flicker_findings(seen(path)) == []
@@ -59,5 +61,9 @@ def test_lamps_that_flicker_are_told(tiny_capture: Callable[..., Path], hertz: i
     t, x, y, p = (np.concatenate(both) for both in zip((t, x, y, p), more, strict=True))
     order = np.argsort(t, kind="stable")
     write_event_file(path / "events.h5", *(column[order] for column in (t, x, y, p)))
-    (finding,) = flicker_findings(seen(path))
+    capture = seen(path)
+    (finding,) = flicker_findings(capture)
     assert f"in turns, {hertz} times a second" in str(finding)
+    # Found once: the training that was warned does not read millions of events once more.
+    monkeypatch.setattr("evsplat.events.EventStore.between", None)
+    assert capture.flicker_us == pytest.approx(1e6 / hertz, rel=0.02)

@@ -162,7 +162,7 @@ def event_windows(path, purpose: Purpose) -> EventWindows:
 def test_counts_are_averaged_over_the_period_of_lamps_that_flicker(
     tiny_capture, monkeypatch, found_us, purpose
 ):
-    monkeypatch.setattr("evsplat.methods.sensor.flicker_period_us", lambda *_: found_us)
+    monkeypatch.setattr("evsplat.capture.training_capture.flicker_period_us", lambda *_: found_us)
     windows = event_windows(tiny_capture(), purpose)
     assert windows.flicker_us == (found_us or 0)
     # All of such a picture would count as noise.

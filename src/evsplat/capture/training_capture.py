@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.calibration import FramePair
+from evsplat.calibration import FramePair, flicker_period_us
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
 from evsplat.capture.metadata import Frame, NovelView
@@ -25,6 +25,8 @@ from evsplat.pictures.light import Transfer
 
 _KEPT_EVENT_BYTES = 256 << 20
 """Of decoded events: estimates before a training and its steps ask for the same ones."""
+_A_MINUTE_US = 60_000_000
+"""A pixel that is hot fires a few hundred times in it."""
 _KEPT_MASKS = 64
 """Estimated masks kept in memory; the least recently used one goes first."""
 
@@ -165,6 +167,24 @@ class TrainingCapture:
         if events is None:
             return None
         return events.restricted_to(self._readable_us).keeping(_KEPT_EVENT_BYTES)
+
+    @property
+    def minute_around_us(self) -> Span:
+        """From the first training exposure to the last, or at least a minute about their middle."""
+        spans = [frame.exposure_us for frame in self.train_frames]
+        start, end = min(span[0] for span in spans), max(span[1] for span in spans)
+        missing = max(0, _A_MINUTE_US - (end - start))
+        return start - missing // 2, end + missing // 2
+
+    @functools.cached_property
+    def flicker_us(self) -> int:
+        """Period of lamps that flicker, microseconds, as events about the training frames tell it.
+
+        0 where they do not. It is looked for once: up to 20 million events are read for it.
+        """
+        if self.events is None:
+            return 0
+        return flicker_period_us(self.events, self.minute_around_us) or 0
 
     @property
     def contrast_threshold(self) -> tuple[float, float] | None:

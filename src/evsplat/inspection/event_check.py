@@ -7,7 +7,6 @@ from evsplat.calibration import (
     answered_share,
     came_elsewhere,
     estimate_disagreement,
-    flicker_period_us,
     lost_spans,
 )
 from evsplat.capture import TrainingCapture
@@ -92,12 +91,11 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
 def flicker_findings(capture: TrainingCapture) -> list[Finding]:
     """A warning where lamps flicker, of which a camera with long exposures shows nothing."""
     findings = Findings()
-    period_us = None if capture.events is None else flicker_period_us(capture.events)
-    if capture.events is not None and period_us is not None:
+    if capture.events is not None and capture.flicker_us:
         findings.warning(
             capture.events.path, "",
-            f"all of the picture brighter and darker in turns, {1e6 / period_us:.0f} times a "
-            "second, as lamps flicker",
+            f"all of the picture brighter and darker in turns, {1e6 / capture.flicker_us:.0f} "
+            "times a second, as lamps flicker",
             "light that is even",
             "Method evsplat counts events over whole periods, which costs little; other methods, "
             "restore and the estimate of noise take them as they are. Better is light that does "

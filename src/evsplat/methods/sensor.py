@@ -4,14 +4,14 @@ import logging
 
 import torch
 
-from evsplat.calibration import SensorEstimate, flicker_period_us, untold_spans
+from evsplat.calibration import SensorEstimate, untold_spans
 from evsplat.capture import TrainingCapture, estimate_sensor, warn_of_linear_frames
 from evsplat.capture.sensor_estimate import frame_pairs
 from evsplat.events import EventStore, Span
 from evsplat.methods.base import Purpose
 from evsplat.methods.evsplat_settings import EvsplatConfig
 from evsplat.models.discs import DiscModel
-from evsplat.objectives import EventNoise, EventSensor, EventWindows, minute_around
+from evsplat.objectives import EventNoise, EventSensor, EventWindows
 
 logger = logging.getLogger(__name__)
 
@@ -46,13 +46,10 @@ def event_windows(
             )  # fmt: skip
     sensor = EventSensor(*known, late_us=late_us).to(device)
     model.sensor = sensor
-    around_us = minute_around([frame.exposure_us for frame in capture.train_frames])
-    events, flicker_us = capture.events, 0
-    if purpose != "draw":
-        flicker_us = flicker_period_us(events, around_us) or 0
+    flicker_us = 0 if purpose == "draw" else capture.flicker_us
     # All of a flickering picture sends events that nothing moves; they are averaged out instead.
     aware = config.event_noise_aware and not flicker_us
-    noise = EventNoise(events, during_us=around_us, aware=aware)
+    noise = EventNoise(capture.events, during_us=capture.minute_around_us, aware=aware)
     if purpose != "draw":
         noise.measure()
     return EventWindows(

@@ -2,7 +2,7 @@
 
 from evsplat.objectives.base import Objective, Step
 from evsplat.objectives.event import EventChange
-from evsplat.objectives.event_sensor import EventNoise, EventSensor, minute_around
+from evsplat.objectives.event_sensor import EventNoise, EventSensor
 from evsplat.objectives.event_windows import EventWindows, HeldOutWindows
 from evsplat.objectives.exposure import Exposure, motion_px, renders_for, sweep_px
 from evsplat.objectives.isometry import Isometry
@@ -28,7 +28,6 @@ __all__ = [
     "RenderedSemantics",
     "SkinningPrior",
     "Step",
-    "minute_around",
     "motion_px",
     "sweep_px",
     "renders_for",

@@ -1,7 +1,6 @@
 """The event camera in training: its noise, learned contrast thresholds, a clock that runs apart."""
 
 import math
-from collections.abc import Sequence
 from functools import cached_property
 
 import torch
@@ -12,8 +11,6 @@ from evsplat.calibration import noise_of
 from evsplat.events import EventStore
 from evsplat.events.store import ALWAYS, Span
 
-_LEAST_NOISE_US = 60_000_000
-"""A pixel that is hot fires a few hundred times in it."""
 _OFFSET_UNIT_US = 10_000.0
 """One unit of the offset's parameter, so that all parameters learn well at one rate."""
 
@@ -76,13 +73,6 @@ class EventSensor(nn.Module):
     def path(self, count: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch H W"]:
         """Size of the log-brightness change that counts of events without polarity report."""
         return self.logs.mean().exp() * count
-
-
-def minute_around(exposures_us: Sequence[Span]) -> Span:
-    """From the first exposure to the last, or at least a minute about their middle."""
-    start, end = min(span[0] for span in exposures_us), max(span[1] for span in exposures_us)
-    missing = max(0, _LEAST_NOISE_US - (end - start))
-    return start - missing // 2, end + missing // 2
 
 
 class EventNoise:
