@@ -95,6 +95,25 @@ def test_a_run_goes_on_with_its_own_capture(trained, run, tmp_path):
     assert "was trained on the capture 'tiny', and is to go on with 'other'" in said
 
 
+def test_a_run_does_not_go_on_with_another_up(tmp_path):
+    """Floor and light were learned by it; another length of the same axis is no other one."""
+    capture, run = write_tiny_capture(tmp_path / "tiny"), tmp_path / "run"
+    document = json.loads((capture / "capture.json").read_text())
+
+    def write(**up: list[float]) -> None:
+        (capture / "capture.json").write_text(json.dumps(document | up))
+
+    write(up=[0, 0.1, 2])
+    train(capture, out=run, iterations=1, overrides=small("evsplat"))
+    write(up=[0, 0, 1])
+    assert load_run(run).iteration == 1
+    for other, found in (({"up": [0, 1, 0]}, "[0.0, 1.0, 0.0]"), ({}, "None")):
+        write(**other)
+        for call in (lambda: load_run(run), lambda: train(capture, out=run, resume=True)):
+            said = refused(call)
+            assert "versions.json: up is [0.0, 0.0, 1.0]" in said and f"has {found} now" in said
+
+
 def test_a_run_without_a_checkpoint_begins_its_log_anew(trained, run):
     shutil.rmtree(run / "checkpoints")
     (run / "log.jsonl").write_text('{"iteration": 10}\n{"iteration": 20}\n[]\n')

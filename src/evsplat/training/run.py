@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from evsplat.body import nearest_axis
 from evsplat.capture import Camera, Capture, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.capture.policy import Terms
@@ -101,6 +102,7 @@ def write_facts(
             "capture": str(seen.path.resolve()),
             "capture_name": seen.name,
             "training_frames": _frames_of(seen),
+            "up": _up_of(seen),
             "method": method,
             "settings": _settings_of({"method": method, **to_dict(config)}),
             "device": device,
@@ -191,11 +193,11 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     return method, config, facts
 
 
-def check_frames(facts: dict[str, Any], seen: TrainingCapture, folder: RunFolder) -> None:
-    """Refuse a capture whose frames of split `train` are others than those that were trained on.
+def check_capture(facts: dict[str, Any], seen: TrainingCapture, folder: RunFolder) -> None:
+    """Refuse a capture whose training frames, or whose up, are others than when it was trained on.
 
-    What is held out now may have been seen then: figures of it would say nothing. Runs of before do
-    not tell.
+    What is held out now may have been seen then: figures of it would say nothing. Floor and light
+    were learned by what was up. Runs of before do not tell.
     """
     then, now = facts.get("training_frames"), _frames_of(seen)
     if then is not None and then != now:
@@ -204,6 +206,17 @@ def check_frames(facts: dict[str, Any], seen: TrainingCapture, folder: RunFolder
             f"{now!r} now: what is held out may have been trained on; give the frames of "
             "capture.json the splits that they had, or train again."
         )
+    if "up" in facts and facts["up"] != _up_of(seen):
+        raise DataError(
+            f"{folder.facts}: up is {brief(facts['up'])}, and {seen.path / 'capture.json'} has "
+            f"{brief(_up_of(seen))} now: floor and light were learned by it; put it back, or train "
+            "again."
+        )
+
+
+def _up_of(seen: TrainingCapture) -> list[float] | None:
+    """The axis that capture.json says is up; None where it says nothing."""
+    return None if seen.up is None else nearest_axis(torch.tensor(seen.up)).tolist()
 
 
 def _frames_of(seen: TrainingCapture) -> str:
@@ -249,7 +262,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
     shown = seen_by_training(capture, config)
-    check_frames(facts, shown, folder)
+    check_capture(facts, shown, folder)
     composition = TRAINABLE[method].build(
         config, shown, facts["seed"], device=device, purpose="draw"
     )

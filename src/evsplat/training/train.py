@@ -39,7 +39,7 @@ from evsplat.training.checkpoint import (
 from evsplat.training.clock import Clock
 from evsplat.training.run import (
     RunFolder,
-    check_frames,
+    check_capture,
     new_run_folder,
     read_config,
     seen_by_training,
@@ -132,7 +132,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     iterations, max_minutes = options.iterations, options.max_minutes
     started = time.perf_counter()
     seen = seen_by_training(capture, start.settings)
-    check_frames(start.facts, seen, start.folder)
+    check_capture(start.facts, seen, start.folder)
     loaded = load_latest(start.folder.checkpoints) if options.resume else None
     purpose: Purpose = "train" if loaded is None else "resume"
     fitting = None
