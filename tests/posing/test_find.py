@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -228,3 +229,28 @@ def test_a_moving_camera_is_not_refined_and_refused_where_it_was_asked_for(unpos
         find_poses(path, tmp_path / "new", keypoints=points, refine_s=5)
     find_poses(path, tmp_path / "new", keypoints=points)
     assert "refinement" not in load_capture(tmp_path / "new").provenance["poses"]
+
+
+@pytest.mark.parametrize("from_a_file", [False, True])
+def test_frames_without_anybody_are_left_out_and_named(tiny_capture, caplog, from_a_file):
+    """Pictures of training frames are looked at (0 to 6 and 10 to 16 of 20); seven of them tell.
+
+    A held-out frame beside empty ones goes with them, one between others stays.
+    """
+    capture = load_capture(tiny_capture(frames=20))
+    pictures = [
+        SimpleNamespace(frame=frame, time_us=frame.mid_us) for frame in capture.train_frames
+    ]
+    told = {2, 3, 4, 6, 10, 15, 16}
+    landmarks = SimpleNamespace(times_us=np.array([capture.frames[k].mid_us for k in told]))
+    shown = find._with_somebody(capture, pictures, landmarks, nobody_in_between=not from_a_file)
+    names = [int(frame.name) for frame in shown.frames]
+    between = [] if not from_a_file else [5, 11, 12, 13, 14]
+    assert names == sorted([*told, *between, 7, 8, 9, 17, 18, 19])
+    (said,) = caplog.messages
+    assert "2 frames before the person enters (0000 to 0001)" in said
+    for words in ("1 frame while they are away (0005)", "while they are away (0011 to 0014)"):
+        assert (words in said) != from_a_file
+    everybody = SimpleNamespace(times_us=np.array([picture.time_us for picture in pictures]))
+    whole = find._with_somebody(capture, pictures, everybody, nobody_in_between=True)
+    assert whole is capture

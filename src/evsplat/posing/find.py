@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from evsplat.body import Body, BodyTrack
 from evsplat.body.make import rig_arrays
 from evsplat.body.smpl import smpl_body
 from evsplat.camera import Camera
-from evsplat.capture import Capture, Policy, TrainingCapture, load_capture
+from evsplat.capture import Capture, Frame, Policy, TrainingCapture, load_capture
 from evsplat.capture.derive import Derivation, derived_capture
 from evsplat.commands import command
 from evsplat.config import to_dict
@@ -95,8 +96,8 @@ def find_poses(
 
     Landmarks on sharpened pictures (`evsplat.landmarks`; or the key points of a file), and a motion
     fitted to them (`fit_landmarks`), corrected by drawing the person (`refine`), which is taken
-    where it explains pictures better that it has not seen. Frames before the person enters and
-    after they have left are left out. Of the capture is seen what its policy
+    where it explains pictures better that it has not seen. Frames before the person enters, after
+    they have left and while they are away are left out. Of the capture is seen what its policy
     shows: by default no picture, mask or event of a held-out interval. Poses that the capture has
     are ignored; its true poses between keys, of another body, are left out of the new one.
     ``poses.html`` in the new capture shows what was found. ``overwrite`` replaces a folder that is
@@ -194,7 +195,9 @@ def _found(
         with stages(bar, "landmarks"):
             pictures = sharp_pictures(seen)
             landmarks = _landmarks(seen, pictures, keypoints)
-            shown = _with_somebody(capture, pictures, landmarks)
+            shown = _with_somebody(
+                capture, pictures, landmarks, nobody_in_between=keypoints is None
+            )
             if shown is not capture:
                 capture, seen = shown, _seen(shown, policy, focal_px)
         with stages(bar, "fit"):
@@ -237,33 +240,44 @@ def _landmarks(
 
 
 def _with_somebody(
-    capture: Capture, pictures: Sequence[SharpPicture], landmarks: Landmarks
+    capture: Capture,
+    pictures: Sequence[SharpPicture],
+    landmarks: Landmarks,
+    *,
+    nobody_in_between: bool,
 ) -> Capture:
-    """Without the frames before the person enters and after they have left.
+    """Without the frames before the person enters, and after they have left.
 
-    Those in between stay: their poses follow from the rest.
+    With ``nobody_in_between`` those between others that show nobody are left out as well; in a
+    file of key points somebody may only have been missed there, and poses follow from the rest.
     """
     looked_at = {picture.frame.name for picture in pictures}
-    told = set(landmarks.times_us.tolist())
-    mids = [picture.frame.mid_us for picture in pictures if picture.time_us in told]
-    before = [frame for frame in capture.frames if mids and frame.mid_us < min(mids)]
-    after = [frame for frame in capture.frames if mids and frame.mid_us > max(mids)]
-    empty = {
-        frame.name
-        for side in (before, after)
-        if any(frame.name in looked_at for frame in side)
-        for frame in side
-    }
+    times = set(landmarks.times_us.tolist())
+    told = {picture.frame.name for picture in pictures if picture.time_us in times}
+    frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
+    runs = [(shows, list(run)) for shows, run in groupby(frames, lambda one: one.name in told)]
+    empty: set[str] = set()
+    said = []
+    for index, (shows, run) in enumerate(runs):
+        at_an_end = index in (0, len(runs) - 1)
+        if shows or not told or not (at_an_end or nobody_in_between):
+            continue
+        if any(frame.name in looked_at for frame in run):
+            empty |= {frame.name for frame in run}
+            when = "before the person enters" if index == 0 else "after they have left"
+            when = when if at_an_end else "while they are away"
+            said.append(f"{counted(len(run), 'frame')} {when} ({_from_to(run)})")
     if not empty:
         return capture
     logger.warning(
-        "%s: nobody is in the picture in %s before the person enters and %s after they have left, "
-        "which are left out.",
-        capture.path,
-        counted(sum(frame.name in empty for frame in before), "frame"),
-        counted(sum(frame.name in empty for frame in after), "frame"),
+        "%s: nobody is in the picture in %s, which are left out.", capture.path, ", ".join(said)
     )
     return capture.of_frames([frame for frame in capture.frames if frame.name not in empty])
+
+
+def _from_to(frames: Sequence[Frame]) -> str:
+    first, last = frames[0].name, frames[-1].name
+    return first if first == last else f"{first} to {last}"
 
 
 def key_times(capture: TrainingCapture) -> list[int]:
