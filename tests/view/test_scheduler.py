@@ -140,6 +140,17 @@ def test_asking_never_waits_for_a_picture_and_a_bad_picture_ends_nothing(caplog)
     assert "could not be drawn" in caplog.text
 
 
+def test_a_job_that_fails_leaves_the_others_to_the_next_step():
+    scheduler, done = RenderScheduler(), []
+    for job in (lambda: done.append(1), lambda: 1 // 0, lambda: done.append(2)):
+        scheduler.submit(job)
+    with pytest.raises(ZeroDivisionError):
+        scheduler.step()
+    assert done == [1]
+    assert scheduler.step() == 0 and done == [1, 2]
+    assert scheduler.step() is None
+
+
 @pytest.mark.parametrize("nanoseconds_per_pixel", [20, 100, 300])
 def test_drafts_come_to_take_the_target(nanoseconds_per_pixel):
     resolution = DraftResolution(target_s=0.04)

@@ -84,8 +84,8 @@ class SavePanel:
             path = folder / name
             try:
                 write_file(path, kind, cloud, rotation, facts)
-            except DataError:
-                self._notify("Nothing to save", f"There is no Gaussian of the {which[1:]}.")
+            except DataError as error:
+                self._notify("Nothing is saved", str(error).removeprefix(f"{path}: "))
                 return
             data = path.read_bytes()
         self._send(name, data)

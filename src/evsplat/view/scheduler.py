@@ -105,10 +105,12 @@ class RenderScheduler:
     def step(self) -> float | None:
         """Draw for every client that needs it, once; seconds to the next step, None: unknown."""
         with self._condition:
-            jobs, self._jobs = self._jobs, []
+            jobs = len(self._jobs)
             # The client that waited longest comes first.
             states = sorted(self._states.values(), key=lambda state: state.drawn_s)
-        for job in jobs:
+        for _ in range(jobs):
+            with self._condition:  # one that fails leaves the others to the next step
+                job = self._jobs.pop(0)
             job()
         pause: float | None = 0.0 if jobs else None
         for state in states:
