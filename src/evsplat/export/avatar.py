@@ -154,12 +154,15 @@ def clip_of(name: str, track: BodyTrack) -> Clip:
 
 
 def _clip(name: str, rotations: Tensor, transl: Tensor) -> Clip:
-    quaternions = matrix_to_quaternion(rotations.double()).numpy()
-    # Neighbouring keys on the same side, so that a player may interpolate them as they are.
-    turned = (quaternions[1:] * quaternions[:-1]).sum(-1) < 0
-    flips = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
-    quaternions[1:] *= flips[..., None]
+    quaternions = on_one_side(matrix_to_quaternion(rotations.double()).numpy())
     return Clip(name, KEYS_PER_SECOND, quaternions.astype(np.float32), transl.numpy())
+
+
+def on_one_side(quaternions: Float[np.ndarray, "T J 4"]) -> Float[np.ndarray, "T J 4"]:
+    """The same rotations, of which a player may interpolate neighbouring keys as they are."""
+    turned = (quaternions[1:] * quaternions[:-1]).sum(-1) < 0
+    signs = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
+    return np.concatenate([quaternions[:1], quaternions[1:] * signs[..., None]])
 
 
 def _even_times(first: int, last: int) -> list[int]:

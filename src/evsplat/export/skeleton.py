@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import Body
-from evsplat.export.avatar import Clip, clip_of, recorded_clip
+from evsplat.export.avatar import Clip, clip_of, on_one_side, recorded_clip
 from evsplat.export.formats import glb_bytes
 from evsplat.export.gaussians import facts_of, file_rotation, rest_track
 from evsplat.files import write_bytes, write_text
@@ -140,9 +140,7 @@ def write_skeleton(
     """
     count, joints = motion.rotations.shape[:2]
     quaternions = Rotation.from_matrix(motion.rotations.reshape(-1, 3, 3)).as_quat()
-    quaternions = quaternions.reshape(count, joints, 4)
-    turned = (quaternions[1:] * quaternions[:-1]).sum(-1) < 0
-    quaternions[1:] *= np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)[..., None]
+    quaternions = on_one_side(quaternions.reshape(count, joints, 4))
     root = motion.parents.index(-1)
     rest = np.zeros((joints, 3))
     for joint, above in enumerate(motion.parents):
