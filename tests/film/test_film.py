@@ -1,5 +1,6 @@
 """Films from start to end: options that contradict, stopping and going on, light and events."""
 
+import json
 import signal
 import threading
 import time
@@ -16,6 +17,7 @@ from evsplat.errors import ConfigError, DataError, OutputError
 from evsplat.events import open_recording
 from evsplat.export import render_run, rendering
 from evsplat.film import Film, FilmPlan, Look, plan
+from evsplat.film.camera_path import camera_path_document
 from evsplat.film.frame_cache import FilmFrame, FrameCache
 from evsplat.methods.reconstruction import Rendering
 from evsplat.pictures.video import write_animation
@@ -84,14 +86,18 @@ def test_a_stopped_film_goes_on_where_it_was_and_equals_an_uninterrupted_one(lam
 
 
 def test_pictures_of_other_options_or_a_further_trained_run_are_not_taken(lamp, tmp_path):
-    for change in ("options", "training"):
+    behind = tmp_path / "behind.png"
+    for change in ("options", "training", "background"):
+        Image.new("RGB", (4, 4), "white").save(behind)
+        background = str(behind) if change == "background" else None
         lamp.lamp.drawn, lamp.lamp.stop_after = [], 8
         with pytest.raises(KeyboardInterrupt):
-            render_run(lamp.run, fps=100, out=tmp_path / change)
+            render_run(lamp.run, fps=100, out=tmp_path / change, background=background)
         lamp.lamp.drawn, lamp.lamp.stop_after = [], None
+        Image.new("RGB", (4, 4), "grey").save(behind)
         lamp.loaded.iteration += change == "training"
         fps = 50 if change == "options" else 100
-        render_run(lamp.run, fps=fps, out=tmp_path / change)
+        render_run(lamp.run, fps=fps, out=tmp_path / change, background=background)
         assert len(lamp.lamp.drawn) == 1 + LAST_US * fps // 10**6
 
 
@@ -241,6 +247,23 @@ def test_the_camera_turns_about_the_vertical_of_the_recording_whatever_the_motio
     frames = FilmPlan.of(film, capture, _Lamp(recorded)).frames
     heights = torch.stack([frame.camera.center() for frame in frames]).double() @ up.double()
     assert len(frames) > 5 and float(heights.max() - heights.min()) < 1e-4
+
+
+@pytest.mark.parametrize("seen_by", ["recorder", "another", "one key"])
+def test_the_edge_of_what_was_recorded_is_soft_from_wherever_else_it_is_seen(
+    tiny_capture, tmp_path, monkeypatch, seen_by
+):
+    """A camera that stands still and did not record is elsewhere too, and is not the recorder."""
+    capture = load_capture(tiny_capture())
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(camera_path_document([capture.cameras["side"]])))
+    asked = {"recorder": {}, "another": {"camera": "side"}, "one key": {"path": str(path)}}
+    made = []
+    monkeypatch.setattr(_Lamp, "changed_by", lambda lamp, *changes: made.extend(changes) or lamp)
+    FilmPlan.of(Film(**asked[seen_by]), capture, _Lamp(load_body_track(capture)))
+    rooms = [change.__self__ for change in made if change.__name__ == "soften"]
+    assert len(rooms) == (seen_by != "recorder")
+    assert all(room.recording is capture.camera_at("main", 0) for room in rooms)
 
 
 def test_a_film_stops_at_the_first_picture_that_cannot_be_kept(lamp, tmp_path, monkeypatch):

@@ -88,7 +88,7 @@ def render_run(
     transfer = loaded.capture.transfer(loaded.capture.frames[0])
     look = Look(film.show, film.parts, film.transparent, transfer, plan.surroundings)
     trained = loaded.method, loaded.iteration, loaded.train_seconds
-    digest = film_digest(plan.frames, look, film, *trained, *plan.poses)
+    digest = film_digest(plan.frames, look, film, *trained, *plan.from_files)
     cache = FrameCache(out.with_name(out.name + ".partial"), digest)
     cache.fill(plan.reconstruction, look, plan.frames)
     _write(film, plan, cache, out, events_out, anew=ours)

@@ -33,8 +33,8 @@ class FilmPlan:
     """Frames drawn per picture shown."""
     human_distance_m: float
     """Distance of the person from the first camera, metres."""
-    poses: tuple[object, ...]
-    """Times and poses of a motion, for the film's digest; empty for the recorded one."""
+    from_files: tuple[object, ...]
+    """Times and poses of a motion and pixels of a background, for the film's digest."""
     surroundings: Room | Painted | None
     """What shows where nothing is."""
 
@@ -45,14 +45,14 @@ class FilmPlan:
         Raises:
             ConfigError: the capture or the method cannot give what is asked for.
         """
-        poses: tuple[object, ...] = ()
+        from_files: tuple[object, ...] = ()
         recorded = reconstruction.track.to("cpu")
         if film.motion is not None:
             track = load_motion_of(
                 film.motion, recorded, fps=film.motion_fps, in_place=film.in_place
             )
             reconstruction = reconstruction.in_new_motion(track)
-            poses = (
+            from_files = (
                 track.times_us,
                 *(value.numpy() for value in track.at(track.times_us.tolist())),
             )
@@ -68,9 +68,13 @@ class FilmPlan:
 
         middle = _middle(track, times)
         start = capture.camera_at(view, times[0])
+        # It may be another than the one that the film is seen by, which recorded nothing.
+        recorder = capture.camera_at(recording, times[0]) if capture.is_static_camera else None
         # Up is where people stood in the recording: a motion may be a somersault.
-        room = Room.of(recorded, track, start if capture.is_static_camera else None)
+        room = Room.of(recorded, track, recorder)
         surroundings = _surroundings(film, room)
+        if isinstance(surroundings, Painted):
+            from_files += (surroundings.picture.numpy(),)
         path = _camera_path(film, capture)
         turn = {"orbit": whole_turn, "swing": to_both_sides}.get(film.path or "", straight)
         leaves = (
@@ -88,7 +92,8 @@ class FilmPlan:
         changes = [room.stand_back] if film.motion is not None else []
         if film.path in ("orbit", "swing"):
             changes.append(room.clear)
-        if surroundings is not None and cameras[0] is not cameras[-1]:
+        elsewhere = any(camera is not recorder for camera in cameras)
+        if surroundings is not None and recorder is not None and elsewhere:
             changes.append(room.soften)
         if changes:
             reconstruction = reconstruction.changed_by(*changes)
@@ -100,7 +105,7 @@ class FilmPlan:
             frames,
             oversampling,
             float((middle - cameras[0].center().cpu()).norm()),
-            poses,
+            from_files,
             surroundings,
         )
 
