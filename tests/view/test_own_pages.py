@@ -1,7 +1,10 @@
 """The viewer talks to its own page and to no other, and junk costs it a line."""
 
 import asyncio
+import gzip
 import logging
+from pathlib import Path
+from urllib.request import Request, urlopen
 
 import pytest
 
@@ -113,6 +116,22 @@ def test_junk_costs_one_line(server, caplog, capfd, junk):
 async def _still_there(server):
     async with connected(server) as socket:
         assert await asyncio.wait_for(socket.recv(), 10)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_the_page_looks_for_its_server_while_it_is_seen(server, packed):
+    """Also where another window has the focus; what else the page is stays as viser has it."""
+    encoding = {"Accept-Encoding": "gzip" if packed else "identity"}
+    address = f"http://127.0.0.1:{server.get_port()}/"
+    with urlopen(Request(address, headers=encoding)) as answer:
+        page = answer.read()
+        assert int(answer.headers["Content-Length"]) == len(page)
+    page = gzip.decompress(page) if packed else page
+    before, _, rest = page.partition(b"<script>")
+    script, _, after = rest.partition(b"</script>")
+    assert b"document.hasFocus = " in script and b"visibilitychange" in script
+    build = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    assert before + after == build.read_bytes()
 
 
 def test_a_connection_that_speaks_no_http_is_quiet(server, caplog):

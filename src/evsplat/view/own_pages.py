@@ -16,6 +16,8 @@ from urllib.parse import urlsplit
 
 import websockets.asyncio.server
 
+from evsplat.view.served_page import found_when_seen
+
 logger = logging.getLogger(__name__)
 
 _one_at_a_time = threading.Lock()
@@ -42,8 +44,8 @@ def refusal(origins: Sequence[str], hosts: Sequence[str], listens_at: str) -> st
 def own_pages_alone(listens_at: str) -> Iterator[None]:
     """Servers of websockets that are started in the block refuse other pages.
 
-    Messages that are none end their connection with one line in the log. viser has no setting for
-    either.
+    Their own finds them again when it is seen (`found_when_seen`). Messages that are none end their
+    connection with one line in the log. viser has no setting for any of it.
     """
     module: Any = websockets.asyncio.server
     serve = module.serve
@@ -58,7 +60,8 @@ def own_pages_alone(listens_at: str) -> Iterator[None]:
                 if why is not None:
                     logger.warning("The viewer refused %s.", why)
                     return connection.respond(HTTPStatus.FORBIDDEN, f"Refused: {why}.\n")
-            return process_request(connection, request) if process_request else None
+            answer = process_request(connection, request) if process_request else None
+            return None if answer is None else found_when_seen(answer)
 
         rest["logger"] = silent
         return serve(_said_in_a_line(handler), *arguments, process_request=judged, **rest)
