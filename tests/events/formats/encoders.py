@@ -169,11 +169,14 @@ def aedat4(
     *,
     compression: int = 1,
     packet: int = 700,
+    table_at: int = -1,
 ) -> bytes:
     """Packets of events with one of IMU between, then frames (image, start, end of exposure)."""
     xml = _XML.format(w=width, h=height).encode()
     header = flatbuffer(
-        {0: struct.pack("<i", compression), 1: struct.pack("<q", -1)}, {2: (len(xml), xml)}, b"IOHE"
+        {0: struct.pack("<i", compression), 1: struct.pack("<q", table_at)},
+        {2: (len(xml), xml)},
+        b"IOHE",
     )
     out = b"#!AER-DAT4.0\r\n" + header
 

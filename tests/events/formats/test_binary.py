@@ -154,6 +154,40 @@ def test_cut_file_is_an_error_or_kept_up_to_the_cut(tmp_path: Path, name: str) -
     assert any("before the cut (1)" in note for note in recording.notes)
 
 
+@pytest.mark.parametrize("repair", [False, True])
+@pytest.mark.parametrize("name", ENCODERS)
+def test_two_recordings_in_one_file_are_refused_where_the_second_begins(
+    tmp_path: Path, name: str, repair: bool
+) -> None:
+    """Its header was read as events, with words shifted behind it, or it was passed over."""
+    seed = int(np.random.default_rng().integers(1 << 31))
+    encode = ENCODERS[name][1]
+    first = encode(random_stream(seed, 4000, first_us=1000))
+    second = encode(random_stream(seed + 1, 4000, first_us=500_000))
+    if second.startswith(b"% "):
+        # headers of any length: by chance what follows is in step with the words before it
+        second = b"% date 2026-01-01" + b" " * (seed % 9) + b"\n% owner x\r\n" + second
+    path = tmp_path / "both"
+    path.write_bytes(first + second)
+    with pytest.raises(DataError, match=f"another recording begins at byte {len(first)},"):
+        open_recording(path, repair=repair).read()
+    path.write_bytes(second)
+    assert len(open_recording(path, width=WIDTH, height=260).read().t)
+
+
+def test_a_second_recording_behind_the_table_of_packets_is_refused(tmp_path: Path) -> None:
+    """An AEDAT4 file that was closed says where its packets end; the rest was passed over."""
+    s = random_stream(int(np.random.default_rng().integers(1 << 31)), 3000)
+    one = encoders.aedat4(s, WIDTH, HEIGHT)
+    closed = encoders.aedat4(s, WIDTH, HEIGHT, table_at=len(one)) + b"FTAB, any bytes" * 9
+    path = tmp_path / "closed"
+    path.write_bytes(closed)
+    assert same(read_events(path), s)
+    path.write_bytes(closed + one)
+    with pytest.raises(DataError, match=f"another recording begins at byte {len(closed)},"):
+        open_recording(path)
+
+
 def test_unknown_words_are_an_error_with_their_place(tmp_path: Path) -> None:
     s = random_stream(15, 100)
     data = encoders.evt2(s)

@@ -18,6 +18,7 @@ _CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f]")
 _MAX_LINE_BYTES = 1 << 16
 _MAX_HEADER_BYTES = 16 << 20
 _READ_EVENTS = 1 << 17
+_ANOTHER = re.compile(rb"#!AER-DAT2")
 _PAIR = np.dtype([("address", ">u4"), ("t", ">i4")])
 
 
@@ -75,7 +76,7 @@ class Aedat2(Source):
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte at a time."""
         chip = self._chip
-        with ByteReader(self.path, self._start) as reader:
+        with ByteReader(self.path, self._start, another=_ANOTHER) as reader:
             for pairs in reader.records(_PAIR, _READ_EVENTS, self.damage):
                 address = pairs["address"].astype(np.uint32)
                 keep = (address & chip.not_polarity) == 0

@@ -5,6 +5,7 @@ int32 stream, int32 size, payload (compressed), up to the table of packets at th
 https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4.0.html
 """
 
+import re
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,10 +20,12 @@ from evsplat.events.formats.base import (
     RawEvents,
     RecordedFrame,
     Source,
+    two_recordings,
 )
 from evsplat.options import ReadOptions
 
 MAGIC = b"#!AER-DAT4.0\r\n"
+_ANOTHER = re.compile(re.escape(MAGIC))
 _MAX_HEADER_BYTES = 16 << 20
 # DV writes packets of a few hundred kilobytes; a picture of 20 megapixels in colour has 60 MB.
 _MAX_PACKET_BYTES = 256 << 20
@@ -50,6 +53,8 @@ class Aedat4(Source):
         compression, table_position, description = self._preamble()
         # the table of packets at the end is not needed; 0 or -1 where there is none
         self._end = table_position if table_position > 0 else None
+        if self._end is not None:
+            self._refuse_another(self._end)
         self._decompress = _decompressor(self.path, compression)
         streams = self._streams(description)
         self._events = self._choose(streams, "EVTS")
@@ -97,6 +102,12 @@ class Aedat4(Source):
         except _FlatbufferError as error:
             raise DataError(f"{self.path}: its AEDAT4 header is damaged ({error}).") from None
 
+    def _refuse_another(self, end: int) -> None:
+        """Raise where another recording follows the table of packets, which nothing would read."""
+        with ByteReader(self.path, end, another=_ANOTHER) as reader:
+            while reader.read(1 << 20):
+                pass
+
     def _streams(self, description: bytes) -> _Streams:
         try:
             if b"<!" in description:
@@ -133,6 +144,8 @@ class Aedat4(Source):
                 payload = reader.read(size) if wanted else b""
                 if not wanted:
                     reader.skip_to(offset + 8 + max(size, 0))
+                if head == MAGIC[:8]:
+                    raise two_recordings(self.path, offset, zipped=reader.zipped)
                 if len(head) < 8 or size < 0 or reader.offset < offset + 8 + size:
                     self.damage.found(
                         f"ends in the middle of a packet, or is damaged, at byte {offset}",

@@ -2,6 +2,7 @@
 
 import gzip
 import os
+import re
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -23,6 +24,9 @@ BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
 _BUFFER_BYTES = 1 << 16
 _SEEK_BYTES = 1 << 12
+# Kept of what was read, to know the beginning of another recording with all lines of its header.
+_SEEN_BYTES = 1 << 10
+_LINES_BEFORE = re.compile(rb"(?:% [ -~]*\r?\n)*\Z")
 
 
 class RawEvents(NamedTuple):
@@ -108,21 +112,33 @@ class Source(ABC):
 class ByteReader(ExitStack):
     """Sequential bytes of a file, gunzipped where it is a gzip file, with the offset in mind."""
 
-    def __init__(self, path: Path, start: int = 0) -> None:
-        """The first byte to be read is that at ``start``."""
+    def __init__(
+        self, path: Path, start: int = 0, *, another: re.Pattern[bytes] | None = None
+    ) -> None:
+        """The first byte to be read is that at ``start``.
+
+        Where ``another`` matches what is read with `read`, another recording begins, as in files
+        that were put together: a `DataError`, since its header would be read as events.
+        """
         super().__init__()
         self.path = path
         self.offset = 0
+        self._another: re.Pattern[bytes] | None = None
+        self._seen = b""
         self._file = self.enter_context(open_bytes(path, buffer=_BUFFER_BYTES))
         self._size = os.fstat(self._file.fileno()).st_size
         self.zipped = self._file.read(2) == b"\x1f\x8b"
         self._file.seek(0)
         self._stream = gzip.GzipFile(fileobj=self._file) if self.zipped else self._file
         self.skip_to(start)
+        self._another = another  # from here on: what was skipped has a header of its own
 
     def read(self, count: int) -> bytes:
         """``count`` bytes, fewer only at the end of the file."""
-        return self._taken(self._stream.read, count)
+        data = self._taken(self._stream.read, count)
+        if self._another is not None:
+            self._refuse_another(self._another, data)
+        return data
 
     def read_line(self, limit: int) -> bytes:
         """Bytes up to and with the next newline, at most ``limit``."""
@@ -146,6 +162,16 @@ class ByteReader(ExitStack):
                     repaired_by="keeps the events before the cut",
                 )
 
+    def _refuse_another(self, another: re.Pattern[bytes], data: bytes) -> None:
+        """Raise where another recording begins in ``data`` or across its beginning."""
+        seen = self._seen + data
+        found = another.search(seen)
+        if found:
+            before = _LINES_BEFORE.search(seen, max(0, found.start() - _SEEN_BYTES), found.start())
+            first = before.start() if before else found.start()
+            raise two_recordings(self.path, self.offset - len(seen) + first, zipped=self.zipped)
+        self._seen = seen[-_SEEN_BYTES:]
+
     def _taken(self, read: Callable[[int], bytes], most: int) -> bytes:
         try:
             data = read(most)
@@ -155,6 +181,16 @@ class ByteReader(ExitStack):
             ) from None
         self.offset += len(data)
         return data
+
+
+def two_recordings(path: Path, at: int, *, zipped: bool) -> DataError:
+    """The error of a file in which another recording begins at byte ``at``."""
+    unpack = "gunzip it and " if zipped else ""
+    return DataError(
+        f"{path}: another recording begins at byte {at}, expected one in a file; {unpack}cut it "
+        f"there (head -c {at} IN > FIRST; tail -c +{at + 1} IN > SECOND) and give the part that "
+        "belongs to the pictures."
+    )
 
 
 def is_gzipped(path: Path) -> bool:

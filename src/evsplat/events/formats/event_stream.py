@@ -3,6 +3,7 @@
 https://github.com/neuromorphic-paris/event_stream, with the bytes that its version 2 writes today.
 """
 
+import re
 from collections.abc import Iterator
 
 from evsplat.errors import DataError
@@ -13,6 +14,7 @@ from evsplat.options import ReadOptions
 _KINDS = {1: "es_dvs", 2: "es_atis"}
 _NAMES = {0: "generic", 4: "colour"}
 _HEADER_BYTES = 20
+_ANOTHER = re.compile(rb"Event Stream\x02")
 
 
 class EventStreamFile(Source):
@@ -42,7 +44,7 @@ class EventStreamFile(Source):
         """About a megabyte at a time."""
         decoder = WordDecoder(self._kind, self.damage)
         assert self.height is not None
-        with ByteReader(self.path, _HEADER_BYTES) as reader:
+        with ByteReader(self.path, _HEADER_BYTES, another=_ANOTHER) as reader:
             for events in decoder.blocks(reader):
                 # rows count from the bottom; beyond the sensor is for the checks to find
                 yield events._replace(y=self.height - 1 - events.y.astype("i4"))

@@ -21,6 +21,9 @@ _EVT_VERSIONS = {"2": "evt2", "2.0": "evt2", "2.1": "evt21", "3": "evt3", "3.0":
 _FORMAT_NAMES = {"EVT2": "evt2", "EVT21": "evt21", "EVT3": "evt3"}
 # Types of EVT 2.1 words: events, time, trigger, others, continued
 _EVT21_TYPES = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
+# Lines of which every header has one; so many bytes are no events by chance.
+_ANOTHER_RAW = re.compile(rb"% (?:evt [23]|format EVT)")
+_ANOTHER_DAT = re.compile(rb"% (?:Data file containing|Version [12])")
 _DAT_EVENT = np.dtype([("t", "<u4"), ("pixel", "<u4")])
 _DAT_EVENT_TYPES = (0x00, 0x0C)
 _DAT_READ_EVENTS = 1 << 17
@@ -89,7 +92,7 @@ class Raw(Source):
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte of words at a time."""
         decoder = WordDecoder(self._kind, self.damage)
-        with ByteReader(self.path, self._start) as reader:
+        with ByteReader(self.path, self._start, another=_ANOTHER_RAW) as reader:
             yield from decoder.blocks(reader)
         note = "events before the first time are left out, as they have none"
         if decoder.untimed and not any(note in known for known in self.notes):
@@ -142,7 +145,7 @@ class Dat(Source):
 
     def blocks(self) -> Iterator[RawEvents]:
         """About a megabyte at a time."""
-        with ByteReader(self.path, self._start) as reader:
+        with ByteReader(self.path, self._start, another=_ANOTHER_DAT) as reader:
             for events in reader.records(_DAT_EVENT, _DAT_READ_EVENTS, self.damage):
                 pixel = events["pixel"]
                 yield RawEvents(
