@@ -1,5 +1,9 @@
 """HDF5 files and ROS bags in the layouts of the field."""
 
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -115,8 +119,48 @@ def test_prophesees_own_packing_is_refused_in_one_sentence(tmp_path: Path) -> No
         file.create_group("CD")
         space = h5py.h5s.create_simple((10,))
         h5py.h5d.create(file.id, b"CD/events", kind, space, properties)
-    with pytest.raises(DataError, match="packed with Prophesee's ECF"):
+    with pytest.raises(
+        DataError, match="packed with Prophesee's ECF, whose plug-in is not found; set HDF5_PLUGIN"
+    ):
         open_recording(tmp_path / "e.h5")
+
+
+_STAND_IN = """
+#include <stddef.h>
+typedef size_t filter_t(unsigned, size_t, const unsigned *, size_t, size_t *, void **);
+static size_t turned(unsigned f, size_t n, const unsigned *v, size_t bytes, size_t *s, void **b) {
+    for (size_t i = 0; i < bytes; ++i) ((unsigned char *)*b)[i] ^= 0x5a;
+    return bytes;
+}
+static const struct {
+    int version, id; unsigned encodes, decodes; const char *name; void *can, *set; filter_t *f;
+} filter = {1, 36559, 1, 1, "stand-in", 0, 0, turned};
+int H5PLget_plugin_type(void) { return 0; }
+const void *H5PLget_plugin_info(void) { return &filter; }
+"""
+_WRITE_AND_READ = """
+import sys, h5py, numpy as np
+from evsplat.events import read_events
+kind = [("x", "u2"), ("y", "u2"), ("p", "i2"), ("t", "i8")]
+rows = np.zeros(1000, kind)
+rows["t"], rows["x"] = np.arange(1000) * int(sys.argv[1]), np.arange(1000) % 7
+with h5py.File("e.h5", "w") as file:
+    file.create_dataset("CD/events", data=rows, chunks=(100,), compression=36559)
+events = read_events("e.h5")
+assert np.array_equal(events.t, rows["t"]) and np.array_equal(events.x, rows["x"])
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_a_file_packed_with_ecf_is_read_where_its_plug_in_is(tmp_path: Path) -> None:
+    """A plug-in of that number turns bits of each byte; what it is told to unpack comes out."""
+    (tmp_path / "ecf.c").write_text(_STAND_IN)
+    build = ["cc", "-shared", "-fPIC", "-o", tmp_path / "libecf.so", tmp_path / "ecf.c"]
+    subprocess.run(build, check=True)
+    step = str(np.random.default_rng().integers(1, 1000))
+    command = [sys.executable, "-c", _WRITE_AND_READ, step]
+    environment = {**os.environ, "HDF5_PLUGIN_PATH": str(tmp_path)}
+    subprocess.run(command, check=True, cwd=tmp_path, env=environment)
 
 
 def test_a_shape_without_content_is_refused(tmp_path: Path) -> None:
@@ -144,6 +188,10 @@ def test_ros1_bag_of_event_arrays(tmp_path: Path) -> None:
     recording = open_recording(tmp_path / "e.bag")
     assert (recording.format, recording.width, recording.height) == ("rosbag", WIDTH, HEIGHT)
     assert same(recording.read(), s)
+    data = (tmp_path / "e.bag").read_bytes()
+    (tmp_path / "cut.bag").write_bytes(data[: len(data) * 2 // 3])  # no index yet
+    with pytest.raises(DataError, match="recording was cut off, make it whole: 'rosbag reindex'"):
+        open_recording(tmp_path / "cut.bag")
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])

@@ -1,6 +1,6 @@
 """HDF5 files of events: DSEC, our own, Metavision's /CD/events, and others with the usual names.
 
-Blosc and other packings need `hdf5plugin` (extra `recordings`); Prophesee's own (ECF) is not read.
+Blosc and other packings need `hdf5plugin` (extra `recordings`), Prophesee's own (ECF) its plug-in.
 """
 
 import re
@@ -187,12 +187,14 @@ def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
     """Load the plugins that unpack a dataset, or say what is missing."""
     properties = dataset.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
-    if _ECF in filters:
+    if _ECF in filters and not h5py.h5z.filter_avail(_ECF):
         raise DataError(
-            f"{path}: packed with Prophesee's ECF, which only its own software unpacks; write it "
-            "as RAW or DAT with Metavision (metavision_file_to_dat) and read that."
+            f"{path}: packed with Prophesee's ECF, whose plug-in is not found; set "
+            "HDF5_PLUGIN_PATH to its folder (it comes with Metavision, and alone as "
+            "github.com/prophesee-ai/hdf5_ecf), or write the recording as RAW or DAT with "
+            "Metavision (metavision_file_to_dat) and read that."
         )
-    others = [number for number in filters if number not in _BUILT_IN]
+    others = [number for number in filters if number not in (*_BUILT_IN, _ECF)]
     if others:
         try:
             import hdf5plugin  # noqa: F401 - registers the filters

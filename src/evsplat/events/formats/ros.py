@@ -69,7 +69,8 @@ class RosBag(Source):
         if message.encoding != _ENCODING:
             raise DataError(
                 f"{self.path}: message {number} of {self._topic} is encoded as "
-                f"{message.encoding!r}, expected {_ENCODING!r}."
+                f"{message.encoding!r}, expected {_ENCODING!r}; record it so, or publish it again "
+                "as dvs_msgs/EventArray (event_camera_tools) and record that."
             )
         start = 0
         while start + 1 < len(message.events):
@@ -172,4 +173,7 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:
         reason = re.sub(r"\s+", " ", str(error))[:200]
-        raise DataError(f"{path}: the bag cannot be read ({reason}).") from None
+        raise DataError(
+            f"{path}: the bag cannot be read ({reason}); where its recording was cut off, make it "
+            "whole: 'rosbag reindex' (ROS 1), 'ros2 bag reindex', or 'mcap recover' of an .mcap."
+        ) from None
