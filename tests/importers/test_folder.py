@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from evsplat.body.smpl import ENVIRONMENT
 from evsplat.capture import Capture, load_body_track, load_capture
@@ -56,14 +57,14 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "mine"
 
 
-def worst_miss(capture: Capture) -> float:
+def worst_miss(capture: Capture, shrink: int = 1) -> float:
     track = load_body_track(capture)
     worst = 0.0
     for frame in capture.frames:
         row = int(frame.name.removeprefix("shot"))
         seen, _ = capture.camera(frame).project(track.vertices(frame.mid_us))
         person = VIEW.pixels(trees.zju_person().vertices(row), distorted=False) + 0.5
-        worst = max(worst, float(np.abs(seen.numpy() - person).max()))
+        worst = max(worst, float(np.abs(shrink * seen.numpy() - person).max()))
     return worst
 
 
@@ -131,6 +132,51 @@ def test_a_part_of_the_pictures_has_their_poses_masks_and_events(
     begin, end = capture.frames[0].exposure_us[0], capture.frames[1].exposure_us[1]
     assert capture.events is not None
     assert len(capture.events) == ((rows[:, 0] >= begin) & (rows[:, 0] < end)).sum() > 0
+
+
+def test_a_recording_is_made_smaller_with_its_camera_masks_and_events(
+    recording: Path, tmp_path: Path, monkeypatch
+) -> None:
+    models = write_smpl(tmp_path / "models")
+    factor = int(np.random.default_rng().integers(2, 5))
+    wide, high = 128 // factor, 136 // factor
+    options = {"fps": 25.0, "exposure_us": 30_000.0, "start_us": 16_000, "contrast": (0.4, 0.2)}
+    import_capture("folder", recording, tmp_path / "out", smpl=models, shrink=factor, **options)
+    monkeypatch.setenv(ENVIRONMENT, str(models))
+    capture = load_capture(tmp_path / "out")
+    camera = capture.camera(capture.frames[0])
+    assert (camera.width, camera.height) == (wide, high)
+    assert worst_miss(capture, factor) < 0.01
+    for frame in capture.frames:
+        whole = np.array(Image.open(recording / "images" / f"{frame.name}.png"), dtype=float)
+        places = [
+            whole[y::factor, x::factor][:high, :wide] for x in range(factor) for y in range(factor)
+        ]
+        assert np.abs(np.array(Image.open(frame.image)) - np.mean(places, axis=0)).max() <= 0.5
+        mask = capture.mask(frame)
+        assert mask is not None and mask.shape == (high, wide) and 0.05 < mask.mean() < 0.9
+    rows = np.loadtxt(recording / "events.csv", delimiter=",", skiprows=1).astype(int)
+    kept = rows[(rows[:, 1] < wide * factor) & (rows[:, 2] < high * factor)]
+    assert capture.events is not None
+    events = capture.events.between(0, 1_000_000)
+    assert np.array_equal(
+        np.stack([events.t, events.x, events.y]).T, kept[:, :3] // [1, factor, factor]
+    )
+    # an event of one of the pixels is its share of what their mean changes by
+    assert capture.contrast_threshold == pytest.approx((0.4 / factor**2, 0.2 / factor**2))
+
+
+@pytest.mark.parametrize(
+    ("shrink", "said"),
+    [(0, "above 0"), (13, "left 9x10, .* at least 11"), (999, "left 0x0, .* 11")],
+)
+def test_a_recording_is_not_made_too_small(
+    recording: Path, tmp_path: Path, shrink: int, said: str
+) -> None:
+    options = {"fps": 25.0, "exposure_us": 30_000.0, "no_poses": True}
+    with pytest.raises(EvsplatError, match=said):
+        import_capture("folder", recording, tmp_path / "out", shrink=shrink, **options)
+    assert not (tmp_path / "out").exists()
 
 
 def test_pictures_without_a_mask_are_counted(recording: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from evsplat.cli.main import main
 from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.events import EventStream, write_events
 from evsplat.importers import import_capture
+from evsplat.importers.recorded import large_pictures
 from evsplat.options import PoseOptions
 from evsplat.pictures.video import write_video
 
@@ -209,6 +210,16 @@ def test_a_part_of_a_video_keeps_its_clock_and_the_events_of_its_time(tmp_path: 
     with pytest.raises(ConfigError, match=f"no frame in 40..49; there are 0..{COUNT - 1}"):
         import_capture("video", clip, tmp_path / "none", frames=(40, 50), exposure_us=20_000.0)
     assert not (tmp_path / "none").exists()
+
+
+def test_of_large_pictures_the_least_factor_that_leaves_few_pixels_is_told() -> None:
+    rng = np.random.default_rng()
+    for width, height in rng.integers(1300, 8000, (20, 2)).tolist():
+        (note,) = large_pictures((width, height))
+        factor = int(note.split("--shrink ")[1].split()[0])
+        assert width * height / factor**2 <= 1_500_000 < width * height / (factor - 1) ** 2
+        assert note.endswith(f"makes them {width // factor}x{height // factor}")
+    assert large_pictures((1280, 720)) == []
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from evsplat.untrusted.faults import brief
 # Rotations written as rounded decimals are accepted down to about five digits.
 _ROTATION_TOLERANCE = 1e-4
 # Training and evaluation compare pictures by SSIM, whose window has this side.
-_SMALLEST_PX = 11
+SMALLEST_PX = 11
 _LARGEST_PX = 16_384
 # From a fish eye's middle to a telescope.
 _FOCAL_IN_SIDES = (0.05, 200.0)
@@ -59,11 +59,11 @@ def _pixels(entry: Fields, key: str) -> int:
     count = entry.integer(key, minimum=1)
     if count > _LARGEST_PX:
         entry.fail(key, f"{count} pixels", f"at most {_LARGEST_PX}", "Shrink the pictures.")
-    if 0 < count < _SMALLEST_PX:
+    if 0 < count < SMALLEST_PX:
         entry.fail(
             key,
             f"{count} pixels",
-            f"at least {_SMALLEST_PX}, the side of SSIM's window",
+            f"at least {SMALLEST_PX}, the side of SSIM's window",
             "Record larger pictures, or shrink them less.",
         )
     return count

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from evsplat.capture.parse_cameras import SMALLEST_PX
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
 from evsplat.options.declare import LAST, Flag
@@ -71,12 +72,10 @@ class SourceCamera:
         ``picture`` is one of them as stored, or its width and height.
         """
         width, height = image_size(picture) if isinstance(picture, Path) else picture
-        K = self.K.copy()
-        K[:2] /= shrink
+        K, size = shrunk_view(self.K, (width, height), shrink)
         writer.add_camera(
             name,
-            width // shrink,
-            height // shrink,
+            *size,
             K,
             self.world_to_camera,
             distortion=self.distortion,
@@ -86,6 +85,26 @@ class SourceCamera:
     def moved(self, world_from_new: Float[np.ndarray, "4 4"]) -> "SourceCamera":
         """The same camera seen from another world."""
         return replace(self, world_to_camera=self.world_to_camera @ world_from_new)
+
+
+def shrunk_view(
+    K: Float[np.ndarray, "3 3"], size: tuple[int, int], factor: int
+) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
+    """Intrinsics, and width and height, of pictures of ``size`` made smaller by ``factor``.
+
+    Raises:
+        ConfigError: The factor is not positive, or captures have no pictures as small as that.
+    """
+    check_positive(shrink=factor)
+    width, height = size[0] // factor, size[1] // factor
+    if min(width, height) < SMALLEST_PX:
+        raise ConfigError(
+            f"--shrink {factor}: of pictures of {size[0]}x{size[1]} pixels would be left "
+            f"{width}x{height}, expected at least {SMALLEST_PX} either way; give a smaller factor."
+        )
+    smaller = np.array(K, dtype=np.float64)
+    smaller[:2] /= factor
+    return smaller, (width, height)
 
 
 def opencv_intrinsics(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

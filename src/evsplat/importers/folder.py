@@ -33,15 +33,18 @@ from evsplat.importers.option_types import (
     FrameRange,
     Name,
     OwnRate,
+    Shrink,
     TimeUs,
 )
 from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_motion
 from evsplat.importers.recorded import (
     add_recorded_events,
     add_recorded_frame,
+    large_pictures,
     offset_or_levels,
     pictures_of,
     recorded_camera,
+    shrunk_camera,
 )
 from evsplat.importers.smpl import chosen_poses
 from evsplat.options.declare import Flag, option
@@ -56,6 +59,8 @@ class Folder(Importer):
 
     frames: FrameRange = None
     """First picture and one past the last, counted from 0; by default all."""
+    shrink: Shrink = 1
+    """Make pictures and events smaller by this factor."""
     images: FileOption = None
     """Folder of pictures, or a video; by default SOURCE/images or the video in SOURCE."""
     events: FileOption = None
@@ -110,7 +115,8 @@ class Folder(Importer):
         camera, focal, note = self._camera(source, size, motion)
         if self.transfer is not None:
             camera["transfer"] = self.transfer
-        writer.add_camera("main", *size, **camera)
+        camera, small = shrunk_camera(camera, size, self.shrink)
+        writer.add_camera("main", *small, **camera)
         kept = chosen_frames(self.frames, list(range(len(middles))), source)
         seen = sorted(frames_with_poses(motion, middles).intersection(kept))
         if not seen:
@@ -129,6 +135,7 @@ class Folder(Importer):
                 timed,
                 exposure,
                 clock_offset,
+                shrink=self.shrink,
                 mask=masks.of(timed),
                 world_to_camera=views.get(index),
             )
@@ -140,8 +147,10 @@ class Folder(Importer):
             contrast=self.contrast,
             repair=self.repair,
             exposed_only=self.frames is not None,
+            shrink=self.shrink,
         )
-        notes += [*short_exposure(self.exposure_us), *([note] if note else [])]
+        notes += [*short_exposure(self.exposure_us), *large_pictures(small)]
+        notes += [note] if note else []
         if len(seen) < len(kept):
             lacking = counted(len(kept) - len(seen), "picture")
             notes.append(f"left out: {lacking} without a pose")
@@ -150,6 +159,7 @@ class Folder(Importer):
             "focal": focal,
             "notes": notes,
             "frames": [kept[0], kept[-1] + 1],
+            "shrink": self.shrink,
         }
         if path is None or motion is None:
             writer.leave_out_body()

@@ -1,5 +1,6 @@
 """Parts of importers of your own recordings: camera and events."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -7,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from tqdm import tqdm
 
 from evsplat.calibration.offset import LEAST_CORRELATION, BlockLevels, TooLong, estimate_offset
@@ -17,7 +18,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventRecording, EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
 from evsplat.footage import Footage, TimedPicture
-from evsplat.importers.base import check_positive, need
+from evsplat.importers.base import check_positive, need, shrunk, shrunk_view
 from evsplat.pictures.files import to_unit_range
 
 GUESSED_FOV_DEG = 60.0
@@ -25,6 +26,8 @@ GUESSED_FOV_DEG = 60.0
 has about 65 degrees, a DAVIS346 with its usual 6 mm lens 61."""
 _COVERED = 0.9
 """Share of the pictures' time below which events that cover no more are remarked."""
+_MANY_PIXELS = 1_500_000
+"""Pixels of a picture above which training takes minutes before its first step."""
 _MANY = 100
 """Events of which some are of either polarity."""
 
@@ -55,6 +58,26 @@ def recorded_camera(
     return {"K": K}, origin, note
 
 
+def shrunk_camera(
+    camera: dict[str, Any], size: tuple[int, int], factor: int
+) -> tuple[dict[str, Any], tuple[int, int]]:
+    """`recorded_camera` of pictures of ``size`` made smaller by ``factor``, and their size."""
+    K, small = shrunk_view(camera["K"], size, factor)
+    return {**camera, "K": K}, small
+
+
+def large_pictures(size: tuple[int, int]) -> list[str]:
+    """A note where pictures have so many pixels that training is slow."""
+    width, height = size
+    factor = math.ceil(math.sqrt(width * height / _MANY_PIXELS))
+    if factor == 1:
+        return []
+    return [
+        f"pictures: {width}x{height} pixels, with which training is slow; --shrink {factor} makes "
+        f"them {width // factor}x{height // factor}"
+    ]
+
+
 def offset_or_levels(
     clock_offset_us: int | Literal["auto"], camera: dict[str, Any]
 ) -> int | BlockLevels:
@@ -81,20 +104,25 @@ def add_recorded_frame(
     exposure_us: tuple[int, int],
     clock_offset: int | BlockLevels,
     *,
-    mask: Bool[np.ndarray, "H W"] | None = None,
+    shrink: int = 1,
+    mask: Float[np.ndarray, "H W"] | None = None,
     world_to_camera: Float[np.ndarray, "4 4"] | None = None,
 ) -> None:
-    """Write a frame of camera "main"; gather its levels where the clock's offset is to be found."""
+    """Write a frame of camera "main"; gather its levels where the clock's offset is to be found.
+
+    Picture and mask are made smaller by ``shrink``.
+    """
+    pixels = picture.pixels if shrink == 1 else shrunk(picture.pixels, shrink)
     writer.add_frame(
         picture.name,
         "main",
-        picture.pixels,
+        pixels,
         exposure_us,
-        mask=mask,
+        mask=mask if mask is None or shrink == 1 else shrunk(mask, shrink),
         world_to_camera=world_to_camera,
     )
     if isinstance(clock_offset, BlockLevels):
-        clock_offset.add(to_unit_range(picture.pixels), exposure_us)
+        clock_offset.add(to_unit_range(pixels), exposure_us)
 
 
 def add_recorded_events(
@@ -106,11 +134,13 @@ def add_recorded_events(
     contrast: tuple[float, float] | None,
     repair: bool,
     exposed_only: bool = False,
+    shrink: int = 1,
 ) -> list[str]:
     """Write the events of a recording of any format; gives notes for the user.
 
     ``clock_offset`` is in us, or the levels of the frames by which it is found. ``exposed_only``
-    leaves out events before the first exposure and after the last.
+    leaves out events before the first exposure and after the last. ``size`` is that of the pictures
+    as recorded, in whose pixels the events are; both are made smaller by ``shrink``.
     """
     if path is None:
         of_events = {"contrast": contrast, "clock-offset-us": clock_offset, "repair": repair}
@@ -135,17 +165,35 @@ def add_recorded_events(
         clock_offset, note = _found_offset(clock_offset, recording, path, size)
         notes.append(note)
     start, end = (time - clock_offset for time in writer.exposed_us)
-    pieces = passed.watching(recording.chunks())
+    pieces = passed.watching(_shrunk_events(recording.chunks(), size, shrink))
     writer.set_events(
         (piece.between(start, end) for piece in pieces) if exposed_only else pieces,
-        *size,
-        contrast_threshold=contrast,
+        size[0] // shrink,
+        size[1] // shrink,
+        contrast_threshold=contrast and _shrunk_contrast(contrast, shrink),
         simulated=False,
         clock_offset_us=clock_offset,
     )
     # Repairs are known once the events have been read.
     notes += recording.notes
     return [*notes, *passed.notes(path, writer.exposed_us, clock_offset)]
+
+
+def _shrunk_events(
+    pieces: Iterable[EventStream], size: tuple[int, int], factor: int
+) -> Iterator[EventStream]:
+    """The events in the squares of ``factor`` pixels that pictures of ``size`` are made of."""
+    for piece in pieces:
+        if factor > 1:
+            x, y = piece.x // factor, piece.y // factor
+            inside = (x < size[0] // factor) & (y < size[1] // factor)
+            piece = EventStream(piece.t, x, y, piece.p).take(inside)
+        yield piece
+
+
+def _shrunk_contrast(contrast: tuple[float, float], factor: int) -> tuple[float, float]:
+    """Thresholds of squares of pixels: one pixel's event is a share of the mean's change."""
+    return contrast[0] / factor**2, contrast[1] / factor**2
 
 
 def _found_offset(

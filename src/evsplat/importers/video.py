@@ -22,14 +22,17 @@ from evsplat.importers.option_types import (
     Focal,
     FrameRange,
     OwnRate,
+    Shrink,
     TimeUs,
 )
 from evsplat.importers.recorded import (
     add_recorded_events,
     add_recorded_frame,
+    large_pictures,
     offset_or_levels,
     pictures_of,
     recorded_camera,
+    shrunk_camera,
 )
 from evsplat.options.declare import Flag
 
@@ -40,6 +43,8 @@ class Video(Importer):
 
     frames: FrameRange = None
     """First picture and one past the last, counted from 0; by default all."""
+    shrink: Shrink = 1
+    """Make pictures and events smaller by this factor."""
     events: FileOption = None
     """Event recording of any known format, in the pixels of the video."""
     exposure_us: Exposure = None
@@ -74,13 +79,14 @@ class Video(Importer):
         camera, focal, note = recorded_camera(self.camera, self.focal, size)
         if self.transfer is not None:
             camera["transfer"] = self.transfer
-        writer.add_camera("main", *size, **camera)
+        camera, small = shrunk_camera(camera, size, self.shrink)
+        writer.add_camera("main", *small, **camera)
         clock_offset = offset_or_levels(self.clock_offset_us, camera)
         kept = chosen_frames(self.frames, list(range(len(footage.times_us))), source)
         for _, timed in pictures_of(footage, kept):
             middle = timed.time_us + self.start_us
             exposure = exposure_around(middle, self.exposure_us)
-            add_recorded_frame(writer, timed, exposure, clock_offset)
+            add_recorded_frame(writer, timed, exposure, clock_offset, shrink=self.shrink)
         notes = add_recorded_events(
             writer,
             self.events,
@@ -89,13 +95,16 @@ class Video(Importer):
             contrast=self.contrast,
             repair=self.repair,
             exposed_only=self.frames is not None,
+            shrink=self.shrink,
         )
-        notes += [*short_exposure(self.exposure_us), *([note] if note else [])]
+        notes += [*short_exposure(self.exposure_us), *large_pictures(small)]
+        notes += [note] if note else []
         writer.provenance |= {
             "source": f"video {source.name}",
             "focal": focal,
             "notes": notes,
             "frames": [kept[0], kept[-1] + 1],
+            "shrink": self.shrink,
         }
         writer.leave_out_body()
         return notes
