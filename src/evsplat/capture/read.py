@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
+from tqdm import tqdm
 
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile, body_from_arrays
@@ -26,7 +27,9 @@ from evsplat.untrusted.arrays import read_plain_npz
 
 IMAGE_CACHE_BYTES = 192 << 20
 # A temporal median settles long before this many frames; more would only cost memory.
-_MEDIAN_FRAMES = 255
+_MEDIAN_FRAMES, _MEDIAN_BYTES = 255, 1 << 30
+"""Frames that a median is taken of at most, and bytes: 255 of 1024x1024 in colour, 43 of 4k."""
+_LEAST_MEDIAN_FRAMES = 15
 
 
 class CaptureReader:
@@ -257,7 +260,10 @@ class CaptureReader:
         return body_from_arrays(path, keyed, self._metadata.body_model)
 
     def median_background(self) -> Float[Tensor, "H W 3"]:
-        """Per-pixel temporal median of the train frames (at most 255, evenly spread)."""
+        """Per-pixel temporal median of the train frames (at most 255, evenly spread).
+
+        Of pictures above a megapixel so many that they take a gigabyte.
+        """
         return self._median.clone()
 
     @functools.cached_property
@@ -268,13 +274,19 @@ class CaptureReader:
                 "capture has a moving camera or several."
             )
         train = self.train_frames
-        chosen = np.unique(np.linspace(0, len(train) - 1, min(len(train), _MEDIAN_FRAMES)).round())
+        first = self._stored(train[0].image, train[0].camera, train[0].gain)
+        each = first.size * (4 if any(frame.gain for frame in train) else first.itemsize)
+        most = min(_MEDIAN_FRAMES, max(_LEAST_MEDIAN_FRAMES, _MEDIAN_BYTES // each))
+        chosen = np.unique(np.linspace(0, len(train) - 1, min(len(train), most)).round())
         frames = [train[int(i)] for i in chosen]
-        stored = [self._stored(frame.image, frame.camera, frame.gain) for frame in frames]
+        pictures = tqdm(frames, "background", unit="picture", leave=False, disable=None)
+        stored = [self._stored(frame.image, frame.camera, frame.gain) for frame in pictures]
         if any(frame.gain for frame in frames):  # those without are still as they are stored
             stored = [to_unit_range(picture).numpy() for picture in stored]
         stack = np.stack(stored)
-        rows = [np.median(stack[:, row], axis=0) for row in range(stack.shape[1])]
+        del stored
+        counted = tqdm(range(stack.shape[1]), "median", unit="row", leave=False, disable=None)
+        rows = [np.median(stack[:, row], axis=0) for row in counted]
         scale = 1.0 if stack.dtype == np.float32 else float(np.iinfo(stack.dtype).max)
         return to_rgb(torch.from_numpy((np.stack(rows) / scale).astype(np.float32)))
 

@@ -1,6 +1,7 @@
 """`evsplat inspect`: check a capture, sum it up in words and draw it."""
 
 import logging
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
+from tqdm import tqdm
 
 from evsplat.body import BodyTrack, nearest_axis, silhouette, up_axis
 from evsplat.calibration import SensorEstimate
@@ -323,10 +325,15 @@ def _label(frame: Frame) -> str:
     return f"{frame.name}   {frame.mid_us / 1e6:.3f} s"
 
 
+def _drawn(frames: Sequence[Frame], what: str) -> Iterable[Frame]:
+    """The frames, with a bar on a terminal: pictures of 8 megapixels take a second each."""
+    return tqdm(frames, what, unit="frame", leave=False, disable=None)
+
+
 def _contact_sheet(capture: Capture) -> Image.Image:
     chosen = _spread(capture.frames, CONTACT_FRAMES)
     tiles = []
-    for frame in chosen:
+    for frame in _drawn(chosen, "frames"):
         camera = capture.camera(frame)
         picture = to_picture(
             capture.shown(capture.image(frame)), fit(camera.width, camera.height, 170)
@@ -348,7 +355,7 @@ def _events_sheet(capture: Capture) -> Image.Image:
             _label(frame),
             frame.split,
         )
-        for frame in _spread(capture.frames, DETAIL_FRAMES)
+        for frame in _drawn(_spread(capture.frames, DETAIL_FRAMES), "events")
     ]
     subtitle = f"{EVENT_WINDOW_US / 1000:g} ms about mid-exposure; red: brighter, blue: darker"
     return sheet(f"{capture.name}: events", subtitle, tiles, columns=4)
@@ -357,7 +364,7 @@ def _events_sheet(capture: Capture) -> Image.Image:
 def _body_sheet(capture: Capture, track: BodyTrack) -> Image.Image:
     """Outline of the posed body at mid-exposure, thin lines where it is at the exposure's ends."""
     tiles = []
-    for frame in _spread(capture.frames, DETAIL_FRAMES):
+    for frame in _drawn(_spread(capture.frames, DETAIL_FRAMES), "body"):
         camera = capture.camera(frame)
         size = fit(camera.width, camera.height, DETAIL_PX)
         picture = to_picture(capture.shown(capture.image(frame)), size)

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float32
+from tqdm import tqdm
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
@@ -71,7 +72,7 @@ def _differences(
     if len(frames) < _FEWEST_FOR_BACKGROUND:
         return np.zeros((len(frames), coarse.height, coarse.width), np.float32)
     small = []
-    for frame in frames:
+    for frame in tqdm(frames, "pictures", unit="picture", leave=False, disable=None):
         channels = capture.image(frame).unbind(-1)
         small.append(np.stack([coarse.shrunk(channel) for channel in channels]))
     pictures = np.stack(small)

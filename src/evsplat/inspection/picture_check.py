@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from tqdm import tqdm
 
 from evsplat.calibration import Exposure, exposure
 from evsplat.calibration.gain import LOOKED_AT_PX, QUARTERS, common_change
@@ -47,7 +48,8 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
     frames = capture.train_frames
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_LOOKED_AT, len(frames))).astype(int))
     looked_at = [frames[i] for i in chosen]
-    pictures = [_thinned(capture.image(frame)) for frame in looked_at]
+    bar = tqdm(looked_at, "pictures", unit="picture", leave=False, disable=None)
+    pictures = [_thinned(capture.image(frame)) for frame in bar]
     grey = [to_grey(picture).numpy() for picture in pictures]
     brightest = max(float(np.quantile(picture, _BRIGHT)) for picture in grey)
     burnt = float(np.median([(picture > _BURNT).mean() for picture in grey]))

@@ -12,6 +12,7 @@ from scipy.ndimage import (
     label,
 )
 from torch import Tensor
+from tqdm import tqdm
 
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.events import EventStream, polarity_counts
@@ -60,11 +61,17 @@ class Motion:
         self.frames: list[Frame] = sorted(capture.train_frames, key=lambda frame: frame.mid_us)
         self.background: Float[Tensor, "H W 3"] = capture.median_background()
         self._mids = np.array([frame.mid_us for frame in self.frames])
-        own = [self._moving(capture, frame) for frame in self.frames]
+        self._shape = self.background.shape[0], self.background.shape[1]
+        shares, own = np.empty(len(self.frames)), []
+        bar = tqdm(self.frames, "motion", unit="picture", leave=False, disable=None)
+        for index, frame in enumerate(bar):
+            moving = self._moving(capture, frame)
+            shares[index] = moving.mean()
+            own.append(np.packbits(moving))
+        # A bit a pixel: of long recordings of large pictures bytes would be gigabytes.
         self._maps = [
-            np.logical_or.reduce(own[max(0, k - JOINED) : k + JOINED + 1]) for k in range(len(own))
+            np.bitwise_or.reduce(own[max(0, k - JOINED) : k + JOINED + 1]) for k in range(len(own))
         ]
-        shares = np.array([one.mean() for one in own])
         self._still = shares < _STILL * np.percentile(shares, _USUAL)
         self._pieces: dict[int, list[Box]] = {}
 
@@ -74,13 +81,13 @@ class Motion:
 
     def moving(self, time_us: int) -> Bool[np.ndarray, "H W"]:
         """Pixels that move about a time."""
-        return self._maps[self.nearest(time_us)]
+        return self._map(self.nearest(time_us))
 
     def boxes(self, time_us: int) -> list[Box]:
         """Boxes of the pieces that move about a time, the largest area first; may be none."""
         index = self.nearest(time_us)
         if index not in self._pieces:
-            self._pieces[index] = pieces(self._maps[index])
+            self._pieces[index] = pieces(self._map(index))
         return self._pieces[index]
 
     def is_still(self, time_us: int) -> bool:
@@ -89,6 +96,12 @@ class Motion:
         The median of a recording in which the person is half of the time holds some of them.
         """
         return bool(self._still[self.nearest(time_us)])
+
+    def _map(self, index: int) -> Bool[np.ndarray, "H W"]:
+        """Pixels that move in a training frame or one of those about it."""
+        height, width = self._shape
+        bits = np.unpackbits(self._maps[index], count=height * width)
+        return bits.view(np.bool_).reshape(height, width)
 
     def _moving(self, capture: TrainingCapture, frame: Frame) -> Bool[np.ndarray, "H W"]:
         """Differences to the background, and pixels with many events during the exposure."""

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from tqdm import tqdm
 
 from evsplat.capture import Camera
 from evsplat.devices import send
@@ -25,7 +26,7 @@ def fit_skinning(
     """Start the skinning network at the body's weights instead of at random ones."""
     rate = 5e-3
     adam = Adam(model.skinning.parameters(), lr=rate)
-    for step in range(steps):
+    for step in tqdm(range(steps), "skinning", unit="step", leave=False):
         for group in adam.param_groups:
             group["lr"] = rate * max(1 - step / steps, 0.02)
         adam.zero_grad()
@@ -84,7 +85,7 @@ def fit_scene(
         rgb_at = lambda step: network(values[colour], directions * (step % 2))  # noqa: E731
     adam = Adam(groups, eps=1e-15)
     no_person = torch.zeros(len(means), device=means.device)
-    for step in range(steps):
+    for step in tqdm(range(steps), "scene", unit="step", leave=False):
         for group in adam.param_groups:
             group["lr"] = group["rate"] * 0.1 ** (step / steps)
         adam.zero_grad()

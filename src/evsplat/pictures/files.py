@@ -113,7 +113,7 @@ def write_image(path: Path, pixels: np.ndarray, *, source: str = "") -> None:
         with open_output(path) as file:
             file.write(_encode_16_bit_colour(pixels))
     elif pixels.dtype in (np.uint8, np.uint16):
-        Image.fromarray(np.ascontiguousarray(pixels)).save(path)
+        _save_png(path, pixels)
     else:
         raise DataError(f"{source}: holds {pixels.dtype}, expected uint8, uint16 or floats.")
 
@@ -121,9 +121,13 @@ def write_image(path: Path, pixels: np.ndarray, *, source: str = "") -> None:
 def save_png(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
     """Write a PNG, whole or not at all."""
     with atomic_path(path) as temporary:
-        # Of what the filters leave of a render runs are all that is worth looking for: half of the
-        # time of level 4, for as many bytes.
-        Image.fromarray(picture).save(temporary, compress_type=zlib.Z_RLE)
+        _save_png(temporary, picture)
+
+
+def _save_png(path: Path, pixels: np.ndarray) -> None:
+    # Of what the filters leave of a picture runs are all that is worth looking for: half of the
+    # time of level 4 for as many bytes of a render, a quarter of level 6 for 2 % more of a frame.
+    Image.fromarray(np.ascontiguousarray(pixels)).save(path, compress_type=zlib.Z_RLE)
 
 
 def _pixels(path: Path, image: Image.Image) -> np.ndarray | None:
