@@ -73,11 +73,17 @@ class Compositor:
     def _pane(self, request: ViewRequest, width: int, height: int) -> Pane:
         if request.recording_camera is None:
             return Pane(request.browser_camera.sized(width, height), None)
-        # Another motion has times of its own; the camera then stands where it stood first.
+        camera = self.recording(request.recording_camera, request)
+        return Pane(*letterboxed(camera, width, height))
+
+    def recording(self, camera: str, request: ViewRequest) -> Camera:
+        """A recording camera at the time of a request.
+
+        Another motion has times of its own; the camera then stands where it stood first.
+        """
         recorded = request.motion.name is None
         time_us = request.time_us if recorded else self.capture.frames[0].mid_us
-        camera = self.capture.camera_at(request.recording_camera, time_us)
-        return Pane(*letterboxed(camera, width, height))
+        return self.capture.camera_at(camera, time_us)
 
     def _run_picture(
         self, viewed: ViewedRun, pane: Pane, request: ViewRequest, draft: bool

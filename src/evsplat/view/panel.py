@@ -182,7 +182,7 @@ class Panel:
     def look_through(self, camera: str) -> None:
         """Put the browser's camera where a recording camera is at this time."""
         request = self.client.current
-        recording = self.capture.camera_at(camera, request.time_us)
+        recording = self.client.compositor.recording(camera, request)
         view, _ = letterboxed(recording, request.width, request.height)
         centre, ahead = recording.center().double().numpy(), forward(recording)
         # The view turns around the place on the optical axis that is as far as the pivot.
