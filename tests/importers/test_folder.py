@@ -367,6 +367,14 @@ FAULTS = {
         DataError,
         "camera.json: distortion: found 0.5, expected 4, 5 or 8 numbers",
     ),
+    "a fish eye": (
+        lambda root: rewrite_camera(
+            root, distortion={"model": "fisheye", "coefficients": [0.1, 0.01, 0, 0]}
+        ),
+        {},
+        DataError,
+        "camera.json: distortion: model: found 'fisheye', expected 'opencv'; undistort",
+    ),
     "a curve of another name": (
         lambda root: rewrite_camera(root, transfer="gamma"),
         {},

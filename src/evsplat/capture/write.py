@@ -443,6 +443,12 @@ def _coefficients(path: Path, lens: Any) -> list[float] | None:
     values = lens.get("coefficients") if isinstance(lens, dict) else lens
     if not lens:
         return None
+    model = lens.get("model", "opencv") if isinstance(lens, dict) else "opencv"
+    if model != "opencv":  # a fish eye's four numbers would pass for k1, k2, p1, p2
+        raise DataError(
+            f"{path}: distortion: model: found {brief(model)}, expected 'opencv'; undistort the "
+            "pictures first (of a fish eye by cv2.fisheye.undistortImage) and give null."
+        )
     numbers = values if isinstance(values, list) else []
     if not are_coefficients(numbers):
         raise DataError(
