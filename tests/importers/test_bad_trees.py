@@ -301,6 +301,16 @@ FAULTS: dict[str, tuple[str, Change, str]] = {
         edit("event_info.pkl", drop("tF", FRAME)),
         rf"event_info.pkl: tF: has no frame {FRAME}",
     ),
+    "times in no unit": (
+        "zju-mocap-blur",
+        edit("event_info.pkl", lambda c: c.update(tF={k: v * 1e-6 for k, v in c["tF"].items()})),
+        r"event_info.pkl: tF: frame_\d+ and frame_\d+: found times 0.02 us apart",
+    ),
+    "two frames of one time": (
+        "zju-mocap-blur",
+        edit("event_info.pkl", lambda c: c["tF"].__setitem__(FRAME, c["tF"]["frame_000006"])),
+        rf"event_info.pkl: tF: frame_000006 and {FRAME}: found times 0 us apart, expected more",
+    ),
     "event beside the picture": (
         "zju-mocap-blur",
         edit("event_info.pkl", lambda c: c["xE"].__setitem__(7, 128)),

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -59,6 +60,7 @@ class ZjuMocapBlur(Importer):
         frames = {path.stem: path for path in pictures.values()}
         moments = _times(tables["event_info"], source / "event_info.pkl", list(frames))
         unit = _microseconds_per_unit(list(moments.values()))
+        _check_apart(moments, unit, source / "event_info.pkl")
         first = next(iter(frames))
         cameras = {
             name: _camera(tables["cameras"], name, source / "cameras.pkl") for name in frames
@@ -148,6 +150,17 @@ def _microseconds_per_unit(times: list[float]) -> float:
     """Blurry pictures are a few hundredths of a second apart; only one unit makes that of them."""
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     return 1e6 if spacing < 1 else 1e3 if spacing < 1000 else 1.0
+
+
+def _check_apart(times: dict[str, float], unit: float, path: Path) -> None:
+    """Captures count whole microseconds, of which neighbours in time need one each."""
+    for (before, start), (after, end) in pairwise(times.items()):
+        apart_us = (end - start) * unit
+        if apart_us <= 1:
+            raise DataError(
+                f"{path}: tF: {before} and {after}: found times {apart_us:.3g} us apart, "
+                "expected more than 1 us. Write tF and tE in seconds, milliseconds or microseconds."
+            )
 
 
 def _exposure(names: list[str], times: list[float], unit: float) -> tuple[float, int]:
