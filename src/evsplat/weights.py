@@ -73,7 +73,7 @@ class WeightFile:
         raise MissingWeights(
             f"{home_as_tilde(path)}: file not found. {self.network} needs {self.name} "
             f"({self.size}): get it {self.source} and put it there, or give its place with "
-            f"--weights or {self.variable}."
+            f"{self.variable}, or --weights of the commands that have it."
         )
 
 

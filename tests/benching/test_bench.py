@@ -4,6 +4,7 @@ import importlib
 import json
 import random
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from evsplat.capture.policy import Terms
 from evsplat.cli import main
 from evsplat.errors import ConfigError
 from evsplat.evaluation import evaluate
+from evsplat.restore import WEIGHT_FILES
 from evsplat.training import load_run
 from evsplat.training.checkpoint import latest_checkpoint
 from evsplat.training.trainer import Trainer
@@ -162,6 +164,39 @@ def test_masks_that_rows_lack_are_told_before_anything_is_trained(tiny_capture, 
     assert main(words[1:]) == 0
     told, said = bench("after")
     assert not told and "failed" not in said
+
+
+def test_weights_that_rows_lack_are_told_before_anything_is_trained(
+    tiny_capture, tmp_path, monkeypatch, capsys
+):
+    """Once per restorer, with the rows; not where captures are restored already."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nowhere"))
+    monkeypatch.delenv(WEIGHT_FILES["mprnet"].variable, raising=False)
+    capture = tiny_capture("one")
+    restored = [
+        {"name": f"{name}_{row}", "method": "nearest_frame", "restore": name}
+        for name in ("mprnet", "edi")
+        for row in "ab"
+    ]
+    suite = write_suite(tmp_path / "suite.yaml", {"one": capture}, MEDIAN, *restored)
+    out = tmp_path / "out"
+
+    def told(*more: str) -> list[str]:
+        with cells_in_this_process():
+            assert main(["bench", str(suite), "--out", str(out), *more]) == 0
+        return capsys.readouterr().err.splitlines()
+
+    lines = told()
+    first = next(i for i, line in enumerate(lines) if line.startswith("[1/"))
+    (sentence,) = [line for line in lines[:first] if "these rows fail" in line]
+    assert "model_deblurring.pth" in sentence and WEIGHT_FILES["mprnet"].variable in sentence
+    assert sentence.endswith("Without it these rows fail: mprnet_a, mprnet_b.")
+    failed = [name for name, record in records(out).items() if record["status"] == "failed"]
+    assert failed == ["one/mprnet_a/seed0.json", "one/mprnet_b/seed0.json"]
+
+    shutil.copytree(capture, out / "captures" / "one-mprnet")
+    assert not any("these rows fail" in line for line in told("--retry"))
+    assert all(record["status"] == "done" for record in records(out).values())
 
 
 def test_a_person_without_scene_can_be_measured_before_the_background(tiny_capture, tmp_path):

@@ -246,17 +246,23 @@ def _restored(bench: BenchFolder, recorded: Capture, cell: Cell) -> Path:
     """Folder of what is trained on: restored once for all rows that want it so."""
     if cell.restore is None:
         return recorded.path
+    path = restored_at(bench, cell)
+    with exclusive(bench.lock_of(f"captures/{path.name}")):
+        if not path.exists():
+            restore_capture(recorded.path, path, method=cell.restore, policy=cell.policy)
+    return path
+
+
+def restored_at(bench: BenchFolder, cell: Cell) -> Path:
+    """Folder of the restored capture that a cell with a restorer trains on, made or not yet."""
+    assert cell.restore is not None
     # What restorers see and is not the default.
     asked = [
         f"{name}-{value}"
         for name in ("held_out_events", "thresholds")
         if (value := getattr(cell.policy, name)) != getattr(Policy(), name)
     ]
-    path = bench.captures / "-".join((cell.capture.name, cell.restore, *asked))
-    with exclusive(bench.lock_of(f"captures/{path.name}")):
-        if not path.exists():
-            restore_capture(recorded.path, path, method=cell.restore, policy=cell.policy)
-    return path
+    return bench.captures / "-".join((cell.capture.name, cell.restore, *asked))
 
 
 def _peak_memory_mb() -> float:

@@ -25,6 +25,7 @@ from evsplat.benching.strips import write_strips
 from evsplat.benching.suite import read_suite
 from evsplat.benching.tables import SPREAD, make_tables
 from evsplat.benching.unmasked import unmasked
+from evsplat.benching.unweighted import unweighted
 from evsplat.errors import ConfigError
 from evsplat.evaluation.tables import LEGEND, latex, markdown
 from evsplat.files import try_target, write_json, write_text
@@ -84,9 +85,12 @@ def bench(suite: Path | str, options: BenchOptions | None = None, **changes: Any
 
 
 def _run(plan: Plan, todo: Sequence[Cell], folder: BenchFolder, executor: Executor) -> None:
+    told = [*plan.missing.values(), *unmasked(todo)]
+    if isinstance(executor, LocalPool):  # Ray's machines have weights of their own
+        told += unweighted(todo, folder)
     with (
         _stopped_by_signals(),
-        Progress(plan, todo, folder) as progress,
+        Progress(plan, todo, folder, told) as progress,
         closing(executor.run(todo)) as ends,
     ):
         for cell, reason in ends:
@@ -141,7 +145,10 @@ def _stopped_by_signals() -> Iterator[None]:
 class Progress:
     """A line on stderr for every cell that ends, and one that says how far the bench is."""
 
-    def __init__(self, plan: Plan, todo: Sequence[Cell], folder: BenchFolder) -> None:
+    def __init__(
+        self, plan: Plan, todo: Sequence[Cell], folder: BenchFolder, told: Sequence[str]
+    ) -> None:
+        """``told``: sentences on what will not run, printed before anything does."""
         self._titles = {row.name: row.label for row in plan.suite.rows}
         self._total, self._ended, self._failed = len(todo), 0, 0
         self._trained, self._to_train = 0, sum(cell.trains for cell in todo)
@@ -153,7 +160,7 @@ class Progress:
             f"{counted(len(todo), 'cell')} to do, {done} done before; "
             f"logs in {folder.path / 'logs'}"
         )
-        for sentence in (*plan.missing.values(), *unmasked(todo)):
+        for sentence in told:
             _print(sentence)
         self._bar = tqdm(
             total=len(todo),

@@ -46,9 +46,10 @@ class Pretrained(ABC):
         self.device = network_device(device)
         self.network = self.load(self.weights).to(self.device)
 
-    def find(self, weights: Path | str | None) -> Path:
-        """The weight file."""
-        return self.file.find(weights)
+    @classmethod
+    def find(cls, weights: Path | str | None = None) -> Path:
+        """The weight file; `MissingWeights` where there is none."""
+        return cls.file.find(weights)
 
     @abstractmethod
     def load(self, path: Path) -> Any:

@@ -39,7 +39,8 @@ class PieNet(FromEvents):
         """Raises `WeightsError` where the package is not installed, or another one than 1.1.3."""
         super().__init__(capture, device=device)
 
-    def find(self, weights: Path | str | None) -> Path:
+    @classmethod
+    def find(cls, weights: Path | str | None = None) -> Path:
         """The weight file in the installed package."""
         return find_weights()
 
