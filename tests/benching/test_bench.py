@@ -166,6 +166,27 @@ def test_masks_that_rows_lack_are_told_before_anything_is_trained(tiny_capture, 
     assert not told and "failed" not in said
 
 
+def test_a_capture_that_changes_while_the_bench_runs_costs_the_cells_that_are_left(
+    tiny_capture, tmp_path
+):
+    """As `evsplat masks --in-place` changes it: no record says of it what was asked of another."""
+    capture = tiny_capture("one")
+    suite = write_suite(
+        tmp_path / "suite.yaml", {"one": capture}, MEDIAN, MEDIAN | {"name": "later"}
+    )
+    folder = BenchFolder(tmp_path / "out")
+    before, after = make_plan(read_suite(suite), folder).cells
+    run_cell(folder.path, before, threads=1, device="cpu")
+    document = json.loads((capture / "capture.json").read_text())
+    del document["frames"][0]["mask"]
+    (capture / "capture.json").write_text(json.dumps(document))
+    run_cell(folder.path, after, threads=1, device="cpu")
+    assert read_json(folder.record_of(before.id))["status"] == "done"
+    record = read_json(folder.record_of(after.id))
+    assert record["status"] == "failed"
+    assert record["reason"].startswith(f"{capture / 'capture.json'}: changed since this bench")
+
+
 def test_weights_that_rows_lack_are_told_before_anything_is_trained(
     tiny_capture, tmp_path, monkeypatch, capsys
 ):

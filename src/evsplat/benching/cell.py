@@ -1,5 +1,6 @@
 """One cell: a method on a capture with a seed, trained, measured and recorded, whatever happens."""
 
+import hashlib
 import logging
 import resource
 import sys
@@ -56,6 +57,11 @@ def read_cell_record(path: Path) -> dict[str, Any]:
     if wrong:
         raise DataError(f"{path}: {wrong}; {remedy}.")
     return record
+
+
+def fingerprint_of(content: bytes) -> str:
+    """Sixteen hexadecimal digits that change when a capture's description does."""
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -233,8 +239,19 @@ def _trained(
 
 
 def _recorded(bench: BenchFolder, source: CaptureSource) -> Path:
-    """Folder of the capture; a staged one is made by the first cell that needs it."""
+    """Folder of the capture; a staged one is made by the first cell that needs it.
+
+    Raises `DataError` where a recording is another one than when the bench began: figures of two
+    captures would stand in one row.
+    """
     if source.stage is None:
+        description = source.path / "capture.json"
+        there = fingerprint_of(description.read_bytes()) if description.is_file() else "nothing"
+        if there != source.fingerprint:
+            raise DataError(
+                f"{description}: changed since this bench began, expected the same capture for all "
+                f"rows; stop it, remove {bench.path} or choose another --out, and begin anew."
+            )
         return source.path
     with exclusive(bench.lock_of(f"captures/{source.path.name}")):
         if not source.path.exists():

@@ -1,13 +1,19 @@
 """The plan of a suite on this machine: captures found, cells in the order they are run."""
 
-import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from evsplat.benching.cell import FAILED, UNTRAINED, CaptureSource, Cell, read_cell_record
+from evsplat.benching.cell import (
+    FAILED,
+    UNTRAINED,
+    CaptureSource,
+    Cell,
+    fingerprint_of,
+    read_cell_record,
+)
 from evsplat.benching.drawn import drawn_settings
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.given_pictures import PICTURES, digest_of
@@ -206,14 +212,16 @@ def _source(capture: SuiteCapture, folder: BenchFolder) -> CaptureSource | str:
     """The capture, or a sentence that says how to get it."""
     if capture.stage is not None:
         made = folder.captures.resolve() / capture.name
-        return CaptureSource(capture.name, made, _digest(_request(capture.stage)), capture.stage)
+        return CaptureSource(
+            capture.name, made, fingerprint_of(_request(capture.stage)), capture.stage
+        )
     assert capture.path is not None
     path = demo_capture() if capture.path == "demo" else Path(capture.path)
     description = path / "capture.json"
     if not description.is_file():
         how = f"make it with `{capture.get}`" if capture.get else "check the path"
         return f"{path}: capture not found; {how}, or name captures with --captures."
-    return CaptureSource(capture.name, path.resolve(), _digest(description.read_bytes()))
+    return CaptureSource(capture.name, path.resolve(), fingerprint_of(description.read_bytes()))
 
 
 def _request(settings: StageSettings) -> bytes:
@@ -221,10 +229,6 @@ def _request(settings: StageSettings) -> bytes:
     usual = asdict(StageSettings())
     chosen = {name: value for name, value in asdict(settings).items() if value != usual[name]}
     return json.dumps(chosen, sort_keys=True).encode()
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def _check_same_request(
