@@ -26,7 +26,7 @@ OWN_FILES = {
     *(("disk.py", "open"), ("files.py", "open"), ("cli/exits.py", "open")),
     *(("pages.py", "read_text"), ("export/avatar.py", "read_text"), ("devices.py", "read_text")),
     *(("evaluation/report/clip.py", "read_bytes"), ("view/save_panel.py", "read_bytes")),
-    *(("benching/local.py", "read_text"), ("benching/plan.py", "read_bytes")),
+    ("benching/local.py", "read_text"),
 }
 CONTAINERS = ("av", "archive", "found", "Showcase(folder.path)")
 """Have an ``open`` of their own, which opens no file to read it."""

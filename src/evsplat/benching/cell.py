@@ -28,6 +28,7 @@ from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
 from evsplat.render import choose_device
 from evsplat.restore import restore_capture
 from evsplat.staging import StageSettings, stage
+from evsplat.untrusted.faults import open_bytes
 from evsplat.untrusted.records import Shape, misfit, read_record
 
 logger = logging.getLogger(__name__)
@@ -62,6 +63,12 @@ def read_cell_record(path: Path) -> dict[str, Any]:
 def fingerprint_of(content: bytes) -> str:
     """Sixteen hexadecimal digits that change when a capture's description does."""
     return hashlib.sha256(content).hexdigest()[:16]
+
+
+def fingerprint_of_file(path: Path) -> str:
+    """`fingerprint_of` what a file holds; a `DataError` where it is no ordinary one."""
+    with open_bytes(path) as file:
+        return fingerprint_of(file.read())
 
 
 @dataclass(frozen=True)
@@ -246,7 +253,7 @@ def _recorded(bench: BenchFolder, source: CaptureSource) -> Path:
     """
     if source.stage is None:
         description = source.path / "capture.json"
-        there = fingerprint_of(description.read_bytes()) if description.is_file() else "nothing"
+        there = fingerprint_of_file(description) if description.is_file() else "nothing"
         if there != source.fingerprint:
             raise DataError(
                 f"{description}: changed since this bench began, expected the same capture for all "

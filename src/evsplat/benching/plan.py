@@ -12,6 +12,7 @@ from evsplat.benching.cell import (
     CaptureSource,
     Cell,
     fingerprint_of,
+    fingerprint_of_file,
     read_cell_record,
 )
 from evsplat.benching.drawn import drawn_settings
@@ -221,7 +222,7 @@ def _source(capture: SuiteCapture, folder: BenchFolder) -> CaptureSource | str:
     if not description.is_file():
         how = f"make it with `{capture.get}`" if capture.get else "check the path"
         return f"{path}: capture not found; {how}, or name captures with --captures."
-    return CaptureSource(capture.name, path.resolve(), fingerprint_of(description.read_bytes()))
+    return CaptureSource(capture.name, path.resolve(), fingerprint_of_file(description))
 
 
 def _request(settings: StageSettings) -> bytes:
