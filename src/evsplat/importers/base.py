@@ -157,7 +157,12 @@ def picture(path: Path, shrink: int = 1) -> np.ndarray | Path:
 
 
 def shrunk(pixels: np.ndarray, factor: int) -> np.ndarray:
-    """Means over squares of ``factor`` pixels; what is left at the right and below is cut off."""
+    """Means over squares of ``factor`` pixels; what is left at the right and below is cut off.
+
+    With a factor of 1 the pixels themselves.
+    """
+    if factor == 1:
+        return pixels
     height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
     cut = pixels[: height * factor, : width * factor]
     squares = cut.reshape(height, factor, width, factor, *pixels.shape[2:])

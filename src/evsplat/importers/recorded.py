@@ -112,13 +112,13 @@ def add_recorded_frame(
 
     Picture and mask are made smaller by ``shrink``.
     """
-    pixels = picture.pixels if shrink == 1 else shrunk(picture.pixels, shrink)
+    pixels = shrunk(picture.pixels, shrink)
     writer.add_frame(
         picture.name,
         "main",
         pixels,
         exposure_us,
-        mask=mask if mask is None or shrink == 1 else shrunk(mask, shrink),
+        mask=None if mask is None else shrunk(mask, shrink),
         world_to_camera=world_to_camera,
     )
     if isinstance(clock_offset, BlockLevels):
