@@ -19,7 +19,7 @@ class Clock:
 
 class Client:
     def __init__(self, name="", drawn=None):
-        self.name, self.wanted = name, None
+        self.name, self.wanted = name, "view"
         self.drawn = [] if drawn is None else drawn
 
     def request(self, now):
@@ -46,9 +46,8 @@ def _run(scheduler, seconds):
 
 def test_a_view_that_settles_is_drawn_roughly_then_sharply_and_then_rests(scheduler):
     client = Client()
-    scheduler.add(client)
     assert scheduler.step() is None
-    client.wanted = "view"
+    scheduler.add(client)
     _run(scheduler, 10)
     assert client.drawn == [("", "view", True), ("", "view", False)]
 
@@ -93,7 +92,6 @@ def test_clients_take_turns(scheduler):
 
 def test_a_client_that_left_is_not_drawn(scheduler):
     client = Client()
-    client.wanted = "view"
     scheduler.add(client)
     scheduler.remove(client)
     _run(scheduler, 1)
@@ -102,7 +100,6 @@ def test_a_client_that_left_is_not_drawn(scheduler):
 
 def test_new_parameters_are_drawn_anew(scheduler):
     client = Client()
-    client.wanted = "view"
     scheduler.add(client)
     _run(scheduler, 1)
     scheduler.redraw()

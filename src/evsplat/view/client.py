@@ -104,7 +104,7 @@ class Client:
         with self._lock:
             return replace(self._request, time_us=round(self._playback.at(now)))
 
-    def render(self, request: Any, *, draft: bool) -> None:
+    def render(self, request: ViewRequest, *, draft: bool) -> None:
         """Draw a request and send its picture."""
         shrink = min(1.0, LONGEST_PX / max(request.width, request.height))
         size = max(16, round(shrink * request.width)), max(16, round(shrink * request.height))

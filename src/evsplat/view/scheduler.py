@@ -4,9 +4,11 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
+
+from evsplat.view.request import ViewRequest
 
 logger = logging.getLogger(__name__)
 
@@ -23,11 +25,11 @@ _SCALE_STEPS = math.ceil(math.log(MIN_SCALE) / math.log(_SCALE_STEP))
 class RenderClient(Protocol):
     """A browser as the scheduler sees it."""
 
-    def request(self, now: float) -> Hashable | None:
-        """The picture to show at wall-clock second ``now``; None: nothing yet."""
+    def request(self, now: float) -> ViewRequest:
+        """The picture to show at wall-clock second ``now``."""
         ...
 
-    def render(self, request: Hashable, *, draft: bool) -> None:
+    def render(self, request: ViewRequest, *, draft: bool) -> None:
         """Draw ``request`` and send it; ``draft`` while it changes."""
         ...
 
@@ -35,8 +37,8 @@ class RenderClient(Protocol):
 @dataclass(eq=False)
 class _ClientState:
     client: RenderClient
-    shown: Hashable | None = None
-    """The request drawn last."""
+    shown: ViewRequest | None = None
+    """The request drawn last; None: nothing yet, or what equal requests mean has changed."""
     is_final: bool = False
     """Drawn in full quality, not as a draft."""
     changed_s: float = -1e9
@@ -122,8 +124,6 @@ class RenderScheduler:
     def _draw(self, state: _ClientState) -> float | None:
         now = self._clock()
         request = state.client.request(now)
-        if request is None:
-            return None
         if request != state.shown:
             if now - state.drawn_s < MIN_INTERVAL_S:
                 return state.drawn_s + MIN_INTERVAL_S - now
