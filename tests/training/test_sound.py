@@ -15,8 +15,10 @@ from safetensors.torch import save_file
 from evsplat.cli import main
 from evsplat.errors import EvsplatError
 from evsplat.evaluation.run import evaluate_run, write_report
+from evsplat.methods import TRAINABLE
 from evsplat.training import load_run, train
-from evsplat.training.checkpoint import latest_checkpoint
+from evsplat.training.checkpoint import latest_checkpoint, load_latest
+from evsplat.training.run import RunFolder
 
 from ..conftest import write_event_file, write_tiny_capture
 from ..small_model import small
@@ -112,6 +114,24 @@ def test_a_run_does_not_go_on_with_another_up(tmp_path):
         for call in (lambda: load_run(run), lambda: train(capture, out=run, resume=True)):
             said = refused(call)
             assert "versions.json: up is [0.0, 0.0, 1.0]" in said and f"has {found} now" in said
+
+
+@pytest.mark.parametrize("method", [name for name, of in TRAINABLE.items() if not of.drawn_by_up])
+def test_what_is_not_drawn_by_up_goes_on_with_another_bit_for_bit(tmp_path, method):
+    """A scene may begin with a floor under the feet; what it became is in the checkpoint."""
+    capture, run, same = write_tiny_capture(tmp_path / "tiny"), tmp_path / "run", tmp_path / "same"
+    train(capture, out=run, method=method, iterations=2, overrides=small(method))
+    shutil.copytree(run, same)
+    train(capture, out=same, resume=True, iterations=3)
+    document = json.loads((capture / "capture.json").read_text())
+    (capture / "capture.json").write_text(json.dumps(document | {"up": [0, -1, 0]}))
+    train(capture, out=run, resume=True, iterations=3)
+    (_, tensors, _), (_, expected, _) = (
+        load_latest(RunFolder(folder).checkpoints) for folder in (run, same)
+    )
+    assert tensors.keys() == expected.keys()
+    assert all(torch.equal(tensors[name], expected[name]) for name in tensors)
+    assert load_run(run).iteration == 3
 
 
 def test_a_run_without_a_checkpoint_begins_its_log_anew(trained, run):

@@ -23,12 +23,15 @@ class Method:
     """Frozen dataclass of all its settings, a `MethodConfig`."""
     build: Callable[..., Composition]
     """``build(config, capture, seed, device=, purpose=)``."""
+    drawn_by_up: bool = False
+    """Whether a trained model is drawn by which way is up: light from above, a floor beyond what
+    was recorded. Others begin with it at most."""
 
 
 TRAINABLE = {
     "avatar3dgs": Method(avatar3dgs.AvatarConfig, avatar3dgs.build),
     "avatar3dgs_semantic": Method(avatar3dgs.AvatarSemanticConfig, avatar3dgs.build_semantic),
-    "evsplat": Method(EvsplatConfig, build_evsplat),
+    "evsplat": Method(EvsplatConfig, build_evsplat, drawn_by_up=True),
     "hugs": Method(hugs.HugsConfig, hugs.build),
     "paper": Method(paper.PaperConfig, paper.build),
 }

@@ -193,11 +193,13 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
     return method, config, facts
 
 
-def check_capture(facts: dict[str, Any], seen: TrainingCapture, folder: RunFolder) -> None:
+def check_capture(
+    facts: dict[str, Any], seen: TrainingCapture, folder: RunFolder, method: str
+) -> None:
     """Refuse a capture whose training frames, or whose up, are others than when it was trained on.
 
     What is held out now may have been seen then: figures of it would say nothing. Floor and light
-    were learned by what was up. Runs of before do not tell.
+    were learned by what was up, of methods that draw them by it. Runs of before do not tell.
     """
     then, now = facts.get("training_frames"), _frames_of(seen)
     if then is not None and then != now:
@@ -206,7 +208,7 @@ def check_capture(facts: dict[str, Any], seen: TrainingCapture, folder: RunFolde
             f"{now!r} now: what is held out may have been trained on; give the frames of "
             "capture.json the splits that they had, or train again."
         )
-    if "up" in facts and facts["up"] != _up_of(seen):
+    if TRAINABLE[method].drawn_by_up and "up" in facts and facts["up"] != _up_of(seen):
         raise DataError(
             f"{folder.facts}: up is {brief(facts['up'])}, and {seen.path / 'capture.json'} has "
             f"{brief(_up_of(seen))} now: floor and light were learned by it; put it back, or train "
@@ -262,7 +264,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
     shown = seen_by_training(capture, config)
-    check_capture(facts, shown, folder)
+    check_capture(facts, shown, folder, method)
     composition = TRAINABLE[method].build(
         config, shown, facts["seed"], device=device, purpose="draw"
     )

@@ -132,7 +132,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     iterations, max_minutes = options.iterations, options.max_minutes
     started = time.perf_counter()
     seen = seen_by_training(capture, start.settings)
-    check_capture(start.facts, seen, start.folder)
+    check_capture(start.facts, seen, start.folder, start.method)
     loaded = load_latest(start.folder.checkpoints) if options.resume else None
     purpose: Purpose = "train" if loaded is None else "resume"
     fitting = None
