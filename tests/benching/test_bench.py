@@ -158,6 +158,8 @@ def test_masks_that_rows_lack_are_told_before_anything_is_trained(tiny_capture, 
         return [line for line in told.splitlines() if "make masks first" in line], told
 
     (sentence,), _ = bench("before")
+    failed = records(tmp_path / "before")["bare/hugs/seed0.json"]
+    assert "pass --set policy.masks=estimated. In a bench settings stand" in failed["reason"]
     assert sentence.startswith(f"{path / 'capture.json'}: 7 of 7 training frames have no mask")
     assert "these rows fail: hugs." in sentence
     words = shlex.split(sentence.partition("make masks first: ")[2])
@@ -307,3 +309,4 @@ def test_a_row_that_trained_on_everything_is_not_measured(tiny_capture, tmp_path
     run_cell(folder.path, cell, threads=1, device="cpu")
     record = read_json(folder.record_of(cell.id))
     assert record["status"] == "failed" and "nothing to measure" in record["reason"]
+    assert "In a bench settings" not in record["reason"]

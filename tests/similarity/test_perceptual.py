@@ -237,6 +237,8 @@ def test_without_weights_the_reason_names_file_and_place(name):
     with pytest.raises(MissingWeights, match=HUB_FILES[name]) as error:
         load_lpips(name)
     assert "checkpoints" in str(error.value) and WEIGHTS_VARIABLE in str(error.value)
+    # Of the commands that say this one alone has the option.
+    assert str(error.value).endswith("or --lpips-weights of evsplat evaluate.")
 
 
 def test_missing_st_lpips_names_the_extra(monkeypatch):

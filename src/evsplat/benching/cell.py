@@ -147,7 +147,7 @@ def run_cell(folder: Path, cell: Cell, *, threads: int | None, device: str) -> N
         try:
             record = {"status": DONE, **_measured(bench, cell, threads, device)}
         except EvsplatError as error:
-            record = {"status": FAILED, "reason": str(error)}
+            record = {"status": FAILED, "reason": _reason(error)}
         except Exception as error:
             # A fault of the program costs this cell only; the log has the traceback.
             logger.exception("%s failed", cell.id)
@@ -164,6 +164,14 @@ def run_cell(folder: Path, cell: Cell, *, threads: int | None, device: str) -> N
                 "machine": machine(),
             },
         )
+
+
+def _reason(error: EvsplatError) -> str:
+    """The sentence of a command's own failure, and where a bench has the option that it names."""
+    text = str(error)
+    if "--set " not in text:
+        return text
+    return f"{text} In a bench settings stand in the suite, under 'settings' of the row."
 
 
 def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) -> dict[str, Any]:

@@ -81,7 +81,7 @@ def load_lpips(
     raise MissingWeights(
         f"{NETWORKS[name].name}: no weights. Fetch https://download.pytorch.org/models/"
         f"{HUB_FILES[name]} and put it in {home_as_tilde(cached.parent)}, or give its place with "
-        f"--lpips-weights or {WEIGHTS_VARIABLE}."
+        f"{WEIGHTS_VARIABLE}, or --lpips-weights of evsplat evaluate."
     )
 
 
