@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import asdict, replace
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -109,6 +110,24 @@ def test_every_gap_has_its_reason(records):
     assert "fetch <it> & put_it there" in notes
     assert "4 of 16 cells have not been run yet." not in notes
     assert "2 of 16 cells have not been run yet." in notes
+
+
+def test_every_form_of_a_table_says_below_what_a_baseline_differs_in(records):
+    """Once for all rows of it, whatever marks their titles have."""
+    methods = {"good": "hugs", "poor": "hugs", "half": "avatar3dgs_semantic"}
+    rows = tuple(
+        replace(row, method=methods.get(row.name, row.method)) for row in records.plan.suite.rows
+    )
+    suite = replace(records.plan.suite, rows=rows)
+    tables = make_tables(replace(records, plan=replace(records.plan, suite=suite)))
+    note = "Good*; Poor & Sons†: HUGS with slips of its released code repaired (docs/baselines.md)."
+    of_avatar = next(note for note in tables[0].footnotes if note.startswith("half: 3DGS-Avatar"))
+    for note_there in (note, of_avatar):
+        assert tables[0].footnotes.count(note_there) == 1
+        assert f"% {note_there}" in latex(tables)
+        assert f"<li>{escape(note_there)}</li>" in html(tables[0])
+        assert note_there.replace("*", "\\*") in markdown("", "", tables)
+    assert not any("baselines.md" in note for note in make_tables(records)[0].footnotes)
 
 
 def test_latex_rows_have_as_many_cells_as_columns_and_nothing_unescaped(records):

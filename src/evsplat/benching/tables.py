@@ -12,7 +12,7 @@ from evsplat.benching.suite import PublishedTable, SuiteRow
 from evsplat.capture.policy import STRICT_TERMS, terms_of
 from evsplat.evaluation.protocols import PROTOCOLS
 from evsplat.evaluation.tables import METRIC_TITLES, REGION_TITLES, Figure, Heading, Row, Table
-from evsplat.methods import NOMINAL_ITERATIONS
+from evsplat.methods import NOMINAL_ITERATIONS, TRAINABLE
 from evsplat.wording import counted
 
 Column = tuple[Heading, Callable[[SuiteRow], Figure | None]]
@@ -248,10 +248,23 @@ def _threads(record: Record) -> str:
     return counted(record.get("threads") or 1, "thread")
 
 
+def _baselines(records: Records) -> list[str]:
+    """A sentence per baseline that is not quite what its name stands for, with its rows."""
+    titles: dict[str, list[str]] = {}
+    for row in records.plan.suite.rows:
+        if row.method in TRAINABLE and TRAINABLE[row.method].differs:
+            titles.setdefault(row.method, []).append(row.label)
+    return [
+        f"{'; '.join(labels)}: {TRAINABLE[method].differs} (docs/baselines.md)."
+        for method, labels in titles.items()
+    ]
+
+
 def _footnotes(records: Records) -> list[str]:
-    """Reasons why something is not in the tables."""
+    """What titles leave out, and reasons why something is not in the tables."""
     titles = {row.name: row.label for row in records.plan.suite.rows}
-    notes = [
+    notes = _baselines(records)
+    notes += [
         f"{titles[row]} failed on {', '.join(captures)}: {reason}"
         for (row, reason), captures in records.failures().items()
     ]

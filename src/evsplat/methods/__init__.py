@@ -26,13 +26,21 @@ class Method:
     drawn_by_up: bool = False
     """Whether a trained model is drawn by which way is up: light from above, a floor beyond what
     was recorded. Others begin with it at most."""
+    differs: str = ""
+    """What tables say below of a baseline that is not quite what its name stands for elsewhere."""
 
 
 TRAINABLE = {
     "avatar3dgs": Method(avatar3dgs.AvatarConfig, avatar3dgs.build),
-    "avatar3dgs_semantic": Method(avatar3dgs.AvatarSemanticConfig, avatar3dgs.build_semantic),
+    "avatar3dgs_semantic": Method(
+        avatar3dgs.AvatarSemanticConfig,
+        avatar3dgs.build_semantic,
+        differs="3DGS-Avatar of person and scene at once, told apart by the paper's attribute",
+    ),
     "evsplat": Method(EvsplatConfig, build_evsplat, drawn_by_up=True),
-    "hugs": Method(hugs.HugsConfig, hugs.build),
+    "hugs": Method(
+        hugs.HugsConfig, hugs.build, differs="HUGS with slips of its released code repaired"
+    ),
     "paper": Method(paper.PaperConfig, paper.build),
 }
 """Every method that is trained, by name."""
