@@ -260,7 +260,7 @@ def test_stretches_that_show_nobody_are_left_out(moves, recognised, kept):
     moves, recognised, kept = (
         [mark == "1" for mark in marks if mark != " "] for marks in (moves, recognised, kept)
     )
-    motion = SimpleNamespace(is_still=lambda time: not moves[time])
+    motion = SimpleNamespace(moves_little=lambda time: not moves[time])
     pictures = [SimpleNamespace(time_us=index) for index in range(len(moves))]
     found = [SimpleNamespace(is_person=person) for person in recognised]
     of_somebody, persons = _of_somebody(motion, pictures, found)

@@ -125,10 +125,10 @@ def _repeated(capture: TrainingCapture) -> int:
     short = [run for run in runs if run <= _MOST_REPEATS]
     if len(short) < 2 or sum(short) < max(3, _FEWEST_REPEATED * (len(pairs) + 1)):
         return 0
-    return 0 if _is_still(capture, pairs, np.array(same)) else sum(short)
+    return 0 if _events_pause(capture, pairs, np.array(same)) else sum(short)
 
 
-def _is_still(
+def _events_pause(
     capture: TrainingCapture, pairs: Sequence[tuple[Frame, Frame]], same: Bool[np.ndarray, "P"]
 ) -> bool:
     """Whether hardly an event came between pictures that are equal, beside others."""

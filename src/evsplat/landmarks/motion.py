@@ -90,7 +90,7 @@ class Motion:
             self._pieces[index] = pieces(self._map(index))
         return self._pieces[index]
 
-    def is_still(self, time_us: int) -> bool:
+    def moves_little(self, time_us: int) -> bool:
         """Whether next to nothing moves in the training frame nearest in time, beside others.
 
         The median of a recording in which the person is half of the time holds some of them.

@@ -71,7 +71,7 @@ def find_landmarks(
     capture = coded(capture)
     motion = Motion(capture)
     tracker = _Tracker(network, motion)
-    busy = [picture for picture in pictures if not motion.is_still(picture.time_us)]
+    busy = [picture for picture in pictures if not motion.moves_little(picture.time_us)]
     first = _spread(busy or pictures)
     refuse_empty(capture, first, lambda picture: tracker.search_anew(picture).is_person)
     found = [
@@ -114,7 +114,7 @@ def _of_somebody(
     """
     shown: list[tuple[SharpPicture, Found]] = []
     both = list(zip(pictures, found, strict=True))
-    for still, stretch in groupby(both, lambda one: motion.is_still(one[0].time_us)):
+    for still, stretch in groupby(both, lambda one: motion.moves_little(one[0].time_us)):
         part = list(stretch)
         if not still or 2 * sum(person.is_person for _, person in part) >= len(part):
             shown += part
