@@ -41,6 +41,7 @@ from evsplat.landmarks import (
     find_landmarks,
     sharp_pictures,
 )
+from evsplat.posing.bridging import bridged
 from evsplat.posing.find import key_times
 from evsplat.posing.fit import FitSettings, PoseFit, fit_landmarks
 from evsplat.posing.prior import pose_prior
@@ -99,11 +100,10 @@ def measure(
     except DataError:
         prior = pose_prior()
     rows: list[dict] = []
+    pictures = sharp_pictures(seen)
     if keypoints_px is None:
         start = time.perf_counter()
-        points = find_landmarks(
-            seen, sharp_pictures(seen), network=LandmarkNetwork(), progress=False
-        )
+        points = find_landmarks(seen, pictures, network=LandmarkNetwork(), progress=False)
         found_s = time.perf_counter() - start
         errors = landmark_errors(capture, truth, points)
         rows.append({"stage": "landmarks", "seconds": found_s, **errors})
@@ -115,17 +115,16 @@ def measure(
     cameras = [capture.camera(nearest(capture, t)) for t in points.times_us.tolist()]
     span = capture.frames[0].exposure_us[0], max(f.exposure_us[1] for f in capture.frames)
     fitted = fit_landmarks(points, cameras, span, settings=settings, prior=prior)
-    track = fitted.track(key_times(seen))
+    track = bridged(fitted.track(key_times(seen)), points.times_us.tolist())
     seconds = time.perf_counter() - start
     rows.append({"stage": stage, "seconds": seconds, **pose_errors(capture, truth, track)})
     tracks = {stage: track}
     dressed = None
     if refined:
         better = refine(track, seen, steps=FOUND_STEPS)
-        dressed = better.track.with_body(better.dressed)
-        errors = pose_errors(capture, truth, better.track) | dressed_overlap(
-            capture, truth, dressed
-        )
+        corrected = bridged(better.track, [picture.time_us for picture in pictures])
+        dressed = corrected.with_body(better.dressed)
+        errors = pose_errors(capture, truth, corrected) | dressed_overlap(capture, truth, dressed)
         rows.append({"stage": f"{stage}, refined", "seconds": better.seconds, **errors})
         tracks[f"{stage}, refined"] = dressed
     if out is not None:

@@ -52,7 +52,7 @@ def motion_noise(track: BodyTrack, most_rad: Float[np.ndarray, " J"], most_m: fl
     found, stiffness = np.zeros(joints), np.zeros(joints + 1)
     if len(track.times_us) < FEWEST_KEYS:
         return MotionNoise(found, 0.0, stiffness)
-    quaternions, pieces = _quaternions(track.poses), _pieces(_seconds(track))
+    quaternions, pieces = continuous_quaternions(track.poses), _pieces(_seconds(track))
     # A small rotation changes a unit quaternion by half of it, in three of four directions.
     per_component = math.sqrt(3) / 4
     noisy = np.flatnonzero(moving_joints(track) & (most_rad > 0))
@@ -69,15 +69,15 @@ def motion_noise(track: BodyTrack, most_rad: Float[np.ndarray, " J"], most_m: fl
 
 def moving_joints(track: BodyTrack) -> Bool[np.ndarray, " J"]:
     """Joints that move at all."""
-    return np.ptp(_quaternions(track.poses), axis=0).max(-1) > _STILL
+    return np.ptp(continuous_quaternions(track.poses), axis=0).max(-1) > _STILL
 
 
 def smoothed(track: BodyTrack, noise: MotionNoise) -> BodyTrack:
     """The track with key poses on the smoothing splines that ``noise`` names (Reinsch 1967)."""
     seconds = _seconds(track)
-    series = [*np.moveaxis(_quaternions(track.poses), 1, 0), track.transl]
+    series = [*np.moveaxis(continuous_quaternions(track.poses), 1, 0), track.transl]
     *rotations, transl = (
-        _smooth(seconds, values, stiffness) if stiffness > 0 else values
+        smooth_values(seconds, values, stiffness) if stiffness > 0 else values
         for values, stiffness in zip(series, noise.stiffness_s3, strict=True)
     )
     stacked = np.stack(rotations, 1)
@@ -97,8 +97,8 @@ def _seconds(track: BodyTrack) -> Float[np.ndarray, " P"]:
     return (track.times_us - track.times_us[0]) * 1e-6
 
 
-def _quaternions(poses: Float[np.ndarray, "P J 3"]) -> Float[np.ndarray, "P J 4"]:
-    """Unit quaternions, each of the sign that is nearer to the one before."""
+def continuous_quaternions(poses: Float[np.ndarray, "P J 3"]) -> Float[np.ndarray, "P J 4"]:
+    """Unit quaternions (x, y, z, w) of poses, each of the sign that is nearer to the one before."""
     count, joints = poses.shape[:2]
     found = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(count, joints, 4)
     turned = (found[1:] * found[:-1]).sum(-1) < 0
@@ -122,8 +122,14 @@ def _roughness(seconds: np.ndarray) -> tuple[sparse.csc_array, sparse.csc_array]
     return q.tocsc(), r.tocsc()
 
 
-def _smooth(seconds: np.ndarray, values: np.ndarray, stiffness: float) -> np.ndarray:
-    """Values (P, C) of the smoothing spline at the keys."""
+def smooth_values(
+    seconds: Float[np.ndarray, " P"], values: Float[np.ndarray, "P C"], stiffness: float
+) -> Float[np.ndarray, "P C"]:
+    """What a natural cubic spline has at its P >= 3 ascending keys that is near ``values`` there.
+
+    It is least in squared differences plus ``stiffness`` (s^3) times the integral of its squared
+    second derivative (Reinsch, Smoothing by spline functions, 1967).
+    """
     q, r = _roughness(seconds)
     return values - stiffness * (q @ splu((r + stiffness * (q.T @ q)).tocsc()).solve(q.T @ values))
 

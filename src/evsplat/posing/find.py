@@ -33,6 +33,7 @@ from evsplat.landmarks import (
 )
 from evsplat.options import PoseSearch
 from evsplat.options.declare import given
+from evsplat.posing.bridging import bridged
 from evsplat.posing.fit import FocalFit, PoseFit, fit_focal, fit_landmarks
 from evsplat.posing.page import poses_page
 from evsplat.posing.problem import FitSettings
@@ -209,6 +210,7 @@ def _found(
                 seen = _seen(capture, policy, focal_px)
                 logger.warning("%s", _rough(focal))
         track = fitted.track(key_times(seen))
+        held_us = landmarks.times_us.tolist()
         refined: Refined | None = None
         dressed: Body | None = None
         if limit_s > 0:
@@ -216,9 +218,12 @@ def _found(
                 refined = refine(track, seen, seconds=limit_s, progress=True, steps=FOUND_STEPS)
             if refined.better:
                 track = refined.track
+                names = {frame.name for frame in seen.frames}
+                held_us = [one.time_us for one in pictures if one.frame.name in names]
                 if rig.model == "default":  # the vertices of a licensed model are not ours to write
                     dressed = refined.dressed
                     track = track.with_body(dressed)
+        track = bridged(track, held_us)
     return _Motion(seen, pictures, landmarks, fitted, track, refined, dressed, focal_px, focal)
 
 
