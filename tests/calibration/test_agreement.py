@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from evsplat.calibration import (
+    Lost,
     answered_share,
-    came_elsewhere,
     estimate_disagreement,
-    lost_spans,
+    find_lost,
+    pauses,
     untold_spans,
 )
-from evsplat.events import ALWAYS, EventStore, EventStream, Span
+from evsplat.events import ALWAYS, EventStore, EventStream, Span, write_events
 
 from ..conftest import write_event_file
 from .synthetic import HEIGHT, WIDTH, Recording, record
@@ -98,10 +99,10 @@ def _without(recording: Recording, start_us: int, end_us: int) -> EventStream:
 def test_a_gap_in_the_events_is_found_where_it_is() -> None:
     seed = int(np.random.default_rng().integers(10_000))
     recording = record(seed, plus=0.2, minus=0.2)
-    assert lost_spans(recording.pairs, recording.events) == []
+    assert find_lost(recording.pairs, recording.events) == Lost()
     # frames are 40 ms apart: those of 200.5 to 280.5 and 280.5 to 320.5 ms saw no event
-    found = lost_spans(recording.pairs, _without(recording, 200_000, 325_000))
-    assert found == [(200_500, 320_500)]
+    found = find_lost(recording.pairs, _without(recording, 200_000, 325_000))
+    assert found == Lost(((200_500, 320_500),))
 
 
 def test_of_lost_events_all_the_silence_tells_nothing_across_held_out_intervals_too(
@@ -119,8 +120,9 @@ def test_of_lost_events_all_the_silence_tells_nothing_across_held_out_intervals_
         for pair in recording.pairs
         if span[0] <= pair.span_us[0] and pair.span_us[1] <= span[1]
     ]
-    assert untold_spans(pairs, events) == [(before, after)]
-    assert untold_spans(pairs, _stored(recording.events, tmp_path / "whole.h5", readable)) == []
+    assert untold_spans(find_lost(pairs, events), events) == [(before, after)]
+    whole = _stored(recording.events, tmp_path / "whole.h5", readable)
+    assert untold_spans(find_lost(pairs, whole), whole) == []
 
 
 def _stored(events: EventStream, path: Path, readable_us: list[Span]) -> EventStore:
@@ -128,25 +130,59 @@ def _stored(events: EventStream, path: Path, readable_us: list[Span]) -> EventSt
     return EventStore(path, WIDTH, HEIGHT, readable_us=readable_us)
 
 
+@pytest.mark.parametrize("noise", [0, 40])
+def test_a_pause_is_seen_among_more_frames_than_anybody_reads(tmp_path: Path, noise: int) -> None:
+    """Of a stall the frames about it; of rest, which comes slowly, some, however often it comes."""
+    rng, count, period = np.random.default_rng(), 6_000, 40_000
+    spans = [(k * period, k * period + 10_000) for k in range(count)]
+    # Somebody who rests for some frames time and again.
+    usual = 60 * np.clip(1.5 * np.sin(np.arange(count) / rng.uniform(9, 12)), 0, 1)
+    begins = int(rng.integers(1_000, 5_000))
+    while usual[begins - 5 : begins + 15].min() < 50:
+        begins += 1
+    start, end = (
+        (begins + part) * period + int(rng.integers(0, 9_000))
+        for part in (0, int(rng.integers(3, 9)))
+    )
+    frame = np.repeat(np.arange(count), rng.poisson(usual + noise))
+    t = np.sort(frame * period + rng.integers(0, period, len(frame)))
+    t = t[(t < start) | (t >= end)]
+    events = EventStream(
+        t, *(rng.integers(0, side, len(t)).astype(np.uint16) for side in (WIDTH, HEIGHT)),
+        rng.choice(np.array([-1, 1], np.int8), len(t)),
+    )  # fmt: skip
+    events = replace(events, y=np.minimum(events.y, HEIGHT - 1))
+    write_events(tmp_path / "long.h5", events)
+    store = EventStore(tmp_path / "long.h5", WIDTH, HEIGHT)
+    found = pauses(spans, [ALWAYS] * count, store)
+    silent = [k for k in range(count) if start <= spans[k][0] and spans[k][1] <= end]
+    within = [pair for pair in found if pair[0] <= silent[-1] and pair[1] >= silent[0]]
+    assert [within[0][0], within[-1][1]] == [silent[0], silent[-1]]
+    assert len(found) <= 60 and (len(found) == len(within)) == bool(noise)
+
+
 def test_no_gap_is_told_where_nothing_moves_or_nothing_was_recorded() -> None:
     recording = record(3, plus=0.2, minus=0.2)
     still = [replace(pair, change=np.zeros_like(pair.change)) for pair in recording.pairs]
-    assert lost_spans(still, recording.events.take(slice(0, 0))) == []
+    assert find_lost(still, recording.events.take(slice(0, 0))) == Lost()
     late = [replace(pair, recorded_us=(400_000, 900_000)) for pair in recording.pairs]
-    assert lost_spans(late, _without(recording, 0, 400_000)) == []
+    assert find_lost(late, _without(recording, 0, 400_000)) == Lost()
 
 
 def test_events_that_lie_in_other_pixels_are_told_from_lost_ones() -> None:
     seed = int(np.random.default_rng().integers(10_000))
     recording = record(seed, plus=0.2, minus=0.2, still_rows=HEIGHT // 2, noise_hz=1.0)
-    assert not came_elsewhere(recording.pairs, recording.events)
+    assert not find_lost(recording.pairs, recording.events).elsewhere
     # Where nothing moves in the pictures.
     moved = _changed(recording.events, y=(HEIGHT - 1 - recording.events.y).astype(np.uint16))
-    assert lost_spans(recording.pairs, moved) and came_elsewhere(recording.pairs, moved)
+    found = find_lost(recording.pairs, moved)
+    assert found.spans_us and found.elsewhere
     silent = _without(recording, 200_000, 325_000)
-    assert lost_spans(recording.pairs, silent) and not came_elsewhere(recording.pairs, silent)
+    found = find_lost(recording.pairs, silent)
+    assert found.spans_us and not found.elsewhere
     few = recording.events.take(np.random.default_rng(seed).random(len(recording.events)) < 0.01)
-    assert lost_spans(recording.pairs, few) and not came_elsewhere(recording.pairs, few)
+    found = find_lost(recording.pairs, few)
+    assert found.spans_us and not found.elsewhere
 
 
 @pytest.mark.parametrize("lag_us", [0, 15_000])

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from evsplat.errors import DataError, HeldOutError
-from evsplat.events import EventStore, EventStream, write_events
+from evsplat.events import ALWAYS, EventStore, EventStream, write_events
 from evsplat.events import store as store_module
 
 WIDTH, HEIGHT = 24, 18
@@ -52,6 +52,37 @@ def test_what_was_decoded_is_not_looked_up_again(tmp_path: Path, monkeypatch) ->
     first = store.between(10_000, 20_000)
     monkeypatch.setattr(h5py.Group, "__getitem__", lambda *_: pytest.fail("opened again"))
     assert len(first) and same(store.between(10_000, 20_000), first)
+
+
+@pytest.mark.parametrize("piece", [3, 1 << 20])
+def test_counts_are_those_of_the_milliseconds_that_may_be_read(
+    tmp_path, monkeypatch, piece
+) -> None:
+    """Against brute force, with clocks apart by any number of microseconds."""
+    monkeypatch.setattr(store_module, "_INDEX_PIECE", piece)
+    rng = np.random.default_rng()
+    events, offset = random_events(int(rng.integers(10_000)), 800, 60_000), int(rng.integers(5_000))
+    write_events(tmp_path / "events.h5", events)
+    readable = [(ALWAYS[0], 15_200), (20_700, 40_100), (47_300, ALWAYS[1])]
+    place, size = tmp_path / "events.h5", (WIDTH, HEIGHT)
+    whole, store = (EventStore(place, *size, offset, None, spans) for spans in ([ALWAYS], readable))
+    spans = [
+        tuple(sorted(rng.integers(max(start, -9_000), min(end, 90_000) + 1, 2)))
+        for start, end in readable
+        for _ in range(20)
+    ]
+    t = whole.between(*whole.time_range_us).t
+    for one, limits in ((whole, [ALWAYS] * len(spans)), (store, np.repeat(readable, 20, axis=0))):
+        expected = []
+        for (start, end), (low, high) in zip(spans, limits, strict=True):
+            first_ms, last_ms = (start - offset) // 1000, -((offset - end) // 1000)
+            within = (t >= max(low, 1000 * first_ms + offset)) & (t < 1000 * last_ms + offset)
+            expected.append((within & (t < high)).sum())
+        assert one.counts(np.array(spans)).tolist() == expected
+    with pytest.raises(HeldOutError, match="events from 14000 to 15201 us"):
+        store.counts(np.array([(14_000, 15_200), (14_000, 15_201)]))
+    with pytest.raises(HeldOutError, match="events from 15300 to 15400 us"):
+        store.counts(np.array([(15_300, 15_400)]))
 
 
 def same(a: EventStream, b: EventStream) -> bool:

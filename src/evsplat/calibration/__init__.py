@@ -16,7 +16,7 @@ from evsplat.calibration.brightness import (
 )
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
 from evsplat.calibration.flicker import flicker_period_us
-from evsplat.calibration.lost import answered_share, came_elsewhere, lost_spans, untold_spans
+from evsplat.calibration.lost import Lost, answered_share, find_lost, pauses, untold_spans
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
@@ -26,20 +26,21 @@ __all__ = [
     "EventSource",
     "Exposure",
     "FramePair",
+    "Lost",
     "NoiseEstimate",
     "NoiseMeter",
     "SensorEstimate",
     "ThresholdEstimate",
     "answered_share",
-    "came_elsewhere",
     "estimate_disagreement",
     "estimate_from_pairs",
+    "find_lost",
     "flicker_period_us",
-    "lost_spans",
     "noise_of",
     "exposure",
     "pair",
     "pair_indices",
+    "pauses",
     "untold_spans",
 ]
 

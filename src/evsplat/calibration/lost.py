@@ -4,7 +4,9 @@ Times are what a full buffer loses; places, what a sensor coarser than the pictu
 its pixels, or events that were warped elsewhere.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from jaxtyping import Bool
@@ -24,45 +26,133 @@ _AS_EVER = 0.5
 """Share of their usual rate from which events are taken to have come as ever."""
 _LOOK_US = 20_000
 """Read at first in search of the next event; then twice as long each time."""
+_NEXT_TO_NONE = 0.01
+"""Share of the usual rate of events up to which a sensor pauses: it has no more noise then."""
+_BESIDE = 2
+"""Pairs of frames on either side of a pause whose events tell how suddenly it came: in the first
+one it began."""
+_MOST_PAUSES = 30
+"""Of which pictures are read, three each."""
 VERY_MUCH = 1.5
 """Change that stays above thresholds where linear frames are taken as coded, 2.2 times as large."""
 
 
-def lost_spans(pairs: Sequence[FramePair], events: EventSource) -> list[Span]:
-    """Between which frames much changed and hardly an event came, as mid-exposures; joined.
+@dataclass(frozen=True)
+class Lost:
+    """Times at which pictures change and hardly an event came where they do."""
 
-    Clocks that differ by less than the time between two frames change little: some of the events
-    of a pair that moves come within it all the same. Pairs at whose time none were recorded or may
-    be read are passed over.
+    spans_us: tuple[Span, ...] = ()
+    """Mid-exposures between which that is so, in order and apart."""
+    elsewhere: bool = False
+    """Whether events came as ever meanwhile, at other pixels than those that changed. They were not
+    lost then but lie in other pixels than the frames': a change that is so large makes several at
+    each pixel, and a sensor that loses them falls silent."""
+
+
+@dataclass(frozen=True)
+class _Unanswered:
+    """A pair between which much changed and hardly an event came there."""
+
+    mids_us: Span
+    span_us: Span
+    changed: int
+    """Pixels."""
+
+    @classmethod
+    def of(cls, pair: FramePair, events: EventSource) -> "_Unanswered | None":
+        """None where it is answered, or its events were not recorded or may not be read."""
+        moved = _moved(pair, MUCH)
+        if moved.sum() < LEAST_PIXELS or not pair.recorded_at(0):
+            return None
+        if _fired(pair, events)[moved].mean() >= SILENT:
+            return None
+        mids_us = sum(pair.before_us) // 2, sum(pair.after_us) // 2
+        return cls(mids_us, pair.span_us, int(moved.sum()))
+
+
+def find_lost(
+    pairs: Sequence[FramePair], events: EventSource, more: Iterable[FramePair] = ()
+) -> Lost:
+    """When events did not tell what changed between two frames of a pair.
+
+    ``more`` are pairs that are not spread over the recording as ``pairs`` are, looked at one after
+    the other. Clocks that differ by less than the time between two frames change little: some of
+    the events of a pair that moves come within it all the same. Pairs at whose time none were
+    recorded or may be read are passed over.
     """
-    found: list[Span] = []
-    for pair in _unanswered(pairs, events):
-        first, last = sum(pair.before_us) // 2, sum(pair.after_us) // 2
-        if found and first <= found[-1][1]:
-            found[-1] = found[-1][0], max(last, found[-1][1])
-        else:
-            found.append((first, last))
-    return found
+    looked_at = (_Unanswered.of(pair, events) for pair in chain(pairs, more))
+    lost = sorted((one for one in looked_at if one is not None), key=lambda one: one.span_us)
+    if not lost:
+        return Lost()
+    came, rate = _came([one.span_us for one in lost], events)
+    usual = _came([pair.span_us for pair in pairs if pair.recorded_at(0)], events)[1]
+    as_many = came >= sum(one.changed for one in lost)
+    return Lost(_joined(one.mids_us for one in lost), as_many and rate >= _AS_EVER * usual)
 
 
-def untold_spans(pairs: Sequence[FramePair], events: EventStore) -> list[Span]:
-    """Times, in order and apart, of which events say nothing: `lost_spans` and the silence about
-    each, from the last event before it to the first one after.
+def untold_spans(lost: Lost, events: EventStore) -> list[Span]:
+    """Times, in order and apart, of which events say nothing: what was lost and the silence about
+    it, from the last event before to the first one after.
 
     A sensor begins and ends to lose events within exposures, and beside held-out intervals, where
     no pair tells. If silence was honest there, that nothing moved is all that is not learned from
     it. Empty where events were not lost but lie in other pixels.
     """
-    lost = lost_spans(pairs, events)
-    if not lost or came_elsewhere(pairs, events):
+    if lost.elsewhere:
         return []
+    about = ((_event_before(a, events), _event_after(b, events)) for a, b in lost.spans_us)
+    return list(_joined(about))
+
+
+def _joined(spans_us: Iterable[Span]) -> tuple[Span, ...]:
+    """Spans in order of their starts, those put together that meet."""
     found: list[Span] = []
-    for first, last in lost:
-        start, end = _event_before(first, events), _event_after(last, events)
+    for start, end in spans_us:
         if found and start <= found[-1][1]:
-            start, end = found[-1][0], max(end, found[-1][1])
-            found.pop()
-        found.append((start, end))
+            found[-1] = found[-1][0], max(end, found[-1][1])
+        else:
+            found.append((start, end))
+    return tuple(found)
+
+
+def pauses(
+    spans_us: Sequence[Span], stretch: Sequence[Span], events: EventStore
+) -> list[tuple[int, int]]:
+    """Numbers of frames between which next to no event came, so that pictures are to be asked.
+
+    ``spans_us`` are exposures in order and ``stretch`` the readable stretch of each. All of them
+    are looked at, by counts of events alone. A pause of several frames is two pairs, to its middle
+    and from there: somebody who goes to and fro may be back at its end. Of many pauses those are
+    taken that most events came beside: of who comes to rest they grow fewer, a stall comes at once.
+    """
+    if len(spans_us) < 2:
+        return []
+    exposed, readable = np.array(spans_us), np.array(stretch)
+    start = np.minimum(exposed[:-1, 0], exposed[1:, 0])
+    end = np.maximum(exposed[:-1, 1], exposed[1:, 1])
+    first, last = events.time_range_us
+    told = (readable[:-1] == readable[1:]).all(1)
+    told &= start >= np.maximum(first, readable[:-1, 0])
+    told &= end <= np.minimum(last, readable[:-1, 1])
+    if not told.any():
+        return []
+    counts = np.zeros(len(start), np.int64)
+    counts[told] = events.counts(np.stack([start[told], end[told]], axis=-1))
+    rate = counts / (end - start)
+    silent = told & (rate <= _NEXT_TO_NONE * np.median(rate[told]))
+    # Where silence begins, and one past its end.
+    begun, over = (
+        np.flatnonzero(np.diff(silent.astype(np.int8), prepend=0, append=0) == step)
+        for step in (1, -1)
+    )
+    until = np.concatenate([[0], np.cumsum(counts)])
+    before = until[begun] - until[np.maximum(begun - _BESIDE, 0)]
+    after = until[np.minimum(over + _BESIDE, len(counts))] - until[over]
+    chosen = np.sort(np.argsort(-(before + after), kind="stable")[:_MOST_PAUSES])
+    found = []
+    for low, high in zip(begun[chosen].tolist(), over[chosen].tolist(), strict=True):
+        middle = (low + high) // 2
+        found += [(low, middle), (middle, high)] if middle > low else [(low, high)]
     return found
 
 
@@ -92,35 +182,10 @@ def _event_after(time_us: int, events: EventStore) -> int:
     return time_us
 
 
-def came_elsewhere(pairs: Sequence[FramePair], events: EventSource) -> bool:
-    """Whether in `lost_spans` events came as ever, at other pixels than those that changed.
-
-    Such events were not lost: they lie in other pixels than the frames'. A change that is so large
-    makes several at each pixel, and a sensor that loses them falls silent.
-    """
-    lost = _unanswered(pairs, events)
-    changed = sum(int(_moved(pair, MUCH).sum()) for pair in lost)
-    came, rate = _came(lost, events)
-    usual = _came([pair for pair in pairs if pair.recorded_at(0)], events)[1]
-    return changed > 0 and came >= changed and rate >= _AS_EVER * usual
-
-
-def _unanswered(pairs: Sequence[FramePair], events: EventSource) -> list[FramePair]:
-    """Pairs between which much changed and hardly an event came there, in order of time."""
-    found = []
-    for pair in sorted(pairs, key=lambda pair: pair.span_us):
-        moved = _moved(pair, MUCH)
-        if moved.sum() < LEAST_PIXELS or not pair.recorded_at(0):
-            continue
-        if _fired(pair, events)[moved].mean() < SILENT:
-            found.append(pair)
-    return found
-
-
-def _came(pairs: Sequence[FramePair], events: EventSource) -> tuple[int, float]:
-    """Number of events during pairs, all pixels together, and their rate per microsecond."""
-    count = sum(len(events.between(*pair.span_us)) for pair in pairs)
-    return count, count / max(1, sum(pair.span_us[1] - pair.span_us[0] for pair in pairs))
+def _came(spans_us: Sequence[Span], events: EventSource) -> tuple[int, float]:
+    """Number of events during spans, all pixels together, and their rate per microsecond."""
+    count = sum(len(events.between(*span)) for span in spans_us)
+    return count, count / max(1, sum(end - start for start, end in spans_us))
 
 
 def answered_share(pairs: Sequence[FramePair], events: EventSource) -> float | None:

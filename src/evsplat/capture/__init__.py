@@ -10,6 +10,7 @@ from evsplat.capture.metadata import Frame, NovelView
 from evsplat.capture.policy import Policy
 from evsplat.capture.sensor_estimate import (
     estimate_sensor,
+    lost_events,
     shared_pairs,
     warn_of_linear_frames,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "warn_of_linear_frames",
     "load_body_track",
     "load_capture",
+    "lost_events",
     "shared_pairs",
     "validate_capture",
 ]

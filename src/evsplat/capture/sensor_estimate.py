@@ -1,7 +1,7 @@
 """Clock and contrast thresholds of a capture's event sensor, from its frames and events."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 
@@ -9,14 +9,18 @@ from evsplat.calibration import (
     MOST_PAIRS,
     Exposure,
     FramePair,
+    Lost,
     SensorEstimate,
     estimate_from_pairs,
     exposure,
+    find_lost,
     pair,
     pair_indices,
+    pauses,
 )
 from evsplat.capture.capture import Capture
 from evsplat.capture.training_capture import TrainingCapture
+from evsplat.events import Span
 
 logger = logging.getLogger(__name__)
 
@@ -83,29 +87,53 @@ def frame_pairs(capture: TrainingCapture) -> list[FramePair]:
     """
     if capture.shared_pairs:
         return capture.shared_pairs
-    pairs = _made_pairs(capture)
+    spans, stretch = _exposures(capture)
+    pairs = list(_made_pairs(capture, pair_indices(spans, MOST_PAIRS, stretch=stretch)))
     size = sum(one.change.nbytes + one.usable.nbytes for one in pairs)
     if capture.shared_pairs is not None and size <= _KEPT_BYTES:
         capture.shared_pairs = pairs
     return pairs
 
 
-def _made_pairs(capture: TrainingCapture) -> list[FramePair]:
+def lost_events(capture: TrainingCapture, pairs: Sequence[FramePair] | None = None) -> Lost:
+    """When events did not tell what changes between training frames, found once of a capture.
+
+    By `frame_pairs`, which miss what is short in a long recording, and by those frames between
+    which next to no event came, of all that there are (`pauses`). ``pairs``: the former, where they
+    are at hand.
+    """
+    if capture.lost is None:
+        assert capture.events is not None
+        silent = _made_pairs(capture, pauses(*_exposures(capture), capture.events))
+        pairs = frame_pairs(capture) if pairs is None else pairs
+        capture.lost = find_lost(pairs, capture.events, silent)
+    return capture.lost
+
+
+def _exposures(capture: TrainingCapture) -> tuple[list[Span], list[Span]]:
+    """Exposures of the training frames, and the readable stretch of events about each."""
+    assert capture.events is not None
+    frames = capture.train_frames
+    stretch = [capture.events.readable_around(frame.mid_us) for frame in frames]
+    return [frame.exposure_us for frame in frames], stretch
+
+
+def _made_pairs(
+    capture: TrainingCapture, indices: Iterable[tuple[int, int]]
+) -> Iterator[FramePair]:
+    """Pairs of training frames by their numbers."""
     assert capture.events is not None
     first, last = capture.events.time_range_us
     frames = capture.train_frames
-    spans = [frame.exposure_us for frame in frames]
-    stretch = [capture.events.readable_around(frame.mid_us) for frame in frames]
 
     # The second frame of a pair is mostly the first one of the next.
     @lru_cache(maxsize=2)
     def exposed(index: int) -> Exposure:
         frame = frames[index]
-        return exposure(capture.image(frame), spans[index], transfer=capture.transfer(frame))
+        span_us, transfer = frame.exposure_us, capture.transfer(frame)
+        return exposure(capture.image(frame), span_us, transfer=transfer)
 
-    pairs = []
-    for before, after in pair_indices(spans, MOST_PAIRS, stretch=stretch):
-        start, end = stretch[before]
+    for before, after in indices:
+        start, end = capture.events.readable_around(frames[before].mid_us)
         recorded_us = max(start, first), min(end, last)
-        pairs.append(pair(exposed(before), exposed(after), recorded_us))
-    return pairs
+        yield pair(exposed(before), exposed(after), recorded_us)

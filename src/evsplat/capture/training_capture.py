@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.calibration import FramePair, flicker_period_us
+from evsplat.calibration import FramePair, Lost, flicker_period_us
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
 from evsplat.capture.metadata import Frame, NovelView
@@ -63,6 +63,8 @@ class TrainingCapture:
         self.shared_pairs: list[FramePair] | None = None
         """Pairs of frames that who asks next may have, empty until somebody does; None: they are
         made anew for everybody. See `evsplat.capture.shared_pairs`."""
+        self.lost: Lost | None = None
+        """Where events were lost, once `evsplat.capture.lost_events` has looked for it."""
         self.path: Path = source.path
         self.name: str = source.name
         self.frames: tuple[Frame, ...] = tuple(self._redacted(f) for f in self._source.frames)

@@ -2,14 +2,8 @@
 
 import logging
 
-from evsplat.calibration import (
-    FramePair,
-    answered_share,
-    came_elsewhere,
-    estimate_disagreement,
-    lost_spans,
-)
-from evsplat.capture import TrainingCapture
+from evsplat.calibration import FramePair, Lost, answered_share, estimate_disagreement
+from evsplat.capture import TrainingCapture, lost_events
 from evsplat.capture.finding import Finding, Findings
 from evsplat.capture.sensor_estimate import frame_pairs
 from evsplat.events import EventStore
@@ -28,7 +22,7 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
     """What is wrong with events that are there and readable.
 
     Compared are at most 60 pairs of frames with the events between them, so that of a
-    long recording a part is looked at.
+    long recording a part is looked at; pauses of the events are found wherever they are.
     """
     findings = Findings()
     events = capture.events
@@ -49,11 +43,11 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
             str(other_way), "events in the pixels of the frames, 1 where it grows brighter",
             "Write the events anew that way (evsplat.events.write_events), or the pictures.",
         )  # fmt: skip
-    lost = lost_spans(pairs, events) if other_way is None else []
-    if lost:
-        where = ", ".join(f"{first / 1e6:.3f} to {last / 1e6:.3f} s" for first, last in lost[:3])
-        where += f" and {len(lost) - 3} more" if len(lost) > 3 else ""
-        if came_elsewhere(pairs, events):
+    lost = lost_events(capture, pairs) if other_way is None else Lost()
+    if lost.spans_us:
+        spans = [f"{first / 1e6:.3f} to {last / 1e6:.3f} s" for first, last in lost.spans_us]
+        where = ", ".join(spans[:3]) + (f" and {len(spans) - 3} more" if len(spans) > 3 else "")
+        if lost.elsewhere:
             findings.warning(
                 events.path, WHICH_WAY[1],
                 f"hardly an event at the pixels that change, and as many as ever at others, from "
@@ -74,7 +68,7 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
                 "thinned when they were written. Method evsplat learns from frames alone there; "
                 "other methods and restore take no event for no change.",
             )  # fmt: skip
-    answered = None if lost or sign or other_way else answered_share(pairs, events)
+    answered = None if lost.spans_us or sign or other_way else answered_share(pairs, events)
     if answered is not None and answered < _FEWEST_ANSWERED:
         findings.warning(
             events.path, "events/x, events/y",

@@ -5,8 +5,12 @@ import logging
 import torch
 
 from evsplat.calibration import SensorEstimate, untold_spans
-from evsplat.capture import TrainingCapture, estimate_sensor, warn_of_linear_frames
-from evsplat.capture.sensor_estimate import frame_pairs
+from evsplat.capture import (
+    TrainingCapture,
+    estimate_sensor,
+    lost_events,
+    warn_of_linear_frames,
+)
 from evsplat.events import EventStore, Span
 from evsplat.methods.base import Purpose
 from evsplat.methods.evsplat_settings import EvsplatConfig
@@ -69,7 +73,7 @@ def event_windows(
 
 def _untold_us(capture: TrainingCapture, events: EventStore) -> list[Span]:
     """When the sensor lost its events."""
-    spans = untold_spans(frame_pairs(capture), events)
+    spans = untold_spans(lost_events(capture), events)
     for start, end in spans:
         logger.info(
             "no event from %.3f to %.3f s, where pictures change: learned from frames alone there",
