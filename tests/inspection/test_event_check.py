@@ -10,7 +10,7 @@ import pytest
 from evsplat.inspection.event_check import event_findings, flicker_findings
 
 from ..conftest import write_event_file
-from ..seen import seen
+from ..seen import changes_much, seen
 
 
 def _warped(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -39,6 +39,28 @@ def test_events_warped_to_half_the_size_are_not_called_lost(
     write_event_file(path / "events.h5", *changed(*columns))
     (finding,) = event_findings(seen(path))
     assert finding.field == field and likeliest in str(finding)
+
+
+def test_of_events_without_polarity_is_told_what_needs_none(
+    tiny_capture: Callable[..., Path],
+) -> None:
+    """That the sensor lost some, and that they lie elsewhere; not which way, which they hide."""
+    drawn = (
+        tiny_capture(str(seed), frames=12, width=96, height=72, seed=int(seed))
+        for seed in np.random.default_rng().integers(10_000, size=30)
+    )
+    path = next(one for one in drawn if changes_much(one, 5, 6))
+    with h5py.File(path / "events.h5") as file:
+        t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
+
+    def found(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> list[str]:
+        write_event_file(path / "events.h5", t, x, y, np.zeros_like(p))
+        assert not seen(path).events.has_polarity
+        return [finding.field for finding in event_findings(seen(path))]
+
+    assert found(t, x, y, p) == []
+    assert found(*_gap(t, x, y, p)) == ["events/t"]
+    assert found(*_warped(t, x, y, p)) == ["events/x, events/y"]
 
 
 @pytest.mark.parametrize("hertz", [100, 120])

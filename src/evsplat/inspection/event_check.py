@@ -22,15 +22,16 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
     """What is wrong with events that are there and readable.
 
     Compared are at most 60 pairs of frames with the events between them, so that of a
-    long recording a part is looked at; pauses of the events are found wherever they are.
+    long recording a part is looked at; pauses of the events are found wherever they are. Without
+    polarity events do not tell whether they are turned.
     """
     findings = Findings()
     events = capture.events
-    if events is None or not len(events) or not events.has_polarity:
+    if events is None or not len(events):
         return []
-    pairs = frame_pairs(capture)
-    sign = _only_sign(pairs, events)
-    other_way = None if sign else estimate_disagreement(pairs, events)
+    pairs, signed = frame_pairs(capture), events.has_polarity
+    sign = _only_sign(pairs, events) if signed else ""
+    other_way = estimate_disagreement(pairs, events) if signed and not sign else None
     if sign:
         findings.warning(
             events.path, WHICH_WAY[0], f"{sign} events alone between all frames",
