@@ -7,7 +7,8 @@ Stages captures at random (character, motion, turn, frame rate, exposure, sensor
 poses that are exact or off as markers or estimators are). Each is judged with its own body and with
 a wrong one, by turns: of another capture, 8 to 14 pixels beside, 2 to 4 frames early or late. The
 same again without events, with dark pictures (events alone) and with a textured square that passes
-through the picture. ``--captures`` are judged apart, with their own and with each other's bodies.
+through the picture, and whether something else than the person is said to move. ``--captures`` are
+judged apart, with their own and with each other's bodies.
 Staged captures stay in the folder. Times are of one thread. The last line is one JSON object.
 """
 
@@ -177,7 +178,8 @@ def judged(capture: Capture, track: BodyTrack | None, label: str) -> tuple[Belon
     print(
         f"{label:78} {found.verdict:8} {found.score:5.2f} of {found.best_score:.2f}, "
         f"order {order}, follows {follows}, off {found.shift_px[0]:+5.1f} "
-        f"{found.shift_px[1]:+5.1f} px {found.delay_frames:+.1f} frames, {seconds:.2f} s",
+        f"{found.shift_px[1]:+5.1f} px {found.delay_frames:+.1f} frames, {seconds:.2f} s"
+        f"{'' if found.elsewhere is None else f', {found.elsewhere.sentence}'}",
         flush=True,
     )
     return found, seconds
@@ -198,6 +200,7 @@ def compare(paths: Sequence[Path], options: argparse.Namespace) -> dict[str, flo
         counts = {
             f"{kind}_{what}": 0 for kind in ("right", *WRONG) for what in ("n", "warned", "refused")
         }
+        counts["right_others"] = 0
         for index, capture in enumerate(captures):
             rng = np.random.default_rng((options.seed, index, 1))
             wrong = WRONG[index % len(WRONG)]
@@ -209,6 +212,8 @@ def compare(paths: Sequence[Path], options: argparse.Namespace) -> dict[str, flo
                 counts[f"{kind}_n"] += 1
                 counts[f"{kind}_warned"] += found.verdict != "belongs"
                 counts[f"{kind}_refused"] += found.verdict == "another"
+                if body is None:
+                    counts["right_others"] += found.elsewhere is not None
         results |= {f"{variant}_{name}_count": count for name, count in counts.items()}
     return results | {"slowest_s": round(max(spent), 2), "mean_s": round(float(np.mean(spent)), 2)}
 
@@ -216,7 +221,13 @@ def compare(paths: Sequence[Path], options: argparse.Namespace) -> dict[str, flo
 def apart(paths: Sequence[Path]) -> dict[str, float]:
     """Judge recorded captures with their own and with each other's bodies."""
     captures = [load_capture(path) for path in paths]
-    counts = {"right_n": 0, "right_warned": 0, "another_n": 0, "another_warned": 0}
+    counts = {
+        "right_n": 0,
+        "right_warned": 0,
+        "right_others": 0,
+        "another_n": 0,
+        "another_warned": 0,
+    }
     counts["another_refused"] = 0
     for capture in captures:
         for other in captures:
@@ -224,6 +235,7 @@ def apart(paths: Sequence[Path]) -> dict[str, float]:
                 found, _ = judged(capture, None, f"{capture.name}: its own")
                 counts["right_n"] += 1
                 counts["right_warned"] += found.verdict != "belongs"
+                counts["right_others"] += found.elsewhere is not None
             else:
                 track, how = wrong_body("another", capture, other, np.random.default_rng(0))
                 found, _ = judged(capture, track, f"{capture.name}: {how}")

@@ -7,7 +7,7 @@ Limits are from staged captures (benchmarks/wrong_bodies.py).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,8 +15,9 @@ from jaxtyping import Int
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Frame, TrainingCapture, load_body_track
+from evsplat.inspection.elsewhere import Elsewhere, find_elsewhere
 from evsplat.inspection.figure import Coarse, Figure, grown, outlines
-from evsplat.inspection.movement import looked_at, movement, spread, stands
+from evsplat.inspection.movement import looked_at, movement, small_pictures, spread, stands
 from evsplat.inspection.search import DELAYS, NOW, REACH_PX, BestPlace, drawn, in_picture
 from evsplat.wording import counted
 
@@ -88,6 +89,13 @@ class Belonging:
     """The posed body is out of view in every training frame."""
     in_no_held_out_frame: bool
     """There are held-out frames, and the posed body is out of view in all of them."""
+    elsewhere: Elsewhere | None = None
+    """What moves beside a body that belongs; None where the camera moves."""
+
+    @property
+    def is_odd(self) -> bool:
+        """Whether there is something to be told, and to be looked at in a picture."""
+        return self.verdict != "belongs" or self.elsewhere is not None
 
     @property
     def verdict(self) -> Verdict:
@@ -199,12 +207,14 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
     cameras = [capture.camera(frame) for frame in frames]
     mids_us = np.array([frame.mid_us for frame in frames])
     coarse = Coarse.of(cameras[0], float(np.median(figure.heights_px(mids_us.tolist(), cameras))))
-    found = movement(capture, frames, coarse)
+    pictures = small_pictures(capture, frames, coarse) if stands(frames) else None
+    found = movement(capture, frames, coarse, pictures)
     period_us = _period_us(capture)
     times_us, owner, row = _times(mids_us, period_us, together=stands(frames))
     posed = figure.maps(times_us, [cameras[k] for k in owner], coarse, REACH_PX)
     edges = outlines(posed)
-    now = in_picture(posed[row[:, NOW]], (coarse.height, coarse.width), 0, 0)
+    size = (coarse.height, coarse.width)
+    now = in_picture(posed[row[:, NOW]], size, 0, 0)
     for _ in range(WIDENED_PX):
         now = grown(now)
     best = BestPlace.of(
@@ -220,7 +230,7 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
         delay, change_lost = best.changed
         assert best.changing is not None
         change_score = float(best.changing[0, delay])
-    return Belonging(
+    judged = Belonging(
         frames,
         shares={name: float(maps[now].sum() / maps.sum()) for name, maps in found.items()},
         area=float(now.mean()),
@@ -239,6 +249,13 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
         in_no_training_frame=not now.any() and _in_none(capture, figure, capture.train_frames),
         in_no_held_out_frame=_in_none(capture, figure, spread(capture.held_out_frames)),
     )
+    if pictures is None or judged.verdict != "belongs":
+        return judged
+    # half a frame before and after: an exposure is hardly longer
+    about = np.logical_or.reduce([posed[row[:, NOW + half]] for half in (-1, 0, 1)])
+    picture_px = (cameras[0].width, cameras[0].height)
+    beside = find_elsewhere(pictures, found, in_picture(about, size, 0, 0), picture_px)
+    return replace(judged, elsewhere=beside)
 
 
 def _in_none(capture: TrainingCapture, figure: Figure, frames: Sequence[Frame]) -> bool:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from evsplat.body import BodyTrack, silhouette
@@ -27,13 +27,14 @@ from evsplat.inspection.drawing import (
     sheet,
     to_picture,
 )
+from evsplat.inspection.elsewhere import EXPECTED, REMEDY
 from evsplat.inspection.movement import event_window
 from evsplat.pictures import shown
 
 logger = logging.getLogger(__name__)
 
 _TILES = 8
-_GIVEN, _BEST = (60, 255, 120), (255, 225, 80)
+_GIVEN, _BEST, _ELSEWHERE = (60, 255, 120), (255, 225, 80), (255, 110, 220)
 FIT_SHEET = "body_fit"
 """Name of the picture."""
 
@@ -64,6 +65,8 @@ def check_body(
         )
     if found.verdict != "belongs":
         logger.warning("%s: %s.", capture.body_file.path, found.sentence)
+    for finding in _elsewhere_findings(found):
+        logger.warning("%s", finding)
     if found.in_no_held_out_frame:
         logger.warning("%s: the person is in no test frame; check camera and poses.", capture.path)
     return found
@@ -80,6 +83,15 @@ def body_findings(capture: TrainingCapture, found: Belonging) -> list[Finding]:
             "a body whose outline lies on what moves",
             f"Look at {FIT_SHEET}.png; correct poses, their times, or the camera.",
         )
+    return findings.items + _elsewhere_findings(found)
+
+
+def _elsewhere_findings(found: Belonging) -> list[Finding]:
+    """A warning where something else moves than the person."""
+    findings = Findings()
+    if found.elsewhere is not None:
+        folder = found.frames[0].image.parent
+        findings.warning(folder, "", found.elsewhere.sentence, EXPECTED, REMEDY)
     return findings.items
 
 
@@ -91,7 +103,8 @@ def save_fit_sheet(capture: TrainingCapture, found: Belonging, folder: Path) -> 
 def fit_sheet(capture: TrainingCapture, found: Belonging) -> Image.Image:
     """The body's outline over events about mid-exposure, or over pictures where there are none.
 
-    Green where it is; yellow where it would fit best, if that is elsewhere.
+    Green where it is; yellow where it would fit best, if that is elsewhere. What else moves is in a
+    pink box.
     """
     track = load_body_track(capture)
     chosen = np.linspace(0, len(found.frames) - 1, min(_TILES, len(found.frames))).round()
@@ -103,10 +116,16 @@ def fit_sheet(capture: TrainingCapture, found: Belonging) -> Image.Image:
         if found.verdict == "off":
             _outline(picture, track, frame.mid_us + found.delay_us, camera, found.shift_px, _BEST)
         _outline(picture, track, frame.mid_us, camera, (0.0, 0.0), _GIVEN)
+        if found.elsewhere is not None:
+            scale = picture.width / camera.width
+            box = [side * scale for side in found.elsewhere.box_px]
+            ImageDraw.Draw(picture).rectangle(box, outline=_ELSEWHERE, width=2)
         tiles.append(Tile(picture, f"{frame.name}   {frame.mid_us / 1e6:.3f} s", frame.split))
     said = "posed body (green) over what moves"
     if found.verdict == "off":
         said = f"posed body (green), {found.place} what moves; where it would fit best (yellow)"
+    if found.elsewhere is not None:
+        said += f"; what else moves, {found.elsewhere.where} (pink)"
     return sheet(f"{capture.name}: fit of the body", said, tiles, columns=4)
 
 

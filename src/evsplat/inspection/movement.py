@@ -1,6 +1,6 @@
 """What moves in a recording, in coarse maps: events, and differences to the background."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float32
@@ -42,17 +42,20 @@ def stands(frames: Sequence[Frame]) -> bool:
 
 
 def movement(
-    capture: TrainingCapture, frames: Sequence[Frame], coarse: Coarse
-) -> Mapping[str, Float32[np.ndarray, "K h w"]]:
+    capture: TrainingCapture,
+    frames: Sequence[Frame],
+    coarse: Coarse,
+    pictures: Float32[np.ndarray, "K 3 h w"] | None,
+) -> dict[str, Float32[np.ndarray, "K h w"]]:
     """What moves about the mid-exposure of each frame, per map pixel, 0 or more.
 
-    "events": how many there are; "frames": difference to the median of the frames, 1 at most. What
-    the capture lacks is left out, as are differences where the camera moves, and what is the
-    same everywhere.
+    "events": how many there are; "frames": difference to the median of the ``pictures``
+    (`small_pictures`), 1 at most. What the capture lacks is left out, as are differences where the
+    camera moves, which has no ``pictures``, and what is the same everywhere.
     """
     found = {}
-    if stands(frames):
-        found["frames"] = _differences(capture, frames, coarse)
+    if pictures is not None:
+        found["frames"] = _differences(pictures)
     # events are of the first frame's camera
     if capture.events is not None and frames[0].camera == capture.frames[0].camera:
         found["events"] = _event_counts(capture, frames, coarse)
@@ -66,16 +69,20 @@ def event_window(events: EventStore, frame: Frame) -> EventStream:
     return events.between(max(start, first), min(end, last))
 
 
-def _differences(
+def small_pictures(
     capture: TrainingCapture, frames: Sequence[Frame], coarse: Coarse
-) -> Float32[np.ndarray, "K h w"]:
-    if len(frames) < _FEWEST_FOR_BACKGROUND:
-        return np.zeros((len(frames), coarse.height, coarse.width), np.float32)
+) -> Float32[np.ndarray, "K 3 h w"]:
+    """The frames' coded values in maps."""
     small = []
     for frame in tqdm(frames, "pictures", unit="picture", leave=False, disable=None):
         channels = capture.image(frame).unbind(-1)
         small.append(np.stack([coarse.shrunk(channel) for channel in channels]))
-    pictures = np.stack(small)
+    return np.stack(small)
+
+
+def _differences(pictures: Float32[np.ndarray, "K 3 h w"]) -> Float32[np.ndarray, "K h w"]:
+    if len(pictures) < _FEWEST_FOR_BACKGROUND:
+        return np.zeros_like(pictures[:, 0])
     differences = np.abs(pictures - np.median(pictures, axis=0)).max(axis=1)
     return np.minimum(differences / CHANGED, 1).astype(np.float32)
 

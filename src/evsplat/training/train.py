@@ -179,7 +179,7 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
             write_facts(folder, seen, start.method, start.settings, device, start.seed)
             # The last of what resuming needs.
             save_yaml(folder.config, start.settings, method=start.method)
-        if fitting is not None and fitting.verdict != "belongs":
+        if fitting is not None and fitting.is_odd:
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
         logger.debug("%s", schedule_table(start.settings, composition.weights))
         logger.info("%s", seen.terms.sentence(len(seen.held_out_frames)))
