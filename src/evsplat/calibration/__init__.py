@@ -15,6 +15,7 @@ from evsplat.calibration.brightness import (
     pair_indices,
 )
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
+from evsplat.calibration.dead_lines import dead_lines_text, dead_rows
 from evsplat.calibration.flicker import flicker_period_us
 from evsplat.calibration.lost import Lost, answered_share, find_lost, pauses, untold_spans
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
@@ -32,6 +33,8 @@ __all__ = [
     "SensorEstimate",
     "ThresholdEstimate",
     "answered_share",
+    "dead_lines_text",
+    "dead_rows",
     "estimate_disagreement",
     "estimate_from_pairs",
     "find_lost",

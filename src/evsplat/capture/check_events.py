@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from evsplat.calibration import dead_lines_text
 from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Metadata
 from evsplat.capture.stillness import nothing_moves
@@ -21,6 +22,8 @@ _SHORT = 500_000
 _INDEX_PIECE = 1 << 20
 """Entries of the index that are read at a time."""
 _INDEX_SAMPLES = 64
+_MOST_PIXELS = 1 << 24
+"""Of a sensor whose events are counted by pixel: more are announced, not built."""
 _REPAIR = "Copy the file again or write it anew."
 
 
@@ -39,7 +42,7 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
                 return
             _check_clock(metadata, entry, file, findings)
             if deep or len(file["events/t"]) <= _SHORT:
-                _Scan(entry, file, findings).run()
+                _Scan(entry, file, findings, counting=deep).run()
             else:
                 _check_index(entry, file, findings)
     except DataError as error:
@@ -221,13 +224,18 @@ def _note_short_index(entry: EventsEntry, length: int, needed: int, findings: Fi
 class _Scan:
     """One pass over the events in pieces: order, coordinates, polarity and the index."""
 
-    def __init__(self, entry: EventsEntry, file: h5py.File, findings: Findings) -> None:
+    def __init__(
+        self, entry: EventsEntry, file: h5py.File, findings: Findings, *, counting: bool
+    ) -> None:
         self.entry, self.file, self.findings = entry, file, findings
         self.first: dict[str, tuple[int, str]] = {}
         """Per kind of fault the first event and what is wrong with it."""
         self.count: dict[str, int] = {}
         self.index_fault: tuple[int, int, int] | None = None
         """Millisecond, stored index and right index of the first wrong entry of ms_to_idx."""
+        counting = counting and entry.height * entry.width <= _MOST_PIXELS
+        self.counts = np.zeros((entry.height, entry.width), np.int64) if counting else None
+        """Events of each pixel of the sensor, where they are asked for."""
         self.next_ms = 0
         self.previous_t: int | None = None
 
@@ -250,6 +258,8 @@ class _Scan:
         if "t" not in self.count:
             self.rest_of_index(total)
         self.report(total)
+        if self.counts is not None and not self.count:
+            self.report_dead_lines(self.counts)
 
     def piece(self, start: int, t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> None:
         t = t.astype(np.int64)
@@ -260,6 +270,9 @@ class _Scan:
         self.note("x", start, (x >= self.entry.width) | (x < 0), lambda i: f"{x[i]}")
         self.note("y", start, (y >= self.entry.height) | (y < 0), lambda i: f"{y[i]}")
         self.note("p", start, (p != 0) & (p != 1), lambda i: f"{p[i]}")
+        if self.counts is not None and not self.count.keys() & {"x", "y"}:
+            place = y.astype(np.int64) * self.entry.width + x
+            self.counts += np.bincount(place, minlength=self.counts.size).reshape(self.counts.shape)
         if "t" not in self.count:
             self.piece_of_index(start, t)
 
@@ -291,6 +304,18 @@ class _Scan:
         if wrong.any() and self.index_fault is None:
             at = int(np.argmax(wrong))
             self.index_fault = (self.next_ms + at, int(stored[at]), int(right[at]))
+
+    def report_dead_lines(self, counts: np.ndarray) -> None:
+        """A warning where rows or columns have no event between others with many."""
+        if lines := dead_lines_text(counts):
+            self.findings.warning(
+                self.entry.file,
+                "events/y" if lines.startswith("row") else "events/x",
+                f"no event in {lines}",
+                "events there as in the rows and columns beside, which have many",
+                "The sensor or its link loses them, or they were put into more pixels than it "
+                "has. A few such lines cost next to nothing in training.",
+            )
 
     def report(self, total: int) -> None:
         width, height = self.entry.width, self.entry.height

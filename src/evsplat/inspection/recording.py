@@ -13,6 +13,7 @@ from evsplat.calibration import (
     NoiseEstimate,
     NoiseMeter,
     SensorEstimate,
+    dead_lines_text,
     estimate_from_pairs,
     exposure,
     pair,
@@ -74,6 +75,8 @@ def inspect_recording(
         f"events     {totals.text(recording.has_polarity)}",
         f"noise      {_noise_text(totals.noise)}",
     ]
+    if totals.dead_lines:
+        lines.append(f"dead       no event in {totals.dead_lines}, beside which there are many")
     drawings = {
         "events": _events_sheet(path.name, frames, totals, lag_us),
         "rate": totals.draw(path.name),
@@ -105,6 +108,8 @@ class _Totals:
     width: int
     height: int
     noise: NoiseEstimate
+    dead_lines: str
+    """Rows and columns that record nothing, in words; empty where there are none."""
     count: int
     brighter: int
     start_us: int
@@ -139,7 +144,8 @@ class _Totals:
         rows = np.concatenate(bins)
         rate = np.bincount(rows[:, 0], rows[:, 1]) / (_RATE_BIN_US / 1e6)
         noise, sample = meter.estimate(end - start), EventStream.joined(kept)
-        return cls(width, height, noise, count, brighter, start, end, rate, sample)
+        dead = dead_lines_text(meter.total)
+        return cls(width, height, noise, dead, count, brighter, start, end, rate, sample)
 
     def text(self, has_polarity: bool) -> str:
         seconds = (self.end_us - self.start_us) / 1e6
