@@ -136,14 +136,14 @@ def test_a_pause_is_seen_among_more_frames_than_anybody_reads(tmp_path: Path, no
     rng, count, period = np.random.default_rng(), 6_000, 40_000
     spans = [(k * period, k * period + 10_000) for k in range(count)]
     # Somebody who rests for some frames time and again.
-    usual = 60 * np.clip(1.5 * np.sin(np.arange(count) / rng.uniform(9, 12)), 0, 1)
+    usual = 200 * np.clip(1.5 * np.sin(np.arange(count) / rng.uniform(14, 18)), 0, 1)
     begins = int(rng.integers(1_000, 5_000))
-    while usual[begins - 5 : begins + 15].min() < 50:
+    while usual[begins - 5 : begins + 15].min() < 180:
         begins += 1
-    start, end = (
-        (begins + part) * period + int(rng.integers(0, 9_000))
-        for part in (0, int(rng.integers(3, 9)))
-    )
+    # Far enough within exposures that these see events, and no frame between them does.
+    within_us = rng.integers(4_000, 6_000, 2).tolist()
+    last = begins + int(rng.integers(3, 9))
+    start, end = begins * period + within_us[0], last * period + within_us[1]
     frame = np.repeat(np.arange(count), rng.poisson(usual + noise))
     t = np.sort(frame * period + rng.integers(0, period, len(frame)))
     t = t[(t < start) | (t >= end)]
