@@ -1,6 +1,7 @@
 """Captures that tests share: those on disk, the one that ships, and a tiny one made on the fly."""
 
 import functools
+import importlib
 import json
 import os
 import shutil
@@ -8,6 +9,7 @@ import signal
 import tempfile
 import tracemalloc
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -32,6 +34,22 @@ hypothesis.settings.load_profile("evsplat")
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONTRAST = 0.2
 PERIOD_US, EXPOSURE_US, SUBFRAMES = 40_000, 30_000, 8
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Workers import different test modules first, so that each is made ready once, for all.
+
+    pytest rewrites a module's assertions on its first import, which takes longer than most tests,
+    and keeps what comes of it. Workers that all collect from the start would rewrite all modules.
+    """
+    folder, worker = REPOSITORY / "tests", int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
+    if worker == 0 or [Path(asked).resolve() for asked in session.config.args] != [folder]:
+        return
+    paths = sorted(folder.rglob("test_*.py"))
+    for path in paths[len(paths) * worker // workers : len(paths) * (worker + 1) // workers]:
+        # One that is skipped or broken is told when it is collected.
+        with suppress(Exception, pytest.skip.Exception):
+            importlib.import_module(".".join(path.relative_to(REPOSITORY).with_suffix("").parts))
 
 
 @pytest.fixture
