@@ -2,14 +2,14 @@
 
 import importlib
 import json
+import os
 import random
 import shlex
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import asdict
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -30,21 +30,17 @@ from evsplat.training.checkpoint import latest_checkpoint
 from evsplat.training.trainer import Trainer
 from evsplat.untrusted.text import read_json
 
+from ..own_process import errors_of, start_bench
 from ..small_model import SMALL
 from .helpers import MEDIAN, PAPER, cells_in_this_process, records, write_suite
 
 training = importlib.import_module("evsplat.training.train")
 
 
-def start(suite: Path, out: Path, **options) -> subprocess.Popen:
-    command = [sys.executable, "-m", "evsplat", "bench", str(suite), "--out", str(out)]
-    return subprocess.Popen([*command, "--cpus-per-cell", "1"], **options)
-
-
-def wait_until_begun(lock: Path, process: subprocess.Popen, *, before: str) -> str:
+def wait_until_begun(lock: Path, process: BaseProcess, *, before: str) -> str:
     """The number of the process that does the cell, another than ``before``, or of none."""
     deadline = time.monotonic() + 300
-    while process.poll() is None:
+    while process.is_alive():
         assert time.monotonic() < deadline
         number = lock.read_text() if lock.exists() else ""
         if number not in ("", before):
@@ -65,14 +61,12 @@ def test_killed_at_random_moments_and_started_again_it_ends_with_the_same_record
     seed = random.randrange(1 << 30)
     moments, worker = random.Random(seed), ""
     for _ in range(2):
-        process = start(suite, tmp_path / "killed")
+        process = start_bench(suite, tmp_path / "killed")
         lock = BenchFolder(tmp_path / "killed").lock_of("one/paper/seed0")
         worker = wait_until_begun(lock, process, before=worker)
-        try:
-            process.wait(moments.uniform(0, 0.9) * took)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        process.join(moments.uniform(0, 0.9) * took)
+        process.kill()
+        process.join()
     with cells_in_this_process():
         ev.bench(suite, out=tmp_path / "killed", jobs=1)
     assert records(tmp_path / "killed") == records(tmp_path / "whole"), f"seed {seed}"
@@ -254,15 +248,16 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tiny_capture, tmp_path):
         tmp_path / "suite.yaml", {"one": tiny_capture("one")}, PAPER, iterations=1_000_000
     )
     out = tmp_path / "out"
-    process = start(suite, out, stderr=subprocess.PIPE, text=True)
+    process = start_bench(suite, out)
     run = out / "runs" / "one" / "paper" / "seed0"
     deadline = time.monotonic() + 300
     while not (run / "log.jsonl").exists():  # opened right before the first step
-        assert time.monotonic() < deadline and process.poll() is None
+        assert time.monotonic() < deadline and process.is_alive()
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 130
+    os.kill(process.pid, signal.SIGINT)
+    process.join(300)
+    errors = errors_of(out).read_text()
+    assert process.exitcode == 130, errors
     assert "0 of 1 cells are done" in errors and f"evsplat bench {suite}" in errors
     assert latest_checkpoint(run / "checkpoints") is not None
     assert "1 of 1 cells have not been run yet" in (out / "tables.md").read_text()

@@ -15,7 +15,7 @@ from evsplat.benching.plan import make_plan
 from evsplat.benching.suite import read_suite
 from evsplat.errors import BackendError
 
-from .helpers import PAPER, records, write_suite
+from .helpers import MEDIAN, PAPER, records, write_suite
 
 ray = pytest.importorskip("ray", reason="needs Ray: pip install 'evsplat[ray]'")
 
@@ -51,8 +51,7 @@ def kill_once_it_trains(folder: BenchFolder, cell: str, killed: list[int]) -> No
 
 
 def test_a_killed_worker_loses_nothing(two_workers, tiny_capture, tmp_path: Path):
-    captures = {"one": tiny_capture("one"), "two": tiny_capture("two")}
-    suite = write_suite(tmp_path / "suite.yaml", captures, PAPER, iterations=25)
+    suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, MEDIAN, PAPER)
     folder = BenchFolder(tmp_path / "ray")
     killed: list[int] = []
     killer = threading.Thread(target=kill_once_it_trains, args=(folder, KILLED, killed))

@@ -62,10 +62,13 @@ def test_a_direction_that_cannot_be_up_is_named(tiny_capture, bad):
         load_capture(path)
 
 
+def test_what_is_up_is_not_told_where_the_capture_does_not_say(tiny_capture, tmp_path):
+    assert "\nup  " not in inspect_capture(tiny_capture(), tmp_path / "out").summary
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_what_a_capture_says_is_up_is_up_and_told(tiny_capture, tmp_path, axis):
     path = tiny_capture()
-    assert "\nup  " not in inspect_capture(path, tmp_path / "before").summary
     said = np.full(3, 0.2)
     said[axis] = -3.0
     write_up(path, said.tolist())

@@ -32,9 +32,9 @@ from evsplat.training.trainer import Trainer
 from evsplat.untrusted.text import read_json
 
 from ..conftest import write_tiny_capture
+from ..own_process import errors_of, start
 from ..seen import seen
 from ..small_model import FILL, built, small
-from .own_process import errors_of, start
 
 
 def wait_for_step(out: Path, step: int, process: BaseProcess) -> None:
@@ -113,22 +113,22 @@ def test_one_frame_trains_in_every_step(tmp_path: Path, caplog: pytest.LogCaptur
 def test_killed_and_resumed_run_equals_the_uninterrupted_one_bit_for_bit(
     method, settings, tiny_capture, tmp_path
 ):
-    """Only the process that is killed saves after each step."""
+    """Killed twice, gone on both times; only the processes that are killed save after each step."""
     capture, settings = tiny_capture(frames=10), small(method, *settings)
     asked = {"iterations": 24, "threads": 1}
     train(capture, out=tmp_path / "whole", method=method, overrides=settings, **asked)
-    for kill_at in (3, 13):
-        broken = tmp_path / f"broken{kill_at}"
-        process = start(capture, broken, asked["iterations"], method=method, settings=settings)
+    broken = tmp_path / "broken"
+    for kill_at, how in ((3, {"method": method, "settings": settings}), (13, {"resume": True})):
+        process = start(capture, broken, asked["iterations"], **how)
         wait_for_step(broken, kill_at, process)
         process.kill()  # SIGKILL: nothing can be tidied up
         process.join()
-        train(capture, out=broken, resume=True, **asked)
-        expected, found = final_tensors(tmp_path / "whole"), final_tensors(broken)
-        assert expected.keys() == found.keys()
-        different = [name for name in expected if not torch.equal(expected[name], found[name])]
-        assert different == []
-        assert log_without_times(broken) == log_without_times(tmp_path / "whole")
+    train(capture, out=broken, resume=True, **asked)
+    expected, found = final_tensors(tmp_path / "whole"), final_tensors(broken)
+    assert expected.keys() == found.keys()
+    different = [name for name in expected if not torch.equal(expected[name], found[name])]
+    assert different == []
+    assert log_without_times(broken) == log_without_times(tmp_path / "whole")
 
 
 def test_ctrl_c_finishes_the_step_saves_and_says_how_to_resume(tiny_capture, tmp_path):
