@@ -100,9 +100,9 @@ def measure(
     except DataError:
         prior = pose_prior()
     rows: list[dict] = []
+    start = time.perf_counter()
     pictures = sharp_pictures(seen)
     if keypoints_px is None:
-        start = time.perf_counter()
         points = find_landmarks(seen, pictures, network=LandmarkNetwork(), progress=False)
         found_s = time.perf_counter() - start
         errors = landmark_errors(capture, truth, points)
