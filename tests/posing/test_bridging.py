@@ -42,15 +42,17 @@ def recording(seed: int):
     return np.concatenate(shown).round().astype(np.int64), keys
 
 
-def track_of(body, keys, poses, places, **more):
-    return BodyTrack(body, keys, poses, places, **more)
+def around(keys, shown):
+    """Indices of the pictures before and after."""
+    following = np.searchsorted(shown, keys, side="right").clip(1, len(shown) - 1)
+    return following - 1, following
 
 
 def unseen(keys, shown):
     """Keys between the pictures of different exposures."""
-    following = np.searchsorted(shown, keys, side="right").clip(1, len(shown) - 1)
+    before, after = around(keys, shown)
     inside = (keys > shown[0]) & (keys < shown[-1])
-    return inside & (shown[following] - shown[following - 1] > EXPOSURE_US)
+    return inside & (shown[after] - shown[before] > EXPOSURE_US)
 
 
 def turned_rad(a, b):
@@ -70,20 +72,15 @@ def test_what_is_wrong_between_pictures_alone_is_mended(body, seed):
     wrong[gap] += deep[:, None, None] * 0.4 * rng.normal(size=poses.shape[1:])
     moved[gap] += deep[:, None] * 0.2 * rng.normal(size=3)
     before = turned_rad(wrong[gap], poses[gap]).mean()
-    found = bridged(track_of(body, keys, wrong, moved), shown.tolist())
+    found = bridged(BodyTrack(body, keys, wrong, moved), shown.tolist())
     assert turned_rad(found.poses[gap], poses[gap]).mean() < 0.1 * before
     assert np.abs(found.transl - places)[gap].mean() < 0.1 * np.abs(moved - places)[gap].mean()
     rotations, _ = found.at(shown.tolist())
-    true, _ = track_of(body, keys, wrong, moved).at(shown.tolist())
+    true, _ = BodyTrack(body, keys, wrong, moved).at(shown.tolist())
     apart = Rotation.from_matrix(rotations.reshape(-1, 3, 3).numpy()).inv() * Rotation.from_matrix(
         true.reshape(-1, 3, 3).numpy()
     )
     assert apart.magnitude().max() < 0.02, "poses at the pictures stay"
-
-
-def around(keys, shown):
-    following = np.searchsorted(shown, keys, side="right").clip(1, len(shown) - 1)
-    return following - 1, following
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -91,7 +88,7 @@ def test_places_lie_on_scipys_smoothing_spline_and_what_it_misses(body, seed):
     shown, keys = recording(seed)
     rng = np.random.default_rng(seed)
     places = rng.normal(size=(len(keys), 3))
-    track = track_of(body, keys, np.zeros((len(keys), len(body.parents), 3)), places)
+    track = BodyTrack(body, keys, np.zeros((len(keys), len(body.parents), 3)), places)
     found = bridged(track, shown.tolist())
     at, seconds = track.at(shown.tolist())[1].double().numpy(), shown * 1e-6
     span = seconds[-1] - seconds[0]
@@ -123,7 +120,7 @@ def test_long_ends_long_gaps_and_what_is_told_stay(body):
         "estimated", np.full((len(keys), joints), 0.1), np.full((len(keys), 3), 0.2)
     )
     up = body.rest_joints.new_tensor([0.0, 0.0, 1.0])
-    given = track_of(body, keys, poses, places, errors=errors, camera_up=up, up=up)
+    given = BodyTrack(body, keys, poses, places, errors=errors, camera_up=up, up=up)
     found = bridged(given, [*shown.tolist(), *later.tolist()])
     kept = (keys < shown[0]) | (keys > later[-1]) | ((keys > shown[-1]) & (keys < later[0]))
     assert kept.sum() > 100 and not kept.all()
@@ -134,6 +131,6 @@ def test_long_ends_long_gaps_and_what_is_told_stay(body):
 
 def test_of_few_pictures_nothing_is_said(body):
     _, keys = recording(0)
-    track = track_of(body, keys, *smooth_motion(body, 0)(keys))
+    track = BodyTrack(body, keys, *smooth_motion(body, 0)(keys))
     assert bridged(track, keys[:4].tolist()) is track
     assert bridged(track, [-5, 10**9, *keys[:4].tolist()]) is track

@@ -82,15 +82,7 @@ def smoothed(track: BodyTrack, noise: MotionNoise) -> BodyTrack:
     )
     stacked = np.stack(rotations, 1)
     poses = Rotation.from_quat(stacked.reshape(-1, 4)).as_rotvec().reshape(track.poses.shape)
-    return BodyTrack(
-        track.body,
-        track.times_us,
-        poses,
-        transl,
-        errors=track.errors,
-        camera_up=track.camera_up,
-        up=track.up,
-    )
+    return track.with_keys(track.times_us, poses, transl, errors=track.errors)
 
 
 def _seconds(track: BodyTrack) -> Float[np.ndarray, " P"]:

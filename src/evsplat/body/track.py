@@ -98,6 +98,27 @@ class BodyTrack:
         other.body = body
         return other
 
+    def with_keys(
+        self,
+        times_us: Int[np.ndarray, "P"],
+        poses: Float[np.ndarray, "P J 3"],
+        transl: Float[np.ndarray, "P 3"],
+        *,
+        source: str = "body track",
+        errors: PoseErrors | None = None,
+    ) -> "BodyTrack":
+        """Another motion of the same body in the same world, as `BodyTrack` takes it."""
+        return BodyTrack(
+            self.body,
+            times_us,
+            poses,
+            transl,
+            source=source,
+            errors=errors,
+            camera_up=self.camera_up,
+            up=self.up,
+        )
+
     def with_errors(self, errors: PoseErrors) -> "BodyTrack":
         """The same motion, whose key poses err so."""
         errors.check(len(self.times_us), len(self.body.parents), "body track")

@@ -57,16 +57,8 @@ def bridged(track: BodyTrack, shown_us: Sequence[int]) -> BodyTrack:
     found = Rotation.from_quat(curve[:, : 4 * joints].reshape(-1, 4)).as_rotvec()
     poses[moved] = found.reshape(-1, joints, 3)
     places[moved] = curve[:, 4 * joints :]
-    return BodyTrack(
-        track.body,
-        times,
-        nearest_axis_angle(poses),
-        places,
-        source="bridged motion",
-        errors=track.errors,
-        camera_up=track.camera_up,
-        up=track.up,
-    )
+    poses = nearest_axis_angle(poses)
+    return track.with_keys(times, poses, places, source="bridged motion", errors=track.errors)
 
 
 def _near(times: Int64[np.ndarray, "P"], shown: Int64[np.ndarray, "N"]) -> Bool[np.ndarray, "P"]:

@@ -87,16 +87,8 @@ class Correction(nn.Module):
         rotations, transl = self.at(times.tolist())
         vectors = Rotation.from_matrix(rotations.flatten(0, 1).double().numpy()).as_rotvec()
         poses = nearest_axis_angle(vectors.reshape(len(times), -1, 3))
-        return BodyTrack(
-            self.track.body,
-            times,
-            poses,
-            transl.double().numpy(),
-            source="corrected motion",
-            errors=errors,
-            camera_up=self.track.camera_up,
-            up=self.track.up,
-        )
+        places = transl.double().numpy()
+        return self.track.with_keys(times, poses, places, source="corrected motion", errors=errors)
 
     @property
     def key_times(self) -> Int64[np.ndarray, "P"]:

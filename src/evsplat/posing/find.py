@@ -210,7 +210,7 @@ def _found(
                 seen = _seen(capture, policy, focal_px)
                 logger.warning("%s", _rough(focal))
         track = fitted.track(key_times(seen))
-        held_us = landmarks.times_us.tolist()
+        shown_us = landmarks.times_us.tolist()
         refined: Refined | None = None
         dressed: Body | None = None
         if limit_s > 0:
@@ -219,11 +219,11 @@ def _found(
             if refined.better:
                 track = refined.track
                 names = {frame.name for frame in seen.frames}
-                held_us = [one.time_us for one in pictures if one.frame.name in names]
+                shown_us = [one.time_us for one in pictures if one.frame.name in names]
                 if rig.model == "default":  # the vertices of a licensed model are not ours to write
                     dressed = refined.dressed
                     track = track.with_body(dressed)
-        track = bridged(track, held_us)
+        track = bridged(track, shown_us)
     return _Motion(seen, pictures, landmarks, fitted, track, refined, dressed, focal_px, focal)
 
 

@@ -80,16 +80,8 @@ def between(track: BodyTrack, start_us: int, end_us: int) -> BodyTrack:
     if errors is not None:
         said = errors.joint_rad[keys], errors.root_m[keys]
         errors = PoseErrors(errors.source, *said, typical=errors.typical)
-    return BodyTrack(
-        track.body,
-        track.times_us[keys],
-        track.poses[keys],
-        track.transl[keys],
-        source="piece of a motion",
-        errors=errors,
-        camera_up=track.camera_up,
-        up=track.up,
-    )
+    times, poses, transl = track.times_us[keys], track.poses[keys], track.transl[keys]
+    return track.with_keys(times, poses, transl, source="piece of a motion", errors=errors)
 
 
 def joined(pieces: Sequence[Piece], tracks: Sequence[BodyTrack]) -> BodyTrack:
@@ -118,17 +110,8 @@ def joined(pieces: Sequence[Piece], tracks: Sequence[BodyTrack]) -> BodyTrack:
             own_var = _at(times[at], track.times_us, np.square(std))
             variance[at] += share[:, None] * (own_var - variance[at])
     errors = PoseErrors("estimated", np.sqrt(joint_var), np.sqrt(root_var))
-    first = tracks[0]
-    return BodyTrack(
-        first.body,
-        times,
-        nearest_axis_angle(turns),
-        places,
-        source="joined motion",
-        errors=errors,
-        camera_up=first.camera_up,
-        up=first.up,
-    )
+    poses = nearest_axis_angle(turns)
+    return tracks[0].with_keys(times, poses, places, source="joined motion", errors=errors)
 
 
 def _inside(piece: Piece, track: BodyTrack) -> Int64[np.ndarray, "P"]:
