@@ -800,6 +800,33 @@ def test_events_that_cover_only_a_part_are_a_warning(tiny_capture: Factory) -> N
     assert "clock_offset_us" in finding.remedy
 
 
+@pytest.mark.parametrize("ends", [("first",), ("last",), ("first", "last")])
+def test_events_that_no_clock_offset_makes_long_enough_say_so(
+    tiny_capture: Factory, ends: tuple[str, ...]
+) -> None:
+    """Of a sensor that was switched on later and off earlier no offset is the remedy."""
+    path = tiny_capture(frames=10, width=64, height=48)
+    with h5py.File(path / "events.h5") as file:
+        t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
+    kept = (t >= 120_000 * ("first" in ends)) & (t < (240_000 if "last" in ends else t[-1] + 1))
+    write_event_file(path / "events.h5", *(column[kept] for column in (t, x, y, p)))
+    finding = the_only(path, "warning")
+    check(finding, path / "events.h5", "events/t", "events from", "over 0..")
+    assert "They last shorter than the frames, whatever their clock" in finding.remedy
+    assert "Frames beside them are learned from their blur alone." in finding.remedy
+
+
+def test_no_test_frame_says_how_to_have_one(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_json(path, "frames", value=[
+        {key: value for key, value in frame.items() if key != "split"}
+        for frame in json.loads((path / "capture.json").read_text())["frames"][:5]
+    ])  # fmt: skip
+    finding = next(item for item in validate_capture(path) if "no test frame" in item.found)
+    assert finding.severity == "warning" and finding.field == "frames"
+    assert "give every frame a split" in finding.remedy and "7, 8 and 9" in finding.remedy
+
+
 @pytest.mark.parametrize("end", ["first", "last"])
 @pytest.mark.parametrize("noise", [0, 2])
 def test_a_sensor_that_is_silent_while_nothing_moves_is_no_fault(

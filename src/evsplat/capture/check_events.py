@@ -149,9 +149,9 @@ def _check_clock(
     start = min(frame.exposure_us[0] for frame in metadata.frames)
     end = max(frame.exposure_us[1] for frame in metadata.frames)
     found, expected = f"events from {first} to {last} us", f"events over {start}..{end} us"
-    remedy = "Correct events.clock_offset_us or t_offset (added to t to get the camera's clock)."
+    clock = "events.clock_offset_us or t_offset (added to t to get the camera's clock)."
     if last < start or first >= end:
-        findings.error(entry.file, "events/t", found, expected, remedy)
+        findings.error(entry.file, "events/t", found, expected, f"Correct {clock}")
         return
     spacing = (end - start) / len(metadata.frames)
     before = [frame for frame in metadata.frames if frame.exposure_us[1] <= first]
@@ -159,11 +159,14 @@ def _check_clock(
     late = first > start + spacing and not nothing_moves(metadata, before)
     early = last < end - spacing and not nothing_moves(metadata, after)
     if late or early:
-        if not (late and early):
-            # one end alone may as well be a sensor that was switched on later, or off earlier
-            remedy += (
-                " Frames beside a recording that is shorter are learned from their blur alone."
+        remedy = f"Correct {clock}"
+        if last - first < end - start - spacing:
+            remedy = (
+                "They last shorter than the frames, whatever their clock: the sensor was switched "
+                "on later or off earlier, or t is not in microseconds. If their clock is wrong as "
+                f"well, correct {clock}"
             )
+        remedy += " Frames beside them are learned from their blur alone."
         findings.warning(entry.file, "events/t", found, expected, remedy)
 
 

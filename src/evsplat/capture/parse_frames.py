@@ -219,15 +219,23 @@ def _check_frames(top: Fields, frames: list[Frame]) -> None:
             "Check the exposure time; a sharp moment is then seen by two frames.",
         )
     _check_unit(frames, top)
-    for split, note in (("train", top.findings.error), ("test", top.findings.warning)):
-        if frames and not any(frame.split == split for frame in frames):
-            note(
-                top.file,
-                "frames",
-                f"no {split} frame among {len(frames)}",
-                f"at least one frame with split {split!r}",
-                "Change the split of some frames.",
-            )
+    if frames and not any(frame.split == "train" for frame in frames):
+        top.findings.error(
+            top.file,
+            "frames",
+            f"no train frame among {len(frames)}",
+            "at least one frame with split 'train'",
+            "Change the split of some frames.",
+        )
+    if frames and not any(frame.split == "test" for frame in frames):
+        top.findings.warning(
+            top.file,
+            "frames",
+            f"no test frame among {len(frames)}",
+            "at least one frame with split 'test'",
+            "Training is not measured without one: give every frame a split, 'test' or 'train' "
+            "(where none has one, 7, 8 and 9 of every ten are test frames, the first being 0).",
+        )
 
 
 def default_split(index: int) -> str:
