@@ -269,12 +269,13 @@ def test_a_person_out_of_sight_in_one_frame_is_left_out_of_the_mean(tiny_capture
     assert reason == "missing in 1 of 3: the person mask is empty"
 
 
-def test_a_person_in_no_test_frame_is_told(tiny_capture, tmp_path, caplog):
+def test_a_person_in_few_test_frames_or_none_is_told(tiny_capture, tmp_path, caplog):
     path = tiny_capture()
     for frame in load_capture(path).test_frames[1:]:
         Image.new("L", (32, 24)).save(frame.mask)
-    run(path, tmp_path / "some")
-    assert "the person is in no test frame" not in caplog.text
+    (remark,) = run(path, tmp_path / "some")["remarks"]
+    assert remark in caplog.text and "the person is in no test frame" not in remark
+    assert remark.startswith(f"{path}: the person is in 1 of 3 test frames: crop and mask are ")
     for frame in load_capture(path).test_frames:
         Image.new("L", (32, 24)).save(frame.mask)
     run(path, tmp_path / "none")

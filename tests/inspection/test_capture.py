@@ -119,6 +119,27 @@ def test_posed_body_falls_on_the_person_of_the_tiny_capture(tiny_capture: Factor
     assert len(overlaps) == 10 and min(overlaps) > 0.85
 
 
+@pytest.mark.parametrize("left", [1, 4])
+def test_frames_after_the_person_left_say_nothing_of_the_fit(
+    tiny_capture: Factory, left: int
+) -> None:
+    path = tiny_capture(width=64, height=48)
+    for index in range(10 - left, 10):
+        Image.new("L", (64, 48)).save(path / f"masks/{index:04d}.png")
+    with np.load(path / "body.npz") as file:
+        arrays = dict(file)
+    arrays["transl"][10 - left :, 0] += 100
+    np.savez(path / "body.npz", **arrays)
+    capture = load_capture(path)
+    overlaps = body_mask_overlap(capture, load_body_track(capture), capture.frames)
+    assert len(overlaps) == 10 - left and min(overlaps) > 0.85
+    # A body that is still in the picture when the person has left does not fit.
+    arrays["transl"][-1, 0] -= 100
+    np.savez(path / "body.npz", **arrays)
+    capture = load_capture(path)
+    assert min(body_mask_overlap(capture, load_body_track(capture), capture.frames)) == 0.0
+
+
 @pytest.mark.parametrize("name", ["man_dance_hard_256", "real_beam_256"])
 def test_posed_body_falls_on_the_person_of_shared_captures(captures_root: Path, name: str) -> None:
     """The masks show clothes and hair, which the body lacks; a wrong pose would be far below."""

@@ -189,13 +189,14 @@ class _MeasuredFrames:
         self._against_blurry = MetricMeans()
         self._chroma: list[dict[str, float]] = []
         self._per_frame: list[dict[str, Any]] = []
-        self._seen = False
+        self._showing = 0
+        """Frames that show the person."""
 
     def measure(self, frame: Frame) -> None:
         """Measure one frame and write its pictures."""
         ours = self.drawn(frame)
         mask, human = self.human_regions.in_frame(frame)
-        self._seen |= not isinstance(human, Absent)
+        self._showing += not isinstance(human, Absent)
         truth = None if frame.sharp is None else self.capture.sharp(frame)
         pictures = {"method": ours, **self._other_pictures(frame)}
         measured: dict[str, dict[str, Measured]] = {row: {} for row in pictures}
@@ -226,9 +227,16 @@ class _MeasuredFrames:
         self._per_frame.append(entry | {"pictures": self._save(frame, ours, truth)})
 
     def human_remark(self) -> str:
-        """A sentence where no measured frame shows the person; then the scene alone counts."""
-        if self._seen or not self._per_frame:
+        """A sentence where some measured frame does not show the person: there the scene counts."""
+        measured = len(self._per_frame)
+        if self._showing == measured:
             return ""
+        if self._showing:
+            return (
+                f"{self.capture.path}: the person is in {self._showing} of {measured} {self.split} "
+                "frames: crop and mask are figures of these, the full frame of all, where rows "
+                "without a method may be perfect."
+            )
         return (
             f"{self.capture.path}: the person is in no {self.split} frame, so the figures are of "
             "the scene alone and rows without a method may be perfect; check camera and poses."

@@ -142,14 +142,19 @@ def warn_of_capture(path: Path, body_models: Path | None = None) -> None:
 
 
 def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, ...]) -> list[float]:
-    """Intersection over union of posed body and person mask, for the frames that have a mask."""
+    """Intersection over union of posed body and person mask, for the frames that have a mask.
+
+    Frames with neither in the picture, as after somebody has left, tell nothing and are passed
+    over.
+    """
     overlaps = []
     for frame in frames:
         mask = capture.mask(frame)
         if mask is not None:
             body = _silhouette(track, frame.mid_us, capture.camera(frame))
             person = mask.numpy() > 0.5
-            overlaps.append(float((body & person).sum() / max(1, (body | person).sum())))
+            if (either := int((body | person).sum())) > 0:
+                overlaps.append(float((body & person).sum() / either))
     return overlaps
 
 
