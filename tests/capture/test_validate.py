@@ -813,7 +813,7 @@ def test_events_that_no_clock_offset_makes_long_enough_say_so(
     finding = the_only(path, "warning")
     check(finding, path / "events.h5", "events/t", "events from", "over 0..")
     assert "They last shorter than the frames, whatever their clock" in finding.remedy
-    assert "Frames beside them are learned from their blur alone." in finding.remedy
+    assert "beside them, these are learned from their blur alone." in finding.remedy
 
 
 def test_no_test_frame_says_how_to_have_one(tiny_capture: Factory) -> None:

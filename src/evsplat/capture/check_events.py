@@ -166,7 +166,9 @@ def _check_clock(
                 "on later or off earlier, or t is not in microseconds. If their clock is wrong as "
                 f"well, correct {clock}"
             )
-        remedy += " Frames beside them are learned from their blur alone."
+        remedy += (
+            " Where more than two frames lie beside them, these are learned from their blur alone."
+        )
         findings.warning(entry.file, "events/t", found, expected, remedy)
 
 
