@@ -4,12 +4,11 @@ import functools
 import importlib
 import json
 import os
-import shutil
 import signal
-import tempfile
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 
 import h5py
@@ -89,64 +88,63 @@ def demo_capture_path() -> Path:
 
 
 @pytest.fixture
-def tiny_capture(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def tiny_capture(tmp_path: Path) -> Callable[..., Path]:
     """Factory of small valid captures: a two-box person before a static background.
 
-    Options are those of `write_tiny_capture`; each call gives a copy that the test may spoil.
+    Options are those of `write_tiny_capture`, but all are named "tiny", whatever their folder.
     """
 
     def make(name: str = "tiny", **options: int) -> Path:
-        key = "-".join(f"{option}{value}" for option, value in sorted(options.items()))
-        original = tmp_path_factory.getbasetemp() / f"original-{key}" / "tiny"
-        if not original.exists():
-            write_tiny_capture(original, **options)
-        return Path(shutil.copytree(original, tmp_path / name))
+        return write_tiny_capture(tmp_path / name, name="tiny", **options)
 
     return make
 
 
 def write_tiny_capture(
-    path: Path, *, frames: int = 10, width: int = 32, height: int = 24, seed: int = 0
+    path: Path,
+    *,
+    frames: int = 10,
+    width: int = 32,
+    height: int = 24,
+    seed: int = 0,
+    name: str | None = None,
 ) -> Path:
-    """Write a valid capture with truth, masks, a novel view and events that fit the pictures."""
-    for name, content in _tiny_files(frames, width, height, seed).items():
-        (path / name).parent.mkdir(parents=True, exist_ok=True)
-        (path / name).write_bytes(content)
-    document = json.loads((path / "capture.json").read_text())
-    (path / "capture.json").write_text(json.dumps(document | {"name": path.name}))
+    """Write a valid capture with truth, masks, a novel view and events that fit the pictures.
+
+    It has the folder's name by default. The test may spoil it: each call writes all files anew.
+    """
+    files = _tiny_files(frames, width, height, seed)
+    document = json.loads(files["capture.json"]) | {"name": name or path.name}
+    for folder in {(path / file).parent for file in files}:
+        folder.mkdir(parents=True, exist_ok=True)
+    for file, content in (files | {"capture.json": json.dumps(document).encode()}).items():
+        (path / file).write_bytes(content)
     return path
 
 
-@functools.lru_cache(maxsize=16)  # tests ask for few kinds, hundreds of times
+# Tests ask for few kinds, hundreds of times, and drawing takes fifty times as long as writing.
+@functools.lru_cache(maxsize=16)
 def _tiny_files(frames: int, width: int, height: int, seed: int) -> dict[str, bytes]:
-    with tempfile.TemporaryDirectory() as folder:
-        _draw_tiny_capture(Path(folder), frames, width, height, seed)
-        files = (file for file in Path(folder).rglob("*") if file.is_file())
-        return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
-
-
-def _draw_tiny_capture(path: Path, frames: int, width: int, height: int, seed: int) -> None:
+    """Content of each file of the capture by its path."""
     rng = np.random.default_rng(seed)
-    for folder in ("images", "sharp", "masks", "novel/side"):
-        (path / folder).mkdir(parents=True)
     rig = _rig()
     cameras = {"main": _camera(width, height, 0.0), "side": _camera(width, height, 0.7)}
     background = _background(rng, width, height)
     phase = rng.uniform(0, 2 * np.pi)
-    entries, views, sequence, times = [], [], [], []
-    for index in range(frames):
-        frame_name, start = f"{index:04d}", index * PERIOD_US
-        subframe_times = start + (np.arange(SUBFRAMES) + 0.5) * EXPOSURE_US / SUBFRAMES
-        linear = [
-            _draw(rig, cameras["main"], background, t, phase)[0] ** 2.2 for t in subframe_times
-        ]
-        sequence += linear
-        times += subframe_times.tolist()
-        middle = start + EXPOSURE_US // 2
-        sharp, mask = _draw(rig, cameras["main"], background, middle, phase)
-        _save(path / f"images/{frame_name}.png", np.mean(linear, axis=0) ** (1 / 2.2))
-        _save(path / f"sharp/{frame_name}.png", sharp)
-        _save(path / f"masks/{frame_name}.png", mask)
+    starts = np.arange(frames) * PERIOD_US
+    middles = starts + EXPOSURE_US // 2
+    times = starts[:, None] + (np.arange(SUBFRAMES) + 0.5) * EXPOSURE_US / SUBFRAMES
+    linear = _draw(rig, cameras["main"], background, times.ravel(), phase)[0] ** 2.2
+    blurry = linear.reshape(frames, SUBFRAMES, height, width, 3).mean(1) ** (1 / 2.2)
+    sharp, masks = _draw(rig, cameras["main"], background, middles, phase)
+    aside = _draw(rig, cameras["side"], background, middles, phase)[0]
+    files: dict[str, bytes] = {}
+    entries, views = [], []
+    for index, (start, middle) in enumerate(zip(starts.tolist(), middles.tolist(), strict=True)):
+        frame_name = f"{index:04d}"
+        files[f"images/{frame_name}.png"] = _png(blurry[index])
+        files[f"sharp/{frame_name}.png"] = _png(sharp[index])
+        files[f"masks/{frame_name}.png"] = _png(masks[index])
         split = "test" if index % 10 >= 7 else "train"
         entry = {"name": frame_name, "camera": "main", "image": f"images/{frame_name}.png"}
         entry |= {"exposure_us": [start, start + EXPOSURE_US], "split": split}
@@ -155,13 +153,12 @@ def _draw_tiny_capture(path: Path, frames: int, width: int, height: int, seed: i
         )
         if split == "test":
             image = f"novel/side/{frame_name}.png"
-            _save(path / image, _draw(rig, cameras["side"], background, middle, phase)[0])
+            files[image] = _png(aside[index])
             views.append({"camera": "side", "frame": frame_name, "time_us": middle, "image": image})
-    write_event_file(path / "events.h5", *_simulate_events(np.array(sequence), np.array(times)))
-    key_times = np.arange(frames) * PERIOD_US + EXPOSURE_US // 2
-    poses, transl = zip(*(_pose(t, phase) for t in key_times), strict=True)
-    arrays = {"times_us": key_times, "poses": np.float32(poses), "transl": np.float32(transl)}
-    np.savez_compressed(path / "body.npz", model="rig", **arrays, **rig)
+    write_event_file(events := BytesIO(), *_simulate_events(linear, times.ravel()))
+    poses, transl = _pose(middles, phase)
+    arrays = {"times_us": middles, "poses": np.float32(poses), "transl": np.float32(transl)}
+    np.savez_compressed(body := BytesIO(), model="rig", **arrays, **rig)
     document = {
         "format": "evsplat-capture",
         "version": 1,
@@ -179,11 +176,12 @@ def _draw_tiny_capture(path: Path, frames: int, width: int, height: int, seed: i
         },
         "provenance": {"text": "made by the tests", "gamma": 2.2},
     }
-    (path / "capture.json").write_text(json.dumps(document))
+    files |= {"events.h5": events.getvalue(), "body.npz": body.getvalue()}
+    return files | {"capture.json": json.dumps(document).encode()}
 
 
 def write_event_file(
-    path: Path, t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray
+    path: Path | BytesIO, t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray
 ) -> None:
     """Events as they are (sorted or not) in the layout of format version 1, with p in {0, 1}."""
     with h5py.File(path, "w") as file:
@@ -192,9 +190,8 @@ def write_event_file(
                 f"events/{key}", data=values.astype(dtype), chunks=True, compression="gzip"
             )
         last_ms = int(t.max()) // 1000 if len(t) else 0
-        file["ms_to_idx"] = np.array(
-            [(t < 1000 * ms).sum() for ms in range(last_ms + 2)], dtype=np.uint64
-        )
+        earlier = np.searchsorted(np.sort(t), 1000 * np.arange(last_ms + 2))
+        file["ms_to_idx"] = earlier.astype(np.uint64)
         file["t_offset"] = np.int64(0)
 
 
@@ -224,32 +221,29 @@ def _rig() -> dict[str, np.ndarray]:
     }
 
 
-def _pose(time_us: float, phase: float) -> tuple[np.ndarray, np.ndarray]:
-    """Axis-angle (3, 3) and root shift: the body sways, the arm swings about the y axis."""
-    angle = time_us * 1e-6 * 2 * np.pi / 0.5 + phase
-    poses = np.zeros((3, 3))
-    poses[0, 2], poses[2, 1] = 0.3 * np.sin(angle / 2), 0.9 * np.sin(angle)
-    return poses, np.array([0.15 * np.cos(angle / 2), 0.0, 0.0])
+def _pose(times_us: np.ndarray, phase: float) -> tuple[np.ndarray, np.ndarray]:
+    """Axis-angle (T, 3, 3) and root shift (T, 3): the body sways, the arm swings about y."""
+    angle = times_us * 1e-6 * 2 * np.pi / 0.5 + phase
+    poses, transl = np.zeros((len(angle), 3, 3)), np.zeros((len(angle), 3))
+    poses[:, 0, 2], poses[:, 2, 1] = 0.3 * np.sin(angle / 2), 0.9 * np.sin(angle)
+    transl[:, 0] = 0.15 * np.cos(angle / 2)
+    return poses, transl
 
 
-def _posed_vertices(rig: dict[str, np.ndarray], time_us: float, phase: float) -> np.ndarray:
-    """Linear blend skinning, written out."""
-    poses, transl = _pose(time_us, phase)
-    rotations, origins = [], []
-    for joint, parent in enumerate(rig["parents"]):
-        local = Rotation.from_rotvec(poses[joint]).as_matrix()
-        if parent < 0:
-            rotations.append(local)
-            origins.append(rig["rest_joints"][joint] + transl)
-        else:
-            bone = rig["rest_joints"][joint] - rig["rest_joints"][parent]
-            rotations.append(rotations[parent] @ local)
-            origins.append(origins[parent] + rotations[parent] @ bone)
+def _posed_vertices(rig: dict[str, np.ndarray], times_us: np.ndarray, phase: float) -> np.ndarray:
+    """Linear blend skinning (T, V, 3), written out."""
+    poses, transl = _pose(times_us, phase)
+    turns = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
+    rest = rig["rest_joints"]
+    rotations, origins = [turns[:, 0]], [rest[0] + transl]
+    for joint, parent in enumerate(rig["parents"][1:], 1):
+        rotations.append(rotations[parent] @ turns[:, joint])
+        origins.append(origins[parent] + rotations[parent] @ (rest[joint] - rest[parent]))
     posed = [
-        (rig["rest_vertices"] - rig["rest_joints"][j]) @ rotations[j].T + origins[j]
-        for j in range(len(origins))
+        (rig["rest_vertices"] - joint) @ rotation.swapaxes(1, 2) + origin[:, None]
+        for joint, rotation, origin in zip(rest, rotations, origins, strict=True)
     ]
-    return np.einsum("vj,jvc->vc", rig["weights"], np.array(posed))
+    return np.einsum("vj,jtvc->tvc", rig["weights"], np.array(posed))
 
 
 def _camera(width: int, height: int, angle: float) -> dict:
@@ -272,47 +266,58 @@ def _camera(width: int, height: int, angle: float) -> dict:
 
 
 def _draw(
-    rig: dict[str, np.ndarray], camera: dict, background: np.ndarray, time_us: float, phase: float
+    rig: dict[str, np.ndarray],
+    camera: dict,
+    background: np.ndarray,
+    times_us: np.ndarray,
+    phase: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """sRGB picture and person mask, both in [0, 1], four times oversampled."""
-    scale = 4
+    """sRGB pictures (T, H, W, 3) and person masks (T, H, W) in [0, 1], four times oversampled."""
     pose = np.array(camera["world_to_camera"])
-    seen = _posed_vertices(rig, time_us, phase) @ pose[:3, :3].T + pose[:3, 3]
-    pixels = scale * (seen @ np.array(camera["K"]).T)[:, :2] / seen[:, 2:]
-    size = (scale * camera["width"], scale * camera["height"])
-    cover = []
-    for part in (rig["faces"][:12], rig["faces"][12:]):
-        mask = Image.new("L", size)
-        draw = ImageDraw.Draw(mask)
-        for triangle in part:
-            draw.polygon([tuple(pixels[v]) for v in triangle], fill=255)
-        small = mask.resize((camera["width"], camera["height"]), Image.Resampling.BOX)
-        cover.append(np.asarray(small, dtype=np.float32) / 255)
-    picture = background
-    for alpha, colour in zip(cover, ([0.9, 0.3, 0.2], [0.2, 0.3, 0.95]), strict=True):
-        picture = picture * (1 - alpha[..., None]) + alpha[..., None] * np.float32(colour)
-    return picture, np.maximum(*cover)
+    seen = _posed_vertices(rig, times_us, phase) @ pose[:3, :3].T + pose[:3, 3]
+    pixels = (seen @ np.array(camera["K"]).T)[..., :2] / seen[..., 2:]
+    pictures, masks = background, np.float32(0)
+    for faces, colour in (
+        (rig["faces"][:12], [0.9, 0.3, 0.2]),
+        (rig["faces"][12:], [0.2, 0.3, 0.95]),
+    ):
+        cover = np.array([_cover(corners, camera) for corners in pixels[:, faces]])
+        alpha = cover[..., None]
+        pictures = pictures * (1 - alpha) + alpha * np.float32(colour)
+        masks = np.maximum(masks, cover)
+    return pictures, masks
+
+
+def _cover(triangles: np.ndarray, camera: dict) -> np.ndarray:
+    """How much of each pixel triangles (F, 3, 2) cover together, (H, W) in [0, 1]."""
+    scale, size = 4, (camera["width"], camera["height"])
+    mask = Image.new("L", (scale * size[0], scale * size[1]))
+    draw = ImageDraw.Draw(mask)
+    for corners in (scale * triangles).reshape(-1, 6).tolist():
+        draw.polygon(corners, fill=255)
+    return np.asarray(mask.resize(size, Image.Resampling.BOX), dtype=np.float32) / 255
 
 
 def _simulate_events(linear: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, ...]:
     """Noise-free events of (T, H, W, 3) linear pictures at ``times``, sorted, p in {0, 1}."""
     log_luma = np.log(linear @ np.array([0.2126, 0.7152, 0.0722]) + 1e-3)
     level = log_luma[0].copy()
-    columns: list[tuple[float, int, int, int]] = []
-    for step in range(1, len(times)):
-        change = log_luma[step] - level
-        crossings = np.trunc(change / CONTRAST).astype(int)
-        for y, x in np.argwhere(crossings != 0):
-            count = abs(crossings[y, x])
-            spread = times[step - 1] + (np.arange(count) + 1) / count * (
-                times[step] - times[step - 1]
-            )
-            columns += [(t, x, y, int(crossings[y, x] > 0)) for t in spread]
+    steps = []
+    for before, after, target in zip(times[:-1], times[1:], log_luma[1:], strict=True):
+        crossings = np.trunc((target - level) / CONTRAST).astype(int)
         level += crossings * CONTRAST
-    columns.sort(key=lambda event: event[0])
-    t, x, y, p = np.array(columns).T
-    return t.astype(np.int64), x.astype(int), y.astype(int), p.astype(int)
+        y, x = np.nonzero(crossings)
+        count = np.abs(crossings[y, x])
+        pixel = np.repeat(np.arange(len(count)), count)
+        nth = 1 + np.arange(len(pixel)) - (np.cumsum(count) - count)[pixel]
+        t = before + nth / count[pixel] * (after - before)
+        steps.append((t, x[pixel], y[pixel], crossings[y, x][pixel] > 0))
+    t, x, y, p = (np.concatenate(column) for column in zip(*steps, strict=True))
+    order = np.argsort(t, kind="stable")
+    return t[order].astype(np.int64), x[order], y[order], p[order].astype(int)
 
 
-def _save(path: Path, image: np.ndarray) -> None:
-    Image.fromarray((image.clip(0, 1) * 255 + 0.5).astype(np.uint8)).save(path)
+def _png(image: np.ndarray) -> bytes:
+    file = BytesIO()
+    Image.fromarray((image.clip(0, 1) * 255 + 0.5).astype(np.uint8)).save(file, "PNG")
+    return file.getvalue()
