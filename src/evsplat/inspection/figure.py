@@ -85,9 +85,9 @@ class Figure:
     ) -> list[Float[np.ndarray, "N 2"]]:
         """Pixels of the samples before the camera, at each time."""
         pixels = []
-        for time_us, camera in zip(times_us, cameras, strict=True):
-            bones = self._track.body.bone_transforms(*self._track.at([time_us]))
-            points = skin(self._samples.points, self._samples.weights, bones)[0][0]
+        bones = self._track.body.bone_transforms(*self._track.at(times_us))
+        for one, camera in zip(bones.split(1), cameras, strict=True):
+            points = skin(self._samples.points, self._samples.weights, one)[0][0]
             place, depth = camera.project(points)
             pixels.append(place[depth > NEAR].numpy())
         return pixels
