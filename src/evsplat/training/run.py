@@ -5,6 +5,7 @@ import json
 import platform
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -90,12 +91,6 @@ def write_facts(
     seed: int,
 ) -> None:
     """Record what the run was made with; ``seen`` is what its training is given."""
-    versions = {}
-    for package in ("evsplat", *PACKAGES):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed as a package"
     write_json(
         folder.facts,
         {
@@ -111,9 +106,17 @@ def write_facts(
             "seed": seed,
             "python": platform.python_version(),
             "machine": platform.machine(),
-            "packages": versions,
+            "packages": {package: _version_of(package) for package in ("evsplat", *PACKAGES)},
         },
     )
+
+
+@cache
+def _version_of(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed as a package"
 
 
 @dataclass(frozen=True)
