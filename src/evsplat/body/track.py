@@ -211,7 +211,9 @@ def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
     else:
         below = _leg_share(body, (legs.left, legs.right)) > 0.5
     times = track.times_us[:: -(-len(track.times_us) // _MOST_KEYS)]
-    posed = [skin(rest, body.weights, bones)[0][0] for bones in track.bones(times).split(1)]
+    posed = [
+        skin(rest, body.weights, bones)[0][0] for bones in track.bones(times.tolist()).split(1)
+    ]
     directions = torch.stack([v[~below].mean(0) - v[below].mean(0) for v in posed]).cpu()
     direction = torch.nn.functional.normalize(directions, dim=1).mean(0)
     if track.camera_up is not None:
