@@ -55,14 +55,18 @@ def record(
     for time in range(start_us, end_us, STEP_US):
         now = level(time)
         for sign, size in ((1, plus), (-1, minus)):
-            for y, x in np.argwhere(sign * (now - reference) >= size):
-                while sign * (now[y, x] - reference[y, x]) >= size:
-                    events.append((time + lag_us, x, y, sign))
-                    reference[y, x] += sign * size
+            while (passed := sign * (now - reference) >= size).any():
+                y, x = np.nonzero(passed)
+                events.append((np.full(len(x), time + lag_us), x, y, np.full(len(x), sign)))
+                reference[passed] += sign * size
+    noise = []
     for _ in range(rng.poisson(noise_hz * HEIGHT * WIDTH * (end_us - start_us) * 1e-6)):
         x, y = rng.integers(0, WIDTH), rng.integers(0, HEIGHT)
-        events.append((rng.integers(start_us, end_us), x, y, rng.choice([-1, 1])))
-    t, x, y, p = np.array(sorted(events)).T
+        noise.append((rng.integers(start_us, end_us), x, y, (-1, 1)[rng.integers(0, 2)]))
+    events.append(np.array(noise, dtype=int).reshape(-1, 4).T)
+    columns = [np.concatenate(column) for column in zip(*events, strict=True)]
+    order = np.lexsort(columns[::-1])
+    t, x, y, p = (column[order] for column in columns)
     spans = [
         (start_us + k * period_us, start_us + k * period_us + exposure_us) for k in range(frames)
     ]
