@@ -110,7 +110,9 @@ def _samples(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "N 3"]:
         found.append((shares @ corners[parts == count]).reshape(-1, 3))
     points = np.concatenate(found)
     cells = np.floor(points / (0.5 * _SPACING_M)).astype(np.int64)
-    return points[np.unique(cells, axis=0, return_index=True)[1]]
+    cells -= cells.min(0, initial=0)
+    number = np.ravel_multi_index(tuple(cells.T), cells.max(0, initial=0) + 1)
+    return points[np.unique(number, return_index=True)[1]]
 
 
 class _Hidden:

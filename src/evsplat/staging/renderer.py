@@ -122,7 +122,9 @@ def _pyramid(
     pixels = ((np.arange(256) / 255) ** _GAMMA).astype(np.float32)[textures]
     result = [np.ascontiguousarray(pixels)]
     while len(result) < levels and not any(side % 2 for side in pixels.shape[1:3]):
-        count, height, width, _ = pixels.shape
-        pixels = pixels.reshape(count, height // 2, 2, width // 2, 2, 3).mean((2, 4))
-        result.append(np.ascontiguousarray(pixels, dtype=np.float32))
+        upper, lower = pixels[:, ::2], pixels[:, 1::2]
+        # means of four; `mean` takes four times as long over two axes
+        pixels = upper[:, :, ::2] + upper[:, :, 1::2] + lower[:, :, ::2] + lower[:, :, 1::2]
+        pixels /= 4
+        result.append(pixels)
     return result
