@@ -9,7 +9,7 @@ import torch
 from evsplat.devices import DeviceCache
 from evsplat.events import ALWAYS, EventStream, window_counts
 from evsplat.objectives import EventNoise, EventSensor, EventWindows
-from evsplat.pictures import log_luminance, luminance
+from evsplat.pictures import CodedPictures, luminance
 
 HEIGHT, WIDTH, EPS = 9, 11, 0.004
 
@@ -80,7 +80,8 @@ class StepAt(SimpleNamespace):
 
     def log_luminance(self, eps: float, which: slice, *, keeps_hue: bool) -> torch.Tensor:
         if keeps_hue:
-            return log_luminance(self.linear[which].unbind(0), eps, "linear", keeps_hue=True)
+            pictures = CodedPictures(self.linear[which].unbind(0), "linear")
+            return pictures.log_luminance(eps, keeps_hue=True)
         return torch.log(luminance(self.linear[which]) + eps)
 
 

@@ -5,13 +5,12 @@ import torch
 from skimage.color import rgb2gray
 
 from evsplat.pictures import (
+    CodedPictures,
     decode,
     encode,
     log_brightness,
     log_brightness_change,
-    log_luminance,
     luminance,
-    mean_light,
 )
 
 
@@ -106,7 +105,9 @@ def test_a_doubled_luminance_changes_the_logarithm_by_ln_2():
 
 
 @pytest.mark.parametrize("planar", [True, False])
-@pytest.mark.parametrize("function", [mean_light, lambda coded: log_luminance(coded, 0.004)])
+@pytest.mark.parametrize(
+    "function", [CodedPictures.mean_light, lambda pictures: pictures.log_luminance(0.004)]
+)
 def test_compiled_light_of_pictures_and_its_gradient_equal_the_definition_in_float64(
     function, planar
 ):
@@ -115,7 +116,7 @@ def test_compiled_light_of_pictures_and_its_gradient_equal_the_definition_in_flo
     results = []
     for dtype in (torch.float32, torch.float64):
         leaf = (coded.movedim(-1, 1) if planar else coded).to(dtype).contiguous().requires_grad_()
-        value = function((leaf.movedim(1, -1) if planar else leaf).unbind(0))
+        value = function(CodedPictures((leaf.movedim(1, -1) if planar else leaf).unbind(0)))
         weights = torch.arange(value.numel(), dtype=dtype).view(value.shape).cos()
         results.append((value, *torch.autograd.grad((value * weights).sum(), leaf)))
     for compiled, plain in zip(*results, strict=True):
@@ -134,17 +135,18 @@ def test_gradient_that_keeps_the_hue_is_that_of_the_channels_mean_logarithm(tran
     # The compiled module takes the power curve in single precision alone.
     for dtype in (torch.float32, torch.float64):
         leaf = coded.to(dtype).requires_grad_()
-        value = log_luminance(leaf.unbind(0), eps, transfer, keeps_hue=True)
-        assert torch.equal(value, log_luminance(leaf.unbind(0), eps, transfer))
+        pictures = CodedPictures(leaf.unbind(0), transfer)
+        value = pictures.log_luminance(eps, keeps_hue=True)
+        assert torch.equal(value, pictures.log_luminance(eps))
         (gradient,) = torch.autograd.grad(value, leaf, upstream.to(dtype))
         assert (gradient - expected).abs().max() < 2e-6 * expected.abs().max()
 
 
 def test_a_step_along_the_gradient_that_keeps_the_hue_keeps_the_ratios_of_light():
     logs = torch.randn(4, 6, 3, dtype=torch.float64, requires_grad=True)
-    pictures = encode(logs.exp(), "linear").unbind(0)
+    pictures = CodedPictures(encode(logs.exp(), "linear")[:, None].unbind(0), "linear")
     for keeps_hue in (True, False):
-        value = log_luminance([p[None] for p in pictures], 0.0, "linear", keeps_hue=keeps_hue)
+        value = pictures.log_luminance(0.0, keeps_hue=keeps_hue)
         (step,) = torch.autograd.grad(value.sum(), logs, retain_graph=True)
         # Either way a step that is the same for all channels is one of the whole luminance.
         assert torch.allclose(step.sum(-1), torch.ones(4, 6, dtype=torch.float64))
@@ -155,6 +157,6 @@ def test_a_step_along_the_gradient_that_keeps_the_hue_keeps_the_ratios_of_light(
 def test_light_of_pictures_by_other_curves(transfer):
     coded = torch.rand(3, 4, 5, 3)
     linear = decode(coded, transfer)
-    assert torch.allclose(mean_light(coded.unbind(0), transfer), linear.mean(0))
-    logs = log_luminance(coded.unbind(0), 0.01, transfer)
-    assert torch.allclose(logs, torch.log(luminance(linear) + 0.01))
+    pictures = CodedPictures(coded.unbind(0), transfer)
+    assert torch.allclose(pictures.mean_light(), linear.mean(0))
+    assert torch.allclose(pictures.log_luminance(0.01), torch.log(luminance(linear) + 0.01))

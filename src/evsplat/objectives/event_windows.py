@@ -48,7 +48,7 @@ class EventWindows(Objective):
 
     Events see luminance. Where it is wrong its gradient pulls at green ten times as hard as at
     blue, and the frames pull back at all channels alike: what comes of it is a tint. From nominal
-    iteration ``hue_from`` on all channels are pulled at alike (`evsplat.pictures.log_luminance`).
+    iteration ``hue_from`` on all channels are pulled at alike (`CodedPictures.log_luminance`).
 
     Where lamps flicker, counts up to a time are the mean over a period about it: in that every
     pixel is as often brighter as darker.

@@ -2,7 +2,6 @@
 
 from evsplat.pictures.colours import error_map, signed_map, to_bytes
 from evsplat.pictures.light import (
-    BT601,
     CodedPictures,
     Transfer,
     chroma,
@@ -10,15 +9,12 @@ from evsplat.pictures.light import (
     encode,
     log_brightness,
     log_brightness_change,
-    log_luminance,
     luminance,
-    mean_light,
     shown,
     stored,
 )
 
 __all__ = [
-    "BT601",
     "CodedPictures",
     "Transfer",
     "chroma",
@@ -27,9 +23,7 @@ __all__ = [
     "error_map",
     "log_brightness",
     "log_brightness_change",
-    "log_luminance",
     "luminance",
-    "mean_light",
     "shown",
     "signed_map",
     "stored",

@@ -1,6 +1,5 @@
 """Coded values of pictures, linear light, luminance and its logarithm, which events report."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -144,24 +143,6 @@ class CodedPictures:
         return decode(planes, self.transfer)
 
 
-def mean_light(
-    coded: Sequence[Float[Tensor, "H W 3"]], transfer: Transfer = "power"
-) -> Float[Tensor, "H W 3"]:
-    """See `CodedPictures.mean_light`."""
-    return CodedPictures(tuple(coded), transfer).mean_light()
-
-
-def log_luminance(
-    coded: Sequence[Float[Tensor, "H W 3"]],
-    eps: float,
-    transfer: Transfer = "power",
-    *,
-    keeps_hue: bool = False,
-) -> Float[Tensor, "T H W"]:
-    """See `CodedPictures.log_luminance`."""
-    return CodedPictures(tuple(coded), transfer).log_luminance(eps, keeps_hue=keeps_hue)
-
-
 def _planar(picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     """Without gradient, its channels one after the other in memory."""
     return picture.detach().movedim(-1, 0).contiguous().movedim(0, -1)
@@ -227,7 +208,7 @@ class _NativePower(torch.autograd.Function):
 
 
 class _NativeMeanLight(torch.autograd.Function):
-    """`mean_light` for the power curve in the compiled module."""
+    """`CodedPictures.mean_light` for the power curve in the compiled module."""
 
     @staticmethod
     def forward(ctx: Any, *coded: Tensor) -> Float[Tensor, "H W 3"]:
@@ -274,7 +255,7 @@ class _LogLuminance(torch.autograd.Function):
 
 
 class _NativeLogLuminance(torch.autograd.Function):
-    """`log_luminance` for the power curve in the compiled module; slopes are found at once."""
+    """The same for the power curve in the compiled module; slopes are found at once."""
 
     @staticmethod
     def forward(ctx: Any, eps: float, keeps_hue: bool, *coded: Tensor) -> Float[Tensor, "T H W"]:
