@@ -152,11 +152,6 @@ def test_a_bad_file_is_one_sentence_that_names_it(tmp_path, said):
     assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_points_of_another_set_than_asked_for_are_refused(tmp_path):
-    with pytest.raises(DataError, match="17 points, expected the 25 of openpose25"):
-        read_keypoints(write_npz(tmp_path / "a.npz", points(17)), TIMES, points="openpose25")
-
-
 @pytest.fixture(scope="module")
 def good_files(tmp_path_factory) -> dict[str, bytes]:
     folder = tmp_path_factory.mktemp("good")

@@ -43,10 +43,6 @@ def fill(module: torch.nn.Module, seed: int) -> None:
             value.normal_(generator=generator)
 
 
-def joints_of(body, rotations, transl):
-    return body.joint_transforms(rotations, transl)[..., :3, 3]
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_gradients_are_those_of_finite_differences(seed):
     track = dance(seed)

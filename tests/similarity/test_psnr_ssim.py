@@ -32,7 +32,7 @@ def random_pair(seed: int, height: int = 37, width: int = 29) -> tuple[np.ndarra
 @pytest.mark.parametrize("seed", range(5))
 def test_psnr_is_scikit_images(seed):
     first, second = random_pair(seed)
-    ours = psnr(torch.from_numpy(second), torch.from_numpy(first), data_range=1.0)
+    ours = psnr(torch.from_numpy(second), torch.from_numpy(first))
     assert float(ours) == pytest.approx(
         peak_signal_noise_ratio(first, second, data_range=1.0), abs=1e-10
     )
@@ -102,9 +102,6 @@ def test_data_range_scales_with_the_values():
     scaled = Ssim(data_range=255.0)
     assert float(ssim(first * 255, second * 255, scaled)) == pytest.approx(
         float(ssim(first, second)), abs=1e-12
-    )
-    assert float(psnr(first * 255, second * 255, data_range=255)) == pytest.approx(
-        float(psnr(first, second))
     )
 
 

@@ -127,15 +127,13 @@ def shape_like(
     joint_names: tuple[str, ...],
     parents: Sequence[int],
     joints: Float[np.ndarray, "J 3"],
-    *,
-    source: str = "skeleton",
 ) -> Float[np.ndarray, "10"]:
     """Shape coefficients of `default_body` that make it as tall and long-limbed as the skeleton.
 
     ``joints`` (metres) are at rest. Rigs put the hip at different heights of the same person, so
     lengths are compared that do not depend on it. How stout the person is, joints cannot tell.
     """
-    wanted = _lengths(find_skeleton(parents, joint_names, source), np.asarray(joints, np.float64))
+    wanted = _lengths(find_skeleton(parents, joint_names), np.asarray(joints, np.float64))
     body = default_body()
     skeleton = find_skeleton(body.parents.tolist(), body.joint_names)
     mean = body.rest_joints.double().numpy()

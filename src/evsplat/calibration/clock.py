@@ -43,12 +43,7 @@ class ClockEstimate:
         return abs(self.lag_us) > MOST_LAG_US and abs(self.lag_us) > 3 * self.spread_us
 
 
-def estimate_clock(
-    pairs: Sequence[FramePair],
-    events: EventSource,
-    *,
-    search_us: int = SEARCH_US,
-) -> ClockEstimate | None:
+def estimate_clock(pairs: Sequence[FramePair], events: EventSource) -> ClockEstimate | None:
     """The lag at which what events add up to correlates best with the change between frames.
 
     The correlation is taken over the pixels with events, of all pairs together; a parabola through
@@ -59,7 +54,7 @@ def estimate_clock(
     if not pairs:
         return None
     step = max(500.0, float(np.median([pair.gap_us for pair in pairs])) / 4)
-    coarse = np.arange(-round(search_us / step), round(search_us / step) + 1) * step
+    coarse = np.arange(-round(SEARCH_US / step), round(SEARCH_US / step) + 1) * step
     sums = _moments(pairs, events, coarse)
     best = _best(_correlation(sums.sum(0)))
     if best is None:

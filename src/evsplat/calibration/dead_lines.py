@@ -11,6 +11,7 @@ _MANY = 20
 """Busy pixels of a line that cannot all end at the one beside it."""
 _LARGEST_SHARE = 1 / 8
 """Of the lines: more are those of a sensor coarser than the pixels that its events were put in."""
+_MOST_TOLD = 6
 
 
 def dead_rows(counts: Int64[np.ndarray, "H W"]) -> list[int]:
@@ -32,12 +33,12 @@ def dead_rows(counts: Int64[np.ndarray, "H W"]) -> list[int]:
     return found if len(found) <= _LARGEST_SHARE * len(counts) else []
 
 
-def dead_lines_text(counts: Int64[np.ndarray, "H W"], most: int = 6) -> str:
-    """Such as "rows 12, 40; column 7", at most ``most`` numbers of either; empty where none is."""
+def dead_lines_text(counts: Int64[np.ndarray, "H W"]) -> str:
+    """Such as "rows 12, 40; column 7", some numbers of either; empty where none is."""
     parts = []
     for name, across in (("row", counts), ("column", counts.T)):
         if lines := dead_rows(across):
-            more = f" and {len(lines) - most} more" if len(lines) > most else ""
-            shown = ", ".join(map(str, lines[:most]))
+            more = f" and {len(lines) - _MOST_TOLD} more" if len(lines) > _MOST_TOLD else ""
+            shown = ", ".join(map(str, lines[:_MOST_TOLD]))
             parts.append(f"{name}{'s' if len(lines) > 1 else ''} {shown}{more}")
     return "; ".join(parts)

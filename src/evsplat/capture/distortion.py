@@ -9,6 +9,7 @@ from scipy.ndimage import map_coordinates
 
 _COUNTS = (4, 5, 8)
 _LARGEST = 1e9
+_ITERATIONS = 50
 
 
 def are_coefficients(values: Sequence[object]) -> bool:
@@ -34,9 +35,7 @@ class Distortion:
         """Pixels of the lens for what a pinhole camera sees at ``pixels``."""
         return self._to_pixels(_distort(self._to_rays(pixels), self.coefficients))
 
-    def undistort(
-        self, pixels: Float[np.ndarray, "*batch 2"], *, iterations: int = 50
-    ) -> Float[np.ndarray, "*batch 2"]:
+    def undistort(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels of a pinhole camera for what the lens put at ``pixels``; NaN where none is found.
 
         Fixed-point iteration as in OpenCV; a result that does not distort back to within 0.1
@@ -45,7 +44,7 @@ class Distortion:
         target = self._to_rays(pixels)
         rays = target.copy()
         with np.errstate(all="ignore"):
-            for _ in range(iterations):
+            for _ in range(_ITERATIONS):
                 radial, tangential = _radial_and_tangential(rays, self.coefficients)
                 rays = (target - tangential) / radial
             found = self._to_pixels(rays)

@@ -7,7 +7,6 @@ from evsplat.landmarks.landmarks import (
     OPENPOSE_25,
     SETS,
     WHOLEBODY_133,
-    KeypointSet,
     Landmarks,
 )
 from evsplat.landmarks.network import LandmarkNetwork
@@ -20,7 +19,6 @@ __all__ = [
     "OPENPOSE_25",
     "SETS",
     "WHOLEBODY_133",
-    "KeypointSet",
     "LandmarkNetwork",
     "Landmarks",
     "SharpPicture",

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from evsplat.errors import DataError
 from evsplat.landmarks.keypoint_files import read_points
-from evsplat.landmarks.landmarks import SETS, KeypointSet, Landmarks
+from evsplat.landmarks.landmarks import SETS, Landmarks
 
 SIGMA_SHARE = 0.012
 """Error of a point that is surely seen, as a share of the person's height in the picture."""
@@ -16,23 +16,21 @@ LEAST_SEEN = 0.05
 _LARGEST = 1e6
 
 
-def read_keypoints(
-    path: Path | str, times_us: Sequence[int], *, points: KeypointSet | None = None
-) -> Landmarks:
+def read_keypoints(path: Path | str, times_us: Sequence[int]) -> Landmarks:
     """One person's key points from a file (`read_points`), a row for each of the times.
 
     ``times_us`` are microseconds on the camera's clock and ascend.
 
     Places are pixels with the centre of the top left pixel at (0.5, 0.5); the third number is a
-    confidence in 0..1 (1 where there is none), and what has next to none counts as not seen.
-    ``points`` says which set it is where the count should not decide.
+    confidence in 0..1 (1 where there is none), and what has next to none counts as not seen. Which
+    set of points it is, their number says.
 
     Raises:
         DataError: missing, damaged, another count of frames or points, several people, or nobody.
     """
     path = Path(path)
     values = read_points(path)
-    names = _names(path, values.shape[1], points)
+    names = _names(path, values.shape[1])
     if len(values) != len(times_us):
         raise DataError(
             f"{path}: holds {len(values)} frames, expected {len(times_us)}, one for each picture "
@@ -74,13 +72,7 @@ def _height(places: Float[np.ndarray, "N L 2"], seen: Float[np.ndarray, "N L"]) 
     return max(1.0, float(np.percentile(sides, 80)))
 
 
-def _names(path: Path, count: int, points: KeypointSet | None) -> tuple[str, ...]:
-    if points is not None:
-        if len(SETS[points]) != count:
-            raise DataError(
-                f"{path}: holds {count} points, expected the {len(SETS[points])} of {points}."
-            )
-        return SETS[points]
+def _names(path: Path, count: int) -> tuple[str, ...]:
     for names in SETS.values():
         if len(names) == count:
             return names

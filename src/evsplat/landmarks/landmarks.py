@@ -5,7 +5,6 @@ Left and right are the person's own. Points that several sets share have one nam
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -60,9 +59,7 @@ BLAZEPOSE_33 = (
 LIMB_POINTS = tuple(BLAZEPOSE_33.index(name) for name in _LIMBS)
 """Shoulders, elbows, wrists, hips, knees and ankles of BlazePose."""
 
-KeypointSet = Literal["coco17", "wholebody133", "openpose25", "blazepose33"]
-
-SETS: dict[KeypointSet, tuple[str, ...]] = {
+SETS: dict[str, tuple[str, ...]] = {
     "coco17": COCO_17,
     "wholebody133": WHOLEBODY_133,
     "openpose25": OPENPOSE_25,

@@ -25,6 +25,7 @@ from evsplat.ranges import Above, AtLeast
 
 GRID_S = 0.02
 """Spacing of the times at which motion and pose have their price."""
+_ENOUGH = 2e-4
 
 
 @dataclass(frozen=True)
@@ -262,10 +263,8 @@ class Problem:
         return float(total) / count
 
 
-def descend(
-    problem: Problem, state: State, steps: int, *, enough: float = 2e-4
-) -> tuple[State, float]:
-    """Levenberg-Marquardt steps until a step wins less than the share ``enough`` of the price."""
+def descend(problem: Problem, state: State, steps: int) -> tuple[State, float]:
+    """Levenberg-Marquardt steps until a step wins less than the share `_ENOUGH` of the price."""
     damping = 1e-3
     price, normal = problem.linearised(state)
     for _ in range(steps):
@@ -284,6 +283,6 @@ def descend(
         won = price - cost
         state, damping = tried, max(damping / 4, 1e-9)
         price, normal = problem.linearised(state)
-        if won < enough * abs(price):
+        if won < _ENOUGH * abs(price):
             break
     return state, price

@@ -19,10 +19,9 @@ def psnr(
     image: Float[Tensor, "H W C"],
     reference: Float[Tensor, "H W C"],
     *,
-    data_range: float = 1.0,
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, ""]:
-    """-10 log10(MSE / data_range²) over all pixels and channels, in dB; infinite for equal images.
+    """-10 log10(MSE) of pictures in [0, 1], over all pixels and channels; infinite for equal ones.
 
     With ``mask`` only its true pixels count; a mask without any is a ValueError.
     """
@@ -32,19 +31,16 @@ def psnr(
         if not bool(mask.any()):
             raise ValueError("the mask selects no pixel")
         error = error[mask]
-    return -10.0 * torch.log10(error.mean() / data_range**2)
+    return -10.0 * torch.log10(error.mean())
 
 
 def psnr_channel_mean(
-    image: Float[Tensor, "H W C"],
-    reference: Float[Tensor, "H W C"],
-    *,
-    data_range: float = 1.0,
+    image: Float[Tensor, "H W C"], reference: Float[Tensor, "H W C"]
 ) -> Float[Tensor, ""]:
-    """Mean of the PSNRs of the single channels, in dB; never below `psnr` (Jensen)."""
+    """Mean of the PSNRs of the channels of pictures in [0, 1], dB; never below `psnr` (Jensen)."""
     _check_same_shape(image, reference)
     error = (image - reference).square().mean(dim=(0, 1))
-    return (-10.0 * torch.log10(error / data_range**2)).mean()
+    return (-10.0 * torch.log10(error)).mean()
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ MISFITS = (
     ArithmeticError,
 )
 """What comes of a record with other values than those that were written into it."""
+_LONGEST = 80
+"""Letters of a value that fit a message."""
 _MOST_LETTERS = 200
 
 
@@ -89,15 +91,14 @@ def broken_as(
     fault: str,
     remedy: str = "",
     *,
-    error: type[EvsplatError] = DataError,
     kinds: tuple[type[BaseException], ...] = BROKEN,
 ) -> Iterator[None]:
-    """Errors of ``kinds`` in the block as an ``error`` that begins with path and fault."""
+    """Errors of ``kinds`` in the block as a `DataError` that begins with path and fault."""
     try:
         yield
     except kinds as cause:
         advice = f"; {remedy}" if remedy else ""
-        raise error(f"{path}: {fault} ({reason(cause)}){advice}.") from cause
+        raise DataError(f"{path}: {fault} ({reason(cause)}){advice}.") from cause
 
 
 def reason(error: BaseException) -> str:
@@ -106,7 +107,7 @@ def reason(error: BaseException) -> str:
     return " ".join(text.split())[:_MOST_LETTERS] or type(error).__name__
 
 
-def brief(value: Any, limit: int = 80) -> str:
+def brief(value: Any) -> str:
     """``repr`` cut to a length that fits a message."""
     try:
         text = repr(value)
@@ -114,4 +115,4 @@ def brief(value: Any, limit: int = 80) -> str:
         text = f"a {type(value).__name__} nested too deeply to be shown"
     except ValueError:
         text = "an integer of thousands of digits"
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"

@@ -23,6 +23,8 @@ INSET_SHARE = 0.3
 """Height of the recorded picture in the corner, as a share of the viewport's."""
 _FULL_STRENGTH = 3
 """Events at one pixel that hide what is below them."""
+_DIMMED = 0.45
+"""What is left of the brightness outside of a recorded picture."""
 
 Picture = Float[np.ndarray, "H W 3"]
 
@@ -180,14 +182,14 @@ def paste(picture: Picture, other: Picture, box: Box) -> None:
     picture[rows, columns] = placed
 
 
-def dim_outside(picture: Picture, box: Box, factor: float = 0.45) -> None:
+def dim_outside(picture: Picture, box: Box) -> None:
     """Darken what a recording camera did not see."""
     top, bottom = round(box.top), round(box.top + box.height)
     left, right = round(box.left), round(box.left + box.width)
-    picture[:top] *= factor
-    picture[bottom:] *= factor
-    picture[top:bottom, :left] *= factor
-    picture[top:bottom, right:] *= factor
+    picture[:top] *= _DIMMED
+    picture[bottom:] *= _DIMMED
+    picture[top:bottom, :left] *= _DIMMED
+    picture[top:bottom, right:] *= _DIMMED
 
 
 def divided(left: Picture, right: Picture, share: float) -> Picture:

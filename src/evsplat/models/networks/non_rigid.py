@@ -224,7 +224,6 @@ class NonRigidNetwork(nn.Module):
         """
         super().__init__()
         self.encoding = OneBlobEncoding(bins)
-        self.feature_dim = feature_dim
         self.mlp = PointMLP(
             self.encoding.dim,
             pose_dim,
