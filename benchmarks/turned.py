@@ -43,9 +43,7 @@ def angles(capture: Capture) -> dict[str, float]:
     limbs = find_skeleton(body.parents.tolist(), body.joint_names, str(capture.path)).limbs
     found = {}
     for frame in capture.frames:
-        rotations, transl = track.at([frame.mid_us])
-        bones = body.bone_transforms(rotations, transl)[0]
-        joints = torch.einsum("jrc,jc->jr", bones[:, :3, :3], body.rest_joints) + bones[:, :3, 3]
+        joints = body.joint_transforms(*track.at([frame.mid_us]))[0, :, :3, 3]
         across = joints[limbs["left_thigh"]] - joints[limbs["right_thigh"]]
         ahead = np.array([across[1], -across[0]])
         towards = (capture.camera(frame).center() - joints[0])[:2].numpy()

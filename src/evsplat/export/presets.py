@@ -142,12 +142,10 @@ def _local(
 def _joints(
     body: Body, rotations: Float[np.ndarray, "J 3 3"], transl: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "J 3"]:
-    bones = body.canonical_to_world(
+    frames = body.joint_transforms(
         torch.from_numpy(rotations).float(), torch.from_numpy(transl).float()
     )
-    placed = (bones @ body.canonical_bone_transforms()).double().numpy()
-    rest = body.rest_joints.double().numpy()
-    return (placed[:, :3, :3] @ rest[..., None])[..., 0] + placed[:, :3, 3]
+    return frames[:, :3, 3].double().numpy()
 
 
 def _only_root(rotations: Float[np.ndarray, "J 3 3"], root: int) -> Float[np.ndarray, "J 3 3"]:

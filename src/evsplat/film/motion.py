@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import Body, BodyTrack, SkeletonMotion, retarget, up_axis
+from evsplat.body import BodyTrack, SkeletonMotion, retarget, up_axis
 from evsplat.body.motion import load_motion
 from evsplat.body.pose_files import read_poses, skeleton_motion
 from evsplat.body.retarget import smallest_rotation
@@ -101,7 +101,8 @@ def _facing(track: BodyTrack) -> Float[np.ndarray, "3"]:
     """Vector from the right hip to the left one at the start, in the world."""
     body = track.body
     limbs = find_skeleton(body.parents.tolist(), body.joint_names, "the run's body").limbs
-    joints = _joints(body, track, int(track.times_us[0]))
+    frames = body.joint_transforms(*track.at([int(track.times_us[0])]))
+    joints = frames[0, :, :3, 3].double().numpy()
     return joints[limbs["left_thigh"]] - joints[limbs["right_thigh"]]
 
 
@@ -114,13 +115,6 @@ def _heading(
         return np.eye(3)
     angle = np.arctan2(np.cross(flat[0], flat[1]) @ up, flat[0] @ flat[1])
     return Rotation.from_rotvec(angle * up).as_matrix()
-
-
-def _joints(body: Body, track: BodyTrack, time_us: int) -> Float[np.ndarray, "J 3"]:
-    rotations, transl = track.at([time_us])
-    bones = body.bone_transforms(rotations, transl)[0]
-    placed = torch.einsum("jrc,jc->jr", bones[:, :3, :3], body.rest_joints) + bones[:, :3, 3]
-    return placed.double().numpy()
 
 
 def _floor(track: BodyTrack, up: Float[np.ndarray, "3"]) -> float:
