@@ -1,7 +1,10 @@
-"""Random rigs and slow float64 references of forward kinematics and skinning."""
+"""Random rigs, their joints, and slow float64 references of kinematics and skinning."""
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
+
+from evsplat.body import axis_angle_to_matrix
 
 
 def random_rig(seed, joints=17, vertices=60, shuffled=False):
@@ -53,3 +56,9 @@ def reference_skin(vertices, weights, bones):
         for j in np.flatnonzero(weights[v]):
             moved[v] += weights[v, j] * (bones[j, :3, :3] @ vertex + bones[j, :3, 3])
     return moved
+
+
+def posed_joints(body, poses, transl):
+    """Places of the joints (T, J, 3) in poses (T, J, 3)."""
+    rotations = axis_angle_to_matrix(torch.from_numpy(poses))
+    return body.joint_transforms(rotations, torch.from_numpy(transl))[..., :3, 3].numpy()

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import axis_angle_to_matrix, default_body
+from evsplat.body import default_body
 from evsplat.body.pose_noise import (
     NOISE_PRESETS,
     PoseNoise,
@@ -15,6 +14,8 @@ from evsplat.body.pose_noise import (
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import ConfigError
 
+from .helpers import posed_joints
+
 
 @pytest.fixture(scope="module")
 def body():
@@ -25,11 +26,6 @@ def bent_poses(body, times, seed=0):
     moving = joint_angles(body, PoseNoise(1, 1, 0, 0)) > 0
     rng = np.random.default_rng(seed)
     return 0.5 * rng.normal(size=(times, len(moving), 3)) * moving[:, None]
-
-
-def joints(body, poses, transl):
-    rotations = axis_angle_to_matrix(torch.from_numpy(poses))
-    return body.joint_transforms(rotations, torch.from_numpy(transl))[..., :3, 3].numpy()
 
 
 def wrists_and_ankles(body):
@@ -53,7 +49,7 @@ def test_wrists_and_ankles_are_off_by_what_the_preset_says(body, preset, axes, m
     found = []
     for seed in range(3):
         moved = noisy_poses(body, poses, still, times, preset, seed=seed, view=(0, 1, 0))
-        off = joints(body, *moved) - joints(body, poses, still)
+        off = posed_joints(body, *moved) - posed_joints(body, poses, still)
         found.append(np.linalg.norm(off[:, ends][..., axes], axis=-1).mean())
     assert 1000 * np.mean(found) == pytest.approx(millimetres, rel=0.06)
 
@@ -124,7 +120,9 @@ def test_errors_can_be_scaled_to_a_distance(body, millimetres):
         *moved, error, noise = poses_off_by(
             body, poses, still, times, millimetres / 1000, seed=seed
         )
-        off = np.linalg.norm(joints(body, *moved) - joints(body, poses, still), axis=-1)[:, ends]
+        off = np.linalg.norm(
+            posed_joints(body, *moved) - posed_joints(body, poses, still), axis=-1
+        )[:, ends]
         assert 1000 * off.mean() == pytest.approx(millimetres, rel=0.02)
         assert error == pytest.approx(off.mean(), rel=1e-6)
         assert noise.joint_rad / noise.depth_m == pytest.approx(0.0116 / 0.012)

@@ -11,6 +11,7 @@ from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import DataError
 
+from .helpers import posed_joints
 from .skeletons import (
     ACCLAIM,
     DEEPMIMIC,
@@ -38,11 +39,6 @@ BONES = [
 @pytest.fixture(scope="module")
 def body() -> Body:
     return default_body()
-
-
-def posed_joints(body, poses, transl):
-    rotations = axis_angle_to_matrix(torch.from_numpy(poses))
-    return body.joint_transforms(rotations, torch.from_numpy(transl))[..., :3, 3].numpy()
 
 
 def own_skeleton(body):

@@ -20,6 +20,8 @@ from evsplat.errors import DataError
 from evsplat.events import count_map
 from evsplat.pictures.files import ImageCache
 
+from .editing import edit
+
 Factory = Callable[..., Path]
 FILES_READ: list[str] | None = None
 
@@ -39,12 +41,6 @@ def files_read() -> list[str]:
     FILES_READ = []
     yield FILES_READ
     FILES_READ = None
-
-
-def edit(path: Path, change: Callable[[dict], None]) -> None:
-    document = json.loads((path / "capture.json").read_text())
-    change(document)
-    (path / "capture.json").write_text(json.dumps(document))
 
 
 def test_everything_written_comes_back(tiny_capture: Factory) -> None:

@@ -1,6 +1,5 @@
 """Pictures of an automatic exposure: read, derived and blurred as if the camera had been steady."""
 
-import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -18,15 +17,14 @@ from evsplat.pictures.files import read_image, write_image
 from evsplat.pictures.light import decode, encode
 from evsplat.synthesis import synthesize
 
+from .editing import edit
+
 Factory = Callable[..., Path]
 GAINS = [1.0, [0.9, 0.8, 0.7], 0.6]
 
 
-def edit(path: Path, change) -> Path:
-    document = json.loads((path / "capture.json").read_text())
-    change(document["frames"])
-    (path / "capture.json").write_text(json.dumps(document))
-    return path
+def edit_frames(path: Path, change) -> Path:
+    return edit(path, lambda document: change(document["frames"]))
 
 
 @pytest.fixture
@@ -44,7 +42,7 @@ def pair(tiny_capture: Factory, tmp_path: Path) -> tuple[Capture, Capture]:
         for i, frame in enumerate(frames):
             frame["gain"] = GAINS[i % 3]
 
-    return load_capture(steady), load_capture(edit(changed, give))
+    return load_capture(steady), load_capture(edit_frames(changed, give))
 
 
 def alike(ours: torch.Tensor, theirs: torch.Tensor, tolerance: float = 2e-3) -> bool:
@@ -80,13 +78,13 @@ def test_a_derived_capture_has_one_brightness(pair, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bad", [0, -1, [1, 2], "bright", float("nan"), 1e9, [1, 0, 1]])
 def test_bad_gains_are_named(tiny_capture: Factory, bad) -> None:
-    path = edit(tiny_capture(), lambda frames: frames[3].update(gain=bad))
+    path = edit_frames(tiny_capture(), lambda frames: frames[3].update(gain=bad))
     with pytest.raises(DataError, match=r"capture\.json: frames\[3\]\.gain: found"):
         load_capture(path)
 
 
 def test_gains_of_three_colours_in_a_grey_picture_are_named(tiny_capture: Factory) -> None:
-    path = edit(tiny_capture(), lambda frames: frames[3].update(gain=[1, 1, 0.9]))
+    path = edit_frames(tiny_capture(), lambda frames: frames[3].update(gain=[1, 1, 0.9]))
     capture = load_capture(path)
     frame = capture.frames[3]
     write_image(frame.image, read_image(frame.image)[..., 0])

@@ -1,6 +1,5 @@
 """capture.json by a stranger: names and paths that reach elsewhere, JSON that is none."""
 
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from evsplat.capture.derive import derived_capture
 from evsplat.errors import DataError
 
 from ..test_names import BAD_NAMES
+from .editing import edit
 
 Factory = Callable[..., Path]
 PATHS = {
@@ -23,12 +23,6 @@ PATHS = {
     "body.file": ("body", "file"),
     "events.file": ("events", "file"),
 }
-
-
-def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    document = json.loads((path / "capture.json").read_text())
-    change(document)
-    (path / "capture.json").write_text(json.dumps(document))
 
 
 def put(path: Path, keys: tuple, value: Any) -> Any:

@@ -1,7 +1,6 @@
 """Frames that hold light as the camera measured it: the same recording, coded or not."""
 
 import functools
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +19,7 @@ from evsplat.pictures import decode, encode
 from evsplat.pictures.files import write_image
 from evsplat.restore import restore_capture
 
-
-def edit(path: Path, change) -> Path:
-    document = json.loads((path / "capture.json").read_text())
-    change(document)
-    (path / "capture.json").write_text(json.dumps(document))
-    return path
+from .editing import edit
 
 
 def say(path: Path, transfer: str) -> Capture:

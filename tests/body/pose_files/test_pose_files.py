@@ -13,7 +13,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import BodyTrack, axis_angle_to_matrix
+from evsplat.body import BodyTrack
 from evsplat.body.pose_files import read_poses, to_default_body
 from evsplat.body.pose_files.sequence import moved
 from evsplat.body.skeleton import find_skeleton
@@ -24,6 +24,7 @@ from evsplat.capture.body_track import load_body
 from evsplat.errors import DataError
 from evsplat.untrusted.arrays import read_plain_npz
 
+from ..helpers import posed_joints
 from . import synthetic
 from .synthetic import SIZE, TOOLS, make_motion, write, write_models
 
@@ -33,11 +34,6 @@ BONES = (("upper_arm", "forearm"), ("forearm", "hand"), ("thigh", "shin"), ("shi
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
     return write_models(tmp_path_factory.mktemp("models"))
-
-
-def posed_joints(body, poses, transl):
-    rotations = axis_angle_to_matrix(torch.from_numpy(poses))
-    return body.joint_transforms(rotations, torch.from_numpy(transl))[..., :3, 3].numpy()
 
 
 def directions(joints, skeleton):
