@@ -59,7 +59,7 @@ def test_counts_are_those_of_the_milliseconds_that_may_be_read(
     tmp_path, monkeypatch, piece
 ) -> None:
     """Against brute force, with clocks apart by any number of microseconds."""
-    monkeypatch.setattr(store_module, "_INDEX_PIECE", piece)
+    monkeypatch.setattr(store_module, "INDEX_PIECE", piece)
     rng = np.random.default_rng()
     events, offset = random_events(int(rng.integers(10_000)), 800, 60_000), int(rng.integers(5_000))
     write_events(tmp_path / "events.h5", events)

@@ -12,6 +12,7 @@ from evsplat.capture.finding import Findings, reason_and_remedy
 from evsplat.capture.metadata import EventsEntry, Metadata
 from evsplat.capture.stillness import nothing_moves
 from evsplat.errors import DataError
+from evsplat.events.store import INDEX_PIECE
 from evsplat.untrusted.faults import BROKEN, reason
 from evsplat.untrusted.hdf5 import open_hdf5, wrong_data_set
 
@@ -19,8 +20,6 @@ _COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 _SCAN_EVENTS = 1 << 20
 _SHORT = 500_000
 """Events of a recording that is scanned whenever it is opened, which takes some 20 ms."""
-_INDEX_PIECE = 1 << 20
-"""Entries of the index that are read at a time."""
 _INDEX_SAMPLES = 64
 _MOST_PIXELS = 1 << 24
 """Of a sensor whose events are counted by pixel: more are announced, not built."""
@@ -198,8 +197,8 @@ def _check_index(entry: EventsEntry, file: h5py.File, findings: Findings) -> Non
 
 def _descent(index: h5py.Dataset) -> int | None:
     """The first millisecond whose entry is less than the one before it."""
-    for start in range(0, len(index), _INDEX_PIECE):
-        piece = index[max(0, start - 1) : start + _INDEX_PIECE]
+    for start in range(0, len(index), INDEX_PIECE):
+        piece = index[max(0, start - 1) : start + INDEX_PIECE]
         falls = np.flatnonzero(piece[1:] < piece[:-1])
         if len(falls):
             return max(0, start - 1) + int(falls[0]) + 1

@@ -29,8 +29,6 @@ from evsplat.shipped import demo_capture
 if TYPE_CHECKING:
     from evsplat.training import Run
 
-_REGIONS = ("full", "person_crop", "person_mask")
-
 
 def demo(
     *,
@@ -309,6 +307,7 @@ def summary_table(metrics: dict[str, Any]) -> str:
 
     The last row is what the camera itself took at those times, which no method sees.
     """
+    from evsplat.evaluation.protocols import REGIONS
     from evsplat.evaluation.splits import count_of, words_of
     from evsplat.evaluation.tables import composited, input_is_truth, terms, without_truth
 
@@ -324,11 +323,11 @@ def summary_table(metrics: dict[str, Any]) -> str:
     if not input_is_truth(metrics):
         rows["own blurry picture"] = metrics["blurry_input"]
     width = max(map(len, rows))
-    head = "".join(f"{region.replace('_', ' '):>18}" for region in _REGIONS)
+    head = "".join(f"{region.replace('_', ' '):>18}" for region in REGIONS)
     frames = words_of(metrics).title.lower()
     lines = [f"PSNR dB / SSIM on the {frames}, protocol 'standard'\n{'':{width}}{head}"]
     for name, regions in rows.items():
-        cells = "".join(f"{_cell(regions[region]):>18}" for region in _REGIONS)
+        cells = "".join(f"{_cell(regions[region]):>18}" for region in REGIONS)
         lines.append(f"{name:{width}}{cells}")
     return "\n".join([*lines, terms(metrics)])
 

@@ -38,7 +38,7 @@ _KEPT_BLOCK = 1 << 16
 """Rows that are decoded and kept together."""
 _CHECKED_ROWS = 1 << 16
 """Entries of the index that are remembered as right."""
-_INDEX_PIECE = 1 << 20
+INDEX_PIECE = 1 << 20
 """Entries of the index that are read at a time."""
 _EVENT_BYTES = 13
 """Of an `EventStream`."""
@@ -324,8 +324,8 @@ class EventStore:
         data = self._open()
         count, length = int(data["events/t"].shape[0]), int(data["ms_to_idx"].shape[0])
         rows = np.where(milliseconds < 0, 0, count)
-        for piece in range(0, length, _INDEX_PIECE):
-            within = (milliseconds >= piece) & (milliseconds < min(piece + _INDEX_PIECE, length))
+        for piece in range(0, length, INDEX_PIECE):
+            within = (milliseconds >= piece) & (milliseconds < min(piece + INDEX_PIECE, length))
             if within.any():
                 first, last = int(milliseconds[within].min()), int(milliseconds[within].max())
                 read = self._read("ms_to_idx", first, last + 1)
