@@ -49,6 +49,11 @@ class Camera:
         )
         return replace(self, width=width, height=height, K=K)
 
+    def resized(self, width: int, height: int) -> "Camera":
+        """The camera of its picture resampled to another size; pixel centres stay at +0.5."""
+        factors = torch.tensor([width / self.width, height / self.height, 1.0])
+        return replace(self, width=width, height=height, K=self.K * factors[:, None])
+
     def widened(self, beyond_x: int, beyond_y: int) -> "Camera":
         """The same camera with so many pixels more at the left and right, and above and below."""
         K = self.K.clone()

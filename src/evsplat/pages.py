@@ -2,20 +2,16 @@
 
 import base64
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
 from evsplat.untrusted.pictures import read_picture
-
-Item = TypeVar("Item")
 
 _LOSSLESS_PIXELS = 6_000_000
 """Up to this many pixels in all, pictures are embedded without loss; beyond, at quality 92."""
@@ -74,13 +70,6 @@ def legend(gradient: str, low: str, high: str, title: str) -> str:
         f'<p class="scale"><span>{escape(title)}:</span><span>{escape(low)}</span>'
         f'<i style="background:{gradient}"></i><span>{escape(high)}</span></p>'
     )
-
-
-def spread(items: Sequence[Item], count: int) -> list[Item]:
-    """Evenly spread items, ``count`` at most, the first and the last among them."""
-    if len(items) <= count:
-        return list(items)
-    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
 
 
 @dataclass(frozen=True)

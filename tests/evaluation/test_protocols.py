@@ -161,8 +161,8 @@ def test_mask_box_is_tight(seed):
 def test_boxes_stay_inside_the_picture():
     box = Box(1, 39, 2, 58).enlarged(0.1, 40, 60)
     assert box == Box(0, 40, 0, 60)
-    assert Box(5, 35, 50, 58).at_least(1.0, 40, 60) == Box(5, 35, 30, 60)
-    assert Box(5, 15, 10, 40).at_least(1.0, 40, 60) == Box(5, 15, 10, 40)
+    assert Box(5, 35, 50, 58).at_least(1.0, 60) == Box(5, 35, 30, 60)
+    assert Box(5, 15, 10, 40).at_least(1.0, 60) == Box(5, 15, 10, 40)
 
 
 def test_means_skip_gaps_and_say_how_many():

@@ -11,8 +11,9 @@ from evsplat.benching.tables import SPREAD
 from evsplat.capture import Capture, Frame, load_capture
 from evsplat.evaluation.regions import Box, HumanRegions
 from evsplat.evaluation.tables import LEGEND, Table, html
-from evsplat.pages import Embedder, document, folded, read_rgb, section, spread
+from evsplat.pages import Embedder, document, folded, read_rgb, section
 from evsplat.pictures import to_bytes
+from evsplat.spread import evenly_spread
 
 _PIXELS = 60_000_000
 """Pixels of all pictures of the page; beyond, captures show fewer frames, evenly spread."""
@@ -70,8 +71,8 @@ def _capture(
         rows.append(_Row(row.label, record, run, records.reason_for_gap(name, row.name)))
     camera = next(iter(capture.cameras.values()))
     of_frame = camera.width * camera.height * (len(rows) + 2)
-    frames = spread(capture.test_frames, max(2, budget // of_frame))
-    shown = spread(frames, _OPEN)
+    frames = evenly_spread(capture.test_frames, max(2, budget // of_frame))
+    shown = evenly_spread(frames, _OPEN)
     human_regions = HumanRegions(capture)
     # Pictures of many methods: light compression is seen by nobody at this size.
     embed = Embedder(lossless=False)
@@ -100,7 +101,7 @@ def _frame(
     embed: Embedder,
 ) -> str:
     box, camera = human_regions.crop(frame), capture.camera(frame)
-    style = "" if box is None else _window(box, camera.height, camera.width)
+    style = "" if box is None else _window(box, camera.width)
     blurry = to_bytes(capture.shown(capture.image(frame)))
     tiles = [_tile(embed.image(blurry, "blurry input"), style, "recorded")]
     if frame.sharp is not None:
@@ -134,7 +135,7 @@ def _tile(image: str, style: str, title: str, note: str = "") -> str:
     )
 
 
-def _window(box: Box, height: int, width: int) -> str:
+def _window(box: Box, width: int) -> str:
     """The part of the picture that shows, in shares of the tile's own width and height."""
     wide, high = box.right - box.left, box.bottom - box.top
     return (

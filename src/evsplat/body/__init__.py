@@ -6,11 +6,8 @@ from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.body.retarget import SkeletonMotion, retarget
 from evsplat.body.rotations import (
     axis_angle_to_matrix,
-    matrix_to_quaternion,
-    quaternion_multiply,
-    quaternion_to_matrix,
 )
-from evsplat.body.silhouette import body_box, silhouette
+from evsplat.body.silhouette import body_box, silhouette, track_silhouette
 from evsplat.body.surface import SurfaceSamples
 from evsplat.body.track import BodyTrack, nearest_axis, up_axis
 
@@ -27,13 +24,11 @@ __all__ = [
     "bounding_box",
     "default_body",
     "make_body",
-    "matrix_to_quaternion",
     "nearest_axis",
-    "quaternion_multiply",
-    "quaternion_to_matrix",
     "retarget",
     "silhouette",
     "skin",
     "skin_with_linear",
+    "track_silhouette",
     "up_axis",
 ]

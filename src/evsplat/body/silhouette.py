@@ -5,6 +5,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from evsplat.body.track import BodyTrack
 from evsplat.camera import Camera
 from evsplat.compiled import native
 
@@ -24,6 +25,11 @@ def silhouette(
         native.fill_triangles(*mesh, filled)
         return filled.bool()
     return torch.from_numpy(_filled(places.numpy(), in_front.numpy(), faces.cpu().numpy(), camera))
+
+
+def track_silhouette(track: BodyTrack, time_us: int, camera: Camera) -> Bool[Tensor, "H W"]:
+    """Pixels whose centre the posed body covers."""
+    return silhouette(track.vertices(time_us), track.body.faces, camera)
 
 
 def _filled(

@@ -14,6 +14,7 @@ from evsplat.errors import DataError
 from evsplat.events import EventStore, EventStream, Span
 from evsplat.events.maps import event_pixels
 from evsplat.pictures.light import Transfer, decode, luminance
+from evsplat.spread import evenly_spread
 
 DARKEST, BRIGHTEST = 0.02, 0.98
 """Coded values outside of this range are mostly noise, or clipped."""
@@ -120,8 +121,7 @@ def pair_indices(
     found = [(i, max(int(j), i + 1)) for i, j in enumerate(after) if j < len(middle)]
     if stretch is not None:
         found = [(i, j) for i, j in found if stretch[i] == stretch[j]]
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int))
-    return [found[i] for i in chosen]
+    return evenly_spread(found, most)
 
 
 class PairEvents:

@@ -8,6 +8,7 @@ from scipy.ndimage import binary_dilation, rank_filter
 
 from evsplat.events import EventStore, EventStream
 from evsplat.events.store import ALWAYS, Span
+from evsplat.spread import evenly_spread
 
 SUPPORT_US = 10_000
 """An event with another one at or beside its pixel within about this time is not noise."""
@@ -118,9 +119,7 @@ def _pieces(events: EventStore, during_us: Span) -> list[Span]:
         for start, end in stretches
         for first in range(start, end, _PIECE_US)
     ]
-    if len(pieces) > _MOST_PIECES:
-        chosen = np.linspace(0, len(pieces) - 1, _MOST_PIECES).round().astype(int)
-        pieces = [pieces[index] for index in chosen]
+    pieces = evenly_spread(pieces, _MOST_PIECES)
     whole_us = sum(end - start for start, end in events.stretches_us)
     seen_us = sum(end - start for start, end in pieces)
     expected = len(events) * seen_us / max(whole_us, 1)

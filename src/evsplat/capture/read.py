@@ -23,6 +23,7 @@ from evsplat.errors import DataError
 from evsplat.events import EventStore
 from evsplat.pictures.files import ImageCache, planar, read_image, to_grey, to_rgb, to_unit_range
 from evsplat.pictures.light import Transfer, evened, shown
+from evsplat.spread import evenly_spread
 from evsplat.untrusted.arrays import read_plain_npz
 
 IMAGE_CACHE_BYTES = 192 << 20
@@ -35,10 +36,10 @@ _LEAST_MEDIAN_FRAMES = 15
 class CaptureReader:
     """Pictures, events and poses of a capture folder, held out or not, as `Capture` says."""
 
-    def __init__(self, metadata: Metadata, *, cache_bytes: int = IMAGE_CACHE_BYTES) -> None:
+    def __init__(self, metadata: Metadata) -> None:
         self._metadata = metadata
         self._by_name = {frame.name: frame for frame in metadata.frames}
-        self._images = ImageCache(cache_bytes)
+        self._images = ImageCache(IMAGE_CACHE_BYTES)
         self.path: Path = metadata.path
         self.name: str = metadata.name
         self.cameras: dict[str, Camera] = metadata.cameras
@@ -277,8 +278,7 @@ class CaptureReader:
         first = self._stored(train[0].image, train[0].camera, train[0].gain)
         each = first.size * (4 if any(frame.gain for frame in train) else first.itemsize)
         most = min(_MEDIAN_FRAMES, max(_LEAST_MEDIAN_FRAMES, _MEDIAN_BYTES // each))
-        chosen = np.unique(np.linspace(0, len(train) - 1, min(len(train), most)).round())
-        frames = [train[int(i)] for i in chosen]
+        frames = evenly_spread(train, most)
         pictures = tqdm(frames, "background", unit="picture", leave=False, disable=None)
         stored = [self._stored(frame.image, frame.camera, frame.gain) for frame in pictures]
         if any(frame.gain for frame in frames):  # those without are still as they are stored

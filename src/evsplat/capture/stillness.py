@@ -8,6 +8,7 @@ from evsplat.calibration.offset import BlockLevels
 from evsplat.capture.metadata import Frame, Metadata
 from evsplat.errors import DataError
 from evsplat.pictures.files import read_image, to_unit_range
+from evsplat.spread import evenly_spread
 
 _MOST = 16
 """Pictures that are looked at, spread over the frames."""
@@ -25,10 +26,9 @@ def nothing_moves(metadata: Metadata, frames: Sequence[Frame]) -> bool:
     frames = [frame for frame in frames if frame.split == "train"]
     if len(frames) < 2:
         return False
-    chosen = np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).round().astype(int)
     camera = metadata.cameras[frames[0].camera]
     seen = BlockLevels(metadata.transfers.get(frames[0].camera, "power"))
-    for frame in (frames[index] for index in chosen):
+    for frame in evenly_spread(frames, _MOST):
         try:
             pixels = read_image(frame.image)
         except DataError:  # a check of its own speaks of the picture

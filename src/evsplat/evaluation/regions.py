@@ -53,7 +53,7 @@ class Box:
             min(self.right + columns, width),
         )
 
-    def at_least(self, aspect: float, height: int, width: int) -> "Box":
+    def at_least(self, aspect: float, width: int) -> "Box":
         """Widened to ``aspect`` times its height, about its centre but inside the picture."""
         columns = min(width, max(self.right - self.left, round(aspect * (self.bottom - self.top))))
         left = (self.left + self.right - columns) // 2

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack
 from evsplat.camera import Camera
+from evsplat.spread import evenly_spread
 
 Turn = Callable[[float], float]
 """Angle around the person, radians, at a share of the film."""
@@ -124,6 +125,4 @@ def _showing_all(
 
 def _some(times_us: Sequence[int]) -> list[int]:
     """Times spread evenly over all, the first and the last among them."""
-    different = sorted(set(times_us))
-    count = min(len(different), _MOST_TIMES)
-    return [different[round(i)] for i in np.linspace(0, len(different) - 1, count)]
+    return evenly_spread(sorted(set(times_us)), _MOST_TIMES)

@@ -1,7 +1,7 @@
 """The frames of a film of one run: the motion, and time and camera of each frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -179,10 +179,7 @@ def _of_height(cameras: list[Camera], height: int | None) -> list[Camera]:
         if id(camera) not in made:
             # Videos want even numbers.
             width = 2 * round(camera.width * height / camera.height / 2)
-            K = camera.K.clone()
-            K[0] *= width / camera.width
-            K[1] *= height / camera.height
-            made[id(camera)] = replace(camera, width=width, height=height, K=K)
+            made[id(camera)] = camera.resized(width, height)
     return [made[id(camera)] for camera in cameras]
 
 

@@ -17,8 +17,9 @@ from evsplat.body import BodyTrack
 from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.inspection.elsewhere import Elsewhere, find_elsewhere
 from evsplat.inspection.figure import Coarse, Figure, grown, outlines
-from evsplat.inspection.movement import looked_at, movement, small_pictures, spread, stands
+from evsplat.inspection.movement import MOST_FRAMES, looked_at, movement, small_pictures, stands
 from evsplat.inspection.search import DELAYS, NOW, REACH_PX, BestPlace, drawn, in_picture
+from evsplat.spread import evenly_spread
 from evsplat.wording import counted
 
 Verdict = Literal["belongs", "off", "another", "unknown"]
@@ -230,6 +231,7 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
         delay, change_lost = best.changed
         assert best.changing is not None
         change_score = float(best.changing[0, delay])
+    held_out = evenly_spread(capture.held_out_frames, MOST_FRAMES)
     judged = Belonging(
         frames,
         shares={name: float(maps[now].sum() / maps.sum()) for name, maps in found.items()},
@@ -247,7 +249,7 @@ def judge_body(capture: TrainingCapture, track: BodyTrack | None = None) -> Belo
         parting=best.parting,
         standing_camera=stands(frames),
         in_no_training_frame=not now.any() and _in_none(capture, figure, capture.train_frames),
-        in_no_held_out_frame=_in_none(capture, figure, spread(capture.held_out_frames)),
+        in_no_held_out_frame=_in_none(capture, figure, held_out),
     )
     if pictures is None or judged.verdict != "belongs":
         return judged

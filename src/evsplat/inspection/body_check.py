@@ -1,15 +1,15 @@
 """Warnings about a body that does not belong to its recording; its outline over what moves."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from evsplat.body import BodyTrack, silhouette
+from evsplat.body import BodyTrack, track_silhouette
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.capture.finding import Finding, Findings
@@ -30,6 +30,7 @@ from evsplat.inspection.drawing import (
 from evsplat.inspection.elsewhere import EXPECTED, REMEDY
 from evsplat.inspection.movement import event_window
 from evsplat.pictures import shown
+from evsplat.spread import evenly_spread
 
 logger = logging.getLogger(__name__)
 
@@ -107,9 +108,8 @@ def fit_sheet(capture: TrainingCapture, found: Belonging) -> Image.Image:
     pink box.
     """
     track = load_body_track(capture)
-    chosen = np.linspace(0, len(found.frames) - 1, min(_TILES, len(found.frames))).round()
     tiles = []
-    for frame in (found.frames[int(i)] for i in np.unique(chosen)):
+    for frame in evenly_spread(found.frames, _TILES):
         camera = capture.camera(frame)
         size = fit(camera.width, camera.height, DETAIL_PX)
         picture = to_picture(_moving(capture, frame), size)
@@ -145,9 +145,7 @@ def _outline(
     colour: tuple[int, int, int],
 ) -> None:
     """Draw the body at a time, moved right and down, on a picture of any size."""
-    factors = torch.tensor([picture.width / camera.width, picture.height / camera.height, 1.0])
     K = camera.K.clone()
     K[:2, 2] += torch.tensor(shift_px)
-    drawn = Camera(picture.width, picture.height, K * factors[:, None], camera.world_to_camera)
-    body = silhouette(track.vertices(time_us), track.body.faces, drawn).numpy()
-    draw_outline(picture, body, colour)
+    drawn = replace(camera, K=K).resized(picture.width, picture.height)
+    draw_outline(picture, track_silhouette(track, time_us, drawn).numpy(), colour)

@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.body import BodyTrack, nearest_axis, silhouette, up_axis
+from evsplat.body import BodyTrack, nearest_axis, track_silhouette, up_axis
 from evsplat.calibration import SensorEstimate
-from evsplat.camera import Camera
 from evsplat.capture import estimate_sensor, load_body_track, shared_pairs
 from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding
@@ -46,6 +44,7 @@ from evsplat.inspection.event_check import (
 from evsplat.inspection.picture_check import picture_findings, warn_of_pictures
 from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings, contrast_findings, sensor_lines
+from evsplat.spread import evenly_spread
 from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
@@ -141,7 +140,7 @@ def warn_of_capture(path: Path, body_models: Path | None = None) -> None:
         logger.info("The body is not compared with the recording: %s", error)
 
 
-def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, ...]) -> list[float]:
+def body_mask_overlap(capture: Capture, track: BodyTrack, frames: Sequence[Frame]) -> list[float]:
     """Intersection over union of posed body and person mask, for the frames that have a mask.
 
     Frames with neither in the picture, as after somebody has left, tell nothing and are passed
@@ -151,7 +150,7 @@ def body_mask_overlap(capture: Capture, track: BodyTrack, frames: tuple[Frame, .
     for frame in frames:
         mask = capture.mask(frame)
         if mask is not None:
-            body = _silhouette(track, frame.mid_us, capture.camera(frame))
+            body = track_silhouette(track, frame.mid_us, capture.camera(frame)).numpy()
             person = mask.numpy() > 0.5
             if (either := int((body | person).sum())) > 0:
                 overlaps.append(float((body & person).sum() / either))
@@ -182,7 +181,7 @@ def _summary(
         *_up_lines(track),
         f"truth      {_truth_text(capture)}",
     ]
-    shown = _spread(frames, DETAIL_FRAMES)
+    shown = evenly_spread(frames, DETAIL_FRAMES)
     overlaps = [] if track is None else body_mask_overlap(capture, track, shown)
     if overlaps:
         lines.append(
@@ -320,12 +319,6 @@ def _findings_text(findings: tuple[Finding, ...]) -> str:
     return "\n".join(lines)
 
 
-def _spread(frames: tuple[Frame, ...], count: int) -> tuple[Frame, ...]:
-    """Frames evenly spread over the capture, at most ``count``."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-    return tuple(frames[i] for i in chosen)
-
-
 def _label(frame: Frame) -> str:
     return f"{frame.name}   {frame.mid_us / 1e6:.3f} s"
 
@@ -336,7 +329,7 @@ def _drawn(frames: Sequence[Frame], what: str) -> Iterable[Frame]:
 
 
 def _contact_sheet(capture: Capture) -> Image.Image:
-    chosen = _spread(capture.frames, CONTACT_FRAMES)
+    chosen = evenly_spread(capture.frames, CONTACT_FRAMES)
     tiles = []
     for frame in _drawn(chosen, "frames"):
         camera = capture.camera(frame)
@@ -360,7 +353,7 @@ def _events_sheet(capture: Capture) -> Image.Image:
             _label(frame),
             frame.split,
         )
-        for frame in _drawn(_spread(capture.frames, DETAIL_FRAMES), "events")
+        for frame in _drawn(evenly_spread(capture.frames, DETAIL_FRAMES), "events")
     ]
     subtitle = f"{EVENT_WINDOW_US / 1000:g} ms about mid-exposure; red: brighter, blue: darker"
     return sheet(f"{capture.name}: events", subtitle, tiles, columns=4)
@@ -369,24 +362,15 @@ def _events_sheet(capture: Capture) -> Image.Image:
 def _body_sheet(capture: Capture, track: BodyTrack) -> Image.Image:
     """Outline of the posed body at mid-exposure, thin lines where it is at the exposure's ends."""
     tiles = []
-    for frame in _drawn(_spread(capture.frames, DETAIL_FRAMES), "body"):
+    for frame in _drawn(evenly_spread(capture.frames, DETAIL_FRAMES), "body"):
         camera = capture.camera(frame)
         size = fit(camera.width, camera.height, DETAIL_PX)
         picture = to_picture(capture.shown(capture.image(frame)), size)
-        large = _resized(camera, size)
+        large = camera.resized(*size)
         for time_us in frame.exposure_us:
-            draw_outline(picture, _silhouette(track, time_us, large), _OUTLINE_ENDS, halo=False)
-        draw_outline(picture, _silhouette(track, frame.mid_us, large), _OUTLINE)
+            body = track_silhouette(track, time_us, large).numpy()
+            draw_outline(picture, body, _OUTLINE_ENDS, halo=False)
+        draw_outline(picture, track_silhouette(track, frame.mid_us, large).numpy(), _OUTLINE)
         tiles.append(Tile(picture, _label(frame), frame.split))
     subtitle = "posed body at mid-exposure (green) and at the exposure's ends (yellow)"
     return sheet(f"{capture.name}: body", subtitle, tiles, columns=4)
-
-
-def _silhouette(track: BodyTrack, time_us: int, camera: Camera) -> np.ndarray:
-    return silhouette(track.vertices(time_us), track.body.faces, camera).numpy()
-
-
-def _resized(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera of the picture resampled to ``size`` (pixel centres at +0.5: K just scales)."""
-    factors = torch.tensor([size[0] / camera.width, size[1] / camera.height, 1.0])
-    return Camera(size[0], size[1], camera.K * factors[:, None], camera.world_to_camera)

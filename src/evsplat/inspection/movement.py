@@ -10,6 +10,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.events import EventStore, EventStream, polarity_counts
 from evsplat.inspection.figure import Coarse
+from evsplat.spread import evenly_spread
 
 MOST_FRAMES = 32
 EVENT_REACH_US = 10_000
@@ -27,13 +28,8 @@ def looked_at(capture: TrainingCapture) -> tuple[Frame, ...]:
             "one; change the split, or train with --use everything."
         )
     name = capture.train_frames[0].camera
-    return spread([frame for frame in capture.train_frames if frame.camera == name])
-
-
-def spread(frames: Sequence[Frame]) -> tuple[Frame, ...]:
-    """At most `MOST_FRAMES` of the frames, evenly spread."""
-    chosen = np.linspace(0, len(frames) - 1, min(MOST_FRAMES, len(frames))).round()
-    return tuple(frames[int(i)] for i in np.unique(chosen))
+    frames = [frame for frame in capture.train_frames if frame.camera == name]
+    return tuple(evenly_spread(frames, MOST_FRAMES))
 
 
 def stands(frames: Sequence[Frame]) -> bool:

@@ -14,6 +14,7 @@ from evsplat.landmarks.detect import Found, Region
 from evsplat.landmarks.landmarks import LIMB_POINTS
 from evsplat.landmarks.motion import Box, Motion, global_shift, pieces
 from evsplat.landmarks.pictures import SharpPicture
+from evsplat.spread import evenly_spread
 
 logger = logging.getLogger(__name__)
 
@@ -134,8 +135,8 @@ def refuse_two_people(
 
     The first is painted over with the background; in what else moves another is searched for.
     """
-    spread = np.unique(np.linspace(0, len(pictures) - 1, _EXAMINED).round().astype(int))
-    chosen = [k for k in spread if found[k].is_person]
+    examined = evenly_spread(range(len(pictures)), _EXAMINED)
+    chosen = [k for k in examined if found[k].is_person]
     seconds = [
         person
         for k in chosen

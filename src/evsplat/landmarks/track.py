@@ -23,6 +23,7 @@ from evsplat.landmarks.refusals import (
     refuse_nobody,
     refuse_two_people,
 )
+from evsplat.spread import evenly_spread
 
 logger = logging.getLogger(__name__)
 
@@ -126,8 +127,7 @@ def _spread(pictures: Sequence[SharpPicture]) -> list[SharpPicture]:
     """A few of the pictures that are the sharpest, over all of their time."""
     sharpest = min(picture.sigma for picture in pictures)
     clear = [picture for picture in pictures if picture.sigma == sharpest]
-    chosen = np.unique(np.linspace(0, len(clear) - 1, _FIRST_LOOKS).round().astype(int))
-    return [clear[k] for k in chosen]
+    return evenly_spread(clear, _FIRST_LOOKS)
 
 
 class _Tracker:

@@ -17,10 +17,10 @@ from scipy.ndimage import (
 )
 from torch import Tensor
 
+from evsplat.body import track_silhouette
 from evsplat.capture import Frame, TrainingCapture, load_body_track
 from evsplat.capture.masked import masks_command
 from evsplat.errors import ConfigError, DataError
-from evsplat.masks.silhouette import track_silhouette
 from evsplat.pictures import Transfer, decode
 
 THRESHOLD = 0.08

@@ -4,11 +4,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from evsplat.body import BodyTrack, silhouette
+from evsplat.body import BodyTrack, track_silhouette
 from evsplat.capture import Camera, Frame, TrainingCapture, load_body_track
 from evsplat.errors import ConfigError
 
@@ -54,20 +54,10 @@ def soft_silhouette(
     track: BodyTrack, time_us: int, camera: Camera, *, margin_px: float = 0.0
 ) -> Float[Tensor, "H W"]:
     """Share of each pixel that the posed body covers, in [0, 1]."""
-    fine = track_silhouette(track, time_us, enlarged(camera, OVERSAMPLING))
+    large = camera.resized(camera.width * OVERSAMPLING, camera.height * OVERSAMPLING)
+    fine = track_silhouette(track, time_us, large)
     if margin_px > 0 and bool(fine.any()):
         outside = torch.from_numpy(distance_transform_edt(~fine.numpy()))
         fine = outside <= margin_px * OVERSAMPLING
     pooled = torch.nn.functional.avg_pool2d(fine.float()[None, None], OVERSAMPLING)
     return pooled[0, 0]
-
-
-def track_silhouette(track: BodyTrack, time_us: int, camera: Camera) -> Bool[Tensor, "H W"]:
-    """Pixels whose centre the posed body covers."""
-    return silhouette(track.vertices(time_us), track.body.faces, camera)
-
-
-def enlarged(camera: Camera, factor: int) -> Camera:
-    """The camera with ``factor`` times as many pixels each way (pixel centres at +0.5)."""
-    K = camera.K * torch.tensor([factor, factor, 1.0])[:, None]
-    return Camera(camera.width * factor, camera.height * factor, K, camera.world_to_camera)

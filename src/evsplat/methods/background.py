@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from evsplat.body import BodyTrack, silhouette
+from evsplat.body import BodyTrack, track_silhouette
 from evsplat.capture import Frame, TrainingCapture
 
 LEAST = 1 / 9
@@ -103,7 +103,7 @@ def apart(capture: TrainingCapture, track: BodyTrack, frame: Frame) -> Float[np.
     times = sorted({*frame.exposure_us, frame.mid_us})
     cameras = capture.cameras_at(frame.camera, times)
     seen = [
-        silhouette(track.vertices(time), track.body.faces, camera).numpy()
+        track_silhouette(track, time, camera).numpy()
         for time, camera in zip(times, cameras, strict=True)
     ]
     body = np.logical_or.reduce(seen)

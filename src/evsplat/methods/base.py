@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor, nn
 
-from evsplat.body import BodyTrack, silhouette
+from evsplat.body import BodyTrack, track_silhouette
 from evsplat.camera import Camera
 from evsplat.capture import Frame, Policy, TrainingCapture
 from evsplat.errors import ConfigError, DataError
@@ -125,7 +125,7 @@ def semantic_bounds(
     @lru_cache(max(1, _KEPT_BOUNDS_BYTES // max(each, 1)))
     def found(frame: Frame) -> PackedBounds:
         camera = capture.camera(frame)
-        mask = silhouette(track.vertices(frame.mid_us), track.body.faces, camera)
+        mask = track_silhouette(track, frame.mid_us, camera)
         band = max(1, round(band_px_at_256 * camera.height / 256))
         return PackedBounds.of(mask.numpy(), band)
 

@@ -1,11 +1,11 @@
 """poses.html: what was found, over the sharpened pictures, and how sure it is."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 from torch import Tensor
@@ -17,9 +17,10 @@ from evsplat.capture import TrainingCapture
 from evsplat.inspection.drawing import DETAIL_PX, draw_outline, fit, to_picture
 from evsplat.landmarks import Landmarks, SharpPicture
 from evsplat.landmarks.track import HARDLY
-from evsplat.pages import Embedder, document, figure, folded, section, spread
+from evsplat.pages import Embedder, document, figure, folded, section
 from evsplat.posing.fit import PoseFit
 from evsplat.posing.rig import LIMBS, Rig
+from evsplat.spread import evenly_spread
 
 _OPEN, _MOST = 8, 48
 """Pictures shown at once, and in all."""
@@ -51,8 +52,8 @@ def poses_page(
     by_time = {picture.time_us: picture for picture in pictures}
     off = dict(zip(landmarks.times_us.tolist(), misfit(fitted), strict=True))
     shown = [index for index, time in enumerate(landmarks.times_us) if int(time) in by_time]
-    chosen = spread(shown, _MOST)
-    first = spread(chosen, _OPEN)
+    chosen = evenly_spread(shown, _MOST)
+    first = evenly_spread(chosen, _OPEN)
     rest = [index for index in chosen if index not in first]
     worst = sorted((i for i in shown if off[int(landmarks.times_us[i])] > _DOUBTFUL_PX),
                    key=lambda i: -off[int(landmarks.times_us[i])])[:_OPEN]  # fmt: skip
@@ -131,8 +132,7 @@ def _drawn(
     K = camera.K.clone()
     K[0, 2] -= left
     K[1, 2] -= top
-    factors = torch.tensor([scale, size[1] / height, 1.0])
-    large = Camera(*size, K * factors[:, None], camera.world_to_camera)
+    large = replace(camera, width=width, height=height, K=K).resized(*size)
     image = to_picture(picture.image[top : top + height, left : left + width], size)
     mask = silhouette(vertices, track.body.faces, large)
     draw_outline(image, mask.numpy(), _OUTLINE)

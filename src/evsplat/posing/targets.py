@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
 from evsplat.body import BodyTrack
-from evsplat.body.silhouette import silhouette
+from evsplat.body.silhouette import track_silhouette
 from evsplat.camera import Camera
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
@@ -221,7 +221,7 @@ def _distances(
     """Pixels to the posed body at each time, and its median height in pixels."""
     found, heights = [], []
     for time_us in times_us:
-        inside = silhouette(track.vertices(time_us), track.body.faces, camera).numpy()
+        inside = track_silhouette(track, time_us, camera).numpy()
         rows = np.flatnonzero(inside.any(1))
         heights.append(rows[-1] - rows[0] + 1 if len(rows) else 0)
         far = np.full(inside.shape, _FAR_PX)

@@ -23,10 +23,10 @@ from evsplat.pages import (
     legend,
     more,
     section,
-    spread,
 )
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import ERROR_FULL_SCALE, css_gradient
+from evsplat.spread import evenly_spread
 
 _WORTH_ENLARGING = 0.8
 """Crops wider than this share of the picture show nothing new."""
@@ -108,9 +108,9 @@ def _held_out_terms(terms: Terms | None) -> str:
 def _chosen_entries(entries: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     """The most blurred frame, then some evenly spread ones, then others, evenly spread."""
     hardest = min(entries, key=lambda entry: _known_psnr(entry, 1e9))
-    first = [hardest, *(e for e in spread(entries, _FRAMES_OPEN - 1) if e is not hardest)]
+    first = [hardest, *(e for e in evenly_spread(entries, _FRAMES_OPEN - 1) if e is not hardest)]
     rest = [entry for entry in entries if entry not in first]
-    return [*first, *spread(rest, max(2, most - len(first)))]
+    return [*first, *evenly_spread(rest, max(2, most - len(first)))]
 
 
 def _known_psnr(entry: dict[str, Any], otherwise: float) -> float:
@@ -161,8 +161,8 @@ class FramePictures:
         """
         if self.human is None:
             return {}
-        height, width = self.pictures[_RENDER].shape[:2]
-        box = self.human.at_least(aspect, height, width)
+        width = self.pictures[_RENDER].shape[1]
+        box = self.human.at_least(aspect, width)
         if box.right - box.left > _WORTH_ENLARGING * width:
             return {}
         return {

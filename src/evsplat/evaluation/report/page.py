@@ -30,10 +30,10 @@ from evsplat.pages import (
     legend,
     more,
     section,
-    spread,
 )
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import css_gradient
+from evsplat.spread import evenly_spread
 
 _PAIRS_OPEN = {"test": 4, "train": 2}
 """Event map pairs shown at once per split; the others are folded."""
@@ -151,10 +151,10 @@ def _event_maps(source: Source) -> str:
     shown = [
         pair
         for split, count in _PAIRS_OPEN.items()
-        for pair in spread([p for p in events["pairs"] if p["split"] == split], count)
+        for pair in evenly_spread([p for p in events["pairs"] if p["split"] == split], count)
     ]
     rest = [pair for pair in events["pairs"] if pair not in shown]
-    others = spread(rest, _PAIRS_MOST - len(shown))
+    others = evenly_spread(rest, _PAIRS_MOST - len(shown))
     scale = (
         "the rendered change of log brightness over the sensor’s contrast threshold"
         if events["threshold_known"]
@@ -211,7 +211,7 @@ def _novel_views(source: Source) -> str:
     for name, values in cameras.items():
         drawn = [entry for entry in values["per_view"] if entry["pictures"]]
         pairs = []
-        for entry in spread(drawn, _NOVEL_SHOWN):
+        for entry in evenly_spread(drawn, _NOVEL_SHOWN):
             render = source.picture(entry["pictures"]["render"])
             view = views[entry["index"]]
             truth = to_bytes(source.capture.shown(source.capture.novel_image(view)))
