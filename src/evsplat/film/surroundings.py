@@ -83,13 +83,10 @@ class Room:
 
     def behind_coarsely(self, camera: Camera, time_us: int) -> Float[Tensor, "H W 3"]:
         """The same, smooth between one pixel in 16 of a large picture: for pictures in a hurry."""
-        K = camera.K.clone()
         width, height = (
             max(size // 4, min(size, _COARSE_PX)) for size in (camera.width, camera.height)
         )
-        K[0] *= width / camera.width
-        K[1] *= height / camera.height
-        picture = self.behind(replace(camera, width=width, height=height, K=K), time_us)
+        picture = self.behind(camera.resized(width, height), time_us)
         size = (camera.height, camera.width)
         enlarged = interpolate(picture.permute(2, 0, 1)[None], size, mode="bilinear")
         return enlarged[0].permute(1, 2, 0)

@@ -75,7 +75,7 @@ class Composition:
     held_out: HeldOut | None = None
     watched: tuple[str, ...] = ()
     """Terms that compare pictures: how their weighted sum falls tells when little more is to come,
-    and a new run that was given no number of steps ends earlier then. None: it never does."""
+    and a new run that was given no number of steps ends earlier then. Without any it never does."""
     recording: Camera | None = None
     """The camera at rest, which sees no depth: the scene stays as far away from it as it starts,
     and goes on beside the recorded picture. None: it moves anywhere, and black is beside it."""
