@@ -127,10 +127,10 @@ def main() -> None:
                 refined = refine(track, seen)
                 seconds = time.process_time() - began
                 before, after = errors(track, capture), errors(refined.track, capture)
-                rows.append((level, before, after, after if refined.disproves else before))
+                rows.append((level, before, after, after if refined.better else before))
                 print(
                     f"{path.name:32} gain {refined.gain:.3f} +- {refined.gain_error:.3f}, "
-                    f"{'wrong' if refined.disproves else 'not told wrong'}, {seconds:.0f} s, "
+                    f"{'better' if refined.better else 'not told better'}, {seconds:.0f} s, "
                     f"root off {told_ratio(refined.track, capture):.2f} and limbs "
                     f"{told_limbs(refined.track, capture):.2f} times what they say:",
                     ", ".join(f"{name} {before[name]:.2f} -> {after[name]:.2f}" for name in before),

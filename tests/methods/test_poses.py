@@ -19,7 +19,7 @@ from evsplat.methods.evsplat_settings import EvsplatConfig
 from evsplat.methods.poses import Poses, prepare_poses
 from evsplat.models.pose_correction import SHARES
 from evsplat.objectives import DeformationPrior
-from evsplat.posing.refine import LEAST_GAIN, Verdict
+from evsplat.posing.refine import Verdict
 from evsplat.training.clock import Clock
 from evsplat.training.trainer import Trainer
 
@@ -162,20 +162,32 @@ def test_what_a_capture_says_of_its_poses_counts_whatever_their_curve(
     assert bool(found.correction.exact) == (source == "exact")
 
 
-@pytest.mark.parametrize("gain", [0.1, 0.5])
+@pytest.mark.parametrize(
+    ("gain", "gain_error", "coarse", "wrong"),
+    [
+        (0.5, 0.02, 0.5, True),
+        (0.12, 0.02, 0.05, True),
+        (0.08, 0.02, 0.08, False),
+        (0.12, 0.02, 0.16, False),
+        (0.5, np.inf, 0.5, False),
+    ],
+)
 def test_poses_that_say_nothing_are_corrected_once_they_are_disproved(
-    gain, tiny_capture, monkeypatch
+    gain, gain_error, coarse, wrong, tiny_capture, monkeypatch
 ):
+    """By what pictures of half the size do not exaggerate (a true jump has 0.12 after 0.16)."""
     path = tiny_capture("silent", frames=20)
     with_errors(path, source=False)
     capture = seen(path)
     keys, joints = load_body_track(capture).poses.shape[:2]
     told = PoseErrors("estimated", np.full((keys, joints), 0.07), np.full((keys, 3), 0.03))
-    monkeypatch.setattr(poses, "judge", lambda *_, **__: Verdict(gain, 0.01, 1.0, told))
+    monkeypatch.setattr(
+        poses, "judge", lambda *_, **__: Verdict(gain, gain_error, 1.0, coarse, told)
+    )
     corrected = noted_corrections(monkeypatch)
     found = prepared(capture).correction
-    assert bool(found.exact) == (gain < LEAST_GAIN)
-    assert [track.errors for track in corrected] == ([] if gain < LEAST_GAIN else [told])
+    assert bool(found.exact) == (not wrong)
+    assert [track.errors for track in corrected] == ([told] if wrong else [])
     if corrected:
         assert float(found.joint_rad.max()) == pytest.approx(0.07)
 
@@ -184,7 +196,7 @@ def test_joints_whose_errors_nobody_told_are_smoothed_by_less(captures, monkeypa
     """The same poses and errors, once said by the capture and once found by pictures."""
     given, said = load_body_track(captures[1]), prepared(seen(captures[1]), refine="never").track
     with_errors(captures[1].path, source=False, pose_std_rad=None, transl_std_m=None)
-    verdict, smoothed = Verdict(0.5, 0.01, 1.0, given.errors), noted_corrections(monkeypatch)
+    verdict, smoothed = Verdict(0.5, 0.01, 1.0, 0.5, given.errors), noted_corrections(monkeypatch)
     monkeypatch.setattr(poses, "judge", lambda *_, **__: verdict)
     prepared(seen(load_capture(captures[1].path)))
     by_joint = [

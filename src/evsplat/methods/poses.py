@@ -107,7 +107,8 @@ def prepare_poses(config: PoseSettings, capture: TrainingCapture, *, fit: bool) 
     found: Gain | None = None
     if fit and exact is not True and not tried:
         found = _corrected(track, capture) if told else _compared(judge, track, capture)
-    decided = exact if exact is not None else found is None or not found.disproves
+    disproved = isinstance(found, Verdict) and found.disproves
+    decided = exact if exact is not None else not disproved
     if exact is not False and decided and fit:
         _refuse_unread(config, capture)
     given = track
