@@ -458,11 +458,18 @@ def test_pictures_that_serve_twice_are_one_warning_with_their_number(tiny_captur
     assert finding.field == "frames[0].sharp"
 
 
-def test_capture_without_events_is_a_warning(tiny_capture: Factory) -> None:
+def test_events_that_are_not_named_are_a_warning_and_a_video_alone_is_none(
+    tiny_capture: Factory, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tiny_capture()
     edit_json(path, "events", value=...)
     assert the_only(path, "warning").field == "events"
+    load_capture(path, warn=False)
+    assert not caplog.messages
     assert load_capture(path).events is None
+    assert [str(the_only(path, "warning"))] == caplog.messages
+    (path / "events.h5").unlink()
+    assert not validate_capture(path)
 
 
 def test_first_error_is_raised_with_the_count_of_the_others(tiny_capture: Factory) -> None:

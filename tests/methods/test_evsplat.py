@@ -1,6 +1,7 @@
 """Method `evsplat` put together: where its contrast thresholds come from."""
 
 import json
+import logging
 
 import h5py
 import numpy as np
@@ -99,7 +100,8 @@ def test_it_trains_on_what_is_there_and_says_so(tiny_capture, tmp_path, caplog, 
         metadata["events"] = None
         (path / "capture.json").write_text(json.dumps(metadata))
     run = tmp_path / "run"
-    train(path, method="evsplat", out=run, iterations=4, overrides=small("evsplat"))
+    with caplog.at_level(logging.INFO):
+        train(path, method="evsplat", out=run, iterations=4, overrides=small("evsplat"))
     lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert ("event" in lines[-1]["terms"]) == (missing == "polarity")
     said = {"events": "has no events", "polarity": "events have no polarity"}[missing]

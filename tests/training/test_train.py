@@ -105,6 +105,9 @@ def test_one_frame_trains_in_every_step(tmp_path: Path, caplog: pytest.LogCaptur
         )
     assert not [message for message in caplog.messages if "not finite" in message]
     assert all(bool(one.isfinite().all()) for one in final_tensors(tmp_path / "run").values())
+    load_run(tmp_path / "run")
+    told = [message for message in caplog.messages if "no test frame" in message]
+    assert len(told) == 1, "reading the run says it no more"
 
 
 @pytest.mark.parametrize(

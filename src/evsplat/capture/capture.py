@@ -36,11 +36,11 @@ class Capture(CaptureReader):
         return TrainingCapture(self, policy, masker)
 
 
-def load_capture(path: Path | str, *, needs_body: bool = True) -> Capture:
+def load_capture(path: Path | str, *, needs_body: bool = True, warn: bool = True) -> Capture:
     """Open a capture after the quick checks (descriptions, headers, poses; not every pixel).
 
-    Raises `DataError` with the first error found; warnings are logged, that there is no body only
-    if it ``needs_body``.
+    Raises `DataError` with the first error found; warnings are logged where it shall ``warn``, that
+    there is no body only if it ``needs_body``.
     """
     metadata, findings = check_capture(Path(path), deep=False)
     errors = [finding for finding in findings if finding.severity == "error"]
@@ -52,7 +52,7 @@ def load_capture(path: Path | str, *, needs_body: bool = True) -> Capture:
             else ""
         )
         raise DataError(f"{errors[0]}{more}")
-    for finding in findings:
+    for finding in findings if warn else ():
         if needs_body or finding.field != "body":
             logger.warning("%s", finding)
     return Capture(metadata)

@@ -30,6 +30,7 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
     """Layout, clock and sensor size; every event if ``deep``, and of short recordings always."""
     entry = metadata.events
     if entry is None:
+        _check_unnamed(metadata, findings)
         return
     _check_sensor(metadata, entry, findings)
     if not os.path.isfile(entry.file):
@@ -50,6 +51,18 @@ def check_events(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
     except BROKEN as error:
         found = f"a file that HDF5 cannot read ({reason(error)})"
         findings.error(entry.file, "", found, "a whole HDF5 file", _REPAIR)
+
+
+def _check_unnamed(metadata: Metadata, findings: Findings) -> None:
+    """A video alone is a capture as well, unless its events were forgotten."""
+    if os.path.isfile(metadata.path / "events.h5"):
+        findings.warning(
+            metadata.path / "capture.json",
+            "events",
+            "no such entry, though events.h5 lies beside",
+            "the events that were recorded",
+            "Name the file and its sensor's size there, or remove it if it is of something else.",
+        )
 
 
 def _check_sensor(metadata: Metadata, entry: EventsEntry, findings: Findings) -> None:

@@ -122,13 +122,6 @@ def _body_model(body: Fields) -> str:
 def _events(top: Fields) -> EventsEntry | None:
     value = top.value.get("events")
     if value is None:
-        top.findings.warning(
-            top.file,
-            "events",
-            "no events",
-            "the event recording",
-            "Method 'paper' needs event_weight=0 then; all others do without.",
-        )
         return None
     keys = ("file", "width", "height", "contrast_threshold", "simulated", "clock_offset_us")
     entry = top.inner("events", value, keys)

@@ -109,13 +109,14 @@ def build(
         _fit_colours(config, capture, model, background)
     objectives = _of_pictures(config, capture, poses.track, generator) + _priors(model)
     windows = None
-    if config.event_weight != 0.0 and capture.events is None:
-        logger.warning(
+    asks_events = config.event_weight != 0.0 and capture.events is not None
+    if fit and config.event_weight != 0.0 and not asks_events:
+        logger.info(
             "%s: has no events; the blur of the frames alone tells what moved.", capture.path
         )
-    elif config.event_weight != 0.0 and config.event_term == "paper":
+    if asks_events and config.event_term == "paper":
         objectives.append(EventChange(capture, start=config.event_start))
-    elif config.event_weight != 0.0:
+    elif asks_events:
         windows = event_windows(config, capture, model, generator, device=device, purpose=purpose)
         objectives.append(windows)
     return Composition(

@@ -263,7 +263,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
             f"{place}: not found, expected the capture that {folder.path} was trained on; put it "
             f"back, or write its new place under 'capture' in {folder.facts}."
         )
-    capture = load_capture(place)
+    capture = load_capture(place, warn=False)  # its training has
     if config.policy.use == "everything":
         capture = capture.with_nothing_held_out()
     shown = seen_by_training(capture, config)
