@@ -4,9 +4,7 @@ from evsplat.body.body import Body, bounding_box, skin, skin_with_linear
 from evsplat.body.make import default_body, make_body
 from evsplat.body.pose_errors import POSE_SOURCES, PoseErrors, PoseSource
 from evsplat.body.retarget import SkeletonMotion, retarget
-from evsplat.body.rotations import (
-    axis_angle_to_matrix,
-)
+from evsplat.body.rotations import axis_angle_to_matrix
 from evsplat.body.silhouette import body_box, silhouette, track_silhouette
 from evsplat.body.surface import SurfaceSamples
 from evsplat.body.track import BodyTrack, nearest_axis, up_axis

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
+from scipy.ndimage import binary_closing
 
 from evsplat.body import BodyTrack, skin
 from evsplat.body.silhouette import NEAR
@@ -76,7 +77,7 @@ class Figure:
             place = np.floor(pixels * scale) + wide
             column, row = place[((place >= 0) & (place < (width, height))).all(1)].astype(int).T
             maps[k, row, column] = True
-        return _closed(maps)
+        return binary_closing(maps, np.ones((1, 3, 3)))[:, 1:-1, 1:-1]
 
     def _projected(
         self, times_us: Sequence[int], cameras: Sequence[Camera]
@@ -89,15 +90,6 @@ class Figure:
             place, depth = camera.project(points)
             pixels.append(place[depth > NEAR].numpy())
         return pixels
-
-
-def _closed(maps: Bool[np.ndarray, "N H W"]) -> Bool[np.ndarray, "N H-2 W-2"]:
-    """Maps grown by a pixel to all eight sides and shrunk again; they lose a pixel on each side."""
-    wide = np.pad(maps, ((0, 0), (1, 1), (1, 1)))
-    wide = wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:]
-    wide = wide[..., :-2] | wide[..., 1:-1] | wide[..., 2:]
-    wide = wide[:, :-2] & wide[:, 1:-1] & wide[:, 2:]
-    return wide[..., :-2] & wide[..., 1:-1] & wide[..., 2:]
 
 
 def grown(maps: Bool[np.ndarray, "N H W"]) -> Bool[np.ndarray, "N H W"]:
