@@ -106,6 +106,15 @@ def test_interrupt_leaves_nothing_new_and_keeps_the_old(tmp_path, kind):
     assert _content(tmp_path) == before
 
 
+@pytest.mark.parametrize("number", [1, 40])
+def test_a_picture_that_cannot_be_encoded_is_an_error_that_leaves_nothing(tmp_path, number):
+    pictures: list[np.ndarray] = list(_flat_pictures(50, 16, 16))
+    pictures[number] = pictures[number].astype(np.float32)
+    with pytest.raises(ValueError):
+        write_video(tmp_path / "a.mp4", pictures, fps=25)
+    assert not list(tmp_path.iterdir())
+
+
 def _content(folder: Path) -> dict[str, bytes]:
     files = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}

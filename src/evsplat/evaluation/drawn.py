@@ -1,7 +1,10 @@
 """Pictures as a reconstruction draws them, for whoever measures them."""
 
+from collections.abc import Callable
+
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from evsplat.capture import Camera, Capture, Frame
@@ -10,6 +13,9 @@ from evsplat.pictures.files import ImageCache
 
 _KEPT_BYTES = 64 << 20
 """Of drawn frames: a frame is measured, and drawn in up to two pairs of event maps."""
+
+KeepPicture = Callable[[str, UInt8[np.ndarray, "H W 3"]], None]
+"""Writes a picture of the evaluation, by its path inside the run folder."""
 
 
 class DrawnFrames:

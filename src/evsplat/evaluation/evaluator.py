@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,7 +16,7 @@ from tqdm import tqdm
 from evsplat.capture import Capture, Frame, Policy, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.evaluation.chroma import chroma_psnr
-from evsplat.evaluation.drawn import DrawnFrames, drawn, drawn_frame
+from evsplat.evaluation.drawn import DrawnFrames, KeepPicture, drawn, drawn_frame
 from evsplat.evaluation.event_maps import evaluate_event_maps
 from evsplat.evaluation.protocols import (
     METRICS,
@@ -31,6 +32,7 @@ from evsplat.evaluation.protocols import (
 )
 from evsplat.evaluation.regions import Absent, HumanRegions
 from evsplat.evaluation.tables import missing_networks
+from evsplat.meanwhile import meanwhile
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.methods.trivial import TRIVIAL, OnMedianBackground
 from evsplat.names import file_stem
@@ -94,38 +96,43 @@ def evaluate(
     protocols = (STANDARD, *(protocol for protocol in protocols if protocol is not STANDARD))
     human_regions = HumanRegions(capture)
     drawn_frames = DrawnFrames(capture, reconstruction)
-    measured = _MeasuredFrames(
-        capture,
-        reconstruction,
-        drawn_frames,
-        protocols,
-        networks,
-        human_regions,
-        out_dir,
-        split=split,
-        only=test_frames_only,
-        human_only=human_only,
-    )
-    for frame in tqdm(frames, desc=f"{split} frames", unit="frame", leave=False, disable=None):
-        measured.measure(frame)
-    result = {
-        "capture": capture.name,
-        "method": reconstruction.name,
-        "split": split,
-        "frames": {"train": len(capture.train_frames), "test": len(capture.test_frames)},
-        **measured.results(),
-    }
-    reasons: dict[str, str] = result["reasons"]
-    if not test_frames_only:
-        result["novel_views"] = _novel_views(
-            capture, beside or reconstruction, networks, human_regions, out_dir, reasons, split
+    with meanwhile() as do:
+
+        def keep(path: str, picture: np.ndarray) -> None:
+            do(save_png, out_dir / path, picture)
+
+        measured = _MeasuredFrames(
+            capture,
+            reconstruction,
+            drawn_frames,
+            protocols,
+            networks,
+            human_regions,
+            keep,
+            split=split,
+            only=test_frames_only,
+            human_only=human_only,
         )
-        events: dict[str, Any] | Absent = Absent("they are measured with the test frames")
-        if split == "test":
-            events = evaluate_event_maps(capture, drawn_frames, out_dir=out_dir)
-        result["events"] = None if isinstance(events, Absent) else events
-        if isinstance(events, Absent):
-            reasons["events"] = events.reason
+        for frame in tqdm(frames, desc=f"{split} frames", unit="frame", leave=False, disable=None):
+            measured.measure(frame)
+        result = {
+            "capture": capture.name,
+            "method": reconstruction.name,
+            "split": split,
+            "frames": {"train": len(capture.train_frames), "test": len(capture.test_frames)},
+            **measured.results(),
+        }
+        reasons: dict[str, str] = result["reasons"]
+        if not test_frames_only:
+            result["novel_views"] = _novel_views(
+                capture, beside or reconstruction, networks, human_regions, keep, reasons, split
+            )
+            events: dict[str, Any] | Absent = Absent("they are measured with the test frames")
+            if split == "test":
+                events = evaluate_event_maps(capture, drawn_frames, keep)
+            result["events"] = None if isinstance(events, Absent) else events
+            if isinstance(events, Absent):
+                reasons["events"] = events.reason
     remark = measured.human_remark()
     if remark:
         logger.warning("%s", remark)
@@ -166,7 +173,7 @@ class _MeasuredFrames:
     """`STANDARD` comes first; the report shows its figures of every frame and row."""
     networks: Networks
     human_regions: HumanRegions
-    out_dir: Path
+    keep: KeepPicture
     split: Split
     only: bool
     """Measure the reconstruction alone, and no other rows."""
@@ -304,9 +311,10 @@ class _MeasuredFrames:
         pictures = {"render": to_bytes(shown)}
         if truth is not None:
             pictures["error"] = error_map(shown, self.capture.shown(truth))
+        paths = {kind: f"pictures/{stem}_{kind}.png" for kind in pictures}
         for kind, picture in pictures.items():
-            save_png(self.out_dir / "pictures" / f"{stem}_{kind}.png", picture)
-        return {kind: f"pictures/{stem}_{kind}.png" for kind in pictures}
+            self.keep(paths[kind], picture)
+        return paths
 
 
 def _compare(reference: Truth | None, picture: Tensor | Absent) -> Measured:
@@ -320,7 +328,7 @@ def _novel_views(
     reconstruction: Reconstruction,
     networks: Networks,
     human_regions: HumanRegions,
-    out_dir: Path,
+    keep: KeepPicture,
     reasons: dict[str, str],
     split: Split,
 ) -> dict[str, Any]:
@@ -354,7 +362,7 @@ def _novel_views(
         }
         if ours is not None:
             path = f"pictures/{file_stem('novel', view.camera, f'{view.index:04d}')}_render.png"
-            save_png(out_dir / path, to_bytes(capture.shown(ours)))
+            keep(path, to_bytes(capture.shown(ours)))
             entry["pictures"] = {"render": path}
         per_view.setdefault(view.camera, []).append(entry)
     result = {}

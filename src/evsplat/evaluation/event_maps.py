@@ -1,25 +1,23 @@
 """The recorded event map between two frames beside the one that the reconstruction explains."""
 
-from pathlib import Path
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Capture, Frame
-from evsplat.evaluation.drawn import DrawnFrames
+from evsplat.evaluation.drawn import DrawnFrames, KeepPicture
 from evsplat.evaluation.regions import Absent
 from evsplat.events import count_map
 from evsplat.names import file_stem
 from evsplat.pictures import signed_map
-from evsplat.pictures.files import save_png
 from evsplat.pictures.light import log_brightness_change
 
 _TRAIN_PAIRS_SHOWN = 3
 
 
 def evaluate_event_maps(
-    capture: Capture, frames: DrawnFrames, *, out_dir: Path
+    capture: Capture, frames: DrawnFrames, keep: KeepPicture
 ) -> dict[str, Any] | Absent:
     """Similarity and pictures of frame pairs: one per test frame and a few training pairs.
 
@@ -39,8 +37,8 @@ def evaluate_event_maps(
         scale = max(1.0, float(busy.quantile(0.95))) if len(busy) else 1.0
         paths = {}
         for kind, values in (("given", given), ("rendered", rendered)):
-            save_png(out_dir / "pictures" / f"{stem}_{kind}.png", signed_map(values, scale))
             paths[kind] = f"pictures/{stem}_{kind}.png"
+            keep(paths[kind], signed_map(values, scale))
         norms = given.norm() * rendered.norm()
         pairs.append(
             {

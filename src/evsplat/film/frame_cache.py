@@ -2,9 +2,7 @@
 
 import hashlib
 import logging
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice
 from pathlib import Path
@@ -15,10 +13,10 @@ from PIL import Image
 from tqdm import tqdm
 
 from evsplat.camera import Camera
-from evsplat.disk import uninterrupted
 from evsplat.errors import DataError
 from evsplat.files import atomic_path, make_folder, remove_folder, write_json
 from evsplat.film.looks import Exposure, Look
+from evsplat.meanwhile import meanwhile
 from evsplat.names import checked_name
 from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.untrusted.pictures import read_picture
@@ -104,23 +102,18 @@ class FrameCache:
                     desc="render",
                     dynamic_ncols=True,
                 ) as progress,
-                _writer() as writer,
+                meanwhile() as do,
             ):
-                written: list[Future[None]] = []
                 for batch in _of_one_camera(frames):
                     if not any(frame in missing for frame in batch):
                         continue
                     # All of them: one drawn beside fewer others differs in its last bits.
                     times = [frame.time_us for frame in batch]
                     exposures = look.expose(reconstruction, batch[0].camera, times)
-                    _finish(written)
-                    written = [
-                        writer.submit(self._write, frame, exposure)
-                        for frame, exposure in zip(batch, exposures, strict=True)
-                        if frame in missing
-                    ]
-                    progress.update(len(written))
-                _finish(written)
+                    for frame, exposure in zip(batch, exposures, strict=True):
+                        if frame in missing:
+                            do(self._write, frame, exposure)
+                            progress.update()
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"Stopped; {len(self)} of {len(frames)} pictures are kept in {self.path}. "
@@ -134,23 +127,6 @@ class FrameCache:
         if exposure.nbytes <= self._left_bytes:
             self._left_bytes -= exposure.nbytes
             self._drawn[file] = exposure
-
-
-@contextmanager
-def _writer() -> Iterator[ThreadPoolExecutor]:
-    """A thread that writes; what it was given is written whole, whoever stops it, once or twice."""
-    writer = ThreadPoolExecutor(1, thread_name_prefix="frame-cache")
-    try:
-        yield writer
-    finally:
-        with uninterrupted():
-            writer.shutdown()
-
-
-def _finish(written: Iterable[Future[None]]) -> None:
-    """Wait until all is written; the first error of it."""
-    for one in written:
-        one.result()
 
 
 def film_digest(frames: Iterable[FilmFrame], *rest: object) -> str:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from evsplat.errors import BackendError, ConfigError, DataError
 from evsplat.files import atomic_path, new_folder
+from evsplat.meanwhile import meanwhile
 from evsplat.names import checked_name
 
 _BT709 = 1
@@ -66,36 +67,49 @@ def _encode(
     enlarged: int = 1,
     **options: str,
 ) -> int:
-    """Encode RGB or RGBA pictures into an open container and close it; gives their number."""
+    """Encode RGB or RGBA pictures into an open container and close it; gives their number.
+
+    They are encoded while the next ones are made, so a picture must not be written to again.
+    """
     import av
+    from av.video.reformatter import VideoReformatter
 
     count, stream = 0, None
-    with container:
-        for picture in pictures:
-            opaque = picture.shape[2] == 3
-            if stream is None:
-                stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
-                stream.height, stream.width = (enlarged * side for side in picture.shape[:2])
-                stream.pix_fmt = "yuv420p" if opaque else "yuva420p"
-                stream.options = options
-                if colours == "ITU709":
-                    context = stream.codec_context
-                    context.colorspace = context.color_primaries = context.color_trc = _BT709
-                    context.color_range = _LIMITED_RANGE
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24" if opaque else "rgba")
-            # Enlarged when each pixel has its own Cb and Cr: a fraction of the values to convert.
-            frame = frame.reformat(
-                format=stream.pix_fmt if enlarged == 1 else "yuv444p",
-                dst_colorspace=colours,
-                dst_color_range=_LIMITED_RANGE,
+    # Each keeps what it prepared for the pictures before, which takes longer than a small picture.
+    convert, enlarge = VideoReformatter(), VideoReformatter()
+
+    def encode(picture: UInt8[np.ndarray, "H W C"], number: int) -> None:
+        assert stream is not None
+        kind = "rgb24" if picture.shape[2] == 3 else "rgba"
+        frame = av.VideoFrame.from_ndarray(picture, format=kind)
+        # Enlarged when each pixel has its own Cb and Cr: a fraction of the values to convert.
+        frame = convert.reformat(
+            frame,
+            format=stream.pix_fmt if enlarged == 1 else "yuv444p",
+            dst_colorspace=colours,
+            dst_color_range=_LIMITED_RANGE,
+        )
+        if enlarged > 1:
+            frame = enlarge.reformat(
+                frame, stream.width, stream.height, stream.pix_fmt, interpolation="POINT"
             )
-            if enlarged > 1:
-                frame = frame.reformat(
-                    stream.width, stream.height, stream.pix_fmt, interpolation="POINT"
-                )
-            frame.pts = count
-            container.mux(stream.encode(frame))
-            count += 1
+        frame.pts = number
+        container.mux(stream.encode(frame))
+
+    with container:
+        with meanwhile() as do:
+            for picture in pictures:
+                if stream is None:
+                    stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
+                    stream.height, stream.width = (enlarged * side for side in picture.shape[:2])
+                    stream.pix_fmt = "yuv420p" if picture.shape[2] == 3 else "yuva420p"
+                    stream.options = options
+                    if colours == "ITU709":
+                        context = stream.codec_context
+                        context.colorspace = context.color_primaries = context.color_trc = _BT709
+                        context.color_range = _LIMITED_RANGE
+                do(encode, picture, count)
+                count += 1
         if stream is not None:
             container.mux(stream.encode())
     return count
