@@ -126,6 +126,8 @@ struct GaussianGrads {
     KERNEL(void, mlp_backward, (const MlpShape&, const MlpBackward&, size_t block, const MlpSums&, float* scratch)) \
     /* Sums over a band, and the gradient of the similarity. */ \
     KERNEL(SsimSums, ssim_band, (const SsimBand&)) \
+    /* Rows [begin, end) of a plane's windows; `line` is a padded row. */ \
+    KERNEL(void, window_means, (const WindowMeans&, size_t plane, int begin, int end, double* line)) \
     KERNEL(void, log_brightness, (const LogBrightness&, size_t begin, size_t end)) \
     KERNEL(void, power, (const Power&, size_t begin, size_t end)) \
     KERNEL(void, power_mean, (const PowerMean&, size_t begin, size_t end)) /* of all planes' values */ \

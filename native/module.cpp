@@ -256,6 +256,19 @@ std::pair<double, double> ssim(In image, In reference, In window, float c1, floa
     return {sums.similarity, sums.difference};
 }
 
+// Means in the windows of (n, H, W) planes with `pad` zeros around them.
+void ssim_window_means(Array<const double> planes, Column<const double> window, int pad, Array<double> means, int threads) {
+    require(planes.ndim() == 3 && means.ndim() == 3 && means.shape(0) == planes.shape(0), "the planes");
+    require(planes.shape(1) < 1 << 20 && planes.shape(2) < 1 << 20, "the planes");
+    require(window.size() > 0 && window.size() < 1 << 10 && pad >= 0 && size_t(pad) < window.size(), "the window");
+    const WindowMeans job = {int(planes.shape(1)), int(planes.shape(2)), int(window.size()), pad, planes.data(),
+                             window.data(), means.data()};
+    require(job.rows() > 0 && job.columns() > 0, "the window");
+    require(means.shape(1) == size_t(job.rows()) && means.shape(2) == size_t(job.columns()), "the means");
+    nb::gil_scoped_release release;
+    window_means(job, planes.shape(0), threads);
+}
+
 void picture_add_sign(In image, In reference, float by_difference, float scale, Out grad, int threads) {
     require(image.size() == reference.size() && grad.size() == image.size(), "the pictures");
     nb::gil_scoped_release release;
@@ -404,6 +417,8 @@ NB_MODULE(_native, m) {
     m.def("ssim", &ssim, nb::arg("image"), nb::arg("reference"), nb::arg("window"), nb::arg("c1"), nb::arg("c2"),
           nb::arg("grad").none(), nb::arg("threads"),
           "Sums of the structural similarity, whose gradient it writes, and of absolute differences.");
+    m.def("window_means", &ssim_window_means, nb::arg("planes"), nb::arg("window"), nb::arg("pad"), nb::arg("means"),
+          nb::arg("threads"), "Weighted means in the windows of planes with zeros around them, float64.");
     m.def("add_sign", &picture_add_sign, nb::arg("image"), nb::arg("reference"), nb::arg("by_difference"),
           nb::arg("scale"), nb::arg("grad"), nb::arg("threads"),
           "grad = by_difference * sign(image - reference) + scale * grad.");

@@ -27,4 +27,15 @@ SsimSums ssim_planes(size_t planes, int height, int width, const float* image, c
     return total;
 }
 
+void window_means(const WindowMeans& job, size_t planes, int threads) {
+    constexpr int kBand = 64;
+    const size_t bands = (job.rows() + kBand - 1) / kBand;
+    const auto kernel = select_kernels().window_means;
+    parallel_for(threads, planes * bands, [&](size_t i) {
+        const int begin = int(i % bands) * kBand;
+        Buffer<double> line(job.width + 2 * job.pad);
+        kernel(job, i / bands, begin, std::min(job.rows(), begin + kBand), line.data());
+    });
+}
+
 }  // namespace evsplat

@@ -178,5 +178,29 @@ SsimSums ssim_band(const SsimBand& job) {
     return total;
 }
 
+void window_means(const WindowMeans& job, size_t plane, int begin, int end, double* line) {
+    const int width = job.width, columns = job.columns();
+    const double* from = job.planes + plane * job.height * width;
+    double* to = job.means + (plane * job.rows() + begin) * columns;
+    for (int i = 0; i < width + 2 * job.pad; ++i) line[i] = 0.0;
+    double* const inner = line + job.pad;
+    for (int q = begin; q < end; ++q, to += columns) {
+        for (int i = 0; i < width; ++i) inner[i] = 0.0;
+        for (int k = 0; k < job.size; ++k) {
+            const int row = q + k - job.pad;
+            if (row < 0 || row >= job.height) continue;
+            const double weight = job.window[k], *values = from + size_t(row) * width;
+#pragma GCC ivdep
+            for (int i = 0; i < width; ++i) inner[i] += weight * values[i];
+        }
+        for (int i = 0; i < columns; ++i) to[i] = 0.0;
+        for (int k = 0; k < job.size; ++k) {
+            const double weight = job.window[k], *values = line + k;
+#pragma GCC ivdep
+            for (int i = 0; i < columns; ++i) to[i] += weight * values[i];
+        }
+    }
+}
+
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

@@ -156,6 +156,43 @@ def test_compiled_ssim_and_its_gradient_equal_plain_torch_in_float64(
     assert (gradient - truth).norm() < 1e-4 * truth.norm()
 
 
+@pytest.mark.parametrize("pad", [0, 5])
+@pytest.mark.parametrize("shape", [(1, 11, 11), (3, 12, 40), (2, 140, 33), (4, 64, 75)])
+@pytest.mark.parametrize("level", ["avx512", "avx2", "portable"])
+def test_compiled_means_in_windows_are_those_of_numpy(shape, pad, level, monkeypatch):
+    if level not in _native.levels():
+        pytest.skip(f"this CPU has no {level}")
+    monkeypatch.setenv("EVSPLAT_ISA", level)
+    rng = np.random.default_rng(sum(shape) + pad)
+    planes, weights = rng.normal(size=shape), rng.random(11)  # no symmetry that hides a mistake
+    around = np.pad(planes, ((0, 0), (pad, pad), (pad, pad)))
+    windows = np.lib.stride_tricks.sliding_window_view(around, (11, 11), axis=(1, 2))
+    expected = np.einsum("cyxij,i,j->cyx", windows, weights, weights)
+    means = np.full(expected.shape, np.nan)
+    _native.window_means(planes, weights, pad, means, 2)
+    np.testing.assert_allclose(means, expected, rtol=0, atol=1e-13)
+
+
+def test_means_in_windows_refuse_shapes_that_do_not_fit():
+    planes, weights = np.zeros((2, 20, 30)), np.full(11, 1 / 11)
+    for shape, pad in [((2, 10, 19), 0), ((1, 10, 20), 0), ((2, 10, 20), 5), ((2, 10, 20), 11)]:
+        with pytest.raises(ValueError, match="bad shape"):
+            _native.window_means(planes, weights, pad, np.zeros(shape), 1)
+    with pytest.raises(ValueError, match="bad shape of the window"):
+        _native.window_means(planes[:, :9], weights, 0, np.zeros((2, 1, 20)), 1)
+
+
+@pytest.mark.parametrize("settings", [GAUSSIAN_SSIM, SCIKIT_DEFAULT_SSIM, ZERO_PADDED_SSIM])
+def test_compiled_means_leave_the_map_as_plain_torch_has_it(settings, monkeypatch):
+    first, second = (torch.from_numpy(picture) for picture in random_pair(4, 70, 45))
+    compiled = ssim_map(second, first, settings)
+    monkeypatch.setattr("evsplat.similarity.psnr_ssim.native", None)
+    plain = ssim_map(second, first, settings)
+    # Not bit for bit on every CPU: torch fuses products and sums where it finds AVX2.
+    torch.testing.assert_close(compiled, plain, rtol=0, atol=1e-12)
+    assert compiled.is_contiguous() and plain.is_contiguous()
+
+
 def test_compiled_ssim_reads_planar_and_interleaved_pictures_alike():
     generator = torch.Generator().manual_seed(0)
     planar = torch.rand(3, 30, 20, generator=generator).permute(1, 2, 0)

@@ -100,24 +100,40 @@ class SsimReference:
             raise ValueError(f"the window's side must be odd, not {settings.size}")
         if settings.padding == "valid" and min(image.shape[:2]) < settings.size:
             raise ValueError(f"the {settings.size}-pixel window is larger than the image")
-        x, y = image.movedim(-1, 0), self.picture.movedim(-1, 0)
+        parts = zip(self._parts(image), self._parts(self.picture), self._moments, strict=True)
+        return torch.cat([self._similarity(*part) for part in parts])
+
+    def _similarity(
+        self,
+        x: Float[Tensor, "c H W"],
+        y: Float[Tensor, "c H W"],
+        moments: tuple[Float[Tensor, "c h w"], ...],
+    ) -> Float[Tensor, "c h w"]:
+        """Of some planes, and the moments of those of the picture."""
         mean_x, mean_xx, mean_xy = self._means(x, x * x, x * y)
-        mean_y, square_y, variance_y = self._moments
+        mean_y, square_y, variance_y = moments
         square_x = mean_x**2
         variance_x = self._unbiased(mean_xx - square_x)
         covariance = self._unbiased(mean_xy - mean_x * mean_y)
-        c1, c2 = settings.stabilisers
+        c1, c2 = self.settings.stabilisers
         luminance = (2 * mean_x * mean_y + c1) / (square_x + square_y + c1)
         structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
         return luminance * structure
 
     @cached_property
-    def _moments(self) -> tuple[Float[Tensor, "C h w"], ...]:
-        """The picture's mean, its square, and the picture's variance in each window."""
-        y = self.picture.movedim(-1, 0)
-        mean, mean_yy = self._means(y, y * y)
-        square = mean**2
-        return mean, square, self._unbiased(mean_yy - square)
+    def _moments(self) -> list[tuple[Float[Tensor, "c h w"], ...]]:
+        """Of each part: the mean, its square, and the variance in each window."""
+        found: list[tuple[Tensor, ...]] = []
+        for y in self._parts(self.picture):
+            mean, mean_yy = self._means(y, y * y)
+            square = mean**2
+            found.append((mean, square, self._unbiased(mean_yy - square)))
+        return found
+
+    def _parts(self, picture: Float[Tensor, "H W C"]) -> tuple[Float[Tensor, "c H W"], ...]:
+        """Planes to take together: one, which a cache holds; on a device all, in few operations."""
+        planes = picture.movedim(-1, 0)
+        return planes.split(1 if planes.device.type == "cpu" else len(planes))
 
     def _unbiased(self, moments: Float[Tensor, "C h w"]) -> Float[Tensor, "C h w"]:
         """Of a sample where the settings ask for it."""
@@ -127,6 +143,8 @@ class SsimReference:
     def _means(self, *values: Float[Tensor, "C H W"]) -> tuple[Float[Tensor, "C h w"], ...]:
         """Weighted means in each window."""
         pad = self.settings.size // 2 if self.settings.padding == "zero" else 0
+        if values[0].device.type == "cpu":
+            return tuple(_smooth(planes, self.settings, pad) for planes in values)
         return _smooth(torch.cat(values), self.settings, pad).split(len(values[0]))
 
 
@@ -138,8 +156,21 @@ def _smooth(planes: Float[Tensor, "C H W"], settings: Ssim, pad: int) -> Float[T
         down = weights.expand(len(planes), 1, -1)[..., None]
         smooth = F.conv2d(planes[None], down, padding=(pad, 0), groups=len(planes))
         return F.conv2d(smooth, down.mT, padding=(0, pad), groups=len(planes))[0]
+    if native is not None and planes.dtype == torch.float64 and not planes.requires_grad:
+        return _native_means(planes, settings, pad)
     # Shifted sums: torch's convolution is many times slower in float64. A cache holds a plane.
     return torch.cat([_shifted_sums(plane, settings, pad) for plane in planes.split(1)])
+
+
+def _native_means(
+    planes: Float[Tensor, "C H W"], settings: Ssim, pad: int
+) -> Float[Tensor, "C h w"]:
+    """As `_shifted_sums` of each plane, in the same order."""
+    rows, columns = (side + 2 * pad - settings.size + 1 for side in planes.shape[1:])
+    means = planes.new_empty(len(planes), rows, columns)
+    window = constant(_window(settings), planes)
+    native.window_means(planes.contiguous(), window, pad, means, torch.get_num_threads())
+    return means
 
 
 def _shifted_sums(
