@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from evsplat.calibration import (
+    FramePair,
     Lost,
     answered_share,
     estimate_disagreement,
     find_lost,
     pauses,
+    unrecorded_spans,
     untold_spans,
 )
 from evsplat.events import ALWAYS, EventStore, EventStream, Span, write_events
@@ -167,6 +169,50 @@ def test_no_gap_is_told_where_nothing_moves_or_nothing_was_recorded() -> None:
     assert find_lost(still, recording.events.take(slice(0, 0))) == Lost()
     late = [replace(pair, recorded_us=(400_000, 900_000)) for pair in recording.pairs]
     assert find_lost(late, _without(recording, 0, 400_000)) == Lost()
+
+
+@pytest.mark.parametrize("backwards", [False, True], ids=["early", "late"])
+@pytest.mark.parametrize("draw", range(2))
+def test_a_recorder_that_ends_early_or_begins_late_is_told_from_who_stands_still(
+    tmp_path: Path, draw: int, backwards: bool
+) -> None:
+    """Late is early with time running backwards: events change sign, pairs their frames."""
+    rng = np.random.default_rng()
+    seed, frames, exposure_us = rng.integers(10_000), 20, int(rng.integers(500, 35_000))
+    plus, minus = rng.uniform(0.1, 0.35, 2)
+    end = frames * 40_000
+
+    def found(recording: Recording, name: str) -> tuple[list[Span], list[FramePair], EventStore]:
+        pairs, events = recording.pairs, recording.events
+        if backwards:
+            pairs = [_backwards(pair, end) for pair in pairs[::-1]]
+            t, p = end - events.t[::-1], -events.p[::-1]
+            events = EventStream(t, events.x[::-1], events.y[::-1], p)
+        store = _stored(events, tmp_path / f"{name}.h5", [ALWAYS])
+        return unrecorded_spans(pairs, store), pairs, store
+
+    def recorded(moving_frames: int) -> Recording:
+        return record(
+            seed, plus=plus, minus=minus, exposure_us=exposure_us, frames=frames,
+            moving_frames=moving_frames, frame_noise=rng.choice([0.0, 0.01]),
+        )  # fmt: skip
+
+    for still in range(4):
+        assert found(recorded(frames - still), f"still{still}")[0] == []
+    whole = recorded(frames)
+    last_mid = sum(whole.pairs[-1].after_us) // 2
+    short = _without(whole, last_mid - int(rng.uniform(1, 2) * 40_000), end)
+    spans, pairs, store = found(Recording(whole.pairs, short), "short")
+    first, last = store.time_range_us
+    expected = sum(pairs[0].before_us) // 2 - 1, first
+    if not backwards:
+        expected = last, sum(pairs[-1].after_us) // 2 + 1
+    assert spans == [expected]
+
+
+def _backwards(pair: FramePair, end_us: int) -> FramePair:
+    before, after = ((end_us - b, end_us - a) for a, b in (pair.after_us, pair.before_us))
+    return FramePair(before, after, -pair.change, pair.usable, ALWAYS)
 
 
 def test_events_that_lie_in_other_pixels_are_told_from_lost_ones() -> None:

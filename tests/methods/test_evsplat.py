@@ -152,6 +152,21 @@ def test_a_sensor_that_lost_its_events_for_a_while_says_nothing_of_that_time(
     assert start == t[t < 120_000][-1] + 1 and end == t[t > 220_000][0]
 
 
+def test_of_a_recorder_that_began_a_frame_late_nothing_is_asked_before(tiny_capture):
+    path = tiny_capture(frames=12, width=96, height=72)
+    assert event_windows(path, "train").untold_us == ()
+    frames = load_capture(path).frames
+    with h5py.File(path / "events.h5") as file:
+        t, *columns = (file[f"events/{key}"][:] for key in "txyp")
+    kept = t >= (frames[1].mid_us + frames[2].mid_us) // 2
+    write_event_file(path / "events.h5", t[kept], *(column[kept] for column in columns))
+    windows = event_windows(path, "train")
+    ((start, end),) = windows.untold_us
+    assert start < frames[0].mid_us and end == t[kept][0]
+    assert windows.times(frames[0], 1e9) == windows.times(frames[1], 1e9) == ()
+    assert min(windows.times(frames[2], 1e9)) >= end
+
+
 def event_windows(path, purpose: Purpose) -> EventWindows:
     objectives = built("evsplat", path, purpose=purpose).objectives
     (windows,) = (each for each in objectives if isinstance(each, EventWindows))

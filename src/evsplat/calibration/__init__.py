@@ -17,7 +17,14 @@ from evsplat.calibration.brightness import (
 from evsplat.calibration.clock import ClockEstimate, estimate_clock
 from evsplat.calibration.dead_lines import dead_lines_text, dead_rows
 from evsplat.calibration.flicker import flicker_period_us
-from evsplat.calibration.lost import Lost, answered_share, find_lost, pauses, untold_spans
+from evsplat.calibration.lost import (
+    Lost,
+    answered_share,
+    find_lost,
+    pauses,
+    unrecorded_spans,
+    untold_spans,
+)
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
@@ -44,6 +51,7 @@ __all__ = [
     "pair",
     "pair_indices",
     "pauses",
+    "unrecorded_spans",
     "untold_spans",
 ]
 

@@ -71,6 +71,10 @@ class FramePair:
         """Time between the two mid-exposures."""
         return (sum(self.after_us) - sum(self.before_us)) / 2
 
+    def weights(self, times_us: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+        """Share of the change of log luminance at each time that is in the change of the pair."""
+        return _elapsed(times_us, self.before_us) - _elapsed(times_us, self.after_us)
+
     def recorded_at(self, lag_us: float) -> bool:
         """True where all events of the pair are there that come ``lag_us`` later than it."""
         start, end = self.span_us
@@ -177,7 +181,7 @@ class PairEvents:
         start, end = (time + shift for time in pair.span_us)
         within = slice(*np.searchsorted(self._t, [start, end]))
         t = self._t[within] - shift
-        return within, _elapsed(t, pair.before_us) - _elapsed(t, pair.after_us)
+        return within, pair.weights(t)
 
 
 def _level_steps(

@@ -33,6 +33,10 @@ _BESIDE = 2
 one it began."""
 _MOST_PAUSES = 30
 """Of which pictures are read, three each."""
+_TOLD = 0.5
+"""Share of what events usually tell of a change, below which much of it was before the first."""
+_FEWEST_OTHERS = 3
+"""Pairs that say what is usual."""
 VERY_MUCH = 1.5
 """Change that stays above thresholds where linear frames are taken as coded, 2.2 times as large."""
 
@@ -102,6 +106,51 @@ def untold_spans(lost: Lost, events: EventStore) -> list[Span]:
         return []
     about = ((_event_before(a, events), _event_after(b, events)) for a, b in lost.spans_us)
     return list(_joined(about))
+
+
+def unrecorded_spans(pairs: Sequence[FramePair], events: EventStore) -> list[Span]:
+    """From the first mid-exposure to the first event, and from the last event to the last
+    mid-exposure, where the sensor was not recorded yet or no more.
+
+    Somebody who stands still makes no events either. But then what changes between the frames
+    beside changed while events came; of a recorder that started late they tell less of it than of
+    any other pair. ``pairs`` in order of time, neither of them across what may not be read.
+    """
+    first, last = events.time_range_us
+    late = [one for one in pairs if sum(one.before_us) // 2 < first]
+    early = [one for one in pairs if sum(one.after_us) // 2 > last]
+    if not late and not early:
+        return []
+    others = (one for one in pairs if one not in late and one not in early)
+    usual = [told for told in (_told(one, events) for one in others) if told is not None]
+    if len(usual) < _FEWEST_OTHERS:
+        return []
+    limit = min(_TOLD * float(np.median(usual)), *usual)
+    spans = []
+    if _any_below(limit, late, events):
+        spans.append((sum(late[0].before_us) // 2 - 1, first))
+    if _any_below(limit, early, events):
+        spans.append((last, sum(early[-1].after_us) // 2 + 1))
+    return spans
+
+
+def _any_below(limit: float, pairs: Iterable[FramePair], events: EventStore) -> bool:
+    shares = (_told(one, events) for one in pairs)
+    return any(share is not None and share < limit for share in shares)
+
+
+def _told(pair: FramePair, events: EventStore) -> float | None:
+    """Events per change of log luminance at the pixels that change much; None where few do."""
+    moved = _moved(pair, MUCH)
+    if moved.sum() < LEAST_PIXELS:
+        return None
+    change = np.where(moved, pair.change - pair.camera_change, 0.0)
+    (start, end), (low, high) = pair.span_us, pair.recorded_us
+    start = max(start, low)
+    near = events.between(start, max(start, min(end, high)))
+    way = np.sign(change).reshape(-1)[event_pixels(near, *change.shape)]
+    agrees = way * near.p if events.has_polarity else np.abs(way)
+    return float((pair.weights(near.t) * agrees).sum() / np.abs(change).sum())
 
 
 def _joined(spans_us: Iterable[Span]) -> tuple[Span, ...]:

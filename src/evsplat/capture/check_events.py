@@ -179,7 +179,8 @@ def _check_clock(
                 f"well, correct {clock}"
             )
         remedy += (
-            " Where more than two frames lie beside them, these are learned from their blur alone."
+            " Where more than two frames, or such as differ, lie beside them, these are learned "
+            "from their blur alone."
         )
         findings.warning(entry.file, "events/t", found, expected, remedy)
 

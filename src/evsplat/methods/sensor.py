@@ -4,13 +4,14 @@ import logging
 
 import torch
 
-from evsplat.calibration import SensorEstimate, untold_spans
+from evsplat.calibration import SensorEstimate, unrecorded_spans, untold_spans
 from evsplat.capture import (
     TrainingCapture,
     estimate_sensor,
     lost_events,
     warn_of_linear_frames,
 )
+from evsplat.capture.sensor_estimate import frame_pairs
 from evsplat.events import EventStore, Span
 from evsplat.methods.base import Purpose
 from evsplat.methods.evsplat_settings import EvsplatConfig
@@ -72,8 +73,9 @@ def event_windows(
 
 
 def _untold_us(capture: TrainingCapture, events: EventStore) -> list[Span]:
-    """When the sensor lost its events."""
-    spans = untold_spans(lost_events(capture), events)
+    """When the sensor lost its events, or was not recorded yet or no more."""
+    lost = untold_spans(lost_events(capture), events)
+    spans = sorted([*lost, *unrecorded_spans(frame_pairs(capture), events)])
     for start, end in spans:
         logger.info(
             "no event from %.3f to %.3f s, where pictures change: learned from frames alone there",

@@ -421,7 +421,7 @@ def _recorded(events: EventStore, frames: Sequence[Frame], interval_us: int) -> 
 
     A sensor that sees nothing move is silent for a while: only where the first event comes, or the
     last went, more than `_SILENT_FRAMES` after the frames begin or before they end is the
-    recording taken to begin or to end there.
+    recording taken to begin or to end there. Of less, pictures tell (`unrecorded_spans`).
     """
     first, last = events.time_range_us
     mids = [frame.mid_us for frame in frames]
