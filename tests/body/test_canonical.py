@@ -83,8 +83,11 @@ def test_legs_already_wide_stay_and_turning_the_whole_rig_turns_the_result():
     assert torch.allclose(turned, turn @ rotations @ turn.T, atol=1e-6)
 
 
-def test_a_rig_without_legs_keeps_its_rest_pose_and_says_so(caplog):
+def test_a_rig_without_legs_keeps_its_rest_pose_and_says_so_once(caplog):
+    rigs = [("base of this test", "arm", tip) for tip in ("tip", "tip", "claw")]
     with caplog.at_level(logging.WARNING):
-        rotations = leg_spread_rotations((-1, 0, 1), torch.rand(3, 3), ("base", "arm", "tip"))
-    assert torch.equal(rotations, torch.eye(3).expand(3, 3, 3))
-    assert "No legs recognised" in caplog.text
+        for names in rigs:
+            rotations = leg_spread_rotations((-1, 0, 1), torch.rand(3, 3), names)
+            assert torch.equal(rotations, torch.eye(3).expand(3, 3, 3))
+    said = [message for message in caplog.messages if "No legs recognised" in message]
+    assert len(said) == 2 and "claw" in said[1], "once for each rig, however often it is made"

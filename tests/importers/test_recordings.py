@@ -227,9 +227,10 @@ def finder(monkeypatch):
     """A stand-in for the search, which takes most of the time; gives what it was asked for."""
     asked = []
 
-    def found(path, out, search, *, keypoints, overwrite):
-        asked.append((load_capture(path), search, keypoints))
-        with derived_capture(load_capture(path), out, replace=overwrite) as making:
+    def found(path, out, search, *, keypoints, overwrite, warn):
+        capture = load_capture(path, needs_body=False, warn=warn)
+        asked.append((capture, search, keypoints))
+        with derived_capture(capture, out, replace=overwrite) as making:
             making.document["provenance"]["poses"] = "found"
 
     monkeypatch.setattr(posing, "find_poses", found)
@@ -255,6 +256,18 @@ def test_an_import_goes_on_to_find_poses_and_leaves_one_capture(
         assert sorted(path.name for path in tmp_path.iterdir()) == names
 
 
+def test_what_is_said_on_the_way_to_poses_names_the_capture_that_stays(
+    tmp_path: Path, finder: list, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = trees.write_zju_raw(tmp_path / "CoreView_377")
+    for mask in (source / "mask_cihp" / "Camera_B1").iterdir():
+        mask.unlink()
+    with caplog.at_level("INFO", "evsplat"):
+        import_capture("zju-mocap", source, tmp_path / "out", find_poses=True)
+    assert f"masks {tmp_path / 'out'}" in caplog.text
+    assert "out_unposed" not in caplog.text
+
+
 def test_key_points_that_cannot_be_read_are_refused_before_anything_is_imported(
     davis: Path, tmp_path: Path, finder: list, capsys
 ) -> None:
@@ -269,7 +282,7 @@ def test_key_points_that_cannot_be_read_are_refused_before_anything_is_imported(
 def test_where_no_poses_are_found_the_capture_without_them_stays(
     davis: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    def nobody(path, out, search, *, keypoints, overwrite):
+    def nobody(path, out, search, **how):
         raise DataError("nobody")
 
     monkeypatch.setattr(posing, "find_poses", nobody)

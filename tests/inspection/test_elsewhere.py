@@ -129,3 +129,8 @@ def test_moving_camera_is_not_judged(path: Path) -> None:
     (path / "capture.json").write_text(json.dumps(document))
     found = judge_body(load_capture(path).for_training(Policy()))
     assert not found.standing_camera and found.elsewhere is None
+    assert "it has no events" not in found.sentence
+    del document["events"]
+    (path / "capture.json").write_text(json.dumps(document))
+    blind = judge_body(load_capture(path).for_training(Policy()))
+    assert blind.verdict == "unknown" and blind.sentence.endswith("and it has no events")

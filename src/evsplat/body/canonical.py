@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -69,15 +70,12 @@ def leg_spread_rotations(
 
     Each leg turns outward about the body's forward axis: by `SMPL_SPREAD_DEG` in the SMPL family,
     else until the thigh is `THIGH_DEG` from straight down (never inward). Where no legs are
-    recognised the rest pose itself is canonical, which is logged.
+    recognised the rest pose itself is canonical, which is logged once.
     """
     rotations = torch.eye(3, dtype=rest_joints.dtype).repeat(len(parents), 1, 1)
     legs = find_legs(parents, joint_names)
     if legs is None:
-        _log.warning(
-            "No legs recognised among joints %s ...: the rest pose is the canonical pose.",
-            ", ".join(joint_names[:6]),
-        )
+        _tell_once(tuple(joint_names))
         return rotations.to(rest_joints.device)
     joints = rest_joints.detach().cpu().double().numpy()
     bones = {joint: _thigh_bone(joint, parents, joints) for joint in (legs.left, legs.right)}
@@ -94,6 +92,15 @@ def leg_spread_rotations(
         turn = torch.from_numpy(forward * sign * np.radians(degrees))
         rotations[joint] = axis_angle_to_matrix(turn).to(rotations)
     return rotations.to(rest_joints.device)
+
+
+@cache
+def _tell_once(joint_names: tuple[str, ...]) -> None:
+    """A run makes the same body several times: trained, evaluated, drawn."""
+    _log.warning(
+        "No legs recognised among joints %s ...: the rest pose is the canonical pose.",
+        ", ".join(joint_names[:6]),
+    )
 
 
 def _is_smpl(parents: Sequence[int], joint_names: Sequence[str]) -> bool:

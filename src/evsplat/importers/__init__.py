@@ -152,9 +152,9 @@ def _import(
     target: CaptureWriter,
     smpl: Path | None,
     *,
-    going_on: bool = False,
+    on_to: Path | None = None,
 ) -> None:
-    """``going_on``: if there are no poses, they are what is found next."""
+    """``on_to``: the capture that is made of this one next, with poses; this one does not stay."""
     with target as writer:
         notes = importer.write(source, writer, smpl)
         if importer.no_poses and writer.has_body:
@@ -168,12 +168,12 @@ def _import(
             )
         found, frames = writer.with_mask
         if importer.brings_masks and found < frames:
-            find = masks_command(writer.path, static_camera=not writer.camera_moves)
+            find = masks_command(on_to or writer.path, static_camera=not writer.camera_moves)
             notes.append(
                 f"masks: {frames - found} of {frames} pictures have none where the data set keeps "
                 f"them (docs/import.md); find the person with: {find}"
             )
-        if not writer.has_body and not going_on:
+        if not writer.has_body and on_to is None:
             find = command("poses", writer.path, "--out", "NEW")
             notes.append(f"body: none; find the person's poses with: {find}")
     for note in notes:
@@ -229,10 +229,11 @@ def _import_and_pose(
 
     unposed = out.with_name(f"{out.name}_unposed")
     writer = CaptureWriter(unposed, out.name, overwrite=overwrite, gains=True)
-    _import(importer, source, writer, smpl, going_on=True)
+    _import(importer, source, writer, smpl, on_to=out)
     try:
         search = PoseSearch(**vars(poses))
-        find_poses(unposed, out, search, keypoints=keypoints, overwrite=overwrite)
+        # what is odd about the capture is said of the one that stays
+        find_poses(unposed, out, search, keypoints=keypoints, overwrite=overwrite, warn=False)
     except BaseException:
         logger.info(
             "without poses it is: %s; find them with: %s",

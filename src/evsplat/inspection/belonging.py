@@ -190,6 +190,11 @@ class Belonging:
             )
         why = "too little moves; check camera and exposure"
         if not self.standing_camera:
+            if not self.shares:
+                return (
+                    "the posed body cannot be judged: the camera moves, so that its pictures do "
+                    "not tell what else does, and it has no events"
+                )
             why = "the camera moves, and so does all that it sees"
         return f"the posed body cannot be judged, {why}: {self.where}"
 

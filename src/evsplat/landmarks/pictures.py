@@ -93,17 +93,17 @@ def sharp_pictures(
 def _thresholds(capture: TrainingCapture) -> tuple[float, float] | None:
     """C+ and C-, given or estimated; None where nothing can be sharpened, which is logged."""
     if capture.events is None or len(capture.events) == 0:
-        reason = "it has no events"
+        reason = "there are no events"
     elif not capture.events.has_polarity:
-        reason = "its events have no polarity"
+        reason = "the events have no polarity"
     elif capture.contrast_threshold is not None:
         return capture.contrast_threshold
     else:
         estimate = estimate_sensor(capture)
         if estimate is not None and estimate.thresholds is not None:
             return estimate.thresholds.plus, estimate.thresholds.minus
-        reason = "its contrast thresholds are unknown and cannot be estimated"
-    logger.warning("%s: %s, so landmarks are found in its blurry pictures.", capture.path, reason)
+        reason = "contrast thresholds are unknown and cannot be estimated"
+    logger.warning("images: %s, so poses are looked for in the blurry pictures.", reason)
     return None
 
 

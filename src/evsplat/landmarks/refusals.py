@@ -83,10 +83,7 @@ def refuse_half_out_of_view(
         )
     if cut:
         logger.warning(
-            "%s: the person is partly out of view in %d of %d pictures.",
-            capture.path,
-            cut,
-            len(pictures),
+            "images: the person is partly out of view in %d of %d pictures.", cut, len(pictures)
         )
 
 

@@ -91,10 +91,7 @@ def find_landmarks(
     doubtful = sum(not person.is_person for person in found)
     if doubtful:
         logger.warning(
-            "%s: the person is hardly recognised in %d of %d pictures.",
-            capture.path,
-            doubtful,
-            len(found),
+            "images: the person is hardly recognised in %d of %d pictures.", doubtful, len(found)
         )
     return Landmarks(
         np.array([picture.time_us for picture in pictures], dtype=np.int64),

@@ -91,6 +91,7 @@ def find_poses(
     keypoints: Path | str | None = None,
     policy: Policy | None = None,
     overwrite: bool = False,
+    warn: bool = True,
     **changes: Any,
 ) -> FoundPoses:
     """Find the person's poses in a capture and write a new one with them, whole or not at all.
@@ -102,7 +103,7 @@ def find_poses(
     shows: by default no picture, mask or event of a held-out interval. Poses that the capture has
     are ignored; its true poses between keys, of another body, are left out of the new one.
     ``poses.html`` in the new capture shows what was found. ``overwrite`` replaces a folder that is
-    at ``out``; ``changes`` are options of `PoseSearch`.
+    at ``out``; ``warn`` as of `load_capture`; ``changes`` are options of `PoseSearch`.
 
     Raises:
         ConfigError: An option is out of range.
@@ -115,7 +116,7 @@ def find_poses(
         refuse_existing(out)
     try_target(out)
     rig = _rig(search.body)
-    capture = load_capture(path, needs_body=False)
+    capture = load_capture(path, needs_body=False, warn=warn)
     policy = policy or Policy(use=search.use, held_out_events=search.held_out_events)
     stages = _Stages()
     motion = _found(capture, policy, rig, search, keypoints, stages)
@@ -274,9 +275,7 @@ def _with_somebody(
             said.append(f"{counted(len(run), 'frame')} {when} ({_from_to(run)})")
     if not empty:
         return capture
-    logger.warning(
-        "%s: nobody is in the picture in %s, which are left out.", capture.path, ", ".join(said)
-    )
+    logger.warning("images: nobody is seen in %s, which are left out.", ", ".join(said))
     return capture.of_frames([frame for frame in capture.frames if frame.name not in empty])
 
 

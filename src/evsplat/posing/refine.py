@@ -24,7 +24,13 @@ from evsplat.posing.correction import Correction
 from evsplat.posing.descent import COARSE_PX, LOOK_STEPS, PROBE_STEPS, PROBES, Descent, Stage
 from evsplat.posing.pieces import between, cut_in_pieces, joined
 from evsplat.posing.surface_discs import SurfaceDiscs
-from evsplat.posing.targets import NobodyInViewError, Targets, find_targets, halved
+from evsplat.posing.targets import (
+    NobodyInViewError,
+    Targets,
+    find_targets,
+    halved,
+    refuse_no_background,
+)
 from evsplat.posing.time_limit import TimeLimit
 
 DISCS, _JUDGED_DISCS = 4_000, 3_000
@@ -118,6 +124,7 @@ def judge(
         DataError: the camera moves, or the posed body is in no picture.
     """
     began = time.monotonic()
+    refuse_no_background(capture)
     frames = _middle(capture)
     times = [time_us for frame in frames for time_us in frame.exposure_us]
     shrink = halved(capture.camera(frames[0]), JUDGED_PX)
@@ -154,6 +161,7 @@ def refine(
         DataError: the camera moves, or the posed body is in no picture.
     """
     began = time.monotonic()
+    refuse_no_background(capture)
     pieces = cut_in_pieces(track, capture)
     planned = 3 * LOOK_STEPS + sum(steps) + _LAST_STEPS + PROBES * PROBE_STEPS
     limit = TimeLimit(seconds, len(pieces) * planned, progress=progress)

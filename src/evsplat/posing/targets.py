@@ -174,11 +174,7 @@ def find_targets(
         DataError: the camera moves.
         NobodyInViewError: the posed body is in few of the pictures or in none.
     """
-    if not capture.is_static_camera:
-        raise DataError(
-            f"{capture.path}: has a moving camera or several, and a motion is corrected by what "
-            "differs from a static background; leave the poses as they are."
-        )
+    refuse_no_background(capture)
     if pictures is None:
         pictures = sharp_pictures(capture)
     image = torch.stack([picture.image for picture in pictures]).float()
@@ -201,6 +197,15 @@ def find_targets(
         return found.around(track)
     except NobodyInViewError as error:
         raise NobodyInViewError(f"{capture.path}: {error}") from None
+
+
+def refuse_no_background(capture: TrainingCapture) -> None:
+    """A `DataError` where the camera moves, before any picture is sharpened in vain."""
+    if not capture.is_static_camera:
+        raise DataError(
+            f"{capture.path}: has a moving camera or several, and a motion is corrected by what "
+            "differs from a static background; leave the poses as they are."
+        )
 
 
 def _grey(coded: Float[Tensor, "*size 3"], transfer: Transfer) -> Float[Tensor, "*size 3"]:
