@@ -1,5 +1,6 @@
 """A motion is corrected by pictures of it, by a known amount, and left where it is right."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,8 @@ from evsplat.body import BodyTrack, default_body
 from evsplat.body.silhouette import silhouette
 from evsplat.body.surface import vertex_normals
 from evsplat.camera import Camera
-from evsplat.capture import Frame, load_body_track
+from evsplat.capture import Frame, Policy, load_body_track, load_capture
+from evsplat.errors import DataError
 from evsplat.pictures import decode, encode, luminance
 from evsplat.posing import refine as refining
 from evsplat.posing.correction import Correction
@@ -384,3 +386,18 @@ def test_larger_pictures_are_made_smaller_for_a_verdict(tiny_capture):
     assert small.image.shape[1:3] == (12, 16) == small.behind.shape[1:3]
     means = torch.nn.functional.avg_pool2d(whole.image.permute(0, 3, 1, 2), 4)
     torch.testing.assert_close(small.image, means.permute(0, 2, 3, 1))
+
+
+@pytest.mark.parametrize("how", [judge, refining.refine])
+def test_before_a_moving_camera_no_picture_is_sharpened_in_vain(tiny_capture, monkeypatch, how):
+    path = tiny_capture()
+    document = json.loads((path / "capture.json").read_text())
+    pose = np.array(document["cameras"]["main"]["world_to_camera"])
+    for index, frame in enumerate(document["frames"]):
+        pose[0, 3] += 0.01 * index
+        frame["world_to_camera"] = pose.tolist()
+    (path / "capture.json").write_text(json.dumps(document))
+    monkeypatch.setattr(refining, "sharp_pictures", None)
+    capture = load_capture(path).for_training(Policy())
+    with pytest.raises(DataError, match="moving camera"):
+        how(load_body_track(capture), capture)
