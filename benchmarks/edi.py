@@ -18,9 +18,10 @@ import torch
 from PIL import Image
 
 from evsplat.capture import Capture, Frame, Policy, estimate_sensor, load_capture
-from evsplat.evaluation.regions import CROP_MARGIN, mask_box
+from evsplat.evaluation.regions import CROP_MARGIN
 from evsplat.events import deblur
 from evsplat.pictures import to_bytes
+from evsplat.pictures.box import mask_box
 
 REGIONS = ("full", "person_crop", "person_mask")
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from make_doc_figures import GAP_PX, beside
 from PIL import Image
 
-from evsplat.evaluation.regions import mask_box
 from evsplat.files import atomic_path
 from evsplat.pictures import error_map, to_bytes
+from evsplat.pictures.box import mask_box
 from evsplat.training import load_run
 
 MARGIN = 0.15

@@ -8,6 +8,7 @@ import torch
 
 from evsplat.body import body_box, default_body, silhouette
 from evsplat.camera import Camera
+from evsplat.pictures.box import Box
 
 
 def camera(width=48, height=37, focal=40.0, distance=3.0):
@@ -69,10 +70,10 @@ def test_a_body_far_away_and_a_body_behind():
     vertices = body.canonical_vertices() @ upright.T
     mask = silhouette(vertices, body.faces, camera(64, 64, 90.0))
     rows, columns = torch.nonzero(mask).T
-    x0, y0, x1, y1 = body_box(vertices, camera(64, 64, 90.0), margin=0.0)
+    box = body_box(vertices, camera(64, 64, 90.0), margin=0.0)
     # The box holds the silhouette, tight to a pixel.
-    assert 0 <= columns.min() - x0 <= 1 and 0 <= x1 - 1 - columns.max() <= 1
-    assert 0 <= rows.min() - y0 <= 1 and 0 <= y1 - 1 - rows.max() <= 1
+    assert 0 <= columns.min() - box.left <= 1 and 0 <= box.right - 1 - columns.max() <= 1
+    assert 0 <= rows.min() - box.top <= 1 and 0 <= box.bottom - 1 - rows.max() <= 1
     behind = camera(64, 64, 90.0, distance=-3.0)
     assert not silhouette(vertices, body.faces, behind).any()
     assert body_box(vertices, behind) is None
@@ -83,6 +84,6 @@ def test_a_body_far_away_and_a_body_behind():
 def test_the_box_grows_by_its_margin_and_is_clipped():
     vertices = torch.tensor([[-0.5, -0.25, 0.0], [0.5, 0.25, 0.0]])
     view = camera(100, 50, focal=60.0, distance=1.5)  # 40 x 20 pixels
-    assert body_box(vertices, view, margin=0.0) == (30, 15, 70, 35)
-    assert body_box(vertices, view, margin=0.1) == (26, 13, 74, 37)
-    assert body_box(vertices, view, margin=2.0) == (0, 0, 100, 50)
+    assert body_box(vertices, view, margin=0.0) == Box(15, 35, 30, 70)
+    assert body_box(vertices, view, margin=0.1) == Box(13, 37, 26, 74)
+    assert body_box(vertices, view, margin=2.0) == Box(0, 50, 0, 100)

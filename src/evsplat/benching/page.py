@@ -9,10 +9,11 @@ from evsplat.benching.figures import Record, Records
 from evsplat.benching.folder import BenchFolder
 from evsplat.benching.tables import SPREAD
 from evsplat.capture import Capture, Frame, load_capture
-from evsplat.evaluation.regions import Box, HumanRegions
+from evsplat.evaluation.regions import HumanRegions
 from evsplat.evaluation.tables import LEGEND, Table, html
 from evsplat.pages import Embedder, document, folded, read_rgb, section
 from evsplat.pictures import to_bytes
+from evsplat.pictures.box import Box
 from evsplat.spread import evenly_spread
 
 _PIXELS = 60_000_000

@@ -9,10 +9,11 @@ from PIL import Image, ImageDraw, ImageFont
 from evsplat.benching.figures import Records
 from evsplat.benching.folder import BenchFolder
 from evsplat.capture import Capture, Frame, load_capture
-from evsplat.evaluation.regions import Box, HumanRegions
+from evsplat.evaluation.regions import HumanRegions
 from evsplat.files import make_folder
 from evsplat.pages import read_rgb
 from evsplat.pictures import to_bytes
+from evsplat.pictures.box import Box
 from evsplat.pictures.files import save_png
 
 TILE_PX = 240

@@ -8,6 +8,7 @@ from torch import Tensor
 from evsplat.body.track import BodyTrack
 from evsplat.camera import Camera
 from evsplat.compiled import native
+from evsplat.pictures.box import Box
 
 NEAR = 0.01
 """Triangles that come nearer to the camera plane than this (metres) are not drawn."""
@@ -58,10 +59,8 @@ def _filled(
     return mask
 
 
-def body_box(
-    vertices: Float[Tensor, "V 3"], camera: Camera, margin: float = 0.1
-) -> tuple[int, int, int, int] | None:
-    """Pixel box (x0, y0, x1, y1), ends exclusive, of a posed body, enlarged per side and clipped.
+def body_box(vertices: Float[Tensor, "V 3"], camera: Camera, margin: float = 0.1) -> Box | None:
+    """Pixels around a posed body, enlarged on each side and clipped to the picture.
 
     ``margin`` is a share of the box's own extent. None where the body is out of view.
     """
@@ -75,7 +74,7 @@ def body_box(
     stop = np.clip(np.ceil(high + margin * (high - low)), 0, size).astype(int)
     if (stop <= start).any():
         return None
-    return int(start[0]), int(start[1]), int(stop[0]), int(stop[1])
+    return Box(int(start[1]), int(stop[1]), int(start[0]), int(stop[0]))
 
 
 def _fill(

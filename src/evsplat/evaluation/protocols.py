@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from evsplat.evaluation.regions import CROP_MARGIN, Absent, Box, mask_box
+from evsplat.evaluation.regions import CROP_MARGIN, Absent
+from evsplat.pictures.box import Box, mask_box
 from evsplat.similarity.perceptual import Features, PerceptualMetric
 from evsplat.similarity.psnr_ssim import (
     GAUSSIAN_SSIM,

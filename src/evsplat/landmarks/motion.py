@@ -30,8 +30,8 @@ _LEAST_AREA = 0.002
 
 
 @dataclass(frozen=True)
-class Box:
-    """Pixels from (x0, y0) to before (x1, y1)."""
+class Bounds:
+    """From (x0, y0) to before (x1, y1), pixels and parts of them; may reach beyond the picture."""
 
     x0: float
     y0: float
@@ -48,10 +48,10 @@ class Box:
         """Its longer side."""
         return max(self.x1 - self.x0, self.y1 - self.y0)
 
-    def grown(self, share: float) -> "Box":
+    def grown(self, share: float) -> "Bounds":
         """Enlarged on each side by a share of its own extent."""
         dx, dy = share * (self.x1 - self.x0), share * (self.y1 - self.y0)
-        return Box(self.x0 - dx, self.y0 - dy, self.x1 + dx, self.y1 + dy)
+        return Bounds(self.x0 - dx, self.y0 - dy, self.x1 + dx, self.y1 + dy)
 
 
 class Motion:
@@ -73,7 +73,7 @@ class Motion:
             np.bitwise_or.reduce(own[max(0, k - JOINED) : k + JOINED + 1]) for k in range(len(own))
         ]
         self._still = shares < _STILL * np.percentile(shares, _USUAL)
-        self._pieces: dict[int, list[Box]] = {}
+        self._pieces: dict[int, list[Bounds]] = {}
 
     def nearest(self, time_us: int) -> int:
         """Index of the training frame nearest in time."""
@@ -83,7 +83,7 @@ class Motion:
         """Pixels that move about a time."""
         return self._map(self.nearest(time_us))
 
-    def boxes(self, time_us: int) -> list[Box]:
+    def boxes(self, time_us: int) -> list[Bounds]:
         """Boxes of the pieces that move about a time, the largest area first; may be none."""
         index = self.nearest(time_us)
         if index not in self._pieces:
@@ -118,7 +118,7 @@ def _busy(events: EventStream, height: int, width: int) -> Bool[np.ndarray, "H W
     return busy
 
 
-def pieces(moving: Bool[np.ndarray, "H W"]) -> list[Box]:
+def pieces(moving: Bool[np.ndarray, "H W"]) -> list[Bounds]:
     """Boxes of connected pieces, largest area first; gaps of a few pixels are bridged."""
     height, width = moving.shape
     bridge = max(1, round(0.012 * max(height, width)))
@@ -130,7 +130,7 @@ def pieces(moving: Bool[np.ndarray, "H W"]) -> list[Box]:
     for index in np.argsort(-areas):
         if areas[index] >= _LEAST_AREA * height * width:
             rows, columns = spans[index]
-            found.append(Box(columns.start, rows.start, columns.stop, rows.stop))
+            found.append(Bounds(columns.start, rows.start, columns.stop, rows.stop))
     return found
 
 

@@ -12,7 +12,7 @@ from evsplat.capture import TrainingCapture
 from evsplat.errors import DataError
 from evsplat.landmarks.detect import Found, Region
 from evsplat.landmarks.landmarks import LIMB_POINTS
-from evsplat.landmarks.motion import Box, Motion, global_shift, pieces
+from evsplat.landmarks.motion import Bounds, Motion, global_shift, pieces
 from evsplat.landmarks.pictures import SharpPicture
 from evsplat.spread import evenly_spread
 
@@ -105,7 +105,7 @@ def refuse_moving_camera(
     frames = sorted(capture.train_frames, key=lambda frame: frame.mid_us)
     images = [capture.image(frame) for frame in frames]
     still = [
-        ~_covered(body_box(_nearest(*found, frame.mid_us)), *image.shape[:2])
+        ~_covered(person_bounds(_nearest(*found, frame.mid_us)), *image.shape[:2])
         for frame, image in zip(frames, images, strict=True)
     ]
     shifts = [
@@ -156,7 +156,7 @@ def _second(
 ) -> Found | None:
     """Another person in a picture, who moves and is not much smaller than the first."""
     height, width = picture.image.shape[:2]
-    box = body_box(first.places)
+    box = person_bounds(first.places)
     covered = _covered(box, height, width)
     boxes = pieces(motion.moving(picture.time_us) & ~covered)
     boxes = [part for part in boxes if part.side > _SECOND_SIZE * box.side]
@@ -165,7 +165,7 @@ def _second(
     painted = torch.where(torch.from_numpy(covered)[..., None], motion.background, picture.image)
     starts = [Region(part.centre, 1.25 * part.side) for part in boxes[:3]]
     person = search(painted, starts)
-    tall = body_box(person.places).side > _SECOND_SIZE * box.side
+    tall = person_bounds(person.places).side > _SECOND_SIZE * box.side
     beside = not np.all(
         (person.region.centre > [box.x0, box.y0]) & (person.region.centre < [box.x1, box.y1])
     )
@@ -173,13 +173,13 @@ def _second(
     return person if sure and tall and beside else None
 
 
-def body_box(places: Float[np.ndarray, "33 2"]) -> Box:
+def person_bounds(places: Float[np.ndarray, "33 2"]) -> Bounds:
     """Box of all landmarks with room for flesh and clothes."""
     low, high = places.min(0), places.max(0)
-    return Box(low[0], low[1], high[0], high[1]).grown(0.15)
+    return Bounds(low[0], low[1], high[0], high[1]).grown(0.15)
 
 
-def _covered(box: Box, height: int, width: int) -> Bool[np.ndarray, "H W"]:
+def _covered(box: Bounds, height: int, width: int) -> Bool[np.ndarray, "H W"]:
     rows, columns = np.ogrid[:height, :width]
     covered: np.ndarray = (
         (columns >= box.x0) & (columns < box.x1) & (rows >= box.y0) & (rows < box.y1)

@@ -8,13 +8,12 @@ are sections of the reference that docs/baselines.md quotes.
 """
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated, ClassVar
 
 import torch
 
 from evsplat.body import body_box
-from evsplat.capture import Frame, Policy, TrainingCapture, load_body_track
+from evsplat.capture import Policy, TrainingCapture, load_body_track
 from evsplat.capture.masked import MaskedCapture
 from evsplat.gaussians import GaussianSet
 from evsplat.methods.avatar_parts import (
@@ -47,7 +46,7 @@ from evsplat.methods.starts import (
     scene_start,
 )
 from evsplat.objectives import Alpha, RenderedSemantics
-from evsplat.objectives.photometric import Box
+from evsplat.pictures.box import mask_box
 from evsplat.ranges import Above, AtLeast
 
 SURELY_PERSON = 20.0
@@ -107,7 +106,7 @@ def build(
         GaussianSet(person, no_gaussians()),
         surface,
         generator,
-        partial(_mask_box, masked),
+        lambda frame: mask_box(masked.human(frame)),
         semantics="fixed",
         released=True,
         scene_direction_dropout=0.0,
@@ -128,14 +127,6 @@ def build(
         generator=generator,
         capture=masked,
     )
-
-
-def _mask_box(capture: MaskedCapture, frame: Frame) -> Box | None:
-    """Tight box of the mask; None where it shows nobody."""
-    rows, columns = torch.nonzero(capture.human(frame), as_tuple=True)
-    if not len(rows):
-        return None
-    return int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from evsplat.methods.settings import Nominal, NotNegative, Weight
 from evsplat.models.paper import PaperModel, Semantics
 from evsplat.objectives import Isometry, Objective, Photometric, SkinningPrior
 from evsplat.objectives.perceptual import PerceptualChoice, choose_perceptual
-from evsplat.objectives.photometric import Box
+from evsplat.pictures.box import Box
 from evsplat.ranges import Above, AtLeast, AtMost, ReadIf, Within
 
 SURFACE_SAMPLES = 100_000

@@ -10,11 +10,9 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.devices import DeviceCache
 from evsplat.objectives.base import OfMiddle, Step
+from evsplat.pictures.box import Box
 from evsplat.similarity.perceptual import PerceptualMetric
 from evsplat.similarity.psnr_ssim import l1_and_ssim
-
-Box = tuple[int, int, int, int]
-"""Pixels (x0, y0, x1, y1), ends exclusive."""
 
 
 class Photometric(OfMiddle):
@@ -34,7 +32,7 @@ class Photometric(OfMiddle):
         perceptual: PerceptualMetric | None,
         perceptual_term: str = "perceptual",
     ) -> None:
-        """``box_of``: the person's pixel box (x0, y0, x1, y1) in a training frame that shows one.
+        """``box_of``: the person's box in a training frame that shows one.
 
         ``perceptual_term`` is what that term is called.
         """
@@ -62,8 +60,7 @@ class Photometric(OfMiddle):
             for frame, a, b in seen:
                 if (box := self.box_of(frame)) is None:
                     continue
-                x0, y0, x1, y1 = box
-                crops = (a[y0:y1, x0:x1], b[y0:y1, x0:x1])
+                crops = (box.crop(a), box.crop(b))
                 if min(crops[0].shape[:2]) >= self.perceptual.network.min_side:
                     values.append(self.perceptual(2 * crops[0] - 1, 2 * crops[1] - 1))
             if values:

@@ -115,10 +115,10 @@ def _window(vertices: Float[Tensor, "V 3"], camera: Camera) -> tuple[int, int, i
     box = body_box(vertices, camera, margin=_MARGIN)
     if box is None:
         return 0, 0, camera.width, camera.height
-    side = max(box[2] - box[0], box[3] - box[1])
+    side = max(box.right - box.left, box.bottom - box.top)
     size = min(side, camera.width), min(side, camera.height)
-    left = min(max((box[0] + box[2] - size[0]) // 2, 0), camera.width - size[0])
-    top = min(max((box[1] + box[3] - size[1]) // 2, 0), camera.height - size[1])
+    left = min(max((box.left + box.right - size[0]) // 2, 0), camera.width - size[0])
+    top = min(max((box.top + box.bottom - size[1]) // 2, 0), camera.height - size[1])
     return left, top, *size
 
 

@@ -35,7 +35,7 @@ class BrowserCamera:
 
 
 @dataclass(frozen=True)
-class Box:
+class ViewportPart:
     """A part of the viewport, pixels from its top left corner."""
 
     left: float
@@ -44,13 +44,13 @@ class Box:
     height: float
 
 
-def letterboxed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
+def letterboxed(camera: Camera, width: int, height: int) -> tuple[Camera, ViewportPart]:
     """A recording camera seen through a viewport: its whole picture, centred, and its box.
 
     The bars that the viewport shows around the picture are drawn as well.
     """
     scale = min(width / camera.width, height / camera.height)
-    box = Box(
+    box = ViewportPart(
         (width - scale * camera.width) / 2,
         (height - scale * camera.height) / 2,
         scale * camera.width,

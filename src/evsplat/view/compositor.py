@@ -15,7 +15,7 @@ from evsplat.capture import Capture
 from evsplat.events.maps import count_map
 from evsplat.inspection.drawing import BRIGHTER, DARKER, font
 from evsplat.methods.trivial import nearest_in_time
-from evsplat.view.camera import Box, letterboxed
+from evsplat.view.camera import ViewportPart, letterboxed
 from evsplat.view.request import BLURRY, OWN_TRUTH, SHARP, ViewRequest
 from evsplat.view.viewed_run import ViewedRun
 
@@ -34,7 +34,7 @@ class Pane:
     """A part of the viewport with a camera of its own."""
 
     camera: Camera
-    box: Box | None
+    box: ViewportPart | None
     """Box of the recorded picture; None for a camera that recorded nothing."""
 
 
@@ -126,13 +126,17 @@ class Compositor:
         if recorded is None:
             return
         recorded = recorded.copy()
-        self._add_events(recorded, request, Box(0, 0, recorded.shape[1], recorded.shape[0]))
+        self._add_events(
+            recorded, request, ViewportPart(0, 0, recorded.shape[1], recorded.shape[0])
+        )
         height = INSET_SHARE * picture.shape[0]
         width = height * recorded.shape[1] / recorded.shape[0]
         margin = 0.02 * picture.shape[0]
-        box = Box(margin, picture.shape[0] - margin - height, width, height)
+        box = ViewportPart(margin, picture.shape[0] - margin - height, width, height)
         line = max(1.0, 0.003 * picture.shape[0])
-        around = Box(box.left - line, box.top - line, box.width + 2 * line, box.height + 2 * line)
+        around = ViewportPart(
+            box.left - line, box.top - line, box.width + 2 * line, box.height + 2 * line
+        )
         paste(picture, np.ones((2, 2, 3), np.float32), around)
         paste(picture, recorded, box)
 
@@ -146,7 +150,7 @@ class Compositor:
             return self.capture.shown(self.capture.sharp(frame)).numpy()
         return self.capture.shown(self.capture.image(frame)).numpy()
 
-    def _add_events(self, picture: Picture, request: ViewRequest, box: Box) -> None:
+    def _add_events(self, picture: Picture, request: ViewRequest, box: ViewportPart) -> None:
         """Lay the recorded events of the request's window, if it has one, over a picture."""
         store = self.capture.events
         if store is None or request.events_us is None:
@@ -164,7 +168,7 @@ def comparisons(capture: Capture, others: Sequence[str]) -> list[str]:
     return [*([OWN_TRUTH] if capture.is_own_truth(known) else [BLURRY, SHARP]), *others]
 
 
-def events_on(picture: Picture, counts: Float[np.ndarray, "h w"], box: Box) -> None:
+def events_on(picture: Picture, counts: Float[np.ndarray, "h w"], box: ViewportPart) -> None:
     """Lay signed event counts over the part ``box`` of a picture: red brighter, blue darker."""
     strength = (np.abs(counts) / _FULL_STRENGTH).clip(0, 1) ** 0.5
     brighter, darker = (np.array(colour, np.float32) / 255 for colour in (BRIGHTER, DARKER))
@@ -176,13 +180,13 @@ def events_on(picture: Picture, counts: Float[np.ndarray, "h w"], box: Box) -> N
     below += placed[..., :3]
 
 
-def paste(picture: Picture, other: Picture, box: Box) -> None:
+def paste(picture: Picture, other: Picture, box: ViewportPart) -> None:
     """Put a picture into the part ``box`` of another."""
     rows, columns, placed = _placed(other, box, picture.shape, smooth=True)
     picture[rows, columns] = placed
 
 
-def dim_outside(picture: Picture, box: Box) -> None:
+def dim_outside(picture: Picture, box: ViewportPart) -> None:
     """Darken what a recording camera did not see."""
     top, bottom = round(box.top), round(box.top + box.height)
     left, right = round(box.left), round(box.left + box.width)
@@ -222,7 +226,7 @@ def with_labels(
 
 
 def _placed(
-    layer: Float[np.ndarray, "h w c"], box: Box, shape: tuple[int, ...], *, smooth: bool
+    layer: Float[np.ndarray, "h w c"], box: ViewportPart, shape: tuple[int, ...], *, smooth: bool
 ) -> tuple[slice, slice, Float[np.ndarray, "rows columns c"]]:
     """The part of a picture of ``shape`` that the box covers, and the layer at its pixels."""
     top, left = max(0, round(box.top)), max(0, round(box.left))

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from evsplat.capture import Frame, load_body_track
 from evsplat.capture.policy import Terms, terms_of
-from evsplat.evaluation.regions import Box, HumanRegions
+from evsplat.evaluation.regions import HumanRegions
 from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.figures import frame_figures, no_test_figures
 from evsplat.evaluation.report.source import Source
@@ -25,6 +25,7 @@ from evsplat.pages import (
     section,
 )
 from evsplat.pictures import to_bytes
+from evsplat.pictures.box import Box
 from evsplat.pictures.colours import ERROR_FULL_SCALE, css_gradient
 from evsplat.spread import evenly_spread
 
