@@ -38,6 +38,21 @@ def test_track_equals_scipy_splines_between_uneven_keys(seed):
     assert np.abs(transl.numpy() - CubicSpline(seconds, places)(at)).max() < 1e-6
 
 
+def test_vertices_at_many_times_are_blended_bones_of_each():
+    seed = int(np.random.default_rng().integers(10_000))
+    track, _, _ = make_track(seed, keys=5)
+    rng = np.random.default_rng(seed)
+    times = rng.integers(track.times_us[0] - 5_000, track.times_us[-1] + 5_000, 7).tolist()
+    rest = torch.nn.functional.pad(track.body.canonical_vertices(), (0, 1), value=1.0).double()
+    found = list(track.vertices_at(times))
+    assert len(found) == len(times)
+    for time, vertices in zip(times, found, strict=True):
+        moved = torch.einsum("jab,vb->vja", track.bones([time])[0].double(), rest)
+        expected = (track.body.weights.double()[..., None] * moved).sum(1)[:, :3]
+        assert (vertices - expected).abs().max() < 1e-5, seed
+        assert torch.equal(vertices, track.vertices(time)), seed
+
+
 @pytest.mark.parametrize("keys", [1, 2, 3, 9])
 def test_keys_are_hit_exactly_and_held_beyond_the_ends(keys):
     track, poses, _ = make_track(11, keys)

@@ -1,7 +1,7 @@
 """The body's pose at any time: smooth rotation and translation splines through the key poses."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -186,8 +186,13 @@ class BodyTrack:
 
     def vertices(self, time_us: int) -> Float[Tensor, "V 3"]:
         """The posed body's vertices in the world at one time."""
+        return next(self.vertices_at([time_us]))
+
+    def vertices_at(self, times_us: Sequence[int]) -> Iterator[Float[Tensor, "V 3"]]:
+        """`vertices` at each of the times, one after the other; poses are asked for at once."""
         body = self.body
-        return skin(body.canonical_vertices(), body.weights, self.bones([time_us]))[0][0]
+        for bones in self.bones(times_us).split(1):
+            yield skin(body.canonical_vertices(), body.weights, bones)[0][0]
 
 
 def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
@@ -211,9 +216,7 @@ def up_axis(track: BodyTrack) -> Float[Tensor, "3"]:
     else:
         below = _leg_share(body, (legs.left, legs.right)) > 0.5
     times = track.times_us[:: -(-len(track.times_us) // _MOST_KEYS)]
-    posed = [
-        skin(rest, body.weights, bones)[0][0] for bones in track.bones(times.tolist()).split(1)
-    ]
+    posed = track.vertices_at(times.tolist())
     directions = torch.stack([v[~below].mean(0) - v[below].mean(0) for v in posed]).cpu()
     direction = torch.nn.functional.normalize(directions, dim=1).mean(0)
     if track.camera_up is not None:

@@ -119,7 +119,7 @@ def _heading(
 
 def _floor(track: BodyTrack, up: Float[np.ndarray, "3"]) -> float:
     """Height along ``up`` of the soles."""
-    times = np.linspace(track.times_us[0], track.times_us[-1], _FLOOR_TIMES).round()
+    times = np.linspace(track.times_us[0], track.times_us[-1], _FLOOR_TIMES).round().astype(int)
     height = torch.from_numpy(up).float()
-    lowest = [float((track.vertices(int(time)) @ height).min()) for time in times]
+    lowest = [float((vertices @ height).min()) for vertices in track.vertices_at(times.tolist())]
     return float(np.percentile(lowest, _FLOOR_PERCENTILE))

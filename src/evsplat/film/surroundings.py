@@ -123,10 +123,8 @@ class Room:
         """How far from the recording camera the filmed person gets."""
         assert self.recording is not None
         recording = self.recording.to("cpu")
-        return max(
-            float(recording.project(self.track.vertices(time).cpu())[1].max())
-            for time in instants(self.track)
-        )
+        posed = self.track.vertices_at(instants(self.track))
+        return max(float(recording.project(vertices.cpu())[1].max()) for vertices in posed)
 
     def soften(self, layers: Layers, camera: Camera) -> Layers:
         """Fade the scene towards the edge of what was recorded, the more the camera went away."""

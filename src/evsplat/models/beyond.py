@@ -65,7 +65,8 @@ class Beyond:
         up = up_axis(track).float().cpu()
         recording = recording.to("cpu")
         floor_m = lowest_m(track, up)
-        middle = torch.stack([track.vertices(time).mean(0) for time in instants(track)]).mean(0)
+        posed = track.vertices_at(instants(track))
+        middle = torch.stack([vertices.mean(0) for vertices in posed]).mean(0)
         middle = middle.float().cpu()
         places = recording.center() + depth[..., None] * pixel_rays(recording)
         high = places @ up - floor_m > FLOOR_M
@@ -145,7 +146,8 @@ def instants(track: BodyTrack) -> list[int]:
 
 def lowest_m(track: BodyTrack, up: Float[Tensor, "3"]) -> float:
     """Height along ``up`` of the person's lowest point: that of the floor."""
-    return min(float((track.vertices(time).cpu() @ up).min()) for time in instants(track))
+    posed = track.vertices_at(instants(track))
+    return min(float((vertices.cpu() @ up).min()) for vertices in posed)
 
 
 def wall_m(depth: Float[Tensor, "*N"], high: Bool[Tensor, "*N"]) -> Float[Tensor, ""]:
