@@ -1,8 +1,8 @@
-"""Writing a capture as a whole, piece by piece, and reading a camera for it."""
+"""Writing a capture as a whole, piece by piece."""
 
 import dataclasses
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from evsplat.body.pose_errors import PoseSource
 from evsplat.calibration.gain import GainMeter
 from evsplat.capture.body_file import key_poses, save_arrays, write_body
-from evsplat.capture.distortion import are_coefficients
 from evsplat.capture.parse import FORMAT, VERSION
 from evsplat.capture.parse_frames import default_split
 from evsplat.capture.points import write_points
@@ -30,9 +29,7 @@ from evsplat.files import (
 )
 from evsplat.names import checked_name
 from evsplat.pictures.files import read_image, write_image
-from evsplat.pictures.light import TRANSFERS, Transfer
-from evsplat.untrusted.faults import brief
-from evsplat.untrusted.text import read_json
+from evsplat.pictures.light import Transfer
 
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
@@ -391,71 +388,6 @@ class CaptureWriter:
                 place = self.path / finding.file.relative_to(self._root)
                 raise DataError(f"{dataclasses.replace(finding, file=place)}")
         self._check_target()
-
-
-def read_camera(
-    path: Path, width: int, height: int, required: Collection[str] = ("K",)
-) -> dict[str, Any]:
-    """One camera as in capture.json, as arguments of `CaptureWriter.add_camera`.
-
-    ``width`` and ``height`` are those of its pictures; a file that says otherwise is a `DataError`,
-    as is one without the ``required`` keys.
-    """
-    entry = read_json(path)
-    missing = [key for key in required if not isinstance(entry, dict) or key not in entry]
-    if missing:
-        raise DataError(
-            f"{path}: {', '.join(missing)} missing, expected one camera as in capture.json "
-            "(docs/capture-format.md)."
-        )
-    for key, size in (("width", width), ("height", height)):
-        if entry.get(key, size) != size:
-            raise DataError(
-                f"{path}: {key}: found {entry[key]}, expected {size} as the pictures have."
-            )
-    transfer = entry.get("transfer")
-    if transfer is not None and transfer not in TRANSFERS:
-        raise DataError(
-            f"{path}: transfer: found {brief(transfer)}, expected one of "
-            f"{', '.join(TRANSFERS)}; correct it or leave it out."
-        )
-    pose = _matrix(path, entry, "world_to_camera", 4) if "world_to_camera" in entry else None
-    return {
-        "K": _matrix(path, entry, "K", 3),
-        "world_to_camera": pose,
-        "distortion": _coefficients(path, entry.get("distortion")),
-        "transfer": transfer,
-    }
-
-
-def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarray:
-    try:
-        matrix = np.array(entry[key], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.empty(0)
-    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise DataError(f"{path}: {key}: expected {size}x{size} numbers.")
-    return matrix
-
-
-def _coefficients(path: Path, lens: Any) -> list[float] | None:
-    """Of a lens as capture.json has it, or of OpenCV's numbers alone; None where there is none."""
-    values = lens.get("coefficients") if isinstance(lens, dict) else lens
-    if not lens:
-        return None
-    model = lens.get("model", "opencv") if isinstance(lens, dict) else "opencv"
-    if model != "opencv":  # a fish eye's four numbers would pass for k1, k2, p1, p2
-        raise DataError(
-            f"{path}: distortion: model: found {brief(model)}, expected 'opencv'; undistort the "
-            "pictures first (of a fish eye by cv2.fisheye.undistortImage) and give null."
-        )
-    numbers = values if isinstance(values, list) else []
-    if not are_coefficients(numbers):
-        raise DataError(
-            f"{path}: distortion: found {brief(values)}, expected 4, 5 or 8 numbers: OpenCV's k1, "
-            "k2, p1, p2, k3, k4, k5, k6; give them, or null."
-        )
-    return [float(value) for value in numbers]
 
 
 def _numbers(matrix: ArrayLike) -> list[Any]:

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 from evsplat.calibration.offset import LEAST_CORRELATION, BlockLevels, TooLong, estimate_offset
-from evsplat.capture.write import CaptureWriter, read_camera
+from evsplat.capture.camera_file import read_camera
+from evsplat.capture.write import CaptureWriter
 from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventRecording, EventStream, open_recording

@@ -12,9 +12,9 @@ from jaxtyping import Int64
 
 from evsplat.body import PoseSource
 from evsplat.capture import BodyFile, Capture, CaptureWriter, Frame, load_capture
+from evsplat.capture.camera_file import read_camera
 from evsplat.capture.check_body import stated_body
 from evsplat.capture.read import without_gain
-from evsplat.capture.write import read_camera
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream
 from evsplat.footage import Footage, TimedPicture

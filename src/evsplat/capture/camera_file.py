@@ -1,0 +1,78 @@
+"""A camera in a file of its own, as capture.json has one, read for a capture that is written."""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evsplat.capture.distortion import are_coefficients
+from evsplat.errors import DataError
+from evsplat.pictures.light import TRANSFERS
+from evsplat.untrusted.faults import brief
+from evsplat.untrusted.text import read_json
+
+
+def read_camera(
+    path: Path, width: int, height: int, required: Collection[str] = ("K",)
+) -> dict[str, Any]:
+    """One camera as in capture.json, as arguments of `CaptureWriter.add_camera`.
+
+    ``width`` and ``height`` are those of its pictures; a file that says otherwise is a `DataError`,
+    as is one without the ``required`` keys.
+    """
+    entry = read_json(path)
+    missing = [key for key in required if not isinstance(entry, dict) or key not in entry]
+    if missing:
+        raise DataError(
+            f"{path}: {', '.join(missing)} missing, expected one camera as in capture.json "
+            "(docs/capture-format.md)."
+        )
+    for key, size in (("width", width), ("height", height)):
+        if entry.get(key, size) != size:
+            raise DataError(
+                f"{path}: {key}: found {entry[key]}, expected {size} as the pictures have."
+            )
+    transfer = entry.get("transfer")
+    if transfer is not None and transfer not in TRANSFERS:
+        raise DataError(
+            f"{path}: transfer: found {brief(transfer)}, expected one of "
+            f"{', '.join(TRANSFERS)}; correct it or leave it out."
+        )
+    pose = _matrix(path, entry, "world_to_camera", 4) if "world_to_camera" in entry else None
+    return {
+        "K": _matrix(path, entry, "K", 3),
+        "world_to_camera": pose,
+        "distortion": _coefficients(path, entry.get("distortion")),
+        "transfer": transfer,
+    }
+
+
+def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarray:
+    try:
+        matrix = np.array(entry[key], dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.empty(0)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise DataError(f"{path}: {key}: expected {size}x{size} numbers.")
+    return matrix
+
+
+def _coefficients(path: Path, lens: Any) -> list[float] | None:
+    """Of a lens as capture.json has it, or of OpenCV's numbers alone; None where there is none."""
+    values = lens.get("coefficients") if isinstance(lens, dict) else lens
+    if not lens:
+        return None
+    model = lens.get("model", "opencv") if isinstance(lens, dict) else "opencv"
+    if model != "opencv":  # a fish eye's four numbers would pass for k1, k2, p1, p2
+        raise DataError(
+            f"{path}: distortion: model: found {brief(model)}, expected 'opencv'; undistort the "
+            "pictures first (of a fish eye by cv2.fisheye.undistortImage) and give null."
+        )
+    numbers = values if isinstance(values, list) else []
+    if not are_coefficients(numbers):
+        raise DataError(
+            f"{path}: distortion: found {brief(values)}, expected 4, 5 or 8 numbers: OpenCV's k1, "
+            "k2, p1, p2, k3, k4, k5, k6; give them, or null."
+        )
+    return [float(value) for value in numbers]
