@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from evsplat.body import BodyTrack
 from evsplat.capture import Camera, Capture, Frame
@@ -67,7 +69,6 @@ class FilmPlan:
         view = film.camera or recording
 
         middle = _middle(track, times)
-        start = capture.camera_at(view, times[0])
         # It may be another than the one that the film is seen by, which recorded nothing.
         recorder = capture.camera_at(recording, times[0]) if capture.is_static_camera else None
         # Up is where people stood in the recording: a motion may be a somersault.
@@ -75,20 +76,7 @@ class FilmPlan:
         surroundings = _surroundings(film, room)
         if isinstance(surroundings, Painted):
             from_files += (surroundings.picture.numpy(),)
-        path = _camera_path(film, capture)
-        turn = {"orbit": whole_turn, "swing": to_both_sides}.get(film.path or "", straight)
-        leaves = (
-            film.motion is not None and film.camera is None and not in_view(start, track, times)
-        )
-        if path is not None:
-            last = max(1, len(times) - 1)
-            cameras = [path(index / last) for index in range(len(times))]
-        elif film.path is not None or leaves:
-            cameras = follow(start, track, times, room.up, turn)
-        elif film.at is None and film.motion is None and not capture.is_static_camera:
-            cameras = list(capture.cameras_at(view, times))
-        else:
-            cameras = [start] * len(times)
+        cameras = _cameras(film, capture, view, track, times, room.up)
         changes = [room.stand_back] if film.motion is not None else []
         if film.path in ("orbit", "swing"):
             changes.append(room.clear)
@@ -154,6 +142,29 @@ def _times(
             raise ConfigError("--show events: the film is shorter than one picture; lengthen it.")
         times, clock = times[:whole], clock[:whole]
     return [f"{index:05d}" for index in range(len(times))], times, clock
+
+
+def _cameras(
+    film: Film,
+    capture: Capture,
+    view: str,
+    track: BodyTrack,
+    times_us: Sequence[int],
+    up: Float[Tensor, "3"],
+) -> list[Camera]:
+    """The camera of each time: on a path, after a person who leaves its picture, or as recorded."""
+    path = _camera_path(film, capture)
+    if path is not None:
+        last = max(1, len(times_us) - 1)
+        return [path(index / last) for index in range(len(times_us))]
+    start = capture.camera_at(view, times_us[0])
+    free = film.motion is not None and film.camera is None
+    if film.path is not None or (free and not in_view(start, track, times_us)):
+        turn = {"orbit": whole_turn, "swing": to_both_sides}.get(film.path or "", straight)
+        return follow(start, track, times_us, up, turn)
+    if film.at is None and film.motion is None and not capture.is_static_camera:
+        return list(capture.cameras_at(view, times_us))
+    return [start] * len(times_us)
 
 
 def _camera_path(film: Film, capture: Capture) -> CameraPath | None:
