@@ -94,8 +94,9 @@ def contrast_findings(capture: Capture, estimate: SensorEstimate | None) -> list
             f"{list(given)}, and an event stands for a change of {fitted.plus:.2f} / "
             f"{fitted.minus:.2f} of the frames",
             "thresholds with which events add up to what the frames show",
-            "Leave them null to have them found; if they are known, see whether events are there "
-            "twice or were thinned, and which transfer the camera has.",
+            "Leave them null to have them found, as where several pixels of the sensor lie in one "
+            "of the pictures; if they are known, see whether events are there twice or were "
+            "thinned, and which transfer the camera has.",
         )
     return findings.items
 
