@@ -22,12 +22,12 @@ def read_camera(
     as is one without the ``required`` keys.
     """
     entry = read_json(path)
-    missing = [key for key in required if not isinstance(entry, dict) or key not in entry]
+    expected = "expected one camera as in capture.json (docs/capture-format.md)"
+    if not isinstance(entry, dict):
+        raise DataError(f"{path}: found {brief(entry)}, {expected}.")
+    missing = [key for key in required if key not in entry]
     if missing:
-        raise DataError(
-            f"{path}: {', '.join(missing)} missing, expected one camera as in capture.json "
-            "(docs/capture-format.md)."
-        )
+        raise DataError(f"{path}: {', '.join(missing)} missing, {expected}.")
     for key, size in (("width", width), ("height", height)):
         if entry.get(key, size) != size:
             raise DataError(
@@ -50,7 +50,7 @@ def read_camera(
 
 def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarray:
     try:
-        matrix = np.array(entry[key], dtype=np.float64)
+        matrix = np.array(entry.get(key), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
