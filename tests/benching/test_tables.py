@@ -172,3 +172,14 @@ def test_the_caption_says_the_terms_and_a_row_where_it_departs_from_them(records
     titles = [row.title for row in make_tables(records)[1].rows]
     assert titles[0] == "Good*"
     assert titles[1] == "Poor & Sons†; events of held-out intervals seen; masks given"
+
+
+def test_a_capture_on_which_a_row_has_no_figure_is_named_with_the_reason(records):
+    for seed in (0, 1):
+        found = records.by_cell["two", "poor", seed]
+        for region in found["protocols"]["standard"].values():
+            region.update(dict.fromkeys(region))
+        found["reasons"] = {"protocols.standard.full.psnr": "no frame has a sharp picture"}
+    notes = make_tables(records)[0].footnotes
+    assert "Poor & Sons† has no figure on two: no frame has a sharp picture." in notes
+    assert not any(note.startswith("Good*") for note in notes)

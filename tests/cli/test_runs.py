@@ -58,3 +58,14 @@ def test_what_was_not_measured_is_a_dash():
     metrics |= {"frames": {"test": 2}, "blurry_input": regions}
     lines = summary_table(metrics).splitlines()
     assert lines[-2].endswith("- / -") and "othing tells what training saw" in lines[-1]
+
+
+def test_a_row_of_dashes_is_explained_below_the_table():
+    gap = {region: dict.fromkeys(values) for region, values in _regions(0.0).items()}
+    metrics = {"method": "avatar3dgs", "protocols": {"standard": _regions(30.0)}}
+    metrics |= {"frames": {"test": 2}, "blurry_input": _regions(25.0)}
+    metrics |= {"trivial": {"median_background": gap}, "composited": {"standard": gap}}
+    places = ("trivial.median_background", "composited.standard")
+    metrics["reasons"] = {f"{place}.full.psnr": "the camera moves." for place in places}
+    lines = summary_table(metrics).splitlines()
+    assert "on_median_background, median_background: the camera moves." in lines

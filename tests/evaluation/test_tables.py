@@ -4,7 +4,7 @@ from evsplat.evaluation.protocols import METRICS, REGIONS
 from evsplat.evaluation.tables import Heading, missing_networks, tables_of, write_tables
 
 
-def row(psnr: float, ssim: float, lpips: float | None = None) -> dict:
+def row(psnr: float | None, ssim: float | None, lpips: float | None = None) -> dict:
     values = dict.fromkeys(METRICS, None) | {"psnr": psnr, "ssim": ssim, "lpips_vgg": lpips}
     return {region: dict(values) for region in REGIONS}
 
@@ -66,3 +66,26 @@ def test_latex_is_escaped_and_every_row_has_all_cells(tmp_path):
     assert r"my\_method" in text
     body = text[text.index(r"\midrule") : text.index(r"\bottomrule")].splitlines()[1:]
     assert len(body) == 4 and {line.count("&") for line in body} == {9}
+
+
+def test_a_row_without_any_figure_has_its_reason_below(tmp_path):
+    told = metrics()
+    told["trivial"]["median_background"] = row(None, None)
+    assert "median background (trivial)" not in " ".join(tables_of(told)[0].footnotes)
+    told["reasons"] = {
+        "trivial.median_background.full.psnr": "c: the camera moves.",
+        "trivial.nearest_frame.full.lpips_vgg": "no weights",
+    }
+    sentence = "median background (trivial): c: the camera moves."
+    assert tables_of(told)[0].footnotes == (sentence,)
+    write_tables(tmp_path, told)
+    assert f"- {sentence}" in (tmp_path / "metrics.md").read_text().splitlines()
+    assert f"% {sentence}" in (tmp_path / "metrics.tex").read_text().splitlines()
+    told["protocols"]["avatar-compat"] = row(20, 0.9)
+    told["protocol_notes"]["avatar-compat"] = "how"
+    rows = {"on_median_background": row(None, None), "nearest_frame": row(None, None)}
+    told["compat_rows"] = {"avatar-compat": rows}
+    for name in rows:
+        told["reasons"][f"compat_rows.avatar-compat.{name}.full.psnr"] = "it moves"
+    both = "the same person on the median background, nearest training frame (trivial): it moves."
+    assert tables_of(told)[1].footnotes == (both,)

@@ -11,7 +11,15 @@ from evsplat.benching.given_pictures import OWN_PICTURE
 from evsplat.benching.suite import PublishedTable, SuiteRow
 from evsplat.capture.policy import STRICT_TERMS, terms_of
 from evsplat.evaluation.protocols import PROTOCOLS
-from evsplat.evaluation.tables import METRIC_TITLES, REGION_TITLES, Figure, Heading, Row, Table
+from evsplat.evaluation.tables import (
+    METRIC_TITLES,
+    REGION_TITLES,
+    Figure,
+    Heading,
+    Row,
+    Table,
+    reason_of_gap,
+)
 from evsplat.methods import NOMINAL_ITERATIONS, TRAINABLE
 from evsplat.wording import counted
 
@@ -260,6 +268,22 @@ def _baselines(records: Records) -> list[str]:
     ]
 
 
+def _without_figures(records: Records) -> list[str]:
+    """A sentence per row and reason why cells that are over have no figure, with their captures."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for row in records.plan.suite.rows:
+        for capture in records.captures:
+            for record in records.of(capture, row.name):
+                if reason := reason_of_gap(record, "protocols.standard"):
+                    captures = found.setdefault(reason, {}).setdefault(row.label, [])
+                    captures += [capture] if capture not in captures else []
+    return [
+        f"{label} has no figure on {', '.join(captures)}: {reason.rstrip('.')}."
+        for reason, rows in found.items()
+        for label, captures in rows.items()
+    ]
+
+
 def _footnotes(records: Records) -> list[str]:
     """What titles leave out, and reasons why something is not in the tables."""
     titles = {row.name: row.label for row in records.plan.suite.rows}
@@ -268,6 +292,7 @@ def _footnotes(records: Records) -> list[str]:
         f"{titles[row]} failed on {', '.join(captures)}: {reason}"
         for (row, reason), captures in records.failures().items()
     ]
+    notes += _without_figures(records)
     notes += list(records.plan.missing.values())
     left = len(records.plan.cells) - len(records.by_cell)
     if left:

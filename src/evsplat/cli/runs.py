@@ -309,7 +309,13 @@ def summary_table(metrics: dict[str, Any]) -> str:
     """
     from evsplat.evaluation.protocols import REGIONS
     from evsplat.evaluation.splits import count_of, words_of
-    from evsplat.evaluation.tables import composited, input_is_truth, terms, without_truth
+    from evsplat.evaluation.tables import (
+        composited,
+        input_is_truth,
+        standard_gaps,
+        terms,
+        without_truth,
+    )
 
     if not count_of(metrics):
         return f"No test figures. {terms(metrics)}"
@@ -329,7 +335,7 @@ def summary_table(metrics: dict[str, Any]) -> str:
     for name, regions in rows.items():
         cells = "".join(f"{_cell(regions[region]):>18}" for region in REGIONS)
         lines.append(f"{name:{width}}{cells}")
-    return "\n".join([*lines, terms(metrics)])
+    return "\n".join([*lines, *standard_gaps(metrics), terms(metrics)])
 
 
 def _cell(values: dict[str, float | None] | None) -> str:

@@ -1,7 +1,7 @@
 """Tables in Markdown, LaTeX (booktabs) and HTML; those of a run's figures, one per protocol."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from itertools import groupby
 from pathlib import Path
@@ -133,8 +133,53 @@ def tables_of(metrics: dict[str, Any]) -> list[Table]:
             others = metrics.get("compat_rows", {}).get(protocol, {})
         rows = {metrics["method"]: ours, **others}
         note = f"{metrics['protocol_notes'][protocol]}."
-        tables.append(_table(f"Protocol {protocol}", note, rows, titles, metrics["method"]))
+        tables.append(
+            replace(
+                _table(f"Protocol {protocol}", note, rows, titles, metrics["method"]),
+                footnotes=_gaps(metrics, protocol, rows, titles),
+            )
+        )
     return tables
+
+
+def standard_gaps(metrics: dict[str, Any]) -> tuple[str, ...]:
+    """A sentence for each row of protocol `standard` that has no figure, with the reason."""
+    rows = {metrics["method"]: metrics["protocols"]["standard"]}
+    rows |= composited(metrics) | metrics.get("trivial", {})
+    return _gaps(metrics, "standard", rows, {})
+
+
+def reason_of_gap(metrics: dict[str, Any], place: str) -> str | None:
+    """Why a row of metrics.json, or of a bench's cell, has no figure; None where it has one.
+
+    ``place`` is its path of keys. None as well where nothing tells.
+    """
+    row: Any = metrics
+    for key in place.split("."):
+        row = row[key]
+    if any(value is not None for region in row.values() for value in region.values()):
+        return None
+    reason: str | None = metrics.get("reasons", {}).get(f"{place}.full.psnr")
+    return reason
+
+
+def _gaps(
+    metrics: dict[str, Any], protocol: str, rows: Iterable[str], titles: dict[str, str]
+) -> tuple[str, ...]:
+    """A sentence for each of ``rows`` that has no figure; those of one reason share it."""
+    found: dict[str, list[str]] = {}
+    for name in rows:
+        if name == "blurry_input":
+            continue  # the camera's pictures are the truth where it has none
+        place = f"compat_rows.{protocol}.{name}"
+        if name == metrics["method"]:
+            place = f"protocols.{protocol}"
+        elif protocol == "standard":
+            own = name in composited(metrics)
+            place = f"composited.{protocol}" if own else f"trivial.{name}"
+        if reason := reason_of_gap(metrics, place):
+            found.setdefault(reason, []).append(titles.get(name, name))
+    return tuple(f"{', '.join(names)}: {why.rstrip('.')}." for why, names in found.items())
 
 
 def _table(
