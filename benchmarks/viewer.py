@@ -72,7 +72,7 @@ def untrained_run(gaussians: int, method: str) -> Run:
     counts = {"human": rows.human_count, "scene": rows.scene_count}
     made = GaussianReconstruction(method, model)
     facts = (capture, made, 0, 0.0, "cpu", counts, False)
-    return Run(Path("none"), config, method, seen.terms, *facts)
+    return Run(Path("none"), config, method, seen.terms(), *facts)
 
 
 async def pictures(port: int, seconds: float, change, viewer: Viewer) -> list[tuple[float, int]]:

@@ -283,7 +283,8 @@ def test_a_cell_is_made_by_its_own_policy_and_says_so(tiny_capture, tmp_path):
         record = read_json(folder.record_of(cell.id))
         assert record["status"] == "done", record
         found[cell.row] = record["policy"]
-        assert found[cell.row] == {**record["cell"]["policy"], "events": True}
+        of_events = {"events": True, "event_use": "amounts", "thresholds_found": True}
+        assert found[cell.row] == {**record["cell"]["policy"], **of_events}
     assert found["strict"] == asdict(Terms())
     assert found["estimated"] == asdict(Terms(thresholds="estimated"))
     assert found["interpolated"] == asdict(Terms(held_out_poses="interpolated"))

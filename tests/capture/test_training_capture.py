@@ -212,15 +212,43 @@ def test_estimated_masks_are_the_maskers_own(tiny_capture):
 
 def test_terms_say_what_the_recording_could_not_give(tiny_capture):
     path = tiny_capture()
-    assert seen(path, masks="given").terms == Terms(masks="given")
+    assert seen(path, masks="given").terms() == Terms(masks="given")
     document = json.loads((path / "capture.json").read_text())
     document["events"]["contrast_threshold"] = None
     document["provenance"]["masks"] = {"with": "background"}
     (path / "capture.json").write_text(json.dumps(document))
-    assert seen(path, masks="given").terms == Terms(masks="estimated", thresholds="estimated")
+    assert seen(path, masks="given").terms() == Terms(masks="estimated", thresholds="estimated")
     del document["events"]
     (path / "capture.json").write_text(json.dumps(document))
-    assert not seen(path).terms.events
+    assert not seen(path).terms().events
+
+
+def test_terms_say_of_thresholds_what_a_method_makes_of_them(tiny_capture):
+    path = tiny_capture()
+    given = seen(path)
+    hidden = seen(path, thresholds="estimated", held_out_events=True)
+    said = {
+        ("amounts", True): "contrast thresholds estimated",
+        ("amounts", False): "contrast thresholds unknown",
+        ("direction", True): "contrast thresholds not used",
+        ("nothing", True): "no events used",
+    }
+    for (use, found), departure in said.items():
+        terms = hidden.terms(use, thresholds_found=found)
+        asks = use != "nothing"
+        seen_too = ("events of held-out intervals seen",) if asks else ()
+        assert terms.departures == (*seen_too, departure)
+        assert ("events of held-out intervals were seen" in terms.sentence(3)) == asks
+        estimated = departure == "contrast thresholds estimated"
+        assert ("estimated from training frames" in terms.sentence(3)) == estimated
+        assert given.terms(use, thresholds_found=found).departures == ()
+    assert "a usual one was taken" in hidden.terms(thresholds_found=False).sentence(3)
+    assert "the method uses no events, no masks" in hidden.terms("nothing").sentence(3)
+    document = json.loads((path / "capture.json").read_text())
+    document["provenance"]["restored"] = {"with": "edi", "contrast_threshold": [0.2, 0.2]}
+    (path / "capture.json").write_text(json.dumps(document))
+    # Pictures that thresholds have sharpened show them to whoever asks for pictures alone.
+    assert seen(path).terms("nothing") == Terms()
 
 
 def test_neighbours_end_at_held_out_frames(tiny_capture):

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from evsplat.capture import Capture, Policy, estimate_sensor, load_capture
-from evsplat.capture.sensor_estimate import SensorEstimate
-from evsplat.inspection.sensor import contrast_findings
+from evsplat.capture.sensor_estimate import SensorEstimate, contrast_findings
 from evsplat.objectives.base import Step
 from evsplat.objectives.exposure import Exposure
 from evsplat.pictures import decode, encode

@@ -7,8 +7,14 @@ import h5py
 import numpy as np
 import pytest
 
-from evsplat.calibration import ClockEstimate, SensorEstimate, ThresholdEstimate
-from evsplat.capture import TrainingCapture, load_capture
+from evsplat.calibration import (
+    ClockEstimate,
+    SensorEstimate,
+    ThresholdEstimate,
+    estimate_from_pairs,
+)
+from evsplat.capture import TrainingCapture, estimate_sensor, load_capture
+from evsplat.capture.sensor_estimate import contrast_findings
 from evsplat.methods import Purpose, sensor
 from evsplat.methods.evsplat import CLOSED_SURFACE
 from evsplat.methods.evsplat_settings import EvsplatConfig
@@ -17,6 +23,7 @@ from evsplat.objectives import EventChange, EventWindows
 from evsplat.training import load_run, train
 
 from ..conftest import write_event_file
+from ..seen import seen
 from ..small_model import built, small
 
 
@@ -184,3 +191,72 @@ def test_counts_are_averaged_over_the_period_of_lamps_that_flicker(
     assert windows.flicker_us == (found_us or 0)
     # All of such a picture would count as noise.
     assert windows.noise.aware == (found_us is None)
+
+
+def test_a_run_says_what_became_of_thresholds_that_nobody_gives(tiny_capture, tmp_path, caplog):
+    """Estimated ones of a method that compares amounts, and only where they were found."""
+    caplog.set_level(logging.INFO)
+    signed, signless = (tiny_capture(name, frames=12, width=64, height=48) for name in "ab")
+    with h5py.File(signless / "events.h5", "r+") as file:
+        file["events/p"][:] = 0
+    for path in (signed, signless):
+        forget(path)
+    said = {
+        ("evsplat", signed): "contrast thresholds estimated from training frames",
+        ("evsplat", signless): "contrast thresholds neither given nor found",
+        ("paper", signless): "no contrast thresholds used",
+        ("avatar3dgs_semantic", signless): "the method uses no events",
+    }
+    for (method, path), sentence in said.items():
+        caplog.clear()
+        out = tmp_path / method / path.name
+        run = train(path, method=method, out=out, iterations=2, overrides=small(method))
+        shown = load_run(run).policy.sentence(1)
+        assert sentence in shown and sentence in caplog.text
+        others = set(said.values()) - {sentence}
+        assert not any(other in shown or other in caplog.text for other in others)
+
+
+def test_given_thresholds_that_do_not_fit_are_told_where_amounts_are_compared(
+    tiny_capture, tmp_path, caplog
+):
+    path, mirrored = (tiny_capture(name, frames=16, width=96, height=72) for name in "ab")
+    given = load_capture(path).contrast_threshold
+
+    def told(name: str, factor: float, *settings: str, method="evsplat", capture=path) -> list[str]:
+        document = json.loads((capture / "capture.json").read_text())
+        document["events"]["contrast_threshold"] = [factor * value for value in given]
+        (capture / "capture.json").write_text(json.dumps(document))
+        caplog.clear()
+        overrides = small(method, *settings)
+        train(capture, method=method, out=tmp_path / name, iterations=1, overrides=overrides)
+        return [text for text in caplog.messages if "events.contrast_threshold" in text]
+
+    assert told("as they are", 1.0) == []
+    (sentence,) = told("too large", 2.8)
+    (finding,) = contrast_findings(load_capture(path), estimate_sensor(seen(path)))
+    assert sentence == str(finding)
+    assert len(told("too small", 1 / 2.8, "clock=never")) == 1
+    # Estimated anyway, cancelled, or not asked for.
+    assert told("hidden", 2.8, "policy.thresholds=estimated") == []
+    assert told("direction", 2.8, "event_term=paper") == []
+    assert told("paper", 2.8, method="paper") == []
+    assert told("none", 2.8, "event_weight=0") == []
+    with h5py.File(mirrored / "events.h5") as file:
+        t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
+    write_event_file(mirrored / "events.h5", t, 95 - x, y, p)
+    # What mirrored events fit is chance, and that they are mirrored is told.
+    assert told("mirrored", 2.8, capture=mirrored) == []
+    assert "mirrored left to right" in caplog.text
+
+
+def test_the_sensor_is_estimated_once(tiny_capture, tmp_path, monkeypatch):
+    calls = []
+
+    def counted(*inputs):
+        calls.append(inputs)
+        return estimate_from_pairs(*inputs)
+
+    monkeypatch.setattr("evsplat.capture.sensor_estimate.estimate_from_pairs", counted)
+    train(tiny_capture(), out=tmp_path / "run", iterations=1, overrides=small("evsplat"))
+    assert len(calls) == 1

@@ -8,7 +8,7 @@ import time
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -18,6 +18,7 @@ from evsplat.benching.folder import BenchFolder, exclusive
 from evsplat.benching.given_pictures import OWN_PICTURE, PICTURES, GivenPictures, OwnPicture
 from evsplat.benching.origin import code, machine
 from evsplat.capture import Capture, Policy, load_capture
+from evsplat.capture.policy import Terms
 from evsplat.config import override, to_dict
 from evsplat.errors import ConfigError, DataError, EvsplatError
 from evsplat.evaluation.evaluator import evaluate
@@ -30,6 +31,9 @@ from evsplat.restore import restore_capture
 from evsplat.staging import StageSettings, stage
 from evsplat.untrusted.faults import open_bytes
 from evsplat.untrusted.records import Shape, misfit, read_record
+
+if TYPE_CHECKING:
+    from evsplat.training import Run
 
 logger = logging.getLogger(__name__)
 
@@ -187,29 +191,31 @@ def _measured(bench: BenchFolder, cell: Cell, threads: int | None, device: str) 
     trained_on = _restored(bench, recorded, cell)
     run = bench.run_of(cell.id)
     facts: dict[str, Any] = {"iteration": None, "train_seconds": None, "gaussians": None}
+    # Of pictures that were made elsewhere nobody knows what they were made from; the camera's own
+    # are what is held out.
+    terms: Terms | None = None
     reconstruction: Reconstruction
     if cell.trains:
-        reconstruction, facts = _trained(run, trained_on, cell, threads, device)
+        trained, facts = _trained(run, trained_on, cell, threads, device)
+        reconstruction, terms = trained.reconstruction, trained.policy
     elif cell.pictures is not None:
         reconstruction = GivenPictures(Path(cell.pictures), recorded)
     elif cell.method == OWN_PICTURE:
         reconstruction = OwnPicture(recorded)
     else:
-        reconstruction = TRIVIAL[cell.method](load_capture(trained_on).for_training(cell.policy))
+        shown = load_capture(trained_on).for_training(cell.policy)
+        reconstruction, terms = TRIVIAL[cell.method](shown), shown.terms("nothing")
     if cell.backdrop:
         reconstruction = OnMedianBackground(reconstruction, seen)
     measured = evaluate(recorded, reconstruction, out_dir=run, device=device, test_frames_only=True)
     kept = ("frames", "protocols", "per_frame", "reasons", "weights", "protocol_notes")
-    # Of pictures that were made elsewhere nobody knows what they were made from; the camera's own
-    # are what is held out.
-    of_a_method = cell.method not in (OWN_PICTURE, PICTURES)
-    terms = to_dict(seen.terms) if of_a_method else None
-    return {**facts, "policy": terms, **{key: measured[key] for key in kept}}
+    policy = None if terms is None else to_dict(terms)
+    return {**facts, "policy": policy, **{key: measured[key] for key in kept}}
 
 
 def _trained(
     run: Path, capture: Path, cell: Cell, threads: int | None, device: str
-) -> tuple[Reconstruction, dict[str, Any]]:
+) -> tuple["Run", dict[str, Any]]:
     from evsplat.training import load_run, train
     from evsplat.training.checkpoint import latest_checkpoint
     from evsplat.training.run import RunFolder
@@ -243,7 +249,7 @@ def _trained(
             go(method=cell.method, overrides=settings, seed=cell.seed)
     used = cpu_seconds()
     trained = load_run(run, device=device)
-    return trained.reconstruction, {
+    return trained, {
         "iteration": trained.iteration,
         "train_seconds": trained.train_seconds,
         "train_cpu_seconds": used,

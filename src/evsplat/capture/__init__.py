@@ -12,7 +12,7 @@ from evsplat.capture.sensor_estimate import (
     estimate_sensor,
     lost_events,
     shared_pairs,
-    warn_of_linear_frames,
+    warn_of_contrast,
 )
 from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import validate_capture
@@ -30,7 +30,7 @@ __all__ = [
     "TrainingCapture",
     "coded",
     "estimate_sensor",
-    "warn_of_linear_frames",
+    "warn_of_contrast",
     "load_body_track",
     "load_capture",
     "lost_events",

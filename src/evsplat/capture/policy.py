@@ -7,6 +7,9 @@ from evsplat.errors import ConfigError
 from evsplat.options.declare import Use
 
 Masks = Literal["given", "estimated", "none"]
+EventUse = Literal["amounts", "direction", "nothing"]
+"""Of what events tell a method takes how much changed, which needs contrast thresholds; which way,
+from which they cancel; or nothing."""
 
 
 @dataclass(frozen=True)
@@ -52,17 +55,30 @@ class Terms(Policy):
 
     events: bool = True
     """False: it has none, so that there is nothing to say of thresholds and held-out events."""
+    event_use: EventUse = "amounts"
+    """Of the events, what the method takes."""
+    thresholds_found: bool = True
+    """False: neither given nor found from training frames, so that a usual one was taken."""
+
+    @property
+    def sees_events(self) -> bool:
+        """Whether the method had any to learn from."""
+        return self.events and self.event_use != "nothing"
 
     @property
     def departures(self) -> tuple[str, ...]:
         """Differences from `STRICT_TERMS`, in words for the title of a row."""
-        of_events = {
-            "held_out_events": "events of held-out intervals seen",
-            "thresholds": "contrast thresholds estimated",
-        }
+        intervals = "events of held-out intervals seen"
+        found = "estimated" if self.thresholds_found else "unknown"
+        thresholds = {
+            "amounts": f"contrast thresholds {found}",
+            "direction": "contrast thresholds not used",
+            "nothing": "no events used",
+        }[self.event_use]
         said = {
             "use": "trained on everything",
-            **(of_events if self.events else {}),
+            **({"held_out_events": intervals} if self.sees_events else {}),
+            **({"thresholds": thresholds} if self.events else {}),
             "masks": f"masks {self.masks}",
             "held_out_poses": "poses at test times interpolated",
         }
@@ -73,7 +89,7 @@ class Terms(Policy):
     def sentence(self, held_out: int) -> str:
         """All of them with ``held_out`` test frames, for a reader of figures."""
         if self.use == "everything":
-            events = " and every event" if self.events else ""
+            events = " and every event" if self.sees_events else ""
             return f"Every frame{events} trained; nothing was held out."
         masks = {
             "given": "masks of training frames given",
@@ -88,7 +104,7 @@ class Terms(Policy):
         if not held_out:
             return f"No frame is a test frame, so nothing was held out; {', '.join(seen)}."
         events = ""
-        if self.events:
+        if self.sees_events:
             events = (
                 ", events of held-out intervals were seen"
                 if self.held_out_events
@@ -100,6 +116,12 @@ class Terms(Policy):
     def _thresholds(self) -> str:
         if not self.events:
             return "the recording has no events"
+        if self.event_use == "nothing":
+            return "the method uses no events"
+        if self.event_use == "direction":
+            return "no contrast thresholds used"
+        if not self.thresholds_found:
+            return "contrast thresholds neither given nor found, so that a usual one was taken"
         return {
             "given": "contrast thresholds as the capture gives them",
             "estimated": "contrast thresholds estimated from training frames",

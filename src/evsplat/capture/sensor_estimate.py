@@ -11,6 +11,7 @@ from evsplat.calibration import (
     FramePair,
     Lost,
     SensorEstimate,
+    ThresholdEstimate,
     estimate_from_pairs,
     exposure,
     find_lost,
@@ -19,6 +20,7 @@ from evsplat.calibration import (
     pauses,
 )
 from evsplat.capture.capture import Capture
+from evsplat.capture.finding import Finding, Findings
 from evsplat.capture.training_capture import TrainingCapture
 from evsplat.events import Span
 
@@ -28,6 +30,11 @@ logger = logging.getLogger(__name__)
 LIKELY_LARGEST = 0.6
 """Sensors' thresholds lie between 0.1 and 0.5; frames that are light and are taken as coded by the
 power curve make them look 2.2 times as large."""
+
+_LEAST_FITTED = 1_000
+"""Pixels with events of which fitted thresholds contradict given ones."""
+_FAR_APART = 1.6
+"""Fitted ones are up to 1.3 times the known where exposures overlap, and within 0.1 elsewhere."""
 
 _KEPT_BYTES = 128 << 20
 """Of shared pairs, which are there while a model is built: 60 of 512 x 512 pixels take 79 MB."""
@@ -42,32 +49,70 @@ def looks_linear(capture: Capture | TrainingCapture, estimate: SensorEstimate | 
     return coded and (fitted.plus + fitted.minus) / 2 > LIKELY_LARGEST
 
 
-def warn_of_linear_frames(capture: TrainingCapture, estimate: SensorEstimate | None) -> None:
-    """Log that frames look linear where their values are taken as coded."""
+def contrast_findings(
+    capture: Capture | TrainingCapture, estimate: SensorEstimate | None
+) -> list[Finding]:
+    """Warnings where the fitted thresholds say that frames hold linear light, or are not the given.
+
+    Thresholds of frames that look linear are far off for that reason, and are not compared.
+    """
+    if estimate is None or estimate.thresholds is None:
+        return []
+    fitted, camera, given = (
+        estimate.thresholds,
+        capture.frames[0].camera,
+        capture.contrast_threshold,
+    )
+    findings = Findings()
     if looks_linear(capture, estimate):
-        assert estimate is not None and estimate.thresholds is not None
-        fitted = estimate.thresholds
-        logger.warning(
-            "%s: the contrast fitted to frames and events is %.2f / %.2f, expected 0.1 to 0.5: the "
-            'frames look linear; if they are, write "transfer": "linear" into their camera.',
+        findings.warning(
             capture.path / "capture.json",
-            fitted.plus,
-            fitted.minus,
+            f"cameras.{camera}.transfer",
+            f"{capture.transfer(capture.frames[0])!r}, with which an event stands for a change of "
+            f"{fitted.plus:.2f} / {fitted.minus:.2f}: the frames look linear",
+            "thresholds of 0.1 to 0.5",
+            'Write "linear" if the camera stores light as it measures it, as a DAVIS does.',
         )
+    elif given is not None and fitted.pixels >= _LEAST_FITTED and _far_apart(given, fitted):
+        findings.warning(
+            capture.path / "capture.json",
+            "events.contrast_threshold",
+            f"{list(given)}, and an event stands for a change of {fitted.plus:.2f} / "
+            f"{fitted.minus:.2f} of the frames",
+            "thresholds with which events add up to what the frames show",
+            "Leave them null to have them found, as where several pixels of the sensor lie in one "
+            "of the pictures; if they are known, see whether events are there twice or were "
+            "thinned, and which transfer the camera has.",
+        )
+    return findings.items
+
+
+def _far_apart(given: tuple[float, float], fitted: ThresholdEstimate) -> bool:
+    """True where fitted thresholds are not those given, whatever their fit errs by."""
+    ratio = (fitted.plus + fitted.minus) / (given[0] + given[1])
+    return not 1 / _FAR_APART < ratio < _FAR_APART
+
+
+def warn_of_contrast(capture: TrainingCapture, estimate: SensorEstimate | None) -> None:
+    """Log `contrast_findings`."""
+    for finding in contrast_findings(capture, estimate):
+        logger.warning("%s", finding)
 
 
 def estimate_sensor(capture: TrainingCapture) -> SensorEstimate | None:
     """Estimate from at most 60 pairs of consecutive frames; None where that is not possible.
 
     Pairs are of training frames with no held-out one between them. Events without polarity tell
-    nothing.
+    nothing. It is made once of a capture.
 
     The lag is what is left after the capture's own ``clock_offset_us``. A moving camera changes
     nothing: both sides see what moves in the picture.
     """
     if capture.events is None or len(capture.events) == 0 or not capture.events.has_polarity:
         return None
-    return estimate_from_pairs(frame_pairs(capture), capture.events)
+    if capture.sensor_estimate is None:
+        capture.sensor_estimate = (estimate_from_pairs(frame_pairs(capture), capture.events),)
+    return capture.sensor_estimate[0]
 
 
 @contextmanager

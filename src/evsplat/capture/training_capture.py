@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.calibration import FramePair, Lost, flicker_period_us
+from evsplat.calibration import FramePair, Lost, SensorEstimate, flicker_period_us
 from evsplat.camera import Camera
 from evsplat.capture.body_file import BodyFile
 from evsplat.capture.metadata import Frame, NovelView
-from evsplat.capture.policy import Policy, Terms
+from evsplat.capture.policy import EventUse, Policy, Terms
 from evsplat.capture.read import CaptureReader
 from evsplat.errors import DataError, HeldOutError
 from evsplat.events import ALWAYS, EventStore, Span
@@ -65,6 +65,8 @@ class TrainingCapture:
         made anew for everybody. See `evsplat.capture.shared_pairs`."""
         self.lost: Lost | None = None
         """Where events were lost, once `evsplat.capture.lost_events` has looked for it."""
+        self.sensor_estimate: tuple[SensorEstimate | None] | None = None
+        """What frames tell of the sensor, once `evsplat.capture.estimate_sensor` has tried."""
         self.path: Path = source.path
         self.name: str = source.name
         self.frames: tuple[Frame, ...] = tuple(self._redacted(f) for f in self._source.frames)
@@ -83,11 +85,23 @@ class TrainingCapture:
         """Frames of which camera and time alone are known."""
         return tuple(frame for frame in self.frames if frame.split != "train")
 
-    @property
-    def terms(self) -> Terms:
-        """The policy as this recording meets it: what it does not give is estimated, or missing."""
+    def terms(self, use: EventUse = "amounts", *, thresholds_found: bool = True) -> Terms:
+        """The policy as this recording meets it: what it does not give is estimated, or missing.
+
+        ``use`` is what a method takes of the events; pictures that were restored by thresholds show
+        both to a method that asks for neither. ``thresholds_found``: that it found those that are
+        not given.
+        """
         source = self._source
-        terms = Terms(**vars(self.policy), events=source.events is not None)
+        restored = source.provenance.get("restored")
+        if isinstance(restored, dict) and "contrast_threshold" in restored:
+            use = "amounts"
+        terms = Terms(
+            **vars(self.policy),
+            events=source.events is not None,
+            event_use=use,
+            thresholds_found=thresholds_found,
+        )
         if source.contrast_threshold is None:
             terms = replace(terms, thresholds="estimated")
         if terms.masks == "given" and "masks" in source.provenance:

@@ -18,6 +18,7 @@ from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding
 from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
+from evsplat.capture.sensor_estimate import contrast_findings
 from evsplat.capture.validate import check_capture
 from evsplat.errors import EvsplatError
 from evsplat.files import try_target
@@ -36,14 +37,14 @@ from evsplat.inspection.drawing import (
     to_picture,
 )
 from evsplat.inspection.event_check import (
-    WHICH_WAY,
     event_findings,
     flicker_findings,
+    lie_elsewhere,
     warn_of_events,
 )
 from evsplat.inspection.picture_check import picture_findings, warn_of_pictures
 from evsplat.inspection.plots import draw_timeline
-from evsplat.inspection.sensor import clock_findings, contrast_findings, sensor_lines
+from evsplat.inspection.sensor import clock_findings, sensor_lines
 from evsplat.spread import evenly_spread
 from evsplat.wording import counted
 
@@ -88,9 +89,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     seen = capture.for_training(Policy(use="everything"))
     with shared_pairs(seen):
         of_events = event_findings(seen)
-        # Clock and thresholds of events that lie elsewhere are chance.
-        elsewhere = any(finding.field in WHICH_WAY for finding in of_events)
-        estimate = None if elsewhere else estimate_sensor(seen)
+        estimate = None if lie_elsewhere(of_events) else estimate_sensor(seen)
     findings = (
         *found,
         *picture_findings(seen),

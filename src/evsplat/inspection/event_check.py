@@ -1,16 +1,17 @@
 """Warnings about events that do not tell what frames show: turned, inverted, sparse, lost."""
 
 import logging
+from collections.abc import Iterable
 
 from evsplat.calibration import FramePair, Lost, answered_share, estimate_disagreement
-from evsplat.capture import TrainingCapture, lost_events
+from evsplat.capture import TrainingCapture, estimate_sensor, lost_events, warn_of_contrast
 from evsplat.capture.finding import Finding, Findings
 from evsplat.capture.sensor_estimate import frame_pairs
 from evsplat.events import EventStore
 
 logger = logging.getLogger(__name__)
 
-WHICH_WAY = ("events/p", "events/x, events/y")
+_WHICH_WAY = ("events/p", "events/x, events/y")
 """Fields of findings with which events tell nothing of the clock or of thresholds."""
 _FEWEST_ANSWERED = 0.7
 """Share of pixels that change very much below which they are not those of the events."""
@@ -34,13 +35,13 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
     other_way = estimate_disagreement(pairs, events) if signed and not sign else None
     if sign:
         findings.warning(
-            events.path, WHICH_WAY[0], f"{sign} events alone between all frames",
+            events.path, _WHICH_WAY[0], f"{sign} events alone between all frames",
             "events of either polarity, as every motion makes them",
             "Check how the recording was exported, and the sensor's biases.",
         )  # fmt: skip
     elif other_way is not None:
         findings.warning(
-            events.path, WHICH_WAY[bool(other_way.turned)],
+            events.path, _WHICH_WAY[bool(other_way.turned)],
             str(other_way), "events in the pixels of the frames, 1 where it grows brighter",
             "Write the events anew that way (evsplat.events.write_events), or the pictures.",
         )  # fmt: skip
@@ -50,7 +51,7 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
         where = ", ".join(spans[:3]) + (f" and {len(spans) - 3} more" if len(spans) > 3 else "")
         if lost.elsewhere:
             findings.warning(
-                events.path, WHICH_WAY[1],
+                events.path, _WHICH_WAY[1],
                 f"hardly an event at the pixels that change, and as many as ever at others, from "
                 f"{where}",
                 "events wherever the brightness changes",
@@ -99,10 +100,22 @@ def flicker_findings(capture: TrainingCapture) -> list[Finding]:
     return findings.items
 
 
-def warn_of_events(capture: TrainingCapture) -> None:
-    """Log what is found about events, before a training that learns from them."""
-    for finding in event_findings(capture) + flicker_findings(capture):
+def lie_elsewhere(findings: Iterable[Finding]) -> bool:
+    """Whether `event_findings` say so of events: what clock and thresholds they fit is chance."""
+    return any(finding.field in _WHICH_WAY for finding in findings)
+
+
+def warn_of_events(capture: TrainingCapture, *, thresholds: bool = False) -> None:
+    """Log what is found about events, before a training that learns from them.
+
+    ``thresholds``: whether it takes them by their contrast thresholds, which are told then if they
+    do not fit.
+    """
+    findings = event_findings(capture)
+    for finding in findings + flicker_findings(capture):
         logger.warning("%s", finding)
+    if thresholds and not lie_elsewhere(findings):
+        warn_of_contrast(capture, estimate_sensor(capture))
 
 
 def _only_sign(pairs: list[FramePair], events: EventStore) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 from evsplat.config import from_dict
 from evsplat.errors import ConfigError
 from evsplat.methods import avatar3dgs, hugs, paper
-from evsplat.methods.base import Composition, MethodConfig, Purpose
+from evsplat.methods.base import Composition, MethodConfig, Purpose, event_use
 from evsplat.methods.evsplat import build as build_evsplat
 from evsplat.methods.evsplat_settings import EvsplatConfig
 from evsplat.methods.settings import NOMINAL_ITERATIONS
@@ -71,5 +71,6 @@ __all__ = [
     "Method",
     "MethodConfig",
     "Purpose",
+    "event_use",
     "method_config",
 ]

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from evsplat.body import BodyTrack, track_silhouette
 from evsplat.camera import Camera
 from evsplat.capture import Frame, Policy, TrainingCapture
+from evsplat.capture.policy import EventUse
 from evsplat.errors import ConfigError, DataError
 from evsplat.gaussians import BodyFrames, DensifyLimits, Part
 from evsplat.methods.learning import Learning
@@ -39,6 +40,13 @@ class MethodConfig(Protocol):
     @property
     def iterations(self) -> int:
         """Training steps; all schedules stretch with it."""
+
+
+def event_use(config: MethodConfig) -> EventUse:
+    """What a method with these settings takes of the events."""
+    if getattr(config, "event_weight", 0.0) == 0.0:
+        return "nothing"
+    return "amounts" if getattr(config, "event_term", "paper") == "windows" else "direction"
 
 
 @dataclass(frozen=True)
@@ -82,6 +90,9 @@ class Composition:
     fill: Callable[[Seen], dict[str, Tensor]] | None = None
     """Parameters by their names in the model's state, as a prior decides them at the end where
     little was seen; None: as they were learned."""
+    thresholds_found: bool = True
+    """False: the method takes events by their contrast thresholds, and neither the capture nor its
+    training frames told them where training began."""
 
 
 def start_of_randomness(seed: int) -> torch.Generator:

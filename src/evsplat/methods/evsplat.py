@@ -108,7 +108,7 @@ def build(
     if fit:
         _fit_colours(config, capture, model, background)
     objectives = _of_pictures(config, capture, poses.track, generator) + _priors(model)
-    windows = None
+    windows, thresholds_found = None, True
     asks_events = config.event_weight != 0.0 and capture.events is not None
     if fit and config.event_weight != 0.0 and not asks_events:
         logger.info(
@@ -117,7 +117,9 @@ def build(
     if asks_events and config.event_term == "paper":
         objectives.append(EventChange(capture, start=config.event_start))
     elif asks_events:
-        windows = event_windows(config, capture, model, generator, device=device, purpose=purpose)
+        windows, thresholds_found = event_windows(
+            config, capture, model, generator, device=device, purpose=purpose
+        )
         objectives.append(windows)
     return Composition(
         model=model,
@@ -143,6 +145,7 @@ def build(
         watched=("l1", "dssim") if poses.correction is None or poses.correction.exact else (),
         recording=recording,
         fill=partial(_filled, model, capture, config) if config.fill else None,
+        thresholds_found=thresholds_found,
     )
 
 

@@ -5,12 +5,7 @@ import logging
 import torch
 
 from evsplat.calibration import SensorEstimate, unrecorded_spans, untold_spans
-from evsplat.capture import (
-    TrainingCapture,
-    estimate_sensor,
-    lost_events,
-    warn_of_linear_frames,
-)
+from evsplat.capture import TrainingCapture, estimate_sensor, lost_events
 from evsplat.capture.sensor_estimate import frame_pairs
 from evsplat.events import EventStore, Span
 from evsplat.methods.base import Purpose
@@ -32,16 +27,18 @@ def event_windows(
     *,
     device: torch.device | str,
     purpose: Purpose,
-) -> EventWindows:
-    """The event term; the sensor with its thresholds and clock becomes a part of ``model``."""
+) -> tuple[EventWindows, bool]:
+    """The event term, and whether its thresholds were given or found, where it starts to learn.
+
+    The sensor with its thresholds and clock becomes a part of ``model``.
+    """
     assert capture.events is not None
     # A loaded model brings its own.
-    known, late_us = (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD), None
+    known, late_us = None, None
     if purpose == "train":
         estimate = None
         if capture.contrast_threshold is None or config.clock != "never":
             estimate = estimate_sensor(capture)
-            warn_of_linear_frames(capture, estimate)
         known = _thresholds(capture, estimate)
         late_us = _late_us(config, estimate)
         if not capture.events.has_polarity:
@@ -49,7 +46,8 @@ def event_windows(
                 "%s: its events have no polarity; the size of changes is compared with their "
                 "number.", capture.path,
             )  # fmt: skip
-    sensor = EventSensor(*known, late_us=late_us).to(device)
+    start = known or (UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD)
+    sensor = EventSensor(*start, late_us=late_us).to(device)
     model.sensor = sensor
     flicker_us = 0 if purpose == "draw" else capture.flicker_us
     # All of a flickering picture sends events that nothing moves; they are averaged out instead.
@@ -57,7 +55,7 @@ def event_windows(
     noise = EventNoise(capture.events, during_us=capture.minute_around_us, aware=aware)
     if purpose != "draw":
         noise.measure()
-    return EventWindows(
+    windows = EventWindows(
         capture,
         sensor,
         generator,
@@ -70,6 +68,7 @@ def event_windows(
         flicker_us=flicker_us,
         untold_us=[] if purpose == "draw" else _untold_us(capture, capture.events),
     )
+    return windows, known is not None
 
 
 def _untold_us(capture: TrainingCapture, events: EventStore) -> list[Span]:
@@ -95,8 +94,10 @@ def _late_us(config: EvsplatConfig, estimate: SensorEstimate | None) -> float | 
     return estimate.clock.lag_us
 
 
-def _thresholds(capture: TrainingCapture, estimate: SensorEstimate | None) -> tuple[float, float]:
-    """C+ and C-: the capture's, or those at which training frames and events agree best."""
+def _thresholds(
+    capture: TrainingCapture, estimate: SensorEstimate | None
+) -> tuple[float, float] | None:
+    """C+ and C-: the capture's, or those at which training frames and events agree best, if any."""
     if capture.contrast_threshold is not None:
         return capture.contrast_threshold
     if estimate is None or estimate.thresholds is None:
@@ -104,7 +105,7 @@ def _thresholds(capture: TrainingCapture, estimate: SensorEstimate | None) -> tu
             "%s: contrast thresholds are neither given nor to be found from frames and events; "
             "starting from %g.", capture.path, UNKNOWN_THRESHOLD,
         )  # fmt: skip
-        return UNKNOWN_THRESHOLD, UNKNOWN_THRESHOLD
+        return None
     found = estimate.thresholds
     logger.info("contrast thresholds found: C+ %.3f, C- %.3f", found.plus, found.minus)
     return found.plus, found.minus

@@ -6,7 +6,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.capture import Frame, TrainingCapture, estimate_sensor, warn_of_linear_frames
+from evsplat.capture import Frame, TrainingCapture, estimate_sensor, warn_of_contrast
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import deblur
 from evsplat.pictures import Transfer
@@ -75,7 +75,7 @@ class Edi:
 
 def _estimated(capture: TrainingCapture) -> tuple[float, float]:
     estimate = estimate_sensor(capture)
-    warn_of_linear_frames(capture, estimate)
+    warn_of_contrast(capture, estimate)
     if estimate is None or estimate.thresholds is None:
         raise DataError(
             f"{capture.path}: its contrast thresholds are unknown and cannot be estimated from its "

@@ -22,7 +22,7 @@ from evsplat.devices import hardware
 from evsplat.errors import ConfigError, DataError
 from evsplat.files import write_json, write_text
 from evsplat.masks import MASKERS
-from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, method_config
+from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, event_use, method_config
 from evsplat.models.beyond import Beyond
 from evsplat.models.kept import Kept
 from evsplat.models.model import Model
@@ -89,8 +89,13 @@ def write_facts(
     config: MethodConfig,
     device: str,
     seed: int,
+    *,
+    thresholds_found: bool,
 ) -> None:
-    """Record what the run was made with; ``seen`` is what its training is given."""
+    """Record what the run was made with; ``seen`` is what its training is given.
+
+    ``thresholds_found`` is as of `Composition`.
+    """
     write_json(
         folder.facts,
         {
@@ -98,6 +103,7 @@ def write_facts(
             "capture_name": seen.name,
             "training_frames": _frames_of(seen),
             "up": _up_of(seen),
+            "thresholds_found": thresholds_found,
             "method": method,
             "settings": _settings_of({"method": method, **to_dict(config)}),
             "device": device,
@@ -279,7 +285,11 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         path=folder.path,
         config=config,
         method=method,
-        policy=shown.terms,
+        policy=shown.terms(
+            event_use(config),
+            # Runs of before do not tell.
+            thresholds_found=facts.get("thresholds_found") is not False,
+        ),
         capture=capture,
         reconstruction=GaussianReconstruction(method, composition.model, seen, Backdrop(), Kept()),
         device=facts["device"],

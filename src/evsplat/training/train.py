@@ -22,7 +22,14 @@ from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError, machine_error
 from evsplat.files import open_output, try_target
 from evsplat.inspection import check_body, save_fit_sheet, warn_of_events, warn_of_pictures
-from evsplat.methods import DEFAULT_METHOD, TRAINABLE, MethodConfig, Purpose, method_config
+from evsplat.methods import (
+    DEFAULT_METHOD,
+    TRAINABLE,
+    MethodConfig,
+    Purpose,
+    event_use,
+    method_config,
+)
 from evsplat.methods.settings import Weight
 from evsplat.options import TrainOptions
 from evsplat.options.declare import given
@@ -135,16 +142,16 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     check_capture(start.facts, seen, start.folder, start.method)
     loaded = load_latest(start.folder.checkpoints) if options.resume else None
     purpose: Purpose = "train" if loaded is None else "resume"
-    fitting = None
+    fitting, uses = None, event_use(start.settings)
     if purpose == "train":
         warn_of_pictures(seen)
     if purpose == "train" and seen.has_body:
         fitting = check_body(seen, refuse=not options.any_body)
     # The check of the events and the estimate of their sensor compare the same frames.
     with shared_pairs(seen):
-        if purpose == "train" and getattr(start.settings, "event_weight", 0.0) != 0.0:
+        if purpose == "train" and uses != "nothing":
             check_events_reach(seen)
-            warn_of_events(seen)
+            warn_of_events(seen, thresholds=uses == "amounts")
         composition = TRAINABLE[start.method].build(
             start.settings, seen, start.seed, device=device, purpose=purpose
         )
@@ -176,13 +183,22 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     try_target(folder.path, _KEPT_AND_NEW * _WITH_OPTIMISER * state_bytes)
     if loaded is None:
         if not options.resume:
-            write_facts(folder, seen, start.method, start.settings, device, start.seed)
+            write_facts(
+                folder,
+                seen,
+                start.method,
+                start.settings,
+                device,
+                start.seed,
+                thresholds_found=composition.thresholds_found,
+            )
             # The last of what resuming needs.
             save_yaml(folder.config, start.settings, method=start.method)
         if fitting is not None and fitting.is_odd:
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
         logger.debug("%s", schedule_table(start.settings, composition.weights))
-        logger.info("%s", seen.terms.sentence(len(seen.held_out_frames)))
+        terms = seen.terms(uses, thresholds_found=composition.thresholds_found)
+        logger.info("%s", terms.sentence(len(seen.held_out_frames)))
     return trainer
 
 

@@ -56,7 +56,7 @@ def no_test_figures(metrics: dict[str, Any]) -> str | None:
         return None
     known = terms_of(metrics)
     if known is not None and known.use == "everything":
-        events = " and every event" if known.events else ""
+        events = " and every event" if known.sees_events else ""
         return (
             f"trained on every frame{events} (<code>--use everything</code>): nothing was held "
             "out, so there are no test figures."

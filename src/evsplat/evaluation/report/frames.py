@@ -92,7 +92,7 @@ def _held_out_terms(terms: Terms | None) -> str:
     if terms is None:
         return "Held out; nothing tells what training saw of these times."
     events = ""
-    if terms.events:
+    if terms.sees_events:
         events = (
             ", but the events of the intervals around them"
             if terms.held_out_events
