@@ -22,6 +22,7 @@ from evsplat.pictures.video import write_video
 
 from ..conftest import EXPOSURE_US, PERIOD_US, write_event_file
 from ..events.formats.encoders import aedat4, evt3
+from ..events.formats.mutations import bag
 from ..small_model import few_descent_steps, small
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-capture.md"
@@ -61,12 +62,16 @@ def write_recordings(folder: Path, tiny: Path) -> None:
         for picture, start in zip(pictures, starts, strict=True)
     ]
     (folder / "dance.aedat4").write_bytes(aedat4(stream, WIDTH, HEIGHT, exposed))
+    (folder / "dance.bag").write_bytes(bag(stream, WIDTH, HEIGHT))
     document = json.loads((tiny / "capture.json").read_text())
     (folder / "camera.json").write_text(json.dumps(document["cameras"]["main"]))
-    images = folder / "rec" / "images"
-    images.mkdir(parents=True)
-    for index, picture in enumerate(pictures):
-        Image.fromarray(picture).save(images / f"{index:04d}.png")
+    for parts in ("rec", "bag"):
+        images = folder / parts / "images"
+        images.mkdir(parents=True)
+        for index, picture in enumerate(pictures):
+            Image.fromarray(picture).save(images / f"{index:04d}.png")
+    lines = "".join(f"{start} {start + EXPOSURE_US}\n" for start in starts)
+    (folder / "bag" / "exposures.txt").write_text(lines)
     header = f"% evt 3.0\n% format EVT3;height={HEIGHT};width={WIDTH}\n"
     (folder / "rec" / "events.raw").write_bytes(evt3(stream, header))
     on = (stream.p > 0).astype(np.uint8)

@@ -1,6 +1,7 @@
 """Recordings without poses: a video, a DAVIS file, and poses that shall not be taken."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,8 @@ from evsplat.importers.recorded import large_pictures
 from evsplat.options import PoseOptions
 from evsplat.pictures.video import write_video
 
-from ..events.formats.encoders import aedat4
+from ..events.formats.encoders import aedat3, aedat4
+from ..events.formats.mutations import bag
 from . import trees
 
 WIDTH, HEIGHT, COUNT = 48, 32, 12
@@ -99,6 +101,49 @@ def test_a_part_of_a_davis_recording_begins_with_its_first_frame(
     assert len(capture.events) == len(some_events(0).between(begin, end))
     assert capture.cameras["main"].K[0, 0] == 55 and capture.provenance["focal"] == "given"
     assert capture.transfer("000004") == "power"
+
+
+def test_aedat3_makes_the_capture_that_aedat4_makes(davis: Path, tmp_path: Path) -> None:
+    # the clock of 31 bits begins again within an exposure
+    begin_us = (1 << 31) - 3_000 - 2 * PERIOD_US - EXPOSURE_US // 2
+    starts = [begin_us + 3_000 + index * PERIOD_US for index in range(COUNT)]
+    frames = [
+        (picture, start, start + EXPOSURE_US)
+        for picture, start in zip(moving_bar(), starts, strict=True)
+    ]
+    path = tmp_path / "dance.aedat"
+    path.write_bytes(aedat3(some_events(begin_us), WIDTH, HEIGHT, frames))
+    old, new = (run("davis", p, tmp_path / p.suffix[1:]) for p in (path, davis))
+    assert [f.exposure_us for f in old.frames] == [f.exposure_us for f in new.frames]
+    for frame in old.frames:
+        assert np.array_equal(old.image(frame), new.image(frame))
+        assert old.transfer(frame) == "linear"
+    assert old.events is not None and new.events is not None
+    a, b = old.events.between(0, 1 << 40), new.events.between(0, 1 << 40)
+    assert all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("t", "x", "y", "p"))
+
+
+def test_a_bag_is_refused_with_how_its_pictures_come_in(
+    tmp_path: Path, capsys, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("dance.bag")
+    starts = [EPOCH_US + index * PERIOD_US for index in range(COUNT)]
+    taken = [(p, t, t + 30_000) for p, t in zip(moving_bar(), starts, strict=True)]
+    path.write_bytes(bag(some_events(EPOCH_US), WIDTH, HEIGHT, taken))
+    assert main(["import", "davis", str(path), "--out", "out"]) == 2
+    error = capsys.readouterr().err
+    assert "of a ROS bag events alone are read" in error and "exposures.txt" in error
+    page = Path(__file__).parents[2] / "docs" / "event-formats.md"
+    programs = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    exec(next(program for program in programs if "rosbags" in program), {})
+    capture = run("folder", Path("bag"), tmp_path / "out", events=path, transfer="linear")
+    assert [f.exposure_us for f in capture.frames] == [(t, t + 30_000) for t in starts]
+    for frame, picture in zip(capture.frames, moving_bar(), strict=True):
+        assert np.array_equal((capture.image(frame)[..., 0] * 255).round(), picture)
+    assert capture.events is not None and capture.transfer(capture.frames[0]) == "linear"
+    got, given = capture.events.between(0, 1 << 62), some_events(EPOCH_US)
+    assert np.array_equal(got.t, given.t) and np.array_equal(got.p, given.p)
 
 
 def events_of_the_bar(first_us: int) -> EventStream:

@@ -62,7 +62,7 @@ class EventRecording:
         return EventStream.joined(parts)
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """Pictures recorded beside the events (AEDAT4 only), in order of the file."""
+        """Pictures recorded beside the events (AEDAT 3.1 and 4 only), in order of the file."""
         return self._source.frames()
 
 

@@ -1,4 +1,4 @@
-"""A recording of a DAVIS: frames with their exposures and events, in one AEDAT4 file."""
+"""A recording of a DAVIS: frames with their exposures and events, in one AEDAT file."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from evsplat.pictures.light import Transfer
 
 @dataclass(frozen=True, kw_only=True)
 class Davis(Importer):
-    """A DAVIS recording (AEDAT4) without poses: frames with exposure times, and events."""
+    """A DAVIS recording (AEDAT 3.1 or 4) without poses: frames with exposure times, and events."""
 
     frames: FrameRange = None
     """First frame and the one after the last; by default all."""
@@ -36,15 +36,11 @@ class Davis(Importer):
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read the recording; see `Importer.write`."""
-        recording = open_recording(need(source, "an AEDAT4 recording"), repair=self.repair)
+        recording = open_recording(need(source, "an AEDAT recording"), repair=self.repair)
         spans = [_span(source, index, frame) for index, frame in enumerate(recording.frames())]
         first = next((piece for piece in recording.chunks() if len(piece)), None)
         if not spans or first is None:
-            missing = "no events" if spans else f"no frames beside its events ({recording.format})"
-            raise DataError(
-                f"{source}: holds {missing}, expected AEDAT4 with both; import the frames' video "
-                "with 'evsplat import video CLIP --events FILE'."
-            )
+            raise _incomplete(source, recording, has_frames=bool(spans))
         kept = chosen_frames(self.frames, list(range(len(spans))), source)
         # Such files count from 1970; a capture begins at 0.
         begin = spans[kept[0]][0]
@@ -108,6 +104,24 @@ class Davis(Importer):
         }
         writer.leave_out_body()
         return notes
+
+
+def _incomplete(source: Path, recording: EventRecording, *, has_frames: bool) -> DataError:
+    """The error of a recording without events, or without frames that are read."""
+    if recording.format == "rosbag":
+        # what a driver stamps its pictures with, and where it says the exposure, is its own
+        return DataError(
+            f"{source}: of a ROS bag events alone are read, expected AEDAT 3.1 or 4 with frames "
+            "and events; write its pictures into DIR/images and the start and end of each "
+            "exposure, in microseconds of the bag's clock, a line each, into DIR/exposures.txt "
+            "(docs/event-formats.md has a program), and: "
+            f"evsplat import folder DIR --events {source} --transfer linear."
+        )
+    missing = f"no frames beside its events ({recording.format})" if not has_frames else "no events"
+    return DataError(
+        f"{source}: holds {missing}, expected AEDAT 3.1 or 4 with both; import the frames' video "
+        "with 'evsplat import video CLIP --events FILE'."
+    )
 
 
 def _span(source: Path, index: int, frame: RecordedFrame) -> tuple[int, int]:

@@ -104,6 +104,57 @@ def aedat2(s: EventStream, chip: str, width: int, height: int) -> bytes:
     return header.encode() + b"".join(body)
 
 
+def aedat3_frame_info(channels: int, *, colours: int = 0) -> bytes:
+    """First word of a frame of AEDAT 3.1, up to the start of its frame at 987,654."""
+    return struct.pack("<Ii", 1 | channels << 1 | colours << 4, 987_654)
+
+
+def aedat3(
+    s: EventStream,
+    width: int,
+    height: int,
+    frames: list[tuple[np.ndarray, int, int]] = (),
+    *,
+    packet: int = 700,
+    invalid_every: int = 0,
+    sensor: str = "SENSOR",
+) -> bytes:
+    """Packets of AEDAT 3.1; a new one where the 31 bits of the clock are over. One of IMU between.
+
+    Without frames a black one says the size of the sensor.
+    """
+    out = f"#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: {sensor}\r\n#!END-HEADER\r\n".encode()
+
+    def add(kind: int, size: int, overflow: int, data: bytes) -> None:
+        nonlocal out
+        count = len(data) // size
+        out += struct.pack("<hhiiiiii", kind, 1, size, 4, overflow, count, count, count) + data
+
+    pending, epoch = b"", 0
+    for index, (t, x, y, on) in enumerate(rows(s)):
+        if pending and (t >> 31 != epoch or len(pending) >= 8 * packet):
+            add(1, 8, epoch, pending)
+            add(3, 36, epoch, bytes(range(36)))
+            pending = b""
+        epoch = t >> 31
+        valid = not invalid_every or index % invalid_every != 0
+        word = int(valid) | bool(on) << 1 | y << 2 | x << 17
+        pending += struct.pack("<Ii", word, t & 0x7FFFFFFF)
+    if pending:
+        add(1, 8, epoch, pending)
+    for image, start, end in frames or [(np.zeros((height, width), np.uint8), 0, 1)]:
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        low = (1 << 31) - 1
+        head = aedat3_frame_info(channels) + struct.pack(
+            "<7i", 987_655, start & low, end & low, image.shape[1], image.shape[0], 0, 0
+        )
+        # what is lost of 16 bits is noise
+        noise = np.arange(image.size).reshape(image.shape) % 256
+        pixels = (image.astype("<u2") << 8) + noise.astype("<u2")
+        add(2, len(head) + 2 * image.size, end >> 31, head + pixels.tobytes())
+    return out
+
+
 def event_stream(s: EventStream, width: int, height: int, kind: int = 1) -> bytes:
     """Kind 1: DVS; 2: ATIS, with an exposure measurement after every third event."""
     body, last = [], 0

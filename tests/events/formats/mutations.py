@@ -6,7 +6,7 @@ Shared by the tests and by benchmarks/fuzz.py, which runs many more.
 import gzip
 import io
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import h5py
@@ -35,6 +35,10 @@ def seeds(encoders, stream: EventStream) -> dict[str, tuple[str, bytes]]:
         "evt3": ("raw", encoders.evt3(stream)),
         "dat": ("dat", encoders.dat(stream)),
         "aedat2": ("aedat2", encoders.aedat2(stream, "Davis346B", 346, 260)),
+        "aedat3": (
+            "aedat3",
+            encoders.aedat3(stream, WIDTH, HEIGHT, frames, packet=90, sensor="DAVIS346"),
+        ),
         "es": ("es", encoders.event_stream(stream, WIDTH, HEIGHT)),
         "aedat4": ("aedat4", encoders.aedat4(stream, WIDTH, HEIGHT, frames, packet=90)),
         "aedat4 plain": (
@@ -119,18 +123,59 @@ def check_stream(s: EventStream, width: int | None, height: int | None, polarity
     assert (np.abs(s.p) == int(polarity)).all()
 
 
-def bag(s: EventStream) -> bytes:
-    """A ROS 1 bag with dvs_msgs/EventArray messages of a hundred events."""
+_EVENT_ARRAY_MD5 = "5e8beee5a6c107e504c2e78903c224b8"
+"""Of the definition of dvs_msgs/EventArray; readers compare it."""
+
+
+def _write_pictures(writer, pictures: Sequence[tuple[np.ndarray, int, int]]) -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    if not pictures:
+        return
+    store = get_typestore(Stores.ROS1_NOETIC)
+    image, header, time = (
+        store.types[f"{package}/msg/{name}"]
+        for package, name in (
+            ("sensor_msgs", "Image"),
+            ("std_msgs", "Header"),
+            ("builtin_interfaces", "Time"),
+        )
+    )
+    topic = writer.add_connection("/dvs/image_raw", "sensor_msgs/msg/Image", typestore=store)
+    for index, (grey, start, end) in enumerate(pictures):
+        height, width = grey.shape
+        seconds, rest_us = divmod((start + end) // 2, 1_000_000)
+        stamp = header(index, time(seconds, rest_us * 1000), "dvs")
+        # a row may be longer than the picture is wide
+        rows = np.pad(grey, ((0, 0), (0, 3))).reshape(-1)
+        message = image(stamp, height, width, "mono8", 0, width + 3, rows)
+        writer.write(topic, end, store.serialize_ros1(message, "sensor_msgs/msg/Image"))
+
+
+def bag(
+    s: EventStream,
+    width: int = WIDTH,
+    height: int = HEIGHT,
+    pictures: Sequence[tuple[np.ndarray, int, int]] = (),
+) -> bytes:
+    """A ROS 1 bag with dvs_msgs/EventArray messages of a hundred events.
+
+    Grey pictures, with start and end of their exposure, are stamped with its middle.
+    """
     import struct
 
     from rosbags.rosbag1 import Writer
 
-    definition = "Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
+    definition = (
+        "Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
+        f"{'=' * 80}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+        f"{'=' * 80}\nMSG: dvs_msgs/Event\nuint16 x\nuint16 y\ntime ts\nbool polarity\n"
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "e.bag"
         with Writer(path) as writer:
             topic = writer.add_connection(
-                "/dvs/events", "dvs_msgs/msg/EventArray", msgdef=definition, md5sum="0" * 32
+                "/dvs/events", "dvs_msgs/msg/EventArray", msgdef=definition, md5sum=_EVENT_ARRAY_MD5
             )
             for first in range(0, len(s), 100):
                 rows = slice(first, first + 100)
@@ -139,9 +184,10 @@ def bag(s: EventStream) -> bytes:
                     struct.pack("<HHII?", x, y, t // 1_000_000, t % 1_000_000 * 1000, on)
                     for x, y, t, on in zip(*(c.tolist() for c in columns), strict=True)
                 )
-                head = struct.pack("<IIII3sII", 0, 1, 2, 3, b"dvs", HEIGHT, WIDTH)
+                head = struct.pack("<IIII3sII", 0, 1, 2, 3, b"dvs", height, width)
                 data = head + struct.pack("<I", len(body) // 13) + body
                 writer.write(topic, first + 1, data)
+            _write_pictures(writer, pictures)
         return path.read_bytes()
 
 

@@ -1,5 +1,6 @@
 """Binary formats against encoders written from their descriptions."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -49,6 +50,7 @@ ENCODERS: dict[str, tuple[str, Callable[[EventStream], bytes]]] = {
     "evt3": ("raw", encoders.evt3),
     "dat": ("dat", encoders.dat),
     "davis": ("aedat2", lambda s: encoders.aedat2(s, "Davis346B", 346, 260)),
+    "aedat3": ("aedat3", lambda s: encoders.aedat3(s, WIDTH, HEIGHT)),
     "es": ("es", lambda s: encoders.event_stream(s, WIDTH, HEIGHT)),
     "es atis": ("es", lambda s: encoders.event_stream(s, WIDTH, HEIGHT, kind=2)),
     "aedat4": ("aedat4", lambda s: encoders.aedat4(s, WIDTH, HEIGHT)),
@@ -124,6 +126,59 @@ def test_frames_come_with_their_exposure(tmp_path: Path, compression: int) -> No
     assert [frame.exposure_us for frame in read] == [(1_000, 9_000), (40_000, 55_000)]
     assert np.array_equal(read[0].image, grey) and np.array_equal(read[1].image, colour)
     assert same(recording.read(), s)
+
+
+AEDAT3_FRAMES = [
+    (np.arange(0, 30, dtype=np.uint8).reshape(5, 6), 1_000, 9_000),
+    (np.arange(0, 90, dtype=np.uint8).reshape(5, 6, 3), 2_400_000_000, 2_400_015_000),
+]
+"""A grey one, and one in colour whose clock has begun again."""
+
+
+def test_frames_of_aedat3_come_with_their_exposure_and_name_the_size(tmp_path: Path) -> None:
+    s = random_stream(12, 1_500)
+    s = EventStream(s.t, s.x % 6, s.y % 5, s.p)
+    path = tmp_path / "e.aedat"
+    path.write_bytes(encoders.aedat3(s, 6, 5, AEDAT3_FRAMES, invalid_every=7))
+    recording = open_recording(path)
+    assert (recording.width, recording.height) == (6, 5)
+    assert "its size is taken to be that of its first frame, 6x5" in recording.notes[0]
+    for frame, (image, *exposure) in zip(recording.frames(), AEDAT3_FRAMES, strict=True):
+        assert np.array_equal(frame.image, image) and list(frame.exposure_us) == exposure
+    kept = np.arange(len(s)) % 7 != 0
+    assert same(recording.read(), s.take(kept))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            b"#Format: RAW",
+            b"#Format: SerializedTS",
+            "packed (SerializedTS), expected '#Format: RAW",
+        ),
+        (b"#!END-HEADER\r\n", b"", "has no line #!END-HEADER"),
+        (encoders.aedat3_frame_info(1), encoders.aedat3_frame_info(1, colours=1), "mosaic"),
+        (encoders.aedat3_frame_info(1), encoders.aedat3_frame_info(2), "6x5x2"),
+    ],
+)
+def test_what_of_aedat3_is_not_read_is_one_sentence(
+    tmp_path: Path, old: bytes, new: bytes, said: str
+) -> None:
+    path = tmp_path / "e.aedat"
+    data = encoders.aedat3(random_stream(3, 20), WIDTH, HEIGHT, AEDAT3_FRAMES[:1])
+    assert data.count(old) == 1
+    path.write_bytes(data.replace(old, new))
+    with pytest.raises(DataError, match=re.escape(str(path)) + ".*" + re.escape(said)):
+        list(open_recording(path).frames())
+
+
+def test_two_recordings_of_aedat3_in_one_file_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "e.aedat"
+    data = encoders.aedat3(random_stream(3, 20), WIDTH, HEIGHT)
+    path.write_bytes(data + data)
+    with pytest.raises(DataError, match=f"another recording begins at byte {len(data)}"):
+        read_events(path)
 
 
 def test_events_before_the_first_time_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -245,7 +300,18 @@ def test_wrong_content_is_never_decoded_as_another_format(tmp_path: Path) -> Non
     for name, (kind, encode) in ENCODERS.items():
         path = tmp_path / "recording.raw"
         path.write_bytes(encode(_by_column(s)))
-        for other in ("aedat2", "aedat4", "csv", "dat", "es", "hdf5", "npz", "raw", "rosbag"):
+        for other in (
+            "aedat2",
+            "aedat3",
+            "aedat4",
+            "csv",
+            "dat",
+            "es",
+            "hdf5",
+            "npz",
+            "raw",
+            "rosbag",
+        ):
             if other != kind:
                 with pytest.raises(DataError, match=f"its content is {kind}, not {other}"):
                     open_recording(path, format=other)

@@ -41,6 +41,16 @@ def test_headers_orders_and_units_give_the_same_events(tmp_path: Path) -> None:
         assert same(read_events(packed), s)
 
 
+def test_another_size_of_mmhpsds_columns_is_refused(tmp_path: Path) -> None:
+    """Told 1280x800, the sensor before it was turned, most rows lay beside it."""
+    path = tmp_path / "event0000.csv"
+    path.write_text("0,0,10,3,0\n1279,799,20,3,0\n5,7,20,3,0\n")
+    for columns in (None, "mmhpsd"):
+        with pytest.raises(DataError, match="800x1280 pixels, found 1280x800 given; leave out"):
+            open_recording(path, columns=columns, width=1280, height=800)
+        assert open_recording(path, columns=columns, width=800, height=1280).width == 800
+
+
 def test_mmhpsd_rows_are_turned_by_180_degrees_and_carry_no_polarity(tmp_path: Path) -> None:
     path = tmp_path / "event0000.csv"
     path.write_text("0,0,10,3,0\n1279,799,20,3,0\n5,7,20,3,0\n")

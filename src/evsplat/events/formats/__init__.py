@@ -63,6 +63,7 @@ FORMATS = {
     entry.name: entry
     for entry in (
         Format("aedat4", _starts(b"#!AER-DAT4.0"), "aedat4:Aedat4"),
+        Format("aedat3", _starts(b"#!AER-DAT3.1"), "aedat3:Aedat3"),
         Format("aedat2", _starts(b"#!AER-DAT2.0"), "aedat2:Aedat2"),
         Format("dat", _is_dat, "prophesee:Dat"),
         Format("raw", _is_raw, "prophesee:Raw"),

@@ -48,6 +48,13 @@ class Text(Source):
         columns = self._find_columns(options)
         if self._mmhpsd:
             self.width, self.height = _MMHPSD_SIZE
+            given = (options.width or self.width, options.height or self.height)
+            if given != _MMHPSD_SIZE:
+                raise DataError(
+                    f"{self.path}: MMHPSD's five columns are of a sensor of 800x1280 pixels, found "
+                    f"{given[0]}x{given[1]} given; leave out --width and --height, or name the "
+                    "columns of another recording with --columns."
+                )
         self._roles = [_COMPONENTS.find(name) if name else -1 for name in columns]
         self._unit = options.time_unit or self._find_unit(columns.index("t"))
         self.has_polarity = "p" in columns and self._any_polarity()
