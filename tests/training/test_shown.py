@@ -16,6 +16,9 @@ from ..small_model import FILL, small
 
 GONE = (0, 3, 7)
 """Rows that the end of training makes transparent."""
+ROUNDING = 2.0**-23
+"""Of values up to 1. PyTorch computes the last rows of a tensor, which fill no vector, by other
+code; which rows those are depends on how many there are."""
 OPACITIES = "filled.gaussians.opacity_logits"
 
 
@@ -39,7 +42,7 @@ def thinned(thinned_once, tmp_path):
     return run, load_latest(run / "checkpoints")[0]
 
 
-def test_pictures_without_transparent_rows_are_the_same_to_the_bit(thinned):
+def test_pictures_without_transparent_rows_are_the_same_but_for_rounding(thinned):
     path, checkpoint = thinned
     tensors, state = load_checkpoint(checkpoint)
     run, whole = load_run(path), load_run(path).reconstruction
@@ -56,7 +59,8 @@ def test_pictures_without_transparent_rows_are_the_same_to_the_bit(thinned):
         camera = run.capture.camera(frame)
         pictures = [of.render(camera, [frame.mid_us]) for of in (whole, run.reconstruction)]
         for name in ("rgb", "alpha", "human"):
-            assert torch.equal(*(getattr(picture, name) for picture in pictures))
+            one, other = (getattr(picture, name) for picture in pictures)
+            assert float((one - other).abs().max()) <= ROUNDING, name
 
 
 def test_opaque_enough_for_one_pixel_stays_and_so_does_the_scene(thinned):

@@ -230,6 +230,14 @@ def test_two_recordings_in_one_file_are_refused_where_the_second_begins(
     assert len(open_recording(path, width=WIDTH, height=260).read().t)
 
 
+def test_a_first_recording_may_end_in_the_bytes_that_headers_begin_with(tmp_path: Path) -> None:
+    first = encoders.evt3(random_stream(16, 50)) + b"% "  # a word of EVT3: an event in column 37
+    second = b"% date 2026-01-01\n" + encoders.evt3(random_stream(17, 50, first_us=500_000))
+    (tmp_path / "both").write_bytes(first + second)
+    with pytest.raises(DataError, match=f"another recording begins at byte {len(first)},"):
+        read_events(tmp_path / "both")
+
+
 def test_a_second_recording_behind_the_table_of_packets_is_refused(tmp_path: Path) -> None:
     """An AEDAT4 file that was closed says where its packets end; the rest was passed over."""
     s = random_stream(int(np.random.default_rng().integers(1 << 31)), 3000)

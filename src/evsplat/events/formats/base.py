@@ -26,7 +26,8 @@ _BUFFER_BYTES = 1 << 16
 _SEEK_BYTES = 1 << 12
 # Kept of what was read, to know the beginning of another recording with all lines of its header.
 _SEEN_BYTES = 1 << 10
-_LINES_BEFORE = re.compile(rb"(?:% [ -~]*\r?\n)*\Z")
+# No line of a header begins twice: the last event of the first recording may end in these bytes.
+_LINES_BEFORE = re.compile(rb"(?:% (?!% )[ -~]*\r?\n)*\Z")
 
 
 class RawEvents(NamedTuple):
