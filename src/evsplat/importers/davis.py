@@ -8,6 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from evsplat.capture.write import CaptureWriter
+from evsplat.commands import command
 from evsplat.errors import DataError
 from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
 from evsplat.importers.base import Importer, chosen_frames, need
@@ -110,12 +111,12 @@ def _incomplete(source: Path, recording: EventRecording, *, has_frames: bool) ->
     """The error of a recording without events, or without frames that are read."""
     if recording.format == "rosbag":
         # what a driver stamps its pictures with, and where it says the exposure, is its own
+        going_on = command("import", "folder", "DIR", "--events", source, "--transfer", "linear")
         return DataError(
             f"{source}: of a ROS bag events alone are read, expected AEDAT 3.1 or 4 with frames "
             "and events; write its pictures into DIR/images and the start and end of each "
             "exposure, in microseconds of the bag's clock, a line each, into DIR/exposures.txt "
-            "(docs/event-formats.md has a program), and: "
-            f"evsplat import folder DIR --events {source} --transfer linear."
+            f"(docs/event-formats.md has a program), and: {going_on}."
         )
     missing = f"no frames beside its events ({recording.format})" if not has_frames else "no events"
     return DataError(

@@ -72,7 +72,10 @@ def test_a_rainbow_around_the_picture_goes_and_the_picture_stays(rainbow):
 
 
 def test_their_cost_is_that_of_the_best_colours(rainbow):
-    """Against L-BFGS, from two starts."""
+    """Against L-BFGS, which ends at the same cost from two starts.
+
+    Cells of a picture this small are of far worse condition than those of a usual one.
+    """
     model, recording = rainbow
     scene = scene_of(model)
     own = scene.channels[0, :, :3]
@@ -90,7 +93,7 @@ def test_their_cost_is_that_of_the_best_colours(rainbow):
 
     def least(start):
         free = start.clone().requires_grad_()
-        optimiser = torch.optim.LBFGS([free], max_iter=60, line_search_fn="strong_wolfe")
+        optimiser = torch.optim.LBFGS([free], max_iter=200, line_search_fn="strong_wolfe")
 
         def closure():
             optimiser.zero_grad()
@@ -102,9 +105,11 @@ def test_their_cost_is_that_of_the_best_colours(rainbow):
         return float(closure().detach())
 
     found = float(cost(outskirts(model.gaussians, [recording], model.low_pass)))
-    best = min(least(own), least(told))
-    assert best < 0.5 * min(float(cost(own)), float(cost(told)))
-    assert found < 1.3 * best  # of conditions far worse than those of a picture of usual size
+    best, same = least(own), least(told)
+    assert same == pytest.approx(best, rel=1e-3)
+    simplest = min(float(cost(own)), float(cost(told)))
+    assert best < 0.5 * simplest
+    assert simplest - found > 0.99 * (simplest - best)
 
 
 @pytest.mark.parametrize("seed", range(3))
