@@ -58,15 +58,19 @@ def run(kind: str, source: Path, out: Path, **options) -> Capture:
     return capture
 
 
-@pytest.fixture
-def davis(tmp_path: Path) -> Path:
-    starts = [EPOCH_US + 3_000 + index * PERIOD_US for index in range(COUNT)]
-    frames = [
+def some_frames(begin_us: int) -> list[tuple[np.ndarray, int, int]]:
+    """Pictures of the moving bar with the start and end of their exposures."""
+    starts = [begin_us + 3_000 + index * PERIOD_US for index in range(COUNT)]
+    return [
         (picture, start, start + EXPOSURE_US)
         for picture, start in zip(moving_bar(), starts, strict=True)
     ]
+
+
+@pytest.fixture
+def davis(tmp_path: Path) -> Path:
     path = tmp_path / "dance.aedat4"
-    path.write_bytes(aedat4(some_events(EPOCH_US), WIDTH, HEIGHT, frames))
+    path.write_bytes(aedat4(some_events(EPOCH_US), WIDTH, HEIGHT, some_frames(EPOCH_US)))
     return path
 
 
@@ -106,13 +110,8 @@ def test_a_part_of_a_davis_recording_begins_with_its_first_frame(
 def test_aedat3_makes_the_capture_that_aedat4_makes(davis: Path, tmp_path: Path) -> None:
     # the clock of 31 bits begins again within an exposure
     begin_us = (1 << 31) - 3_000 - 2 * PERIOD_US - EXPOSURE_US // 2
-    starts = [begin_us + 3_000 + index * PERIOD_US for index in range(COUNT)]
-    frames = [
-        (picture, start, start + EXPOSURE_US)
-        for picture, start in zip(moving_bar(), starts, strict=True)
-    ]
     path = tmp_path / "dance.aedat"
-    path.write_bytes(aedat3(some_events(begin_us), WIDTH, HEIGHT, frames))
+    path.write_bytes(aedat3(some_events(begin_us), WIDTH, HEIGHT, some_frames(begin_us)))
     old, new = (run("davis", p, tmp_path / p.suffix[1:]) for p in (path, davis))
     assert [f.exposure_us for f in old.frames] == [f.exposure_us for f in new.frames]
     for frame in old.frames:

@@ -1,7 +1,7 @@
 """Tables in Markdown, LaTeX (booktabs) and HTML; those of a run's figures, one per protocol."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from html import escape
 from itertools import groupby
 from pathlib import Path
@@ -133,12 +133,8 @@ def tables_of(metrics: dict[str, Any]) -> list[Table]:
             others = metrics.get("compat_rows", {}).get(protocol, {})
         rows = {metrics["method"]: ours, **others}
         note = f"{metrics['protocol_notes'][protocol]}."
-        tables.append(
-            replace(
-                _table(f"Protocol {protocol}", note, rows, titles, metrics["method"]),
-                footnotes=_gaps(metrics, protocol, rows, titles),
-            )
-        )
+        gaps = _gaps(metrics, protocol, rows, titles)
+        tables.append(_table(f"Protocol {protocol}", note, rows, titles, metrics["method"], gaps))
     return tables
 
 
@@ -188,6 +184,7 @@ def _table(
     rows: dict[str, Any],
     titles: dict[str, str],
     method: str | None = None,
+    footnotes: tuple[str, ...] = (),
 ) -> Table:
     """Rows of region -> metric -> value; columns without any figure are left out."""
     columns = [
@@ -205,7 +202,8 @@ def _table(
         figures = (None if v is None else Figure(v, competes=competes) for v in values)
         kind = "aside" if name == "blurry_input" else "ours" if name == method else "other"
         lines.append(Row(titles.get(name, name), tuple(figures), kind))
-    return Table(title, note, tuple(Heading.of(*column) for column in columns), tuple(lines))
+    headings = tuple(Heading.of(*column) for column in columns)
+    return Table(title, note, headings, tuple(lines), footnotes)
 
 
 def composited(metrics: dict[str, Any]) -> dict[str, Any]:
