@@ -14,6 +14,7 @@ from typing import Any, TextIO, cast
 
 from evsplat.errors import (
     TRACEBACK,
+    BackendError,
     EvsplatError,
     MachineError,
     OutputError,
@@ -58,6 +59,9 @@ def exit_code(work: Callable[[], object]) -> int:
             return _stopped()
         if isinstance(error, EvsplatError):
             return _said(error)
+        older = _older_module(error)
+        if older is not None:
+            return _said(older)
         fault = machine_error(error)
         if fault is None:
             raise
@@ -113,6 +117,12 @@ def _tell(text: str) -> None:
     """Say it where somebody may read it: messages may go to the disk that is full."""
     with suppress(OSError):
         print(text, file=sys.stderr, flush=True)
+
+
+def _older_module(error: Exception) -> BackendError | None:
+    """`evsplat.compiled.older_module`, of a module that has been imported, which takes time."""
+    compiled = sys.modules.get("evsplat.compiled")
+    return None if compiled is None else compiled.older_module(error)
 
 
 def _kept_traceback(error: EvsplatError) -> str:
