@@ -212,6 +212,28 @@ def test_help_as_a_process_loads_no_torch():
     assert done.stdout.splitlines()[-1] == "False False"
 
 
+def test_a_process_ends_without_a_search_for_what_nobody_needs():
+    """Half a second of every verb that imports PyTorch."""
+    program = (
+        "import gc, sys\n"
+        "class Found:\n"
+        "    def __del__(self): print('found')\n"
+        "found = Found()\n"
+        "found.itself = found\n"
+        "del found\n"
+        "gc.disable()\n"
+    )
+    ended = ["import evsplat.cli", "sys.argv = ['evsplat', '--version']", "evsplat.cli.main()"]
+
+    def printed(*lines):
+        code = program + "\n".join(lines)
+        run = [sys.executable, "-c", code]
+        return subprocess.run(run, capture_output=True, text=True, check=True).stdout
+
+    assert printed() == "found\n"
+    assert printed(*ended) == f"evsplat {evsplat.__version__}\n"
+
+
 @pytest.mark.parametrize("name", sorted(set(evsplat.__all__) - {"__version__"}))
 def test_the_verbs_are_functions_of_the_package(name):
     assert callable(getattr(evsplat, name))
