@@ -10,12 +10,14 @@ from scipy.ndimage import binary_dilation
 from evsplat.body import BodyTrack, silhouette, up_axis
 from evsplat.body.smpl import ENVIRONMENT
 from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
+from evsplat.errors import DataError
 from evsplat.importers import import_capture
 from evsplat.importers.base import shrunk
 from evsplat.pictures.files import read_image
 
 from . import trees
 from .person import Person, View, write_smpl
+from .trees import BLUR_STEP
 
 
 @pytest.fixture
@@ -232,6 +234,21 @@ def test_mmhpsd_events_without_polarity_are_left_out(
     assert "without polarity" in caplog.text and "1 picture without a pose" in caplog.text
 
 
+def test_a_cut_file_of_mmhpsd_is_read_on_where_that_is_asked_for(
+    tmp_path: Path, models: Path
+) -> None:
+    files = trees.write_mmhpsd_raw(tmp_path / "data", signed=True)
+    source = tmp_path / "data" / trees.ACTION
+    path = source / "event_camera" / "events" / "event0002.csv"
+    path.write_text(path.read_text().rstrip("\n").rpartition(",")[0])
+    with pytest.raises(DataError, match=r"event0002.csv: .*\(--repair\) leaves out a last line"):
+        import_capture("mmhpsd", source, tmp_path / "out", smpl=models)
+    capture = run("mmhpsd", source, tmp_path / "out", smpl=models, repair=True)
+    kept = [files[number] for number in range(1, trees.FRAMES - 1)]
+    assert len(capture.events) == sum(map(len, kept)) - 1
+    assert "1 file repaired" in capture.provenance["events"]
+
+
 def test_mmhpsd_release_a(tmp_path: Path, models: Path) -> None:
     trees.write_mmhpsd_a(tmp_path / "data")
     capture = run("mmhpsd", tmp_path / "data", tmp_path / "out", smpl=models, action=trees.ACTION)
@@ -302,7 +319,7 @@ def test_zju_mocap_blur_of_exfman(tmp_path: Path, models: Path, unit: float) -> 
     for row, frame in enumerate(capture.frames):
         assert frame.mid_us == 10_000 + 20_000 * row
         start, end = frame.exposure_us
-        assert abs(end - start - 20_000 * (trees.BLUR_STEP - 1) / trees.BLUR_STEP) <= 1
+        assert abs(end - start - 20_000 * (BLUR_STEP - 1) / BLUR_STEP) <= 1
     assert capture.events is not None
     events = capture.events._open()
     order = np.argsort(given["tE"], kind="stable")
@@ -310,6 +327,22 @@ def test_zju_mocap_blur_of_exfman(tmp_path: Path, models: Path, unit: float) -> 
         assert np.array_equal(events[f"events/{column}"][:], given[key][order])
     assert np.array_equal(events["events/p"][:], given["pE"][order] > 0)
     assert np.abs(events["events/t"][:] - given["tE"][order] / unit * 1e6).max() <= 0.5
+
+
+def test_a_part_of_zju_mocap_blur_has_the_events_of_its_time(tmp_path: Path, models: Path) -> None:
+    given = trees.write_zju_blur(tmp_path / "377", unit=1.0)
+    whole = run("zju-mocap-blur", tmp_path / "377", tmp_path / "out", smpl=models)
+    numbers = BLUR_STEP * 2 - 1, BLUR_STEP * 4 + 1
+    part = run("zju-mocap-blur", tmp_path / "377", tmp_path / "part", smpl=models, frames=numbers)
+    names = [f"frame_{BLUR_STEP * index:06d}" for index in (2, 3, 4)]
+    assert [frame.name for frame in part.frames] == names
+    assert [f.exposure_us for f in part.frames] == [whole.frame(n).exposure_us for n in names]
+    start, end = part.frames[0].exposure_us[0], part.frames[-1].exposure_us[1]
+    times_us = np.sort(np.rint(given["tE"] * 1e6))
+    expected = times_us[(times_us >= start) & (times_us < end)]
+    events = part.events._open()
+    assert np.array_equal(events["events/t"][:] + events["t_offset"][()], expected)
+    assert part.events_simulated and len(part.body_file.times_us) == 3
 
 
 def test_zju_mocap_blur_without_a_body_model(tmp_path: Path, models: Path) -> None:

@@ -168,6 +168,50 @@ def test_the_offset_of_the_events_clock_is_found(tmp_path: Path) -> None:
     assert any("offset of their clock is found" in note for note in capture.provenance["notes"])
 
 
+def test_a_davis_whose_events_have_a_clock_of_their_own_is_brought_onto_that_of_its_frames(
+    tmp_path: Path,
+) -> None:
+    """Whichever way the offset comes, found or given, and wherever the clocks begin."""
+    path = tmp_path / "dance.aedat4"
+    begin_us = EPOCH_US + int(np.random.default_rng().integers(1_000_000))
+    ahead_us = int(np.random.default_rng().integers(-5_000_000, 5_000_000))
+    frames = some_frames(begin_us)
+    path.write_bytes(aedat4(events_of_the_bar(begin_us + ahead_us), WIDTH, HEIGHT, frames))
+    with pytest.raises(DataError, match="give --clock-offset-us auto, which finds the offset.$"):
+        import_capture("davis", path, tmp_path / "out")
+    found = run("davis", path, tmp_path / "out", clock_offset_us="auto")
+    # a picture's bar stands still for the period about it, and its middle is 15.5 ms after begin
+    expected_us = 15_500 - ahead_us
+    assert found.clock_offset_us == pytest.approx(expected_us, abs=PERIOD_US / 2)
+    assert any("offset of their clock is found" in note for note in found.provenance["notes"])
+    given = run("davis", path, tmp_path / "given", clock_offset_us=found.clock_offset_us)
+    assert given.clock_offset_us == found.clock_offset_us
+    assert min(given.events.time_range_us[0], given.frames[0].exposure_us[0]) == 0
+    for capture in (found, given):
+        first_us = capture.events.time_range_us[0] - capture.frames[0].exposure_us[0]
+        assert first_us == ahead_us + found.clock_offset_us - 3_000
+        assert len(capture.events) == len(events_of_the_bar(0))
+    part = run("davis", path, tmp_path / "part", frames=(3, 7), clock_offset_us="auto")
+    start, end = part.frames[0].exposure_us[0], part.frames[-1].exposure_us[1]
+    first, last = part.events.time_range_us
+    assert start == 0 and start <= first < start + PERIOD_US and end - PERIOD_US < last <= end
+    assert part.clock_offset_us == pytest.approx(expected_us, abs=PERIOD_US / 2)
+
+
+def test_a_davis_recording_is_made_smaller_as_a_video_is(davis: Path, tmp_path: Path) -> None:
+    whole = run("davis", davis, tmp_path / "whole", focal=60.0)
+    small = run("davis", davis, tmp_path / "small", focal=60.0, shrink=2, contrast=(0.4, 0.2))
+    camera = small.camera(small.frames[0])
+    assert (camera.width, camera.height, camera.K[0, 0]) == (WIDTH // 2, HEIGHT // 2, 30)
+    for frame in small.frames:
+        squares = whole.image(frame.name).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3)
+        assert (small.image(frame) - squares.mean((1, 3))).abs().max() < 0.51 / 255
+        assert frame.exposure_us == whole.frame(frame.name).exposure_us
+    one, other = (capture.events.between(0, 1 << 40) for capture in (whole, small))
+    assert np.array_equal(one.x // 2, other.x) and np.array_equal(one.t, other.t)
+    assert small.contrast_threshold == (0.1, 0.05)
+
+
 def test_mirrored_events_are_told_where_their_offset_is_looked_for(tmp_path: Path) -> None:
     """As a beam splitter mirrors one of two cameras whose clocks know nothing of each other."""
     clip, events = tmp_path / "clip.mp4", tmp_path / "events.h5"

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,24 @@ from evsplat.capture.write import CaptureWriter
 from evsplat.commands import command
 from evsplat.errors import DataError
 from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
+from evsplat.footage import TimedPicture
 from evsplat.importers.base import Importer, chosen_frames, need
-from evsplat.importers.option_types import Contrast, FileOption, Focal, FrameRange
-from evsplat.importers.recorded import recorded_camera
+from evsplat.importers.option_types import (
+    ClockOffset,
+    Contrast,
+    FileOption,
+    Focal,
+    FrameRange,
+    Shrink,
+)
+from evsplat.importers.recorded import (
+    add_recorded_frame,
+    large_pictures,
+    offset_or_levels,
+    recorded_camera,
+    shrunk_camera,
+    write_recorded_events,
+)
 from evsplat.options.declare import Flag
 from evsplat.pictures.light import Transfer
 
@@ -24,12 +41,16 @@ class Davis(Importer):
 
     frames: FrameRange = None
     """First frame and the one after the last; by default all."""
+    shrink: Shrink = 1
+    """Make pictures and events smaller by this factor."""
     camera: FileOption = None
     """One camera as in capture.json."""
     focal: Focal = None
     """Focal length in pixels, instead of --camera; without both 60 degrees of view are guessed."""
     transfer: Transfer = "linear"
     """From the values of the pictures to light; a DAVIS stores what it measures."""
+    clock_offset_us: ClockOffset = 0
+    """Added to the events' times to get the clock of the pictures; auto finds it."""
     contrast: Contrast = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
     repair: Flag = False
@@ -45,66 +66,53 @@ class Davis(Importer):
         kept = chosen_frames(self.frames, list(range(len(spans))), source)
         # Such files count from 1970; a capture begins at 0.
         begin = spans[kept[0]][0]
-        if self.frames is None:
-            begin = min(begin, int(first.t[0]))
-        end = max(stop for _, stop in spans[kept[0] : kept[-1] + 1])
-        size = self._add_frames(recording, source, writer, spans, kept, begin)
-        writer.set_events(
-            _moved(recording, begin, None if self.frames is None else end),
-            *size,
-            contrast_threshold=self.contrast,
-            simulated=False,
-        )
-        return self._notes(recording, source, writer, size, begin)
-
-    def _add_frames(
-        self,
-        recording: EventRecording,
-        source: Path,
-        writer: CaptureWriter,
-        spans: list[tuple[int, int]],
-        kept: list[int],
-        begin: int,
-    ) -> tuple[int, int]:
-        """Camera and frames; gives the size in pixels, which is that of the sensor."""
-        wanted, size = set(kept), (0, 0)
-        numbered = enumerate(recording.frames())
+        if self.frames is None and not isinstance(self.clock_offset_us, str):
+            begin = min(begin, int(first.t[0]) + self.clock_offset_us)
+        size = _size(recording, kept[0], source)
+        camera, focal, guessed = recorded_camera(self.camera, self.focal, size)
+        camera, small = shrunk_camera({**camera, "transfer": self.transfer}, size, self.shrink)
+        writer.add_camera("main", *small, **camera)
+        clock_offset = offset_or_levels(self.clock_offset_us, camera)
+        wanted, numbered = set(kept), enumerate(recording.frames())
         for index, frame in tqdm(numbered, "pictures", len(spans), leave=False):
-            if index not in wanted:
-                continue
-            height, width = frame.image.shape[:2]
-            if size == (0, 0):
-                size = width, height
-                if size != (recording.width, recording.height):
-                    raise DataError(
-                        f"{source}: its frames have {width}x{height} pixels and its events "
-                        f"{recording.width}x{recording.height}, expected one sensor with both; "
-                        "import a video of the frames and the events warped to it."
-                    )
-                camera = recorded_camera(self.camera, self.focal, size)[0]
-                writer.add_camera("main", *size, **{**camera, "transfer": self.transfer})
-            exposure = spans[index][0] - begin, spans[index][1] - begin
-            writer.add_frame(f"{index:06d}", "main", frame.image, exposure)
-        return size
-
-    def _notes(
-        self,
-        recording: EventRecording,
-        source: Path,
-        writer: CaptureWriter,
-        size: tuple[int, int],
-        begin: int,
-    ) -> list[str]:
-        _, focal, guessed = recorded_camera(self.camera, self.focal, size)
-        notes = [*recording.notes, *([guessed] if guessed else [])]
+            if index in wanted:
+                exposure = spans[index][0] - begin, spans[index][1] - begin
+                timed = TimedPicture(f"{index:06d}", sum(exposure) // 2, frame.image)
+                add_recorded_frame(writer, timed, exposure, clock_offset, shrink=self.shrink)
+        notes = write_recorded_events(
+            writer,
+            partial(_moved, recording, begin),
+            source,
+            size,
+            clock_offset,
+            contrast=self.contrast,
+            exposed_only=self.frames is not None,
+            shrink=self.shrink,
+            unit_is_known=True,
+        )
+        notes = [*recording.notes, *notes, *large_pictures(small), *([guessed] if guessed else [])]
         writer.provenance |= {
             "source": f"DAVIS recording {source.name}",
             "focal": focal,
             "started_us": begin,
             "notes": notes,
+            "shrink": self.shrink,
         }
         writer.leave_out_body()
         return notes
+
+
+def _size(recording: EventRecording, index: int, source: Path) -> tuple[int, int]:
+    """Size in pixels of a frame, by its number, which must be that of the sensor."""
+    frame = next(islice(recording.frames(), index, None))
+    height, width = frame.image.shape[:2]
+    if (width, height) != (recording.width, recording.height):
+        raise DataError(
+            f"{source}: its frames have {width}x{height} pixels and its events "
+            f"{recording.width}x{recording.height}, expected one sensor with both; "
+            "import a video of the frames and the events warped to it."
+        )
+    return width, height
 
 
 def _incomplete(source: Path, recording: EventRecording, *, has_frames: bool) -> DataError:
@@ -136,9 +144,7 @@ def _span(source: Path, index: int, frame: RecordedFrame) -> tuple[int, int]:
     return start, end
 
 
-def _moved(recording: EventRecording, begin: int, end: int | None) -> Iterator[EventStream]:
-    """The events from ``begin`` on (to before ``end``), which becomes time 0."""
+def _moved(recording: EventRecording, begin: int) -> Iterator[EventStream]:
+    """The events, with ``begin`` as time 0."""
     for piece in recording.chunks():
-        last = int(piece.t[-1]) + 1 if end is None and len(piece) else end or 0
-        part = piece.between(begin, last)
-        yield EventStream(np.asarray(part.t) - begin, part.x, part.y, part.p)
+        yield EventStream(np.asarray(piece.t) - begin, piece.x, piece.y, piece.p)

@@ -28,7 +28,7 @@ from evsplat.importers.base import (
 )
 from evsplat.importers.option_types import FrameRange, Name, Rate, Shrink
 from evsplat.importers.smpl import add_body, chosen_poses, some_of, unposed
-from evsplat.options.declare import option
+from evsplat.options.declare import Flag, option
 from evsplat.untrusted.arrays import read_npz
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.pictures import image_size
@@ -45,7 +45,7 @@ class Mmhpsd(Importer):
     blur_recipe: ClassVar[str | None] = "mmhpsd-blur"
 
     action: Name = None
-    """Name of the action, such as subject01_group2_time3 (s1g2t3); needed for the releases."""
+    """Name of the action, as subject01_group2_time3 (s1g2t3); needed for the releases."""
     frames: FrameRange = None
     """First frame and one past the last; by default all that have a picture and a pose."""
     shrink: Shrink = 1
@@ -57,6 +57,8 @@ class Mmhpsd(Importer):
     takes a full picture."""
     gender: Literal["male", "neutral", "female"] = "male"
     """SMPL model that the poses were fitted with."""
+    repair: Flag = False
+    """Read on where an event file is damaged."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read one action; see `Importer.write`."""
@@ -102,23 +104,31 @@ class Mmhpsd(Importer):
             return "events: this release holds binary pictures without polarity; simulate them"
         files = numbered(layout.events, "events", (".csv", ".npz"))
         files = {number: path for number, path in files.items() if number in kept}
-        if not any(open_recording(path).has_polarity for path in files.values()):
+        if not any(
+            open_recording(path, repair=self.repair).has_polarity for path in files.values()
+        ):
             return "events: without polarity (all zero), so they were left out; simulate them"
+        repaired: list[Path] = []
         count = writer.set_events(
-            self._events(files, size),
+            self._events(files, size, repaired),
             size[0] // self.shrink,
             size[1] // self.shrink,
             contrast_threshold=None,
             simulated=False,
         )
-        return f"events: {count:,} recorded ones; their times within a frame are reconstructed"
+        note = f"events: {count:,} recorded ones; their times within a frame are reconstructed"
+        return note + (f"; {counted(len(repaired), 'file')} repaired" if repaired else "")
 
-    def _events(self, files: dict[int, Path], size: tuple[int, int]) -> Iterator[EventStream]:
+    def _events(
+        self, files: dict[int, Path], size: tuple[int, int], repaired: list[Path]
+    ) -> Iterator[EventStream]:
         """The events of a file belong between its picture and the next."""
         interval_us = 1e6 / self.fps
         for number, path in tqdm(files.items(), desc="events", unit="file", leave=False):
-            recording = open_recording(path, width=size[0], height=size[1])
+            recording = open_recording(path, width=size[0], height=size[1], repair=self.repair)
             stream = recording.read()
+            if any(note.startswith("repaired") for note in recording.notes):
+                repaired.append(path)
             if not len(stream):
                 continue
             span = max(1, int(stream.t[-1] - stream.t[0]))

@@ -1,7 +1,7 @@
 """Parts of importers of your own recordings: camera and events."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -16,7 +16,7 @@ from evsplat.capture.camera_file import read_camera
 from evsplat.capture.write import CaptureWriter
 from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
-from evsplat.events import EventRecording, EventStream, open_recording
+from evsplat.events import EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
 from evsplat.footage import Footage, TimedPicture
 from evsplat.importers.base import check_positive, need, shrunk, shrunk_view
@@ -161,23 +161,52 @@ def add_recorded_events(
             f"there first (docs/own-capture.md, two sensors). If they do already, say so: {said}"
         )
     recording = open_recording(path, width=size[0], height=size[1], repair=repair)
+    notes = write_recorded_events(
+        writer,
+        recording.chunks,
+        path,
+        size,
+        clock_offset,
+        contrast=contrast,
+        exposed_only=exposed_only,
+        shrink=shrink,
+        unit_is_known=False,
+    )
+    # Repairs are known once the events have been read.
+    return [*recording.notes, *notes]
+
+
+def write_recorded_events(
+    writer: CaptureWriter,
+    pieces: Callable[[], Iterable[EventStream]],
+    path: Path,
+    size: tuple[int, int],
+    clock_offset: int | BlockLevels,
+    *,
+    contrast: tuple[float, float] | None,
+    exposed_only: bool,
+    shrink: int,
+    unit_is_known: bool,
+) -> list[str]:
+    """Write the events of ``path``, which ``pieces`` gives anew each time; gives notes.
+
+    The rest is as of `add_recorded_events`. ``unit_is_known``: the format says that of the times.
+    """
     passed, notes = _Passed(), []
     if isinstance(clock_offset, BlockLevels):
-        clock_offset, note = _found_offset(clock_offset, recording, path, size)
+        clock_offset, note = _found_offset(clock_offset, pieces, path, size)
         notes.append(note)
     start, end = (time - clock_offset for time in writer.exposed_us)
-    pieces = passed.watching(_shrunk_events(recording.chunks(), size, shrink))
+    shrunken = passed.watching(_shrunk_events(pieces(), size, shrink))
     writer.set_events(
-        (piece.between(start, end) for piece in pieces) if exposed_only else pieces,
+        (piece.between(start, end) for piece in shrunken) if exposed_only else shrunken,
         size[0] // shrink,
         size[1] // shrink,
         contrast_threshold=contrast and _shrunk_contrast(contrast, shrink),
         simulated=False,
         clock_offset_us=clock_offset,
     )
-    # Repairs are known once the events have been read.
-    notes += recording.notes
-    return [*notes, *passed.notes(path, writer.exposed_us, clock_offset)]
+    return notes + passed.notes(path, writer.exposed_us, clock_offset, unit_is_known=unit_is_known)
 
 
 def _shrunk_events(
@@ -198,16 +227,19 @@ def _shrunk_contrast(contrast: tuple[float, float], factor: int) -> tuple[float,
 
 
 def _found_offset(
-    levels: BlockLevels, recording: EventRecording, path: Path, size: tuple[int, int]
+    levels: BlockLevels,
+    pieces: Callable[[], Iterable[EventStream]],
+    path: Path,
+    size: tuple[int, int],
 ) -> tuple[int, str]:
     """The offset of the events' clock, us, and a note of it; raises where it is not certain."""
     try:
-        found = estimate_offset(levels, recording.chunks(), size)
+        found = estimate_offset(levels, pieces(), size)
     except TooLong as error:
         raise DataError(f"{path}: {error}; cut it, or give --clock-offset-us US.") from None
     give = "give --clock-offset-us US, or film more that moves"
     if found is None or not found.is_certain:
-        _refuse_turned(levels, recording, path, size)
+        _refuse_turned(levels, pieces, path, size)
     if found is None or found.correlation < LEAST_CORRELATION:
         best = "" if found is None else f" (correlation {found.correlation:.2f} at best)"
         raise DataError(
@@ -229,19 +261,22 @@ def _found_offset(
 
 
 def _refuse_turned(
-    levels: BlockLevels, recording: EventRecording, path: Path, size: tuple[int, int]
+    levels: BlockLevels,
+    pieces: Callable[[], Iterable[EventStream]],
+    path: Path,
+    size: tuple[int, int],
 ) -> None:
     """Raise where events that were mirrored or inverted would have an offset that is certain."""
     found = []
     for mirror_x, mirror_y, inverted in product((False, True), repeat=3):
-        pieces = (
+        turned = (
             EventStream(
                 piece.t,
                 (size[0] - 1 - piece.x).astype(np.uint16) if mirror_x else piece.x,
                 (size[1] - 1 - piece.y).astype(np.uint16) if mirror_y else piece.y,
                 -piece.p if inverted else piece.p,
             )
-            for piece in recording.chunks()
+            for piece in pieces()
         )
         ways = {
             "mirrored left to right": mirror_x and not mirror_y,
@@ -250,7 +285,7 @@ def _refuse_turned(
             "of the other polarity": inverted,
         }
         words = " and ".join(way for way, taken in ways.items() if taken)
-        offset = estimate_offset(levels, pieces, size) if words else None
+        offset = estimate_offset(levels, turned, size) if words else None
         if offset is not None and offset.is_certain:
             found.append((offset.correlation, words, offset.offset_us))
     if found:
@@ -282,7 +317,9 @@ class _Passed:
                 self.brighter += int((piece.p > 0).sum())
             yield piece
 
-    def notes(self, path: Path, exposed_us: tuple[int, int], offset_us: int) -> list[str]:
+    def notes(
+        self, path: Path, exposed_us: tuple[int, int], offset_us: int, *, unit_is_known: bool
+    ) -> list[str]:
         """What is odd about them; raises where none is at the time of a picture."""
         if not self.count:
             raise DataError(
@@ -294,16 +331,16 @@ class _Passed:
         if last < start or first >= end:
             raise DataError(
                 f"{path}: its events are {times}, expected events while there are pictures; give "
-                "--clock-offset-us auto, which finds the offset, or the unit of their times with "
-                f"{SAY_UNIT}."
+                "--clock-offset-us auto, which finds the offset"
+                + ("." if unit_is_known else f", or the unit of their times with {SAY_UNIT}.")
             )
-        notes = []
+        notes, unit = [], f"the unit of the times ({SAY_UNIT})"
         covered = (min(last, end) - max(first, start)) / (end - start)
         if covered < _COVERED:
             notes.append(
                 f"events: {path.name} covers {covered:.1%} of the pictures' time (it is {times}); "
-                "check the clock (--clock-offset-us auto finds its offset), the rate of the "
-                f"pictures and the unit of the times ({SAY_UNIT})"
+                "check the clock (--clock-offset-us auto finds its offset)"
+                + ("" if unit_is_known else f", the rate of the pictures and {unit}")
             )
         if self.count >= _MANY and self.brighter in (0, self.count):
             sign = "brighter" if self.brighter else "darker"

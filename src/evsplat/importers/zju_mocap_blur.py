@@ -23,6 +23,7 @@ from evsplat.importers.base import (
     SourceCamera,
     add_picture,
     check_positive,
+    chosen_frames,
     human_mask,
     need,
     numbered,
@@ -31,7 +32,7 @@ from evsplat.importers.base import (
     table,
     whole_number,
 )
-from evsplat.importers.option_types import Shrink
+from evsplat.importers.option_types import FrameRange, Shrink
 from evsplat.importers.smpl import add_body
 from evsplat.untrusted.pickles import read_pickle
 from evsplat.untrusted.pictures import image_size
@@ -45,6 +46,8 @@ class ZjuMocapBlur(Importer):
 
     brings_masks: ClassVar[bool] = True
 
+    frames: FrameRange = None
+    """First number of a picture and one past the last; by default all."""
     shrink: Shrink = 1
     """Pictures and events are made smaller by this factor."""
 
@@ -67,6 +70,8 @@ class ZjuMocapBlur(Importer):
         }
         cameras[first].add_to(writer, "main", frames[first], self.shrink, transfer="linear")
         exposure_us, sub_frames = _exposure(list(moments), list(moments.values()), unit)
+        kept = {pictures[n].stem for n in chosen_frames(self.frames, list(pictures), source)}
+        moments = {name: time for name, time in moments.items() if name in kept}
         times = []
         for name in tqdm(moments, desc="pictures", unit="frame", leave=False):
             time_us = moments[name] * unit
@@ -82,8 +87,10 @@ class ZjuMocapBlur(Importer):
             )
             times.append(round(time_us))
         width, height = image_size(frames[first])
+        events = self._events(tables["event_info"], source / "event_info.pkl", unit, width, height)
+        exposed_us = writer.exposed_us
         writer.set_events(
-            self._events(tables["event_info"], source / "event_info.pkl", unit, width, height),
+            events if self.frames is None else (piece.between(*exposed_us) for piece in events),
             width // self.shrink,
             height // self.shrink,
             contrast_threshold=None,
