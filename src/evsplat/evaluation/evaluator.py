@@ -16,8 +16,9 @@ from tqdm import tqdm
 from evsplat.capture import Capture, Frame, Policy, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.evaluation.chroma import chroma_psnr
-from evsplat.evaluation.drawn import DrawnFrames, KeepPicture, drawn, drawn_frame
+from evsplat.evaluation.drawn import DrawnFrames, KeepPicture, drawn_frame
 from evsplat.evaluation.event_maps import evaluate_event_maps
+from evsplat.evaluation.novel_views import evaluate_novel_views
 from evsplat.evaluation.protocols import (
     METRICS,
     PROTOCOLS,
@@ -124,15 +125,10 @@ def evaluate(
         }
         reasons: dict[str, str] = result["reasons"]
         if not test_frames_only:
-            result["novel_views"] = _novel_views(
+            result["novel_views"] = evaluate_novel_views(
                 capture, beside or reconstruction, networks, human_regions, keep, reasons, split
             )
-            events: dict[str, Any] | Absent = Absent("they are measured with the test frames")
-            if split == "test":
-                events = evaluate_event_maps(capture, drawn_frames, keep)
-            result["events"] = None if isinstance(events, Absent) else events
-            if isinstance(events, Absent):
-                reasons["events"] = events.reason
+            result["events"] = _event_maps(capture, drawn_frames, keep, reasons, split)
     remark = measured.human_remark()
     if remark:
         logger.warning("%s", remark)
@@ -323,56 +319,21 @@ def _compare(reference: Truth | None, picture: Tensor | Absent) -> Measured:
     return all_absent(picture.reason) if isinstance(picture, Absent) else reference.measure(picture)
 
 
-def _novel_views(
+def _event_maps(
     capture: Capture,
-    reconstruction: Reconstruction,
-    networks: Networks,
-    human_regions: HumanRegions,
+    drawn_frames: DrawnFrames,
     keep: KeepPicture,
     reasons: dict[str, str],
     split: Split,
-) -> dict[str, Any]:
-    """Standard figures of cameras that took no part in the training; empty where there are none.
-
-    Beside training frames only views of their times count.
-    """
-    train = {frame.name for frame in capture.train_frames}
-    views = [view for view in capture.novel_views if split == "test" or view.frame in train]
-    means_by_camera: dict[str, MetricMeans] = {}
-    per_view: dict[str, list[dict[str, Any]]] = {}
-    for view in tqdm(views, desc="novel views", unit="picture", leave=False, disable=None):
-        camera = capture.cameras[view.camera]
-        ours: Tensor | None = None
-        try:
-            ours = drawn(reconstruction, camera, view.time_us)
-        except DataError as error:  # trivial methods know the recording camera only
-            measured = all_absent(str(error))
-        if ours is not None:
-            human = human_regions.in_view(camera, view.time_us)
-            truth = Truth(STANDARD, capture.novel_image(view), None, human, networks)
-            measured = truth.measure(ours)
-        means_by_camera.setdefault(view.camera, MetricMeans(("full", "person_crop"))).add(measured)
-        entry = {
-            "index": view.index,
-            "frame": view.frame,
-            "time_us": view.time_us,
-            "psnr": without_reasons(measured)["full"]["psnr"],
-            "psnr_person_crop": without_reasons(measured)["person_crop"]["psnr"],
-            "pictures": {},
-        }
-        if ours is not None:
-            path = f"pictures/{file_stem('novel', view.camera, f'{view.index:04d}')}_render.png"
-            keep(path, to_bytes(capture.shown(ours)))
-            entry["pictures"] = {"render": path}
-        per_view.setdefault(view.camera, []).append(entry)
-    result = {}
-    for name, camera_means in means_by_camera.items():
-        means, why = camera_means.means()
-        reasons.update({f"novel_views.{name}.{key}": reason for key, reason in why.items()})
-        result[name] = {**means, "per_view": per_view[name]}
-    if not result:
-        reasons["novel_views"] = "the capture has no novel views"
-    return result
+) -> dict[str, Any] | None:
+    """Event maps between frames; None where there are none, with the reason in ``reasons``."""
+    events: dict[str, Any] | Absent = Absent("they are measured with the test frames")
+    if split == "test":
+        events = evaluate_event_maps(capture, drawn_frames, keep)
+    if isinstance(events, Absent):
+        reasons["events"] = events.reason
+        return None
+    return events
 
 
 def _picture_of(
