@@ -67,16 +67,7 @@ def write_events(
         ConfigError: No such format.
     """
     path = Path(path)
-    if format is None and path.suffix.lower() not in _SUFFIXES:
-        raise ConfigError(
-            f"{path}: the suffix names no format that evsplat writes ({', '.join(_SUFFIXES)}); "
-            f"choose one with format: {', '.join(WRITTEN_FORMATS)}."
-        )
-    format = format or _SUFFIXES[path.suffix.lower()]
-    if format not in WRITTEN_FORMATS:
-        raise ConfigError(f"format is {format!r}, expected one of {', '.join(WRITTEN_FORMATS)}.")
-    if format == "hdf5" and path.exists() and not path.is_file() and not path.is_dir():
-        raise DataError(f"{path}: is a device, which HDF5 cannot be written to; write csv or evt2.")
+    format = _format_of(path, format)
     try_target(path)
     size = None if width is None or height is None else (width, height)
     stored = {**(attributes or {}), **dict(zip(("width", "height"), size or (), strict=False))}
@@ -101,6 +92,21 @@ def write_events(
             last_us, count = int(piece.t[-1]), count + len(piece)
         writer.finish()
     return count
+
+
+def _format_of(path: Path, asked: str | None) -> str:
+    """The format asked for, or that of the suffix; refused where ``path`` cannot be one."""
+    if asked is None and path.suffix.lower() not in _SUFFIXES:
+        raise ConfigError(
+            f"{path}: the suffix names no format that evsplat writes ({', '.join(_SUFFIXES)}); "
+            f"choose one with format: {', '.join(WRITTEN_FORMATS)}."
+        )
+    chosen = asked or _SUFFIXES[path.suffix.lower()]
+    if chosen not in WRITTEN_FORMATS:
+        raise ConfigError(f"format is {chosen!r}, expected one of {', '.join(WRITTEN_FORMATS)}.")
+    if chosen == "hdf5" and path.exists() and not path.is_file() and not path.is_dir():
+        raise DataError(f"{path}: is a device, which HDF5 cannot be written to; write csv or evt2.")
+    return chosen
 
 
 class Writer(ExitStack, ABC):

@@ -118,13 +118,7 @@ class Folder(Importer):
         camera, small = shrunk_camera(camera, size, self.shrink)
         writer.add_camera("main", *small, **camera)
         kept = chosen_frames(self.frames, list(range(len(middles))), source)
-        seen = sorted(frames_with_poses(motion, middles).intersection(kept))
-        if not seen:
-            raise DataError(
-                f"{path}: has no pose at the middle of any of the {len(kept)} exposures, which "
-                f"are from {middles[kept[0]]} to {middles[kept[-1]]} us; correct --fps, --start-us "
-                "or exposures.txt, or leave the poses out with --no-poses."
-            )
+        seen = _with_poses(kept, motion, middles, path)
         views = _camera_poses(motion)
         masks = _Masks(self._masks(source))
         clock_offset = offset_or_levels(self.clock_offset_us, camera)
@@ -161,13 +155,7 @@ class Folder(Importer):
             "frames": [kept[0], kept[-1] + 1],
             "shrink": self.shrink,
         }
-        if path is None or motion is None:
-            writer.leave_out_body()
-            return notes
-        writer.provenance["poses"] = path.name
-        if isinstance(motion, PoseSequence):
-            motion = chosen_poses(motion, seen)
-        return notes + add_motion(writer, motion, [int(middles[i]) for i in seen], smpl)
+        return notes + _add_body(writer, path, motion, middles[seen], seen, smpl)
 
     def _images(self, source: Path) -> Path:
         if self.images is not None:
@@ -252,6 +240,38 @@ class Folder(Importer):
                 f"{GUIDE}."
             )
         return recorded_camera(None, self.focal, size)
+
+
+def _with_poses(
+    kept: list[int], motion: Motion | None, middles: Int64[np.ndarray, "N"], path: Path | None
+) -> list[int]:
+    """Those of the kept pictures that have a pose, or all where there are no poses at all."""
+    seen = sorted(frames_with_poses(motion, middles).intersection(kept))
+    if not seen:
+        raise DataError(
+            f"{path}: has no pose at the middle of any of the {len(kept)} exposures, which "
+            f"are from {middles[kept[0]]} to {middles[kept[-1]]} us; correct --fps, --start-us "
+            "or exposures.txt, or leave the poses out with --no-poses."
+        )
+    return seen
+
+
+def _add_body(
+    writer: CaptureWriter,
+    path: Path | None,
+    motion: Motion | None,
+    times_us: Int64[np.ndarray, "K"],
+    seen: list[int],
+    smpl: Path | None,
+) -> list[str]:
+    """The body in the poses of the pictures that were seen, at their times; gives notes."""
+    if path is None or motion is None:
+        writer.leave_out_body()
+        return []
+    writer.provenance["poses"] = path.name
+    if isinstance(motion, PoseSequence):
+        motion = chosen_poses(motion, seen)
+    return add_motion(writer, motion, times_us.tolist(), smpl)
 
 
 def _only(option: str, found: list[Path]) -> Path | None:

@@ -47,29 +47,7 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
         )  # fmt: skip
     lost = lost_events(capture, pairs) if other_way is None else Lost()
     if lost.spans_us:
-        spans = [f"{first / 1e6:.3f} to {last / 1e6:.3f} s" for first, last in lost.spans_us]
-        where = ", ".join(spans[:3]) + (f" and {len(spans) - 3} more" if len(spans) > 3 else "")
-        if lost.elsewhere:
-            findings.warning(
-                events.path, _WHICH_WAY[1],
-                f"hardly an event at the pixels that change, and as many as ever at others, from "
-                f"{where}",
-                "events wherever the brightness changes",
-                "Most likely they lie in other pixels than the pictures': cut out, moved or warped "
-                "to another size. events.png of 'evsplat inspect' then shows edges beside those of "
-                "the pictures; warp them there (docs/own-capture.md, two sensors). Where it shows "
-                "none, clocks are apart by more than a frame (events.clock_offset_us), or the "
-                "sensor lost what is no noise.",
-            )  # fmt: skip
-        else:
-            findings.warning(
-                events.path, "events/t", f"hardly an event where pictures change from {where}",
-                "events wherever the brightness changes",
-                "Most likely the sensor lost them, as its rate falls there: record again with a "
-                "lower rate of events, or leave out these frames. Otherwise they were left out or "
-                "thinned when they were written. Method evsplat learns from frames alone there; "
-                "other methods and restore take no event for no change.",
-            )  # fmt: skip
+        _tell_lost(findings, events, lost)
     answered = None if lost.spans_us or sign or other_way else answered_share(pairs, events)
     if answered is not None and answered < _FEWEST_ANSWERED:
         findings.warning(
@@ -82,6 +60,33 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
             "(docs/own-capture.md, two sensors).",
         )  # fmt: skip
     return findings.items
+
+
+def _tell_lost(findings: Findings, events: EventStore, lost: Lost) -> None:
+    """A warning of times with hardly an event where pictures change."""
+    spans = [f"{first / 1e6:.3f} to {last / 1e6:.3f} s" for first, last in lost.spans_us]
+    where = ", ".join(spans[:3]) + (f" and {len(spans) - 3} more" if len(spans) > 3 else "")
+    if lost.elsewhere:
+        findings.warning(
+            events.path, _WHICH_WAY[1],
+            f"hardly an event at the pixels that change, and as many as ever at others, from "
+            f"{where}",
+            "events wherever the brightness changes",
+            "Most likely they lie in other pixels than the pictures': cut out, moved or warped "
+            "to another size. events.png of 'evsplat inspect' then shows edges beside those of "
+            "the pictures; warp them there (docs/own-capture.md, two sensors). Where it shows "
+            "none, clocks are apart by more than a frame (events.clock_offset_us), or the "
+            "sensor lost what is no noise.",
+        )  # fmt: skip
+    else:
+        findings.warning(
+            events.path, "events/t", f"hardly an event where pictures change from {where}",
+            "events wherever the brightness changes",
+            "Most likely the sensor lost them, as its rate falls there: record again with a "
+            "lower rate of events, or leave out these frames. Otherwise they were left out or "
+            "thinned when they were written. Method evsplat learns from frames alone there; "
+            "other methods and restore take no event for no change.",
+        )  # fmt: skip
 
 
 def flicker_findings(capture: TrainingCapture) -> list[Finding]:

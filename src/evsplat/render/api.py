@@ -56,10 +56,7 @@ def render(
     ``auto`` takes ``native`` for tensors on the CPU and ``gsplat`` for those on a CUDA device. A
     backend that cannot run is a `BackendError` with the reason, never another one's work.
     """
-    if backend not in get_args(BackendName):
-        raise BackendError(
-            f"Unknown render backend {backend!r}; choose one of {', '.join(get_args(BackendName))}."
-        )
+    chosen = _chosen(backend, splats.means.device)
     splats = splats.with_times()
     times = _check_splats(splats, "")
     if static is not None:
@@ -77,14 +74,6 @@ def render(
     if backdrop is not None and torch.is_grad_enabled():
         raise BackendError("render: a backdrop has no gradients; draw within torch.no_grad().")
 
-    device, chosen = splats.means.device, str(backend)
-    if backend == "auto":
-        chosen = _BACKEND_OF_DEVICE.get(device.type, "")
-        if not chosen:
-            raise BackendError(
-                f"No render backend for device {device}; move the tensors to the CPU or a CUDA "
-                "device, or ask for backend='reference', which is slow."
-            )
     job = RenderJob(
         splats, static, times, camera, background, near, low_pass, backdrop, static_light
     )
@@ -92,6 +81,22 @@ def render(
     if static_light is None or (chosen == "native" and not _needs_gradient(background)):
         return draw(job)
     return lit_apart(job, draw)
+
+
+def _chosen(backend: BackendName, device: torch.device) -> str:
+    """The backend asked for, or for ``auto`` that of the device."""
+    if backend not in get_args(BackendName):
+        raise BackendError(
+            f"Unknown render backend {backend!r}; choose one of {', '.join(get_args(BackendName))}."
+        )
+    if backend != "auto":
+        return backend
+    if device.type not in _BACKEND_OF_DEVICE:
+        raise BackendError(
+            f"No render backend for device {device}; move the tensors to the CPU or a CUDA "
+            "device, or ask for backend='reference', which is slow."
+        )
+    return _BACKEND_OF_DEVICE[device.type]
 
 
 def _needs_gradient(tensor: Tensor | None) -> bool:

@@ -12,16 +12,23 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.capture import Capture, load_capture, shared_pairs
+from evsplat.capture import Capture, TrainingCapture, load_capture, shared_pairs
 from evsplat.commands import command
 from evsplat.config import load_yaml, override
 from evsplat.config_docs import save_yaml
 from evsplat.devices import use_threads
 from evsplat.errors import ConfigError, DataError, machine_error
 from evsplat.files import open_output, try_target
-from evsplat.inspection import check_body, save_fit_sheet, warn_of_events, warn_of_pictures
+from evsplat.inspection import (
+    Belonging,
+    check_body,
+    save_fit_sheet,
+    warn_of_events,
+    warn_of_pictures,
+)
 from evsplat.methods import (
     DEFAULT_METHOD,
     TRAINABLE,
@@ -30,6 +37,7 @@ from evsplat.methods import (
     event_use,
     method_config,
 )
+from evsplat.methods.base import Composition
 from evsplat.methods.settings import Weight
 from evsplat.options import TrainOptions
 from evsplat.options.declare import given
@@ -138,23 +146,12 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     """All that steps need, at its beginning or where the last checkpoint was; the run's files."""
     iterations, max_minutes = options.iterations, options.max_minutes
     started = time.perf_counter()
+    folder = start.folder
     seen = seen_by_training(capture, start.settings)
-    check_capture(start.facts, seen, start.folder, start.method)
-    loaded = load_latest(start.folder.checkpoints) if options.resume else None
+    check_capture(start.facts, seen, folder, start.method)
+    loaded = load_latest(folder.checkpoints) if options.resume else None
     purpose: Purpose = "train" if loaded is None else "resume"
-    fitting, uses = None, event_use(start.settings)
-    if purpose == "train":
-        warn_of_pictures(seen)
-    if purpose == "train" and seen.has_body:
-        fitting = check_body(seen, refuse=not options.any_body)
-    # The check of the events and the estimate of their sensor compare the same frames.
-    with shared_pairs(seen):
-        if purpose == "train" and uses != "nothing":
-            check_events_reach(seen)
-            warn_of_events(seen, thresholds=uses == "amounts")
-        composition = TRAINABLE[start.method].build(
-            start.settings, seen, start.seed, device=device, purpose=purpose
-        )
+    composition, fitting = _composed(seen, start, device, purpose, any_body=options.any_body)
     clock = Clock(
         iterations or start.settings.iterations,
         None if max_minutes is None else 60 * max_minutes,
@@ -165,41 +162,66 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     cache_gb = options.device_memory_gb
     cache_bytes = None if cache_gb is None else int(1e9 * cache_gb)
     trainer = Trainer(composition, composition.capture or seen, clock, cache_bytes=cache_bytes)
-    folder = start.folder
     if loaded is not None:
-        checkpoint, tensors, state = loaded
-        check_fits(trainer.model, tensors, checkpoint)
-        wrong = misfit(state, RESUMED, "state")
-        if wrong:
-            raise DataError(f"{checkpoint}: {wrong}; train again, without --resume.")
-        with misfits_of(checkpoint):
-            trainer.load_state(tensors, state)
+        _put_back(trainer, *loaded)
         if iterations is not None:
             clock.go_by(iterations)
         elif max_minutes is None:
-            clock.iterations = state["clock"]["iterations"]
+            clock.iterations = loaded[2]["clock"]["iterations"]
     folder.truncate_log(clock.iteration)
     state_bytes = sum(value.nbytes for value in trainer.model.state_dict().values())
     try_target(folder.path, _KEPT_AND_NEW * _WITH_OPTIMISER * state_bytes)
     if loaded is None:
+        found = composition.thresholds_found
         if not options.resume:
+            settings = start.settings
             write_facts(
-                folder,
-                seen,
-                start.method,
-                start.settings,
-                device,
-                start.seed,
-                thresholds_found=composition.thresholds_found,
+                folder, seen, start.method, settings, device, start.seed, thresholds_found=found
             )
             # The last of what resuming needs.
-            save_yaml(folder.config, start.settings, method=start.method)
+            save_yaml(folder.config, settings, method=start.method)
         if fitting is not None and fitting.is_odd:
             logger.warning("body over what moves: %s", save_fit_sheet(seen, fitting, folder.path))
         logger.debug("%s", schedule_table(start.settings, composition.weights))
-        terms = seen.terms(uses, thresholds_found=composition.thresholds_found)
+        terms = seen.terms(event_use(start.settings), thresholds_found=found)
         logger.info("%s", terms.sentence(len(seen.held_out_frames)))
     return trainer
+
+
+def _composed(
+    seen: TrainingCapture, start: _Start, device: str, purpose: Purpose, *, any_body: bool
+) -> tuple[Composition, Belonging | None]:
+    """The method put together; before a training the capture is looked over, and its body judged.
+
+    Raises:
+        DataError: the body is that of another recording, and ``any_body`` is not set.
+    """
+    fitting, uses = None, event_use(start.settings)
+    if purpose == "train":
+        warn_of_pictures(seen)
+    if purpose == "train" and seen.has_body:
+        fitting = check_body(seen, refuse=not any_body)
+    # The check of the events and the estimate of their sensor compare the same frames.
+    with shared_pairs(seen):
+        if purpose == "train" and uses != "nothing":
+            check_events_reach(seen)
+            warn_of_events(seen, thresholds=uses == "amounts")
+        composition = TRAINABLE[start.method].build(
+            start.settings, seen, start.seed, device=device, purpose=purpose
+        )
+    return composition, fitting
+
+
+def _put_back(
+    trainer: Trainer, checkpoint: Path, tensors: dict[str, Tensor], state: dict[str, Any]
+) -> None:
+    """Let a trainer go on where it was when the checkpoint was written."""
+    check_fits(trainer.model, tensors, checkpoint)
+    wrong = misfit(state, RESUMED, "state")
+    if wrong:
+        raise DataError(f"{checkpoint}: {wrong}; train again, without --resume.")
+    with misfits_of(checkpoint):
+        trainer.load_state(tensors, state)
 
 
 @contextmanager
