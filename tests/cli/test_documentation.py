@@ -61,6 +61,14 @@ def test_events_of_another_sensor_are_warped_as_the_guide_says(tmp_path, monkeyp
     assert np.abs(np.stack([written.x, written.y], -1) - there[seen]).max() < 0.5001
 
 
+def test_every_picture_of_the_docs_is_on_a_page():
+    pages = [README, *FORMAT.parent.rglob("*.md")]
+    shown = "".join(page.read_text(encoding="utf-8") for page in pages)
+    pictures = [path.name for path in (FORMAT.parent / "images").iterdir()]
+    assert pictures
+    assert [name for name in pictures if f"images/{name}" not in shown] == []
+
+
 def test_readme_python_uses_what_the_package_has():
     used = set(re.findall(r"\bev\.(\w+)", "\n".join(_blocks(README, "python"))))
     assert used and used <= set(evsplat.__all__)

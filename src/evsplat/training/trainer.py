@@ -325,8 +325,8 @@ class Trainer:
                 assert isinstance(rows, GaussianSet)  # only there classes share a set
                 flip_labels(rows, optimiser, self.composition.body_frames)
             self.statistics[name] = _fresh(rows)
-        for keeper in (*self.model.row_caches.values(), *self.composition.objectives):
-            if edited:
+        if edited:
+            for keeper in (*self.model.row_caches.values(), *self.composition.objectives):
                 keeper.rows_changed()
 
 
