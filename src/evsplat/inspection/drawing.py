@@ -54,7 +54,8 @@ def save_drawings(drawings: Mapping[str, Image.Image], out_dir: Path) -> tuple[P
     for name, drawing in drawings.items():
         pictures.append(out_dir / f"{name}.png")
         with atomic_path(pictures[-1]) as temporary:
-            drawing.save(temporary)
+            # Half of the time of level 6 for 7 % more bytes.
+            drawing.save(temporary, compress_level=4)
     return tuple(pictures)
 
 

@@ -82,12 +82,7 @@ def synthesize(
         subframes = making.subframes(progress)
         events = recorded
         if settings.events == "simulate":
-            sensor = _sensor(settings)
-            events = RecordedEvents(
-                simulate_events(subframes, sensor, settings.seed),
-                (sensor.contrast_on, sensor.contrast_off),
-                simulated=True,
-            )
+            events = _simulated(subframes, settings)
         else:
             deque(subframes, maxlen=0)
         if events is not None:
@@ -222,6 +217,15 @@ def _interpolator(settings: SynthesisSettings, weights: Path | str | None) -> In
     from evsplat.synthesis.flow import FlowInterpolator
 
     return FlowInterpolator()
+
+
+def _simulated(
+    subframes: Iterator[tuple[int, Float[np.ndarray, "..."]]], settings: SynthesisSettings
+) -> RecordedEvents:
+    """What a simulated sensor tells of the sub-frames, which are taken as events are asked for."""
+    sensor = _sensor(settings)
+    pieces = simulate_events(subframes, sensor, settings.seed)
+    return RecordedEvents(pieces, (sensor.contrast_on, sensor.contrast_off), simulated=True)
 
 
 def _sensor(settings: SynthesisSettings) -> SensorSettings:

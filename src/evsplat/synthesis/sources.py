@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class RecordedEvents:
-    """Events that a source has of its own."""
+    """Events for a capture: those that a source has of its own, or simulated ones."""
 
     pieces: Iterator[EventStream]
     contrast_threshold: tuple[float, float] | None
