@@ -1,7 +1,6 @@
 """Motion and look of a person drawn as discs, moved downhill until drawings are like pictures."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -44,17 +43,6 @@ PROBE_STEPS = 2 * _PARTS
 """Steps that each takes as long as."""
 
 
-@dataclass(frozen=True)
-class Stage:
-    """One part of the descent."""
-
-    pixels: int
-    """Width of the pictures compared."""
-    before: float
-    after: float
-    """Mean misfit of the pictures at its start and end, in units of one squared deviation."""
-
-
 class Descent:
     """Motion and look, moved downhill together."""
 
@@ -69,7 +57,7 @@ class Descent:
         self.limit = limit or TimeLimit(None, 1)
         self.discs = 0
 
-    def run(self, shrink: int, steps: int, *, first: bool) -> Stage:
+    def run(self, shrink: int, steps: int, *, first: bool) -> None:
         """Adam on pictures smaller by a factor."""
         targets = self.targets.smaller(shrink) if shrink > 1 else self.targets
         known, self.discs = self.discs, self._discs(targets.camera)
@@ -81,11 +69,9 @@ class Descent:
             self.look.colour_from(*poses, camera, image, first=known, count=self.discs)
         if first:
             self.learn_look(targets, shrink, LOOK_STEPS)
-        before = self.misfit(targets)
         motion = [self.correction.turns, self.correction.shifts]
         groups = [*self._look_groups(), {"params": motion, "rate": _RATES["motion"]}]
         self._descend(groups, targets, shrink, steps)
-        return Stage(targets.camera.width, before, self.misfit(targets))
 
     def _discs(self, camera: Camera) -> int:
         """How many are drawn."""
@@ -144,10 +130,6 @@ class Descent:
     def misfits(self, targets: Targets) -> Float[Tensor, "P"]:
         """Mean per picture."""
         return self._differences(targets) / targets.weight.sum((1, 2)).clamp_min(1e-6)
-
-    def misfit(self, targets: Targets) -> float:
-        """Mean over all pictures."""
-        return float(self.misfits(targets).mean())
 
     def errors(self) -> PoseErrors:
         """What is still unknown of the motion, by the curvature at the end (Laplace).

@@ -21,7 +21,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.landmarks.pictures import sharp_pictures
 from evsplat.posing.correction import Correction
-from evsplat.posing.descent import COARSE_PX, LOOK_STEPS, PROBE_STEPS, PROBES, Descent, Stage
+from evsplat.posing.descent import COARSE_PX, LOOK_STEPS, PROBE_STEPS, PROBES, Descent
 from evsplat.posing.pieces import between, cut_in_pieces, joined
 from evsplat.posing.surface_discs import SurfaceDiscs
 from evsplat.posing.targets import (
@@ -100,8 +100,6 @@ class Refined(Gain):
     """The corrected motion with its errors; `better` says whether to use it."""
     dressed: Body
     """The body with its surface where pictures show the person's: clothes, hair and shoes too."""
-    stages: tuple[Stage, ...]
-    """Of each piece of the recording, one after the other."""
 
 
 def judge(
@@ -173,7 +171,7 @@ def refine(
             targets = find_targets(given, capture, piece.pictures(pictures), shrink=piece.shrink)
         except NobodyInViewError as error:
             missed = error
-            found.append(_Piece(torch.empty(0), _with_errors(given), None, []))
+            found.append(_Piece(torch.empty(0), _with_errors(given), None))
             continue
         found.append(_finished(_descended(given, targets, limit, steps, discs, seed)))
     limit.close()
@@ -185,7 +183,6 @@ def refine(
         time.monotonic() - began,
         joined(pieces, [one.track for one in found]),
         _mean_body(bodies),
-        tuple(stage for one in found for stage in one.stages),
     )
 
 
@@ -198,16 +195,15 @@ class _Piece:
     track: BodyTrack
     dressed: Body | None
     """None where the person is out of view, and the motion stays as it is given."""
-    stages: list[Stage]
 
 
 def _finished(found: "_Descended") -> _Piece:
     """With the last steps, in which pictures kept aside are explained as well."""
     descent = found.descent
     descent.targets = found.nearer
-    last = descent.run(1, _LAST_STEPS, first=False)
+    descent.run(1, _LAST_STEPS, first=False)
     corrected = descent.correction.corrected(descent.errors())
-    return _Piece(found.better, corrected, descent.look.dressed(), [*found.stages, last])
+    return _Piece(found.better, corrected, descent.look.dressed())
 
 
 def _with_errors(track: BodyTrack) -> BodyTrack:
@@ -242,7 +238,6 @@ class _Descended:
     descent: Descent
     nearer: Targets
     """All pictures, and what is behind the person by the motion found in the smallest ones."""
-    stages: list[Stage]
     better: Float[Tensor, "A"]
     """See `_gain`."""
     coarse: Float[Tensor, "A"]
@@ -266,21 +261,20 @@ def _descended(
     fitted = sorted(set(range(len(targets.times_us))) - set(aside)) or aside
     descent = Descent(correction, look, targets.rows(fitted), limit)
     nearer = targets
-    stages: list[Stage] = []
     coarse = None
-    for shrink, count in _sizes(targets.camera, steps):
-        stages.append(descent.run(shrink, count, first=not stages))
-        if len(stages) > 1:
+    for number, (shrink, count) in enumerate(_sizes(targets.camera, steps)):
+        descent.run(shrink, count, first=number == 0)
+        if number > 0:
             continue
         if least_gain is not None:
             coarse = _gain(descent, targets.rows(aside), shrink)
             gain, gain_error = _mean_gain(coarse)
             if gain + 2 * gain_error < least_gain:
-                return _Descended(descent, nearer, stages, coarse, coarse)
+                return _Descended(descent, nearer, coarse, coarse)
         nearer = targets.around(correction.corrected(), _NEARER)
         descent.targets = nearer.rows(fitted)
     better = _gain(descent, targets.rows(aside))
-    return _Descended(descent, nearer, stages, better, better if coarse is None else coarse)
+    return _Descended(descent, nearer, better, better if coarse is None else coarse)
 
 
 def _sizes(camera: Camera, steps: tuple[int, int]) -> list[tuple[int, int]]:
