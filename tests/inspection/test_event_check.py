@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from evsplat.inspection.event_check import event_findings, flicker_findings
+from evsplat.inspection.event_check import event_findings, flicker_findings, lie_elsewhere
 
 from ..conftest import write_event_file
 from ..seen import changes_much, seen
@@ -39,6 +39,22 @@ def test_events_warped_to_half_the_size_are_not_called_lost(
     write_event_file(path / "events.h5", *changed(*columns))
     (finding,) = event_findings(seen(path))
     assert finding.field == field and likeliest in str(finding)
+
+
+def test_events_beside_their_pixels_are_told_by_how_far_and_not_as_another_fault(
+    tiny_capture: Callable[..., Path],
+) -> None:
+    path = tiny_capture(frames=12, width=64, height=48)
+    with h5py.File(path / "events.h5") as file:
+        t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
+    right = int(np.random.default_rng().integers(4, 8))
+    kept = x + right < 64
+    write_event_file(path / "events.h5", t[kept], x[kept] + right, y[kept], p[kept])
+    (finding,) = event_findings(seen(path))
+    assert lie_elsewhere([finding]) and finding.severity == "warning"
+    told = float(str(finding).split("in the pictures: ")[1].split(" px to the right")[0])
+    assert told == pytest.approx(right, abs=0.5)
+    assert "docs/event-formats.md" in str(finding)
 
 
 def test_of_events_without_polarity_is_told_what_needs_none(

@@ -26,6 +26,7 @@ from evsplat.calibration.lost import (
     untold_spans,
 )
 from evsplat.calibration.noise import NoiseEstimate, NoiseMeter, noise_of
+from evsplat.calibration.placement import Placement, estimate_placement
 from evsplat.calibration.thresholds import ThresholdEstimate, estimate_thresholds
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "Lost",
     "NoiseEstimate",
     "NoiseMeter",
+    "Placement",
     "SensorEstimate",
     "ThresholdEstimate",
     "answered_share",
@@ -44,6 +46,7 @@ __all__ = [
     "dead_rows",
     "estimate_disagreement",
     "estimate_from_pairs",
+    "estimate_placement",
     "find_lost",
     "flicker_period_us",
     "noise_of",

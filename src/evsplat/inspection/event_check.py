@@ -3,7 +3,13 @@
 import logging
 from collections.abc import Iterable
 
-from evsplat.calibration import FramePair, Lost, answered_share, estimate_disagreement
+from evsplat.calibration import (
+    FramePair,
+    Lost,
+    answered_share,
+    estimate_disagreement,
+    estimate_placement,
+)
 from evsplat.capture import TrainingCapture, estimate_sensor, lost_events, warn_of_contrast
 from evsplat.capture.finding import Finding, Findings
 from evsplat.capture.sensor_estimate import frame_pairs
@@ -45,10 +51,22 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
             str(other_way), "events in the pixels of the frames, 1 where it grows brighter",
             "Write the events anew that way (evsplat.events.write_events), or the pictures.",
         )  # fmt: skip
-    lost = lost_events(capture, pairs) if other_way is None else Lost()
+    asked = signed and not sign and other_way is None
+    beside = estimate_placement(pairs, events) if asked else None
+    if beside is not None:
+        findings.warning(
+            events.path, _WHICH_WAY[1],
+            f"events that lie beside what changes in the pictures: {beside}",
+            "events in the pixels of the pictures",
+            "Warp them there (docs/event-formats.md, events into the pixels of the pictures) and "
+            "import them anew. Where something at another distance is in its place, the two lenses "
+            "stand too far apart.",
+        )  # fmt: skip
+    elsewhere = other_way is not None or beside is not None
+    lost = Lost() if elsewhere else lost_events(capture, pairs)
     if lost.spans_us:
         _tell_lost(findings, events, lost)
-    answered = None if lost.spans_us or sign or other_way else answered_share(pairs, events)
+    answered = None if lost.spans_us or sign or elsewhere else answered_share(pairs, events)
     if answered is not None and answered < _FEWEST_ANSWERED:
         findings.warning(
             events.path, "events/x, events/y",

@@ -1,0 +1,138 @@
+"""Events that lie beside the pixels of the frames, by known ways, are told as they were moved."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from evsplat.calibration import FramePair, estimate_placement, exposure, pair
+from evsplat.events import EventStream
+
+WIDTH, HEIGHT, FRAMES = 96, 80, 9
+PERIOD_US, STEP_US, EXPOSURE_US = 40_000, 2_000, 8_000
+
+
+@functools.cache
+def filmed(seed: int) -> tuple[list[FramePair], EventStream]:
+    """Something with a pattern that goes and turns before a wall with one, by ideal pixels.
+
+    It swings: of what goes evenly a shift along its way is as if it came later.
+    """
+    rng = np.random.default_rng(seed)
+    wall, coat = (gaussian_filter(rng.standard_normal((HEIGHT, WIDTH)), 2.5) * 5 for _ in range(2))
+    way, turn = rng.uniform(-7, 7, 2), rng.uniform(-0.2, 0.2)
+    begin = rng.uniform(0, 2 * np.pi)
+    grid = np.stack(np.mgrid[:HEIGHT, :WIDTH]).astype(float) - np.array(
+        [[[HEIGHT / 2]], [[WIDTH / 2]]]
+    )
+
+    def level(time_us: float) -> np.ndarray:
+        swing = np.sin(begin + 8 * time_us / (FRAMES * PERIOD_US))
+        angle = turn * swing
+        y, x = grid - (swing * way)[:, None, None]
+        rows = np.cos(angle) * y - np.sin(angle) * x
+        columns = np.sin(angle) * y + np.cos(angle) * x
+        inside = 1 / (1 + np.exp(np.maximum((np.hypot(rows / 26, columns / 16) - 1) * 20, -50)))
+        pattern = map_coordinates(
+            coat, [rows + HEIGHT / 2, columns + WIDTH / 2], order=1, mode="mirror"
+        )
+        return -1.6 + (1 - inside) * wall * 0.5 + inside * (pattern + 0.3)
+
+    reference = level(0) + rng.uniform(-0.2, 0.2, (HEIGHT, WIDTH))
+    events = []
+    for time in range(0, FRAMES * PERIOD_US, STEP_US):
+        now = level(time)
+        for sign in (1, -1):
+            while (passed := sign * (now - reference) >= 0.2).any():
+                y, x = np.nonzero(passed)
+                events.append((np.full(len(x), time), x, y, np.full(len(x), sign)))
+                reference[passed] += sign * 0.2
+    t, x, y, p = (np.concatenate(column) for column in zip(*events, strict=True))
+    stream = EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
+    spans = [(k * PERIOD_US, k * PERIOD_US + EXPOSURE_US) for k in range(FRAMES)]
+    seen = [
+        exposure(
+            torch.from_numpy(
+                np.mean([np.exp(level(u)) for u in np.linspace(*span, 5)], axis=0) ** (1 / 2.2)
+            ),
+            span,
+        )
+        for span in spans
+    ]
+    recorded = -(10**9), 10**9
+    return [pair(a, b, recorded) for a, b in zip(seen, seen[1:], strict=False)], stream
+
+
+def moved(
+    events: EventStream, right: float, down: float, angle_deg: float = 0.0, scale: float = 1.0
+) -> EventStream:
+    """Turned and scaled about the middle of the picture, then shifted; what falls out is lost."""
+    turn = scale * np.exp(1j * np.radians(angle_deg))
+    middle = complex(WIDTH - 1, HEIGHT - 1) / 2
+    place = (events.x + 1j * events.y.astype(float) - middle) * turn + middle + complex(right, down)
+    x, y = np.rint(place.real), np.rint(place.imag)
+    inside = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+    x, y = (np.where(inside, value, 0).astype(np.uint16) for value in (x, y))
+    return replace(events, x=x, y=y).take(inside)
+
+
+@pytest.fixture(params=range(3))
+def seed(request: pytest.FixtureRequest) -> int:
+    return int(np.random.default_rng().integers(1_000_000))
+
+
+def test_events_in_their_place_are_not_told_whatever_the_clock_and_the_noise(seed: int) -> None:
+    pairs, events = filmed(seed)
+    rng = np.random.default_rng(seed)
+    assert estimate_placement(pairs, events) is None
+    for late_us in (8_000, -25_000, 55_000, 95_000):
+        assert estimate_placement(pairs, replace(events, t=events.t + late_us)) is None
+    thinned = events.take(rng.random(len(events)) < 0.3)
+    assert estimate_placement(pairs, thinned) is None
+    noise = EventStream(
+        np.sort(rng.integers(0, FRAMES * PERIOD_US, 5_000)),
+        rng.integers(0, WIDTH, 5_000).astype(np.uint16),
+        rng.integers(0, HEIGHT, 5_000).astype(np.uint16),
+        rng.choice(np.array([-1, 1], np.int8), 5_000),
+    )
+    assert estimate_placement(pairs, noise) is None
+
+
+def test_events_of_another_scene_are_not_said_to_lie_somewhere(seed: int) -> None:
+    pairs, _ = filmed(seed)
+    assert estimate_placement(pairs, filmed(seed + 1)[1]) is None
+    assert estimate_placement(pairs[:1], filmed(seed)[1]) is None
+    still = [replace(one, change=np.zeros_like(one.change)) for one in pairs]
+    assert estimate_placement(still, filmed(seed)[1]) is None
+
+
+def test_shift_turn_and_scale_are_those_by_which_events_were_moved(seed: int) -> None:
+    pairs, events = filmed(seed)
+    rng = np.random.default_rng(seed)
+    far, way = rng.uniform(3, 9), rng.uniform(0, 2 * np.pi)
+    right, down = np.rint([far * np.cos(way), far * np.sin(way)]).tolist()
+    found = estimate_placement(pairs, moved(events, right, down))
+    assert found is not None and found.mirrored == (False, False)
+    assert found.shift_px == pytest.approx((right, down), abs=0.4)
+    assert abs(found.angle_deg) < 0.7 and found.scale == pytest.approx(1, abs=0.015)
+    assert found.correlation > 0.8 > found.as_given
+    angle, scale = rng.choice([-3, 3]), rng.choice([0.96, 1.04])
+    found = estimate_placement(pairs, moved(events, right, down, angle, scale))
+    assert found is not None
+    assert found.shift_px == pytest.approx((right, down), abs=0.4)
+    assert found.angle_deg == pytest.approx(angle, abs=0.7)
+    assert found.scale == pytest.approx(scale, abs=0.015)
+
+
+def test_a_mirror_whose_middle_is_not_the_pictures_is_told_with_the_shift(seed: int) -> None:
+    """As of a beam splitter, of which nothing fits in its pixels, mirrored or not."""
+    pairs, events = filmed(seed)
+    turned = replace(events, x=(WIDTH - 1 - events.x).astype(np.uint16))
+    found = estimate_placement(pairs, moved(turned, 6, -2))
+    assert found is not None and found.mirrored == (True, False)
+    # before all else: what is shifted first to the right is mirrored to the left
+    assert found.shift_px == pytest.approx((-6, -2), abs=0.4)
+    assert str(found).startswith("mirrored left to right, ")
