@@ -6,7 +6,7 @@ best one it is fitted how they are turned and scaled. Nothing but the pictures i
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -91,7 +91,8 @@ def estimate_placement(pairs: Sequence[FramePair], events: EventSource) -> Place
     Found are shifts up to a fifth of the picture's shorter side, with turns and scales of a few
     degrees and per cent. Clocks may differ by up to 0.1 s.
     """
-    chosen = evenly_spread(list(pairs), _MOST_PAIRS)
+    alike = [pair for pair in pairs if pair.change.shape == pairs[0].change.shape]
+    chosen = evenly_spread(alike, _MOST_PAIRS)
     if len(chosen) < 2:
         return None
     height, width = chosen[0].change.shape
@@ -100,8 +101,7 @@ def estimate_placement(pairs: Sequence[FramePair], events: EventSource) -> Place
     gap_us = float(np.median([pair.gap_us for pair in chosen]))
     most = 1 + math.ceil(max(SEARCH_US / gap_us, 1) * _STEPS)
     lags = np.arange(-most, most + 1) * gap_us / _STEPS
-    told = np.stack([_told(pair, events, lags) for pair in chosen], axis=1)
-    told = np.stack([_reduced(maps, step) for maps in told])
+    told = np.stack([_told(pair, events, lags, step) for pair in chosen], axis=1)
     if not frames.any() or not told.any():
         return None
     coarse = range(1, len(lags), 2)
@@ -145,18 +145,22 @@ def _change(pair: FramePair) -> Float32[np.ndarray, "H W"]:
 
 
 def _told(
-    pair: FramePair, events: EventSource, lags: Float[np.ndarray, "L"]
-) -> Float32[np.ndarray, "L H W"]:
-    """Sums of polarities at each lag, of what may be read."""
-    height, width = pair.change.shape
+    pair: FramePair, events: EventSource, lags: Float[np.ndarray, "L"], step: int
+) -> Float32[np.ndarray, "L h w"]:
+    """Sums of polarities at each lag, of what may be read, as means over squares of pixels."""
     (start, end), (low, high) = pair.span_us, pair.recorded_us
     first = max(start + math.floor(lags[0]), low)
     near = events.between(first, max(first, min(end + math.ceil(lags[-1]), high)))
     near = near.take(slice(None, None, max(1, len(near) // _MOST_EVENTS)))
-    pixel = event_pixels(near, height, width)
-    sums = [np.bincount(pixel, pair.weights(near.t - lag) * near.p, height * width) for lag in lags]
-    maps = np.array(sums).reshape(len(lags), height, width)
-    return np.clip(maps, -_MOST_THRESHOLDS, _MOST_THRESHOLDS).astype(np.float32)
+    height, width = (side // step for side in pair.change.shape)
+    small = replace(near, x=near.x // step, y=near.y // step)
+    small = small.take((small.x < width) & (small.y < height))
+    pixel = event_pixels(small, height, width)
+    maps = np.empty((len(lags), height, width), np.float32)
+    for one, lag in zip(maps, lags, strict=True):
+        weights = pair.weights(small.t - lag) * small.p
+        one[:] = np.bincount(pixel, weights, height * width).reshape(height, width) / step**2
+    return np.clip(maps, -_MOST_THRESHOLDS, _MOST_THRESHOLDS)
 
 
 def _reduced(maps: Map, step: int) -> Map:
