@@ -33,6 +33,8 @@ from evsplat.evaluation.tables import LEGEND, REGION_TITLES, markdown  # noqa: E
 KEPT = ROOT / "docs" / "results"
 PAGES = ("README.md", "docs/bench.md", "docs/results.md")
 FIGURE = ROOT / "docs" / "images" / "convergence.png"
+LONGER = ROOT / "benchmarks" / "knee.yaml"
+"""Suite of rows of ``stage`` that make more steps."""
 COMPARED = ("man_dance_hard_256", "woman_dance_b_256", "real_beam_256")
 """Captures that every method is compared on."""
 FOR_USERS = (
@@ -56,10 +58,11 @@ _OF_POINT = ("full_psnr_db", "crop_psnr_db", "mask_psnr_db")
 _PLACE = re.compile(r"(<!-- results: ([a-z-]+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 
-def kept_records(suite: str) -> Records:
+def kept_records(named: str | Path) -> Records:
     """Everything kept of a suite; a record that it asks for otherwise is a `ConfigError`."""
-    folder = BenchFolder(ROOT / "build" / "results" / suite, KEPT / suite)
-    plan = plan_of_kept(read_suite(suite), suite, KEPT / suite)
+    suite = read_suite(named)
+    folder = BenchFolder(ROOT / "build" / "results" / suite.name, KEPT / suite.name)
+    plan = plan_of_kept(suite, str(named), KEPT / suite.name)
     pending_cells(plan, folder, retry=False)
     return Records.read(plan, folder)
 
@@ -87,25 +90,28 @@ def trio(records: Records, row: str, capture: str) -> str:
     return text + (f" (± {max(spreads):.2f})" if spreads else "")
 
 
-def methods(records: Records, names: Sequence[str] = ()) -> str:
-    """Every row, or the named ones, on the captures that all methods are compared on."""
+def methods(records: Records, longer: Records, names: Sequence[str] = ()) -> str:
+    """Every row, or the named ones, on the captures that all methods are compared on.
+
+    Below a row stands the same of ``longer`` runs, where every capture has one.
+    """
     lines = [
         f"| method | steps | {' | '.join(COMPARED)} | CPU minutes |",
         f"|---|---:|{'---|' * len(COMPARED)}---:|",
     ]
     missing = []
-    for row, title, captures in _rows(records):
+    for of, row, title, captures in _rows(records, longer):
         if names and row.name not in names:
             continue
-        figures = [trio(records, row.name, capture) for capture in captures]
+        figures = [trio(of, row.name, capture) for capture in captures]
         gaps = [name for name, figure in zip(COMPARED, figures, strict=True) if figure == "–"]
-        if gaps:
+        if gaps and of is records:
             where = "" if len(gaps) == len(COMPARED) else f" on {', '.join(gaps)}"
             missing.append(f"`{row.name}`{where}")
         if len(gaps) == len(COMPARED):
             continue
-        steps = records.figure(row.name, lambda r: r["iteration"], captures)
-        seconds = records.figure(row.name, lambda r: r.get("train_cpu_seconds"), captures)
+        steps = of.figure(row.name, lambda r: r["iteration"], captures)
+        seconds = of.figure(row.name, lambda r: r.get("train_cpu_seconds"), captures)
         lines.append(
             f"| {title} | {f'{steps.mean:,.0f}' if steps else '–'} | {' | '.join(figures)} | "
             f"{f'{seconds.mean / 60:.1f}' if seconds else '–'} |"
@@ -123,14 +129,16 @@ def methods(records: Records, names: Sequence[str] = ()) -> str:
     return "\n".join([*lines, "", " ".join(notes)])
 
 
-def _rows(records: Records) -> Iterator[tuple[SuiteRow, str, list[str]]]:
-    """Rows, their titles and captures; a second time those that ran with found poses."""
+def _rows(records: Records, longer: Records) -> Iterator[tuple[Records, SuiteRow, str, list[str]]]:
+    """Rows, their records, titles and captures; again those that ran longer or by found poses."""
     for row in records.plan.suite.rows:
-        yield row, title_of(records, row, COMPARED), list(COMPARED)
+        yield records, row, title_of(records, row, COMPARED), list(COMPARED)
+        if all(longer.of(capture, row.name) for capture in COMPARED):
+            yield longer, row, title_of(longer, row, COMPARED), list(COMPARED)
         for end, words in FOUND.items():
             found = [capture + end for capture in COMPARED]
             if any(records.of(capture, row.name) for capture in found):
-                yield row, f"{title_of(records, row, found)}; {words}", found
+                yield records, row, f"{title_of(records, row, found)}; {words}", found
 
 
 def _test_frames(records: Records) -> str:
@@ -237,14 +245,15 @@ def convergence() -> str:
 def texts() -> dict[str, str]:
     """Every place by its name."""
     stage, drawn = kept_records("stage"), kept_records("grid")
+    longer = kept_records(LONGER)
     return {
-        "methods": methods(stage),
-        "for-users": methods(stage, FOR_USERS),
+        "methods": methods(stage, longer),
+        "for-users": methods(stage, longer, FOR_USERS),
         "captures": captures(stage),
         "grid": grid(drawn),
         "grid-summary": grid_summary(drawn),
         "stage-tables": suite_tables(_only(stage, COMPARED)),
-        "cells": cells([stage, drawn]),
+        "cells": cells([stage, longer, drawn]),
         "convergence": convergence(),
     }
 
