@@ -66,6 +66,7 @@ def test_from_python_it_is_the_same_sentence(monkeypatch):
 
 def test_what_python_itself_asks_of_a_module_is_simply_not_there():
     assert not hasattr(native, "__wrapped__")
+    assert not hasattr(native, "no_such_function")
 
 
 def test_what_an_object_of_the_module_lacks_is_told(capsys, checkout: Path):

@@ -13,6 +13,11 @@ from torch import Tensor
 
 from evsplat.errors import BackendError
 
+
+class MissingFunctionError(BackendError, AttributeError):
+    """The compiled module lacks a function; also what `hasattr` takes for a no."""
+
+
 native: Any = None
 import_error: ImportError | None = None
 try:
@@ -59,7 +64,7 @@ def _missing(name: str) -> NoReturn:
     """The module's ``__getattr__``, which Python asks only for what is not there."""
     if name.startswith("_"):  # asked for by import, inspect and the like
         raise AttributeError(f"module 'evsplat._native' has no attribute {name!r}", name=name)
-    raise _older(f"it has no {name}")
+    raise MissingFunctionError(str(_older(f"it has no {name}")))
 
 
 if native is not None:
