@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 from convergence import curves_of, draw, knee, read_points  # noqa: E402
 
-from evsplat.benching.figures import Records, metric  # noqa: E402
+from evsplat.benching.figures import Record, Records, metric  # noqa: E402
 from evsplat.benching.folder import BenchFolder  # noqa: E402
 from evsplat.benching.kept import plan_of_kept  # noqa: E402
 from evsplat.benching.plan import pending_cells  # noqa: E402
@@ -205,14 +205,38 @@ def _body(page: str) -> str:
     return page.partition("\n")[2].strip()
 
 
+def doubled(records: Records, longer: Records) -> str:
+    """Cells that ran longer, behind the same of the table, of the same seed."""
+    lines = [f"| method | steps | {' | '.join(COMPARED)} |", f"|---|---|{'---|' * len(COMPARED)}"]
+    for row in longer.plan.suite.rows:
+        found = [
+            tuple(of.by_cell.get((capture, row.name, 0)) for of in (records, longer))
+            for capture in COMPARED
+        ]
+        pairs = [(a, b) if a and b else None for a, b in found]
+        steps = {tuple(f"{one['iteration']:,}" for one in pair) for pair in pairs if pair}
+        if not steps:
+            continue
+        (lengths,) = steps
+        texts = [" → ".join(map(psnr_of, pair)) if pair else "–" for pair in pairs]
+        title = title_of(longer, row, COMPARED)
+        lines.append(f"| {title} | {' → '.join(lengths)} | {' | '.join(texts)} |")
+    return "\n".join(lines)
+
+
+def psnr_of(record: Record) -> str:
+    """PSNR of full frame / person crop / person mask."""
+    regions = record["protocols"]["standard"]
+    values = [regions[region]["psnr"] for region in REGION_TITLES]
+    return " / ".join("–" if value is None else f"{value:.2f}" for value in values)
+
+
 def cells(suites: Sequence[Records]) -> str:
     """Every kept cell with its commit and its record."""
     lines = ["| suite | capture | row | seed | steps | full / crop / mask | CPU minutes | code | |"]
     lines.append("|---|---|---|---:|---:|---|---:|---|---|")
     for records in suites:
         for (capture, row, seed), record in sorted(records.by_cell.items()):
-            regions = record["protocols"]["standard"]
-            values = [regions[region]["psnr"] for region in REGION_TITLES]
             cpu, suite = record.get("train_cpu_seconds"), records.plan.suite.name
             words = (
                 suite,
@@ -220,7 +244,7 @@ def cells(suites: Sequence[Records]) -> str:
                 row,
                 str(seed),
                 f"{record['iteration']:,}" if record["iteration"] else "–",
-                " / ".join("–" if value is None else f"{value:.2f}" for value in values),
+                psnr_of(record),
                 f"{cpu / 60:.1f}" if cpu else "–",
                 (record.get("code") or {}).get("commit", "–"),
                 f"[record](results/{suite}/{capture}/{row}/seed{seed}.json)",
@@ -253,6 +277,7 @@ def texts() -> dict[str, str]:
         "grid": grid(drawn),
         "grid-summary": grid_summary(drawn),
         "stage-tables": suite_tables(_only(stage, COMPARED)),
+        "doubled": doubled(stage, longer),
         "cells": cells([stage, longer, drawn]),
         "convergence": convergence(),
     }
