@@ -57,26 +57,26 @@ def older_module(error: BaseException) -> BackendError | None:
         found = owner.__module__ == "evsplat._native"
     else:
         found = isinstance(error, TypeError) and _OTHER_ARGUMENTS in str(error) and _built_before()
-    return _older(str(error).partition("\n")[0]) if found else None
+    return BackendError(_older(str(error).partition("\n")[0])) if found else None
 
 
 def _missing(name: str) -> NoReturn:
     """The module's ``__getattr__``, which Python asks only for what is not there."""
     if name.startswith("_"):  # asked for by import, inspect and the like
         raise AttributeError(f"module 'evsplat._native' has no attribute {name!r}", name=name)
-    raise MissingFunctionError(str(_older(f"it has no {name}")))
+    raise MissingFunctionError(_older(f"it has no {name}"))
 
 
 if native is not None:
     native.__getattr__ = _missing
 
 
-def _older(found: str) -> BackendError:
+def _older(found: str) -> str:
     again = "install evsplat again."
     if (_CHECKOUT / "native").is_dir():
         install = [sys.executable, "-m", "pip", "install", "-e", str(_CHECKOUT)]
         again = f"build it anew: {shlex.join(install)}"
-    return BackendError(
+    return (
         f"{native.__file__}: evsplat's compiled module is older than the sources that call it "
         f"({found}); {again}"
     )

@@ -15,6 +15,7 @@ from scipy.ndimage import affine_transform, gaussian_filter
 from evsplat.calibration.brightness import EventSource, FramePair
 from evsplat.calibration.clock import SEARCH_US
 from evsplat.events.maps import event_pixels
+from evsplat.pictures.squares import square_means
 from evsplat.spread import evenly_spread
 
 SURE = 0.5
@@ -97,7 +98,7 @@ def estimate_placement(pairs: Sequence[FramePair], events: EventSource) -> Place
         return None
     height, width = chosen[0].change.shape
     step = math.ceil(max(height, width) / _SIDE)
-    frames = _reduced(np.stack([_change(pair) for pair in chosen]), step)
+    frames = square_means(np.stack([_change(pair) for pair in chosen]), step)
     gap_us = float(np.median([pair.gap_us for pair in chosen]))
     most = 1 + math.ceil(max(SEARCH_US / gap_us, 1) * _STEPS)
     lags = np.arange(-most, most + 1) * gap_us / _STEPS
@@ -161,15 +162,6 @@ def _told(
         weights = pair.weights(small.t - lag) * small.p
         one[:] = np.bincount(pixel, weights, height * width).reshape(height, width) / step**2
     return np.clip(maps, -_MOST_THRESHOLDS, _MOST_THRESHOLDS)
-
-
-def _reduced(maps: Map, step: int) -> Map:
-    """Means over squares of ``step`` pixels; what is left at the right and below is cut off."""
-    if step == 1:
-        return maps
-    count, height, width = len(maps), maps.shape[1] // step, maps.shape[2] // step
-    cut = maps[:, : height * step, : width * step]
-    return cut.reshape(count, height, step, width, step).mean((2, 4))
 
 
 def _flipped(maps: np.ndarray, flips: tuple[int, int]) -> np.ndarray:

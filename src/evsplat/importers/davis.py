@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +58,10 @@ class Davis(Importer):
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read the recording; see `Importer.write`."""
         recording = open_recording(need(source, "an AEDAT recording"), repair=self.repair)
-        spans = [_span(source, index, frame) for index, frame in enumerate(recording.frames())]
+        spans, shapes = [], []
+        for index, frame in enumerate(recording.frames()):
+            spans.append(_span(source, index, frame))
+            shapes.append(frame.image.shape[:2])
         first = next((piece for piece in recording.chunks() if len(piece)), None)
         if not spans or first is None:
             raise _incomplete(source, recording, has_frames=bool(spans))
@@ -68,7 +70,7 @@ class Davis(Importer):
         begin = spans[kept[0]][0]
         if self.frames is None and not isinstance(self.clock_offset_us, str):
             begin = min(begin, int(first.t[0]) + self.clock_offset_us)
-        size = _size(recording, kept[0], source)
+        size = _size(recording, shapes[kept[0]], source)
         camera, focal, guessed = recorded_camera(self.camera, self.focal, size)
         camera, small = shrunk_camera({**camera, "transfer": self.transfer}, size, self.shrink)
         writer.add_camera("main", *small, **camera)
@@ -102,10 +104,9 @@ class Davis(Importer):
         return notes
 
 
-def _size(recording: EventRecording, index: int, source: Path) -> tuple[int, int]:
-    """Size in pixels of a frame, by its number, which must be that of the sensor."""
-    frame = next(islice(recording.frames(), index, None))
-    height, width = frame.image.shape[:2]
+def _size(recording: EventRecording, shape: tuple[int, ...], source: Path) -> tuple[int, int]:
+    """Width and height of a frame of (height, width) pixels, which must be those of the sensor."""
+    height, width = shape
     if (width, height) != (recording.width, recording.height):
         raise DataError(
             f"{source}: its frames have {width}x{height} pixels and its events "

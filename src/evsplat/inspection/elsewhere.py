@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import binary_opening, distance_transform_edt, label
 
 from evsplat.inspection.movement import CHANGED
+from evsplat.pictures.squares import square_means
 
 FEWEST_FRAMES = 8
 """A median of fewer pictures is no backdrop."""
@@ -99,11 +100,13 @@ def find_elsewhere(
     if len(pictures) < FEWEST_FRAMES or size == 0:
         return None
     step = max(1, round(size / _FIGURE_PX))
-    here = _reduced(body, step) > 0
+    here = square_means(body, step) > 0
     near = np.stack(
         [distance_transform_edt(~one) <= max(2, round(_AWAY * size / step)) for one in here]
     )
-    colours = np.stack([_reduced(channel, step) for channel in pictures.swapaxes(0, 1)], axis=-1)
+    colours = np.stack(
+        [square_means(channel, step) for channel in pictures.swapaxes(0, 1)], axis=-1
+    )
     other = _other_than_shadow(colours, near)
     area = float(np.median(here.sum((1, 2))))
     largest = np.stack([_largest_piece(one) for one in other])
@@ -121,7 +124,7 @@ def find_elsewhere(
     )  # fmt: skip
     shares = []
     for name, maps in found.items():
-        moving = _reduced(maps, step)
+        moving = square_means(maps, step)
         shares.append((name, float(moving[place & ~near].sum() / max(moving.sum(), 1e-9))))
     return Elsewhere(
         box, picture_px, int((largest & place).any((1, 2)).sum()), len(pictures), tuple(shares)
@@ -140,13 +143,6 @@ def _tall(body: Bool[np.ndarray, "K h w"]) -> float:
         if len(row)
     ]
     return float(np.median(sizes)) if sizes else 0.0
-
-
-def _reduced(maps: np.ndarray, step: int) -> Float32[np.ndarray, "K h w"]:
-    """Means over squares of ``step`` pixels; what is left at the right and below is cut off."""
-    count, height, width = len(maps), maps.shape[1] // step, maps.shape[2] // step
-    cut = maps[:, : height * step, : width * step].astype(np.float32)
-    return cut.reshape(count, height, step, width, step).mean((2, 4))
 
 
 def _other_than_shadow(
