@@ -203,6 +203,18 @@ def test_a_wall_stands_behind_all_that_the_filmed_person_does_and_looks_the_same
     assert Room.of(recorded, recorded).stand_back(layers, camera) is layers
 
 
+def test_a_person_alone_and_a_scene_alone_are_filmed_as_they_are(recorded):
+    camera = camera_before(recorded, away=4.0)
+    room = Room.of(recorded, recorded, camera)
+    some, none = splats(recorded.vertices(0)[None]), splats(torch.zeros(1, 0, 3))
+    for human, scene in ((some, none), (none, some)):
+        layers = Layers(human, scene, torch.eye(4)[None])
+        for change in (room.stand_back, room.clear, room.soften):
+            changed = change(layers, camera)
+            assert torch.equal(changed.human.means, human.means)
+            assert changed.scene.means.shape == scene.means.shape
+
+
 def test_the_rim_of_what_was_recorded_fades_as_the_camera_goes_away(recorded):
     camera = camera_before(recorded, away=4.0)
     room = Room.of(recorded, recorded, camera)

@@ -94,6 +94,8 @@ class Room:
     def clear(self, layers: Layers, camera: Camera) -> Layers:
         """Fade what stands between the camera and the person, but for the floor."""
         scene, human = layers.scene, layers.human
+        if not human.means.numel():
+            return layers
         depth, nearest = (camera.project(part.means)[1] for part in (scene, human))
         begin, end = (nearest.min() - metres for metres in _CLEAR_M)
         share = eased((depth[0] - begin) / (end - begin))
@@ -105,8 +107,9 @@ class Room:
         """Put a wall that somebody would walk through behind all that the filmed person does.
 
         A camera that stood still has not seen how far away the wall is, and recorded the same.
+        A person alone has none.
         """
-        if self.recording is None:
+        if self.recording is None or not layers.scene.means.numel():
             return layers
         scene, recording = layers.scene, self.recording.to(layers.scene.means.device)
         depth = recording.project(scene.means[0])[1]

@@ -135,6 +135,10 @@ def avatar(
 
     The first of the losses compares pictures, perceptual distance in boxes; the others are priors.
     """
+    # Weights of a perceptual network need not be there to draw; where they are missed otherwise,
+    # that is said before the fit below.
+    choice = "none" if purpose == "draw" else terms.perceptual
+    name, perceptual = choose_perceptual(choice, device=device)
     model = PaperModel(
         track,
         [frame.mid_us for frame in capture.train_frames],
@@ -145,10 +149,8 @@ def avatar(
         **vars(networks),
     ).to(device)
     prior = SkinningPrior(surface.to(device), SKINNING_POINTS)
-    fit_skinning(model, prior, terms.skinning_prefit_steps if purpose == "train" else 0, generator)
-    # Weights of a perceptual network need not be there to draw.
-    choice = "none" if purpose == "draw" else terms.perceptual
-    name, perceptual = choose_perceptual(choice, device=device)
+    if purpose == "train":
+        fit_skinning(model, prior, terms.skinning_prefit_steps, generator)
     pictures = Photometric(
         capture, box_of, dssim=dssim != 0.0, perceptual=perceptual, perceptual_term=name
     )

@@ -124,6 +124,8 @@ def build(
     """Put the method together for one capture."""
     require_training_frames(capture)
     refuse_masks(config.policy, "paper")
+    # First of all, since it refuses a capture without events, and the fits below take minutes.
+    events = [_events(config, capture)] if config.event_weight != 0.0 else []
     fit = purpose == "train"
     generator = start_of_randomness(seed)
     track = load_body_track(capture)
@@ -157,9 +159,7 @@ def build(
         fit_scene_colours(network, gaussians, camera, colours.to(device), steps, generator)
         fit_scene(gaussians, camera, picture, steps, low_pass=model.low_pass, network=network)
 
-    objectives: list[Objective] = [pictures]
-    if config.event_weight != 0.0:
-        objectives.append(_events(config, capture))
+    objectives: list[Objective] = [pictures, *events]
     if config.semantics == "rendered":
         bounds = semantic_bounds(capture, track, config.semantic_band_px_at_256)
         objectives.append(RenderedSemantics(bounds))
