@@ -292,7 +292,7 @@ def test_what_ships_has_its_licences():
     [
         ({"character": "nobody"}, "neither a file nor one of man, woman, worker"),
         ({"motion": "moonwalk"}, "neither a file nor one of"),
-        ({"frames": 500}, "500 are asked for"),
+        ({"frames": 500}, "500 are asked for. Ask for fewer (--frames)"),
         ({"start_s": 60}, "gives 0 frames"),
         ({"exposure_ms": 50}, "shorten the exposure"),
         ({"width": 4}, "--width 4: expected an integer within 16 and 4096"),

@@ -290,10 +290,10 @@ def _frame_count(settings: StageSettings, motion: SkeletonMotion) -> int:
     wanted = min(there, MOST_FRAMES) if settings.frames is None else settings.frames
     if wanted > there or wanted < 1:
         raise ConfigError(
-            f"{motion.source}: lasts {lasts:.2f} s, which gives {max(there, 0)} frames at "
-            f"{settings.fps:g} per second from {settings.start_s:g} s on; "
-            f"{max(wanted, 1)} are asked for. Ask for fewer (frames), start earlier (start_s), "
-            "raise fps or take a longer motion."
+            f"--motion {settings.motion}: lasts {lasts:.2f} s, which gives {max(there, 0)} frames "
+            f"at {settings.fps:g} per second from {settings.start_s:g} s on; {max(wanted, 1)} are "
+            "asked for. Ask for fewer (--frames), start earlier (--start), raise --fps, or take a "
+            "longer motion."
         )
     return wanted
 
