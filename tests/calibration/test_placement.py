@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from evsplat.calibration import FramePair, estimate_placement, exposure, pair
 from evsplat.events import EventStream
+from evsplat.events import moved as moved_by
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 9
 PERIOD_US, STEP_US, EXPOSURE_US = 40_000, 2_000, 8_000
@@ -136,3 +137,49 @@ def test_a_mirror_whose_middle_is_not_the_pictures_is_told_with_the_shift(seed: 
     # before all else: what is shifted first to the right is mirrored to the left
     assert found.shift_px == pytest.approx((-6, -2), abs=0.4)
     assert str(found).startswith("mirrored left to right, ")
+
+
+def coarse(
+    pairs: list[FramePair], events: EventStream, factor: int, more: int
+) -> tuple[list[FramePair], EventStream]:
+    """Each pixel ``factor`` by ``factor`` of them, each with its events, and ``more`` beside."""
+
+    def grown(values: np.ndarray) -> np.ndarray:
+        return np.pad(values.repeat(factor, 0).repeat(factor, 1), ((0, more), (0, more)))
+
+    fine = [replace(one, change=grown(one.change), usable=grown(one.usable)) for one in pairs]
+    count = factor**2
+    row, column = (np.tile(at.ravel(), len(events)) for at in np.mgrid[:factor, :factor])
+    x, y = (factor * np.repeat(values, count) for values in (events.x, events.y))
+    places = (x + column).astype(np.uint16), (y + row).astype(np.uint16)
+    return fine, EventStream(np.repeat(events.t, count), *places, np.repeat(events.p, count))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("factor", [1, 2])
+def test_events_are_moved_back_by_what_was_found(seed: int, mirrored: bool, factor: int) -> None:
+    """Those of larger pictures too, which are compared as means that leave out the last pixels."""
+    pairs, events = filmed(seed)
+    more = 0 if factor == 1 else 1
+    pairs, events = coarse(pairs, events, factor, more)
+    height, width = pairs[0].change.shape
+    rng = np.random.default_rng(seed)
+    angle = np.radians(rng.choice([-1, 1]) * rng.uniform(1.5, 3))
+    turn = rng.choice([0.97, 1.03]) * np.array(
+        [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    )
+    away = np.eye(3)
+    away[:2, :2] = turn @ np.diag([-1.0 if mirrored else 1.0, 1.0])
+    middle = np.array([width - 1, height - 1]) / 2
+    away[:2, 2] = middle + factor * rng.uniform(2, 5, 2) - away[:2, :2] @ middle
+    numbered = replace(events, t=np.arange(len(events)))
+    there = EventStream.joined(list(moved_by([numbered], away, width, height)))
+    of = there.t
+    found = estimate_placement(pairs, replace(there, t=events.t[of]))
+    assert found is not None and found.mirrored == (mirrored, False)
+    assert found.size_px == (width, height)
+    back = EventStream.joined(list(moved_by([there], found.homography, width, height)))
+    apart = np.stack([back.x, back.y]).astype(float) - np.stack([events.x, events.y])[:, back.t]
+    # both ways round to pixels
+    assert np.median(np.hypot(*apart)) <= factor
+    assert np.abs(apart.mean(1)).max() < 0.35 * factor

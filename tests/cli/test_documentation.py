@@ -38,7 +38,7 @@ def test_readme_commands_have_only_known_options(arguments, capsys, tmp_path, mo
     assert "Unrecognized" not in stderr
 
 
-def test_events_of_another_sensor_are_warped_as_the_guide_says(tmp_path, monkeypatch):
+def test_events_of_another_sensor_are_moved_as_the_guide_says(tmp_path, monkeypatch):
     seed = int(np.random.default_rng().integers(10_000))
     rng = np.random.default_rng(seed)
     x, y = rng.integers(0, 1280, 3_000), rng.integers(0, 720, 3_000)
@@ -49,16 +49,23 @@ def test_events_of_another_sensor_are_warped_as_the_guide_says(tmp_path, monkeyp
     H[:2] += rng.normal(0, 0.005, (2, 3))
     (tmp_path / "rec").mkdir()
     write_events(tmp_path / "rec/events.raw", [stream], width=1280, height=720)
-    np.savetxt(tmp_path / "homography.txt", H)
     monkeypatch.chdir(tmp_path)
-    guide = FORMAT.parent / "event-formats.md"
-    code = next(block for block in _blocks(guide, "python") if "homography" in block)
-    exec(compile(code, str(guide), "exec"), {})
+    guide = (FORMAT.parent / "event-formats.md").read_text(encoding="utf-8")
+    guide = guide.split("## Events into the pixels of the pictures")[1].split("\n## ")[0]
+    finding, moving = re.findall(r"```python\n(.*?)```", guide, re.DOTALL)
+    corners = rng.uniform(0, 700, (40, 2))
+    seen_corners = cv2.perspectiveTransform(corners[None], H)[0]
+    exec(finding, {"in_events": corners, "in_pictures": seen_corners})
+    H = np.loadtxt("homography.txt")
+    command = re.search("    evsplat (convert rec/events.raw .*)", guide)
+    assert command and main(shlex.split(command[1])) == 0
     there = cv2.perspectiveTransform(np.stack([x, y], -1)[None].astype(float), H)[0]
     seen = ((there > -0.5) & (there < (719.5, 539.5))).all(-1)
-    written = read_events(tmp_path / "warped.h5")
-    assert np.array_equal(written.t, stream.t[seen])
-    assert np.abs(np.stack([written.x, written.y], -1) - there[seen]).max() < 0.5001
+    by_command = read_events("moved.h5")
+    exec(moving, {})
+    for written in (by_command, read_events("moved.h5")):
+        assert np.array_equal(written.t, stream.t[seen])
+        assert np.abs(np.stack([written.x, written.y], -1) - there[seen]).max() < 0.5001
 
 
 def test_every_picture_of_the_docs_is_on_a_page():

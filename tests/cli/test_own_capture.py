@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from evsplat.events import EventStream
 from evsplat.importers import attach_poses
 from evsplat.pictures.video import write_video
 
-from ..conftest import EXPOSURE_US, PERIOD_US, write_event_file
+from ..conftest import EXPOSURE_US, PERIOD_US
 from ..events.formats.encoders import aedat4, evt3
 from ..events.formats.mutations import bag
 from ..small_model import few_descent_steps, small
@@ -73,10 +74,10 @@ def write_recordings(folder: Path, tiny: Path) -> None:
     lines = "".join(f"{start} {start + EXPOSURE_US}\n" for start in starts)
     (folder / "bag" / "exposures.txt").write_text(lines)
     header = f"% evt 3.0\n% format EVT3;height={HEIGHT};width={WIDTH}\n"
-    (folder / "rec" / "events.raw").write_bytes(evt3(stream, header))
-    on = (stream.p > 0).astype(np.uint8)
-    write_event_file(folder / "warped.h5", stream.t, stream.x, stream.y, on)
-    write_tables(folder, stream, on)
+    mirrored = replace(stream, x=(WIDTH - 1 - stream.x).astype(np.uint16))
+    (folder / "rec" / "events.raw").write_bytes(evt3(mirrored, header))
+    np.savetxt(folder / "homography.txt", [[-1, 0, WIDTH - 1], [0, 1, 0], [0, 0, 1]])
+    write_tables(folder, stream, (stream.p > 0).astype(np.uint8))
 
 
 def write_tables(folder: Path, stream: EventStream, on: np.ndarray) -> None:
@@ -153,7 +154,7 @@ def test_the_pages_commands_run_as_they_stand_there(
 def test_what_the_page_imports_is_what_was_recorded(stand_ins: list[str], tmp_path: Path) -> None:
     made = load_capture(tmp_path / "made")
     for command in (["davis", "dance.aedat4", "--camera", "camera.json"], ["folder", "rec"]):
-        more = ["--events", "warped.h5", "--fps", "25", "--exposure-us", "30000"]
+        more = ["--homography", "homography.txt", "--fps", "25", "--exposure-us", "30000"]
         more += ["--start-us", str(EXPOSURE_US // 2)]
         assert main(["import", *command, *(more if "rec" in command else []), "--out", "c"]) == 0
         capture = load_capture("c")
@@ -162,4 +163,5 @@ def test_what_the_page_imports_is_what_was_recorded(stand_ins: list[str], tmp_pa
         assert capture.events is not None and made.events is not None
         ours, theirs = (c.events.between(0, 1 << 40) for c in (capture, made))
         assert np.array_equal(ours.t, theirs.t) and np.array_equal(ours.p, theirs.p)
+        assert np.array_equal(ours.x, theirs.x) and np.array_equal(ours.y, theirs.y)
         shutil.rmtree("c")

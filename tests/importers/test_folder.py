@@ -166,6 +166,52 @@ def test_a_recording_is_made_smaller_with_its_camera_masks_and_events(
     assert capture.contrast_threshold == pytest.approx((0.4 / factor**2, 0.2 / factor**2))
 
 
+@pytest.mark.parametrize("held", ["level", "on end"])
+def test_events_of_a_finer_sensor_are_moved_into_the_pictures_before_they_are_made_smaller(
+    recording: Path, tmp_path: Path, held: str
+) -> None:
+    """Those are upright, as of a camera that was held on end and whose files say so."""
+    if held == "on end":
+        exif = Image.Exif()
+        exif[0x0112] = 6  # orientation: to be turned clockwise
+        for path in sorted((recording / "images").iterdir()):
+            turned = Image.fromarray(np.rot90(np.array(Image.open(path))))
+            turned.save(path.with_suffix(".jpg"), exif=exif)
+            path.unlink()
+    rng = np.random.default_rng()
+    scale, right, down = rng.uniform(1.2, 1.6), *rng.uniform(-6, 6, 2)
+    away = np.array([[scale, 0, right], [0, scale, down], [0, 0, 1]])
+    rows = np.loadtxt(recording / "events.csv", delimiter=",", skiprows=1).astype(int)
+    t, p = rows[:, 0], rows[:, 3]
+    x, y = (rng.integers(0, side, len(t)) for side in (205, 218))
+    lines = np.stack([t, x, y, p], axis=1)
+    header = "t,x@205,y@218,p"
+    np.savetxt(recording / "events.csv", lines, "%d", ",", header=header, comments="")
+    np.savetxt(tmp_path / "H.txt", np.linalg.inv(away))
+    options = {"fps": 25.0, "exposure_us": 30_000.0, "start_us": 16_000, "no_poses": True}
+    with pytest.raises(ConfigError, match="205x218 pixels, .* move them there by --homography"):
+        import_capture("folder", recording, tmp_path / "out", **options)
+    options |= {"homography": tmp_path / "H.txt"}
+    for shrink in (1, 2):
+        import_capture("folder", recording, tmp_path / f"by {shrink}", shrink=shrink, **options)
+        capture = load_capture(tmp_path / f"by {shrink}")
+        camera = capture.cameras["main"]
+        assert (camera.width, camera.height) == (128 // shrink, 136 // shrink)
+        assert capture.events is not None
+        events = capture.events.between(0, 1 << 40)
+        there = np.rint([(x - right) / scale, (y - down) / scale]).astype(int)
+        kept = ((there >= 0) & (there < [[128], [136]])).all(0)
+        assert np.array_equal(events.t, t[kept])
+        assert np.array_equal([events.x, events.y], there[:, kept] // shrink)
+        share = f"{1 - kept.mean():.1%} of them fell outside and were left out"
+        assert any("128x136 pixels by H.txt" in n and share in n for n in _notes(capture))
+        assert not any("size of the sensor" in note for note in _notes(capture))
+
+
+def _notes(capture: Capture) -> list[str]:
+    return capture.provenance["notes"]
+
+
 @pytest.mark.parametrize(
     ("shrink", "said"),
     [(0, "above 0"), (13, "left 9x10, .* at least 11"), (999, "left 0x0, .* 11")],
@@ -465,6 +511,27 @@ FAULTS = {
         ConfigError,
         "--clock-offset-us: there are no events; give --events, or leave it out",
     ),
+    "a homography of no events": (
+        lambda root: (
+            (root / "events.csv").unlink(),
+            (root / "H.txt").write_text("1 0 0\n0 1 0\n0 0 1"),
+        ),
+        {"fps": 25.0, "exposure_us": 3e4, "homography": Path("mine/H.txt")},
+        ConfigError,
+        "--homography: there are no events; give --events, or leave it out",
+    ),
+    "a homography of two lines": (
+        lambda root: (root / "H.txt").write_text("1 0 0\n0 1 0"),
+        {"fps": 25.0, "exposure_us": 3e4, "homography": Path("mine/H.txt")},
+        DataError,
+        "H.txt: found 2 x 3 numbers, expected 3 lines of 3 numbers, the homography",
+    ),
+    "a homography to elsewhere": (
+        lambda root: (root / "H.txt").write_text("1 0 500\n0 1 0\n0 0 1"),
+        {"fps": 25.0, "exposure_us": 3e4, "homography": Path("mine/H.txt")},
+        DataError,
+        "events.csv: by mine/H.txt all of its events fall outside of the pictures' 128x136 pixels",
+    ),
     "no folder of masks": (
         lambda root: None,
         {"fps": 25.0, "exposure_us": 3e4, "masks": Path("maks")},
@@ -506,9 +573,12 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_missing_is_one_sentence(recording: Path, tmp_path: Path, fault: str) -> None:
+def test_what_is_missing_is_one_sentence(
+    recording: Path, tmp_path: Path, fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     change, options, error, message = FAULTS[fault]
     change(recording)
+    monkeypatch.chdir(tmp_path)
     options = options or {"fps": 25.0, "exposure_us": 3e4}
     with pytest.raises(EvsplatError, match=message) as caught:
         import_capture("folder", recording, tmp_path / "out", **options)

@@ -100,7 +100,7 @@ def test_the_words_of_an_importer_are_those_of_all_that_it_calls() -> None:
 def test_every_importer_of_a_recording_has_the_options_of_the_others(capsys) -> None:
     told = {kind: options(kind, capsys) for kind in ("folder", "video", "davis")}
     shared = told["folder"] & told["video"]
-    of_separate_files = {"--events", "--exposure-us", "--fps", "--start-us"}
+    of_separate_files = {"--events", "--exposure-us", "--fps", "--homography", "--start-us"}
     assert shared - told["davis"] == of_separate_files
     for kind in KINDS:
         assert {"--frames", "--shrink", "--no-poses"} <= options(kind, capsys), kind

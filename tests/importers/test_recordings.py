@@ -276,6 +276,27 @@ def test_a_video_with_events_beside_it(tmp_path: Path) -> None:
     assert capture.transfer(capture.frames[0]) == "srgb"
 
 
+def test_a_mirrored_sensor_is_brought_into_the_video_and_its_clock_is_found_there(
+    tmp_path: Path,
+) -> None:
+    """As behind a beam splitter, where events as they are agree at no offset."""
+    clip, events = tmp_path / "clip.mp4", tmp_path / "events.h5"
+    write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)
+    given = events_of_the_bar(3_000_000)
+    right = int(np.random.default_rng().integers(0, 30))
+    x = WIDTH - 1 - given.x + right
+    write_events(events, replace(given, x=x.astype(np.uint16)), width=90, height=HEIGHT)
+    np.savetxt(tmp_path / "H.txt", [[-1, 0, WIDTH - 1 + right], [0, 1, 0], [0, 0, 1]])
+    options = {"exposure_us": 20_000.0, "clock_offset_us": "auto", "shrink": 2}
+    options |= {"events": events, "homography": tmp_path / "H.txt"}
+    capture = run("video", clip, tmp_path / "out", **options)
+    assert capture.clock_offset_us == pytest.approx(-3_000_000, abs=PERIOD_US / 2)
+    assert capture.events is not None
+    found = capture.events.between(-(1 << 40), 1 << 40)
+    inside = given.take(given.x < WIDTH)
+    assert np.array_equal(found.x, inside.x // 2) and np.array_equal(found.p, inside.p)
+
+
 def test_a_part_of_a_video_keeps_its_clock_and_the_events_of_its_time(tmp_path: Path) -> None:
     clip, given = tmp_path / "clip.mp4", some_events(500)
     write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)

@@ -2,6 +2,8 @@
 
 import json
 import re
+import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +13,8 @@ import pytest
 from PIL import Image
 
 from evsplat.capture import load_body_track, load_capture
+from evsplat.capture.finding import Finding
+from evsplat.cli import main
 from evsplat.errors import DataError
 from evsplat.inspection import body_mask_overlap, inspect_capture, warn_of_events, warn_of_pictures
 from evsplat.inspection.picture_check import picture_findings
@@ -316,3 +320,48 @@ def test_given_thresholds_that_are_not_the_fitted_are_told(
     ]
     assert len(found) == (factor != 1)
     assert all(text.startswith(f"{given}, and an event stands for") for text in found)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_is_told_to_type_brings_events_into_the_pixels_of_the_pictures(
+    tiny_capture: Factory, tmp_path: Path
+) -> None:
+    def of_events(findings: tuple[Finding, ...]) -> list[Finding]:
+        return [finding for finding in findings if finding.file.suffix == ".h5"]
+
+    path, out = tiny_capture("my capture", frames=12, width=64, height=48), tmp_path / "out"
+    found = out / "events_to_pictures.txt"
+    with h5py.File(path / "events.h5") as file:
+        t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
+    right = int(np.random.default_rng().integers(4, 8))
+    kept = x + right < 64
+    write_event_file(path / "events.h5", t[kept], x[kept] + right, y[kept], p[kept])
+    (finding,) = of_events(inspect_capture(path, out).findings)
+    typed = shlex.split(str(finding).split("bring them there: ")[1])
+    convert, move = typed[: typed.index("&&")], typed[typed.index("&&") + 1 :]
+    assert convert[:2] == ["evsplat", "convert"] and move[0] == "mv" and str(found) in convert
+    assert main(convert[1:]) == 0
+    shutil.move(*move[1:])
+    with h5py.File(path / "events.h5") as file:
+        brought = file["events/x"][:].astype(int)
+    assert abs(brought.mean() - x[kept].mean()) < 0.7
+    assert not of_events(inspect_capture(path, out).findings) and not found.exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_of_a_lens_that_bends_lines_no_homography_is_written(
+    tiny_capture: Factory, tmp_path: Path
+) -> None:
+    """Events are stored as the lens bent them, and what was found is of them as they are read."""
+    path = tiny_capture(frames=12, width=64, height=48)
+    document = json.loads((path / "capture.json").read_text())
+    bent = {"model": "opencv", "coefficients": [0.01, 0, 0, 0]}
+    document["cameras"]["main"]["distortion"] = bent
+    (path / "capture.json").write_text(json.dumps(document))
+    with h5py.File(path / "events.h5") as file:
+        t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
+    kept = x + 6 < 64
+    write_event_file(path / "events.h5", t[kept], x[kept] + 6, y[kept], p[kept])
+    told = [str(finding) for finding in inspect_capture(path, tmp_path / "out").findings]
+    assert any("else undistort the pictures" in one for one in told)
+    assert not (tmp_path / "out" / "events_to_pictures.txt").exists()

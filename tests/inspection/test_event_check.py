@@ -54,7 +54,7 @@ def test_events_beside_their_pixels_are_told_by_how_far_and_not_as_another_fault
     assert lie_elsewhere([finding]) and finding.severity == "warning"
     told = float(str(finding).split("in the pictures: ")[1].split(" px to the right")[0])
     assert told == pytest.approx(right, abs=0.5)
-    assert "docs/event-formats.md" in str(finding)
+    assert str(finding).endswith(f"what brings them there is told by: evsplat inspect {path}")
 
 
 def test_of_events_without_polarity_is_told_what_needs_none(

@@ -14,6 +14,7 @@ from scipy.ndimage import affine_transform, gaussian_filter
 
 from evsplat.calibration.brightness import EventSource, FramePair
 from evsplat.calibration.clock import SEARCH_US
+from evsplat.events.homography import Homography
 from evsplat.events.maps import event_pixels
 from evsplat.pictures.squares import square_means
 from evsplat.spread import evenly_spread
@@ -65,6 +66,24 @@ class Placement:
     correlation: float
     """Of changes in frames and events, laid onto each other so."""
     as_given: float
+    size_px: tuple[int, int]
+    """Width and height of the frames."""
+    middle_px: tuple[float, float]
+    """About which events are mirrored, turned and scaled, (0, 0) at the first pixel's centre."""
+
+    @property
+    def homography(self) -> Homography:
+        """(3, 3), by which `evsplat.events.moved` brings events into the pixels of the frames."""
+        (x, y), (right, down) = self.middle_px, self.shift_px
+        turn = self.scale * np.exp(1j * math.radians(self.angle_deg))
+        rows = [[turn.real, -turn.imag, right], [turn.imag, turn.real, down], [0, 0, 1]]
+        signs = [-1.0 if is_so else 1.0 for is_so in self.mirrored]
+        to_middle = np.array([[1.0, 0, -x], [0, 1, -y], [0, 0, 1]])
+        from_middle = np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])
+        # events are mirrored in their own pixels, before what is fitted
+        back = np.linalg.inv(np.array(rows)) @ np.diag([*signs, 1.0])
+        matrix: Homography = from_middle @ back @ to_middle
+        return matrix
 
     def __str__(self) -> str:
         """Such as "6.0 px to the right and turned by 2.0 degrees clockwise"."""
@@ -137,6 +156,9 @@ def estimate_placement(pairs: Sequence[FramePair], events: EventSource) -> Place
         scale,
         best,
         max(given, 0.0),
+        (width, height),
+        # of the maps, whose squares leave out what remains at the right and below
+        ((width // step * step - 1) / 2, (height // step * step - 1) / 2),
     )
 
 

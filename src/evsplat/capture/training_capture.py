@@ -138,6 +138,10 @@ class TrainingCapture:
         """From the values of a frame's pictures to light (`Capture.transfer`)."""
         return self._source.transfer(self._name(frame))
 
+    def is_distorted(self, camera: str) -> bool:
+        """True where the lens of a camera distorts (`Capture.is_distorted`)."""
+        return self._source.is_distorted(camera)
+
     @property
     def is_static_camera(self) -> bool:
         """True where all frames come from one camera that stands still."""

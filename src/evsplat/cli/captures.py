@@ -41,13 +41,23 @@ class Convert:
         Literal["hdf5", "npz", "csv", "evt2"] | None, option("FORMAT", default="by OUT's suffix")
     ] = None
     """Format to write."""
+    homography: Annotated[Path | None, option("FILE", default="none")] = None
+    """Move events into the pixels of pictures: 3 lines of 3 numbers, or .npy."""
+    size: Annotated[tuple[int, int] | None, option("WIDTH HEIGHT", default="none")] = None
+    """For --homography: pixels of the pictures."""
     reading: Annotated[ReadOptions, FLAT]
 
     def __call__(self) -> None:
         from evsplat.events.convert import convert_recording
 
         conversion = convert_recording(
-            self.recording, self.out, self.reading, from_zero=self.from_zero, to=self.to
+            self.recording,
+            self.out,
+            self.reading,
+            from_zero=self.from_zero,
+            to=self.to,
+            homography=self.homography,
+            size=self.size,
         )
         print(conversion.summary)
 

@@ -2,6 +2,7 @@
 
 from evsplat.events.edi import deblur
 from evsplat.events.formats.base import RecordedFrame
+from evsplat.events.homography import moved, read_homography
 from evsplat.events.maps import (
     begun_counts,
     count_map,
@@ -35,9 +36,11 @@ __all__ = [
     "begun_counts",
     "count_map",
     "deblur",
+    "moved",
     "open_recording",
     "polarity_counts",
     "read_events",
+    "read_homography",
     "sensor_settings",
     "simulate_events",
     "time_surface",

@@ -8,6 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 from evsplat.errors import ConfigError
+from evsplat.events.homography import Mover
 from evsplat.events.recording import EventRecording, open_recording
 from evsplat.events.stream import EventStream
 from evsplat.events.write import write_events
@@ -27,7 +28,7 @@ class Conversion:
     width: int | None
     height: int | None
     notes: list[str]
-    """Assumptions of the reader and what it repaired."""
+    """Assumptions of the reader, what it repaired, and how many events fell outside of pictures."""
 
     @property
     def summary(self) -> str:
@@ -45,6 +46,8 @@ def convert_recording(
     *,
     from_zero: bool = False,
     to: str | None = None,
+    homography: Path | None = None,
+    size: tuple[int, int] | None = None,
     **changes: Any,
 ) -> Conversion:
     """Read any recording and write it as another; memory does not grow with its length.
@@ -55,29 +58,60 @@ def convert_recording(
         options: The caller's statements about the source.
         from_zero: Let the first event be at 0.
         to: Format to write, whatever the suffix.
+        homography: File of 3 lines of 3 numbers, or .npy, by which events are moved into the pixels
+            of pictures (`evsplat.events.moved`); those that fall outside are left out.
+        size: Width and height of those pictures, 1 to 65536, which becomes that of the recording.
         changes: Fields of ``options``, such as ``repair``, or the source's ``format``.
     """
     source, out = Path(source), Path(out)
+    mover = _mover(homography, size)
     if out.exists() and source.exists() and out.samefile(source):
         raise ConfigError(f"{out}: is the recording itself; write to another file.")
     recording = open_recording(source, options, **changes)
     times: list[int] = []
-    pieces = _watched(recording, from_zero, times)
-    count = write_events(out, pieces, format=to, width=recording.width, height=recording.height)
+    pieces = _watched(recording, from_zero, times, mover)
+    width, height = size or (recording.width, recording.height)
+    count = write_events(out, pieces, format=to, width=width, height=height)
     start_us, end_us = times or (0, 0)
-    return Conversion(
-        out, count, start_us, end_us, recording.width, recording.height, recording.notes
-    )
+    notes = recording.notes if mover is None else mover.notes(recording)
+    return Conversion(out, count, start_us, end_us, width, height, notes)
 
 
-def _watched(recording: EventRecording, from_zero: bool, times: list[int]) -> Iterator[EventStream]:
-    """The chunks, shifted, with a progress bar; ``times`` becomes the first and the last time."""
+def _mover(homography: Path | None, size: tuple[int, int] | None) -> Mover | None:
+    """What moves the events; None where they stay where they are."""
+    if homography is None:
+        if size is not None:
+            raise ConfigError(
+                "--size: belongs to --homography; that of the sensor is --width and --height."
+            )
+        return None
+    if size is None:
+        raise ConfigError(
+            "--homography: moves events into pixels of pictures; give --size WIDTH HEIGHT, theirs."
+        )
+    if not all(1 <= side <= 1 << 16 for side in size):
+        raise ConfigError(f"--size {size[0]} {size[1]}: expected pixels from 1 to 65536.")
+    return Mover(Path(homography), size)
+
+
+def _watched(
+    recording: EventRecording, from_zero: bool, times: list[int], mover: Mover | None
+) -> Iterator[EventStream]:
+    """The chunks, moved and shifted in time, with a progress bar of those that are read.
+
+    ``times`` becomes the first and the last time of what is written.
+    """
     shift = 0
     with tqdm(unit="event", unit_scale=True, desc="convert", dynamic_ncols=True) as progress:
-        for chunk in recording.chunks():
+
+        def read() -> Iterator[EventStream]:
+            for chunk in recording.chunks():
+                yield chunk
+                progress.update(len(chunk))
+
+        for chunk in read() if mover is None else mover.moved(read(), recording.path):
             if not times:
                 shift = -int(chunk.t[0]) if from_zero else 0
                 times[:] = [int(chunk.t[0]) + shift] * 2
             times[1] = int(chunk.t[-1]) + shift
             yield EventStream(chunk.t + shift, chunk.x, chunk.y, chunk.p) if shift else chunk
-            progress.update(len(chunk))

@@ -12,6 +12,12 @@ from evsplat.events.stream import EventStream
 from evsplat.options import ReadOptions
 from evsplat.options.declare import given
 
+SIZE_UNKNOWN = (
+    "the size of the sensor is not in the file; give it with --width and --height of "
+    "'evsplat convert'"
+)
+"""A note, which says nothing to who moves the events to pixels of a known size."""
+
 
 class EventRecording:
     """A recording on disk. Every pass (`chunks`, `read`, `frames`) reads the file anew."""
@@ -100,10 +106,7 @@ def open_recording(
     if not all(size is None or 0 < size <= 1 << 16 for size in (source.width, source.height)):
         raise DataError(f"{path}: its header gives {source.width} x {source.height} pixels.")
     if source.width is None:
-        source.notes.append(
-            "the size of the sensor is not in the file; give it with --width and --height of "
-            "'evsplat convert'"
-        )
+        source.notes.append(SIZE_UNKNOWN)
     return EventRecording(path, found.name, source, damage)
 
 

@@ -11,6 +11,7 @@ from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
+from evsplat.events.homography import Mover
 from evsplat.footage import Footage, TimedPicture, open_footage
 from evsplat.importers.base import (
     GUIDE,
@@ -65,6 +66,9 @@ class Folder(Importer):
     """Folder of pictures, or a video; by default SOURCE/images or the video in SOURCE."""
     events: FileOption = None
     """Event recording of any known format; by default SOURCE/events.* if there is one."""
+    homography: FileOption = None
+    """From the events' pixels to those of the pictures as recorded: 3 lines of 3 numbers, or .npy;
+    by default events are there already."""
     poses: FileOption = None
     """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE;
     without any there is no body."""
@@ -109,6 +113,7 @@ class Folder(Importer):
         middles = exposures.sum(axis=1) // 2
         path = self._poses(source)
         size = footage.width, footage.height
+        mover = None if self.homography is None else Mover(self.homography, size)
         motion: Motion | None = None
         if path is not None:
             motion = read_motion(path, self.person, self.pose_source, size, smpl)
@@ -140,6 +145,7 @@ class Folder(Importer):
             clock_offset,
             contrast=self.contrast,
             repair=self.repair,
+            mover=mover,
             exposed_only=self.frames is not None,
             shrink=self.shrink,
         )

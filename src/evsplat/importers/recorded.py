@@ -18,6 +18,7 @@ from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
+from evsplat.events.homography import Mover
 from evsplat.footage import Footage, TimedPicture
 from evsplat.importers.base import check_positive, need, shrunk, shrunk_view
 from evsplat.pictures.files import to_unit_range
@@ -134,6 +135,7 @@ def add_recorded_events(
     *,
     contrast: tuple[float, float] | None,
     repair: bool,
+    mover: Mover | None = None,
     exposed_only: bool = False,
     shrink: int = 1,
 ) -> list[str]:
@@ -141,10 +143,16 @@ def add_recorded_events(
 
     ``clock_offset`` is in us, or the levels of the frames by which it is found. ``exposed_only``
     leaves out events before the first exposure and after the last. ``size`` is that of the pictures
-    as recorded, in whose pixels the events are; both are made smaller by ``shrink``.
+    as recorded, in whose pixels the events are, or are brought by ``mover``; both are made smaller
+    by ``shrink``.
     """
     if path is None:
-        of_events = {"contrast": contrast, "clock-offset-us": clock_offset, "repair": repair}
+        of_events = {
+            "contrast": contrast,
+            "clock-offset-us": clock_offset,
+            "repair": repair,
+            "homography": mover,
+        }
         for name, value in of_events.items():
             if value:
                 raise ConfigError(f"--{name}: there are no events; give --events, or leave it out.")
@@ -152,18 +160,25 @@ def add_recorded_events(
     sensor = open_recording(need(path, "the events"), repair=repair)
     if not sensor.has_polarity:  # asked first: nobody needs to warp what is left out
         return [f"events: {path.name} has no polarity, so it was left out; simulate them"]
-    if sensor.width is not None and (sensor.width, sensor.height) != size:
+    if mover is None and sensor.width is not None and (sensor.width, sensor.height) != size:
         width, height = map(str, size)
         said = command("convert", path, "NEW.h5", "--width", width, "--height", height)
         raise ConfigError(
             f"{path}: its sensor has {sensor.width}x{sensor.height} pixels, the pictures have "
-            f"{width}x{height}, and events have to lie in the pixels of the pictures; warp them "
-            f"there first (docs/own-capture.md, two sensors). If they do already, say so: {said}"
+            f"{width}x{height}, and events have to lie in the pixels of the pictures; move them "
+            "there by --homography FILE (docs/own-capture.md, two sensors). If they do already, "
+            f"say so: {said}"
         )
-    recording = open_recording(path, width=size[0], height=size[1], repair=repair)
+    recording = sensor
+    if mover is None:
+        recording = open_recording(path, width=size[0], height=size[1], repair=repair)
+
+    def pieces() -> Iterable[EventStream]:
+        return recording.chunks() if mover is None else mover.moved(recording.chunks(), path)
+
     notes = write_recorded_events(
         writer,
-        recording.chunks,
+        pieces,
         path,
         size,
         clock_offset,
@@ -173,7 +188,7 @@ def add_recorded_events(
         unit_is_known=False,
     )
     # Repairs are known once the events have been read.
-    return [*recording.notes, *notes]
+    return [*(recording.notes if mover is None else mover.notes(recording)), *notes]
 
 
 def write_recorded_events(

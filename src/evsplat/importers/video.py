@@ -5,6 +5,7 @@ from pathlib import Path
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
+from evsplat.events.homography import Mover
 from evsplat.footage import open_footage
 from evsplat.importers.base import (
     Importer,
@@ -46,7 +47,10 @@ class Video(Importer):
     shrink: Shrink = 1
     """Make pictures and events smaller by this factor."""
     events: FileOption = None
-    """Event recording of any known format, in the pixels of the video."""
+    """Event recording of any known format, in the pixels of the video or brought there."""
+    homography: FileOption = None
+    """From the events' pixels to those of the pictures as recorded: 3 lines of 3 numbers, or .npy;
+    by default events are there already."""
     exposure_us: Exposure = None
     """Exposure time, microseconds; it has to be known."""
     fps: OwnRate = None
@@ -76,6 +80,7 @@ class Video(Importer):
             )
         check_positive(exposure_us=self.exposure_us)
         size = footage.width, footage.height
+        mover = None if self.homography is None else Mover(self.homography, size)
         camera, focal, note = recorded_camera(self.camera, self.focal, size)
         if self.transfer is not None:
             camera["transfer"] = self.transfer
@@ -94,6 +99,7 @@ class Video(Importer):
             clock_offset,
             contrast=self.contrast,
             repair=self.repair,
+            mover=mover,
             exposed_only=self.frames is not None,
             shrink=self.shrink,
         )

@@ -21,7 +21,8 @@ from evsplat.capture.policy import Policy
 from evsplat.capture.sensor_estimate import contrast_findings
 from evsplat.capture.validate import check_capture
 from evsplat.errors import EvsplatError
-from evsplat.files import try_target
+from evsplat.events.homography import write_homography
+from evsplat.files import remove_file, try_target
 from evsplat.inspection.belonging import judge_body
 from evsplat.inspection.body_check import FIT_SHEET, body_findings, check_body, fit_sheet
 from evsplat.inspection.drawing import (
@@ -37,7 +38,7 @@ from evsplat.inspection.drawing import (
     to_picture,
 )
 from evsplat.inspection.event_check import (
-    event_findings,
+    check_events,
     flicker_findings,
     lie_elsewhere,
     warn_of_events,
@@ -50,6 +51,8 @@ from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
+HOMOGRAPHY = "events_to_pictures.txt"
+"""File beside the drawings: by what to move events that lie beside the pixels of the pictures."""
 CONTACT_FRAMES, DETAIL_FRAMES = 64, 8
 SHOWN_FINDINGS = 12
 _EVEN = 0.1
@@ -77,10 +80,13 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     """Validate the capture fully and, where it has no errors, draw it into ``out_dir``.
 
     Writes contact_sheet.png, events.png, body.png, body_fit.png and timeline.png, as far as there
-    is something to draw.
+    is something to draw. Where events lie beside the pixels of the pictures, what brings them there
+    is written to events_to_pictures.txt (`evsplat.events.moved`); else an earlier one is removed.
     """
     path, out_dir = Path(path), Path(out_dir)
     try_target(out_dir)
+    homography = out_dir / HOMOGRAPHY
+    remove_file(homography)
     metadata, found = check_capture(path, deep=True)
     report = InspectReport(path, tuple(found), "", ())
     if metadata is None or not report.usable:
@@ -88,7 +94,8 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     capture = Capture(metadata)
     seen = capture.for_training(Policy(use="everything"))
     with shared_pairs(seen):
-        of_events = event_findings(seen)
+        events = check_events(seen, homography)
+        of_events = events.findings
         estimate = None if lie_elsewhere(of_events) else estimate_sensor(seen)
     findings = (
         *found,
@@ -109,6 +116,8 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     if capture.events is not None and len(capture.events):
         drawings["events"] = _events_sheet(capture)
     drawings["timeline"] = draw_timeline(capture)
+    if (beside := events.mendable) is not None:
+        write_homography(homography, beside.homography, beside.size_px)
     pictures = save_drawings(drawings, out_dir)
     summary = _summary(capture, track, estimate, doubted=bool(of_events))
     if fitting is not None:

@@ -1,11 +1,15 @@
 """Warnings about events that do not tell what frames show: turned, inverted, sparse, lost."""
 
 import logging
+import shlex
 from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
 from evsplat.calibration import (
     FramePair,
     Lost,
+    Placement,
     answered_share,
     estimate_disagreement,
     estimate_placement,
@@ -13,6 +17,7 @@ from evsplat.calibration import (
 from evsplat.capture import TrainingCapture, estimate_sensor, lost_events, warn_of_contrast
 from evsplat.capture.finding import Finding, Findings
 from evsplat.capture.sensor_estimate import frame_pairs
+from evsplat.commands import command
 from evsplat.events import EventStore
 
 logger = logging.getLogger(__name__)
@@ -25,8 +30,25 @@ _MANY = 100
 """Events of which some are of either polarity."""
 
 
+@dataclass(frozen=True)
+class EventCheck:
+    """What is wrong with events that are there and readable."""
+
+    findings: list[Finding]
+    mendable: Placement | None = None
+    """Where they lie, if it is beside the pictures' pixels and a homography brings them back."""
+
+
 def event_findings(capture: TrainingCapture) -> list[Finding]:
-    """What is wrong with events that are there and readable.
+    """The findings of `check_events`."""
+    return check_events(capture).findings
+
+
+def check_events(capture: TrainingCapture, homography: Path | None = None) -> EventCheck:
+    """Compare events with what frames show.
+
+    Where they lie beside the pictures the finding tells what to type; that takes a file with the
+    `Placement.homography`, which whoever calls writes at ``homography``, or `evsplat inspect`.
 
     Compared are at most 60 pairs of frames with the events between them, so that of a
     long recording a part is looked at; pauses of the events are found wherever they are. Without
@@ -35,7 +57,7 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
     findings = Findings()
     events = capture.events
     if events is None or not len(events):
-        return []
+        return EventCheck([])
     pairs, signed = frame_pairs(capture), events.has_polarity
     sign = _only_sign(pairs, events) if signed else ""
     other_way = estimate_disagreement(pairs, events) if signed and not sign else None
@@ -58,9 +80,8 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
             events.path, _WHICH_WAY[1],
             f"events that lie beside what changes in the pictures: {beside}",
             "events in the pixels of the pictures",
-            "Warp them there (docs/event-formats.md, events into the pixels of the pictures) and "
-            "import them anew. Where something at another distance is in its place, the two lenses "
-            "stand too far apart.",
+            "Where something at another distance is in its place, the two lenses stand too far "
+            f"apart; else {_way_there(capture, events, beside, homography)}",
         )  # fmt: skip
     elsewhere = other_way is not None or beside is not None
     lost = Lost() if elsewhere else lost_events(capture, pairs)
@@ -77,7 +98,28 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
             "pictures are finer than the sensor, and have to be made as coarse "
             "(docs/own-capture.md, two sensors).",
         )  # fmt: skip
-    return findings.items
+    return EventCheck(findings.items, None if _is_distorted(capture) else beside)
+
+
+def _is_distorted(capture: TrainingCapture) -> bool:
+    return any(capture.is_distorted(frame.camera) for frame in capture.frames)
+
+
+def _way_there(
+    capture: TrainingCapture, events: EventStore, beside: Placement, homography: Path | None
+) -> str:
+    """What to type to bring events into the pixels of the pictures."""
+    if _is_distorted(capture):
+        # found is a homography of the pinhole camera, and events are stored as its lens bent them
+        return (
+            "undistort the pictures and bring the events there (docs/event-formats.md, events into "
+            "the pixels of the pictures)."
+        )
+    if homography is None:
+        return f"what brings them there is told by: {command('inspect', capture.path)}"
+    new, size = events.path.with_name("moved.h5"), map(str, beside.size_px)
+    convert = command("convert", events.path, new, "--homography", homography, "--size", *size)
+    return f"bring them there: {convert} && {shlex.join(['mv', str(new), str(events.path)])}"
 
 
 def _tell_lost(findings: Findings, events: EventStore, lost: Lost) -> None:
