@@ -132,7 +132,7 @@ def test_the_command_moves_events_and_says_how_many_fell_outside(
         found = recording.read()
         assert same(found, EventStream(expected.t - expected.t[0], *_places(expected)))
         printed = capsys.readouterr().out
-        share = 1 - len(expected) / len(s)
+        share = (len(s) - len(expected)) / len(s)
         assert f"{len(expected):,} events" in printed and "580 x 440 pixels" in printed
         assert f"into 580x440 pixels by H.txt; {share:.1%} of them fell outside" in printed
         assert "--width" not in printed, "nobody needs the size of the sensor"
