@@ -206,21 +206,19 @@ def _body(page: str) -> str:
 
 
 def doubled(records: Records, longer: Records) -> str:
-    """Cells that ran longer, behind the same of the table, of the same seed."""
+    """Cells that ran longer, behind the same of the table, over the seeds that both ran."""
     lines = [f"| method | steps | {' | '.join(COMPARED)} |", f"|---|---|{'---|' * len(COMPARED)}"]
+    shared = records.by_cell.keys() & longer.by_cell.keys()
+    pair = [replace(of, by_cell={k: of.by_cell[k] for k in shared}) for of in (records, longer)]
     for row in longer.plan.suite.rows:
-        found = [
-            tuple(of.by_cell.get((capture, row.name, 0)) for of in (records, longer))
-            for capture in COMPARED
-        ]
-        pairs = [(a, b) if a and b else None for a, b in found]
-        steps = {tuple(f"{one['iteration']:,}" for one in pair) for pair in pairs if pair}
-        if not steps:
+        steps = [of.figure(row.name, lambda r: r["iteration"], COMPARED) for of in pair]
+        if None in steps:
             continue
-        (lengths,) = steps
-        texts = [" → ".join(map(psnr_of, pair)) if pair else "–" for pair in pairs]
+        lengths = " → ".join(f"{found.mean:,.0f}" for found in steps if found)
+        texts = [[trio(of, row.name, capture) for of in pair] for capture in COMPARED]
+        figures = ["–" if "–" in both else " → ".join(both) for both in texts]
         title = title_of(longer, row, COMPARED)
-        lines.append(f"| {title} | {' → '.join(lengths)} | {' | '.join(texts)} |")
+        lines.append(f"| {title} | {lengths} | {' | '.join(figures)} |")
     return "\n".join(lines)
 
 
