@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from evsplat.calibration import (
+    Disagreement,
     FramePair,
     Lost,
     answered_share,
@@ -16,10 +17,18 @@ from evsplat.calibration import (
     unrecorded_spans,
     untold_spans,
 )
-from evsplat.events import ALWAYS, EventStore, EventStream, Span, write_events
+from evsplat.events import ALWAYS, EventStore, EventStream, Span, moved, write_events
 
 from ..conftest import write_event_file
 from .synthetic import HEIGHT, WIDTH, Recording, record
+
+
+def _taken_back(
+    found: Disagreement, events: EventStream, given: EventStream, width: int, height: int
+) -> None:
+    """Every event is back at its pixel by the homography that was found."""
+    back = EventStream.joined(list(moved([events], found.homography, width, height)))
+    assert np.array_equal(back.x, given.x) and np.array_equal(back.y, given.y)
 
 
 def _changed(events: EventStream, **columns: np.ndarray) -> EventStream:
@@ -53,6 +62,7 @@ def test_what_events_went_through_is_found(turned, flip_x, flip_y, inverted) -> 
     assert found is not None and (found.turned, found.inverted) == (turned, inverted)
     assert found.correlation > max(0.8, found.as_given)
     assert ("other polarity" in str(found)) == inverted and turned in str(found)
+    _taken_back(found, events, given, WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize(
@@ -83,6 +93,7 @@ def test_quarter_turns_are_told_of_square_pictures_by_what_takes_them_back(
     )
     found = estimate_disagreement(pairs, events)
     assert found is not None and (found.turned, found.inverted) == (turned, False)
+    _taken_back(found, events, inside, side, side)
     assert estimate_disagreement(pairs, inside) is None
 
 

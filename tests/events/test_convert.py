@@ -106,6 +106,20 @@ def test_command_converts_repairs_and_says_what_it_did(
     assert same(read_events(out), EventStream(s.t - s.t[0], s.x, s.y, s.p))
 
 
+def test_polarities_are_exchanged_where_there_are_any(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    s = random_stream(int(np.random.default_rng().integers(1_000)), 2_000)
+    write_events(tmp_path / "e.raw", s, width=WIDTH, height=HEIGHT)
+    for source, out, p in (("e.raw", "other.csv", -s.p), ("other.csv", "again.h5", s.p)):
+        assert main(["convert", str(tmp_path / source), str(tmp_path / out), "--invert"]) == 0
+        assert same(read_events(tmp_path / out), EventStream(s.t, s.x, s.y, p))
+    write_events(tmp_path / "none.npz", EventStream(s.t, s.x, s.y, 0 * s.p))
+    assert main(["convert", str(tmp_path / "none.npz"), str(tmp_path / "x.h5"), "--invert"]) == 2
+    assert "none.npz has no polarity to exchange" in capsys.readouterr().err
+    assert not (tmp_path / "x.h5").exists()
+
+
 def test_a_recording_is_not_converted_onto_itself(tmp_path: Path) -> None:
     write_events(tmp_path / "e.npz", random_stream(6, 10))
     with pytest.raises(ConfigError, match="is the recording itself"):

@@ -323,8 +323,9 @@ def test_given_thresholds_that_are_not_the_fitted_are_told(
 
 
 @pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("wrong", ["shifted", "turned", "inverted", "turned and inverted"])
 def test_what_is_told_to_type_brings_events_into_the_pixels_of_the_pictures(
-    tiny_capture: Factory, tmp_path: Path
+    tiny_capture: Factory, tmp_path: Path, wrong: str
 ) -> None:
     def of_events(findings: tuple[Finding, ...]) -> list[Finding]:
         return [finding for finding in findings if finding.file.suffix == ".h5"]
@@ -333,18 +334,25 @@ def test_what_is_told_to_type_brings_events_into_the_pixels_of_the_pictures(
     found = out / "events_to_pictures.txt"
     with h5py.File(path / "events.h5") as file:
         t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
-    right = int(np.random.default_rng().integers(4, 8))
+    right = int(np.random.default_rng().integers(4, 8)) if wrong == "shifted" else 0
     kept = x + right < 64
-    write_event_file(path / "events.h5", t[kept], x[kept] + right, y[kept], p[kept])
+    t, x, y, p = (column[kept] for column in (t, x, y, p))
+    of_file = [t, x + right, y, 1 - p if "inverted" in wrong else p]
+    if "turned" in wrong:
+        of_file[1:3] = 63 - x, 47 - y
+    write_event_file(path / "events.h5", *of_file)
     (finding,) = of_events(inspect_capture(path, out).findings)
-    typed = shlex.split(str(finding).split("bring them there: ")[1])
+    typed = shlex.split(re.split("(?i)bring them there: ", str(finding))[1])
     convert, move = typed[: typed.index("&&")], typed[typed.index("&&") + 1 :]
-    assert convert[:2] == ["evsplat", "convert"] and move[0] == "mv" and str(found) in convert
+    assert convert[:2] == ["evsplat", "convert"] and move[0] == "mv"
+    assert (str(found) in convert) == found.exists() == (wrong != "inverted")
     assert main(convert[1:]) == 0
     shutil.move(*move[1:])
     with h5py.File(path / "events.h5") as file:
-        brought = file["events/x"][:].astype(int)
-    assert abs(brought.mean() - x[kept].mean()) < 0.7
+        brought = {key: file[f"events/{key}"][:].astype(int) for key in "xyp"}
+    assert np.array_equal(brought["p"], p)
+    for key, column in {"x": x, "y": y}.items():
+        assert abs(brought[key].mean() - column.mean()) < (0.7 if wrong == "shifted" else 1e-9)
     assert not of_events(inspect_capture(path, out).findings) and not found.exists()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from evsplat.calibration.brightness import EventSource, FramePair
 from evsplat.calibration.clock import SEARCH_US, correlations_at
+from evsplat.events.homography import Homography
 
 SURE = 0.5
 """Frames and events that correlate so well belong together as they are: they do at 0.8 to 0.97 in
@@ -46,6 +47,18 @@ class Disagreement:
     """Of changes in the frames with what the events add up to, in that way."""
     as_given: float
     """The same, as they are given; 0 where no correlation is positive."""
+    size_px: tuple[int, int]
+    """Width and height of the frames."""
+
+    @property
+    def homography(self) -> Homography:
+        """(3, 3), by which `evsplat.events.moved` brings events into the pixels of the frames."""
+        width, height = self.size_px
+        way = (_WAYS | _SQUARE_WAYS)[self.turned]
+        # columns and rows of the frames, where the events have theirs
+        axes = [way(numbers) for numbers in np.meshgrid(np.arange(width), np.arange(height))]
+        rows = [[one[0, 1] - one[0, 0], one[1, 0] - one[0, 0], one[0, 0]] for one in axes]
+        return np.array([*rows, [0, 0, 1]], np.float64)
 
     def __str__(self) -> str:
         ways = [self.turned] if self.turned else []
@@ -77,12 +90,13 @@ def estimate_disagreement(pairs: Sequence[FramePair], events: EventSource) -> Di
     as_given, inverse = found(_WAYS[""])
     if as_given >= SURE and inverse <= _needed(as_given):
         return None
-    best = Disagreement("", True, inverse, as_given)
     height, width = pairs[0].change.shape
+    size = width, height
+    best = Disagreement("", True, inverse, as_given, size)
     for name, way in (_WAYS | (_SQUARE_WAYS if height == width else {})).items():
         for inverted, correlation in enumerate(found(way) if name else ()):
             if correlation > best.correlation:
-                best = Disagreement(name, bool(inverted), correlation, as_given)
+                best = Disagreement(name, bool(inverted), correlation, as_given, size)
     sure = best.correlation >= SURE and best.correlation > _needed(as_given)
     return best if sure else None
 

@@ -45,6 +45,8 @@ class Convert:
     """Move events into the pixels of pictures: 3 lines of 3 numbers, or .npy."""
     size: Annotated[tuple[int, int] | None, option("WIDTH HEIGHT", default="none")] = None
     """For --homography: pixels of the pictures."""
+    invert: Flag = False
+    """Exchange brighter and darker."""
     reading: Annotated[ReadOptions, FLAT]
 
     def __call__(self) -> None:
@@ -58,6 +60,7 @@ class Convert:
             to=self.to,
             homography=self.homography,
             size=self.size,
+            invert=self.invert,
         )
         print(conversion.summary)
 

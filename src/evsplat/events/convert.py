@@ -48,6 +48,7 @@ def convert_recording(
     to: str | None = None,
     homography: Path | None = None,
     size: tuple[int, int] | None = None,
+    invert: bool = False,
     **changes: Any,
 ) -> Conversion:
     """Read any recording and write it as another; memory does not grow with its length.
@@ -61,6 +62,7 @@ def convert_recording(
         homography: File of 3 lines of 3 numbers, or .npy, by which events are moved into the pixels
             of pictures (`evsplat.events.moved`); those that fall outside are left out.
         size: Width and height of those pictures, 1 to 65536, which becomes that of the recording.
+        invert: Exchange the polarities, of a driver that has darker for brighter.
         changes: Fields of ``options``, such as ``repair``, or the source's ``format``.
     """
     source, out = Path(source), Path(out)
@@ -68,8 +70,12 @@ def convert_recording(
     if out.exists() and source.exists() and out.samefile(source):
         raise ConfigError(f"{out}: is the recording itself; write to another file.")
     recording = open_recording(source, options, **changes)
+    if invert and not recording.has_polarity:
+        raise ConfigError(f"--invert: {source} has no polarity to exchange; leave it out.")
     times: list[int] = []
     pieces = _watched(recording, from_zero, times, mover)
+    if invert:
+        pieces = (EventStream(piece.t, piece.x, piece.y, -piece.p) for piece in pieces)
     width, height = size or (recording.width, recording.height)
     count = write_events(out, pieces, format=to, width=width, height=height)
     start_us, end_us = times or (0, 0)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evsplat.calibration import (
+    Disagreement,
     FramePair,
     Lost,
     Placement,
@@ -35,8 +36,8 @@ class EventCheck:
     """What is wrong with events that are there and readable."""
 
     findings: list[Finding]
-    mendable: Placement | None = None
-    """Where they lie, if it is beside the pictures' pixels and a homography brings them back."""
+    mendable: Placement | Disagreement | None = None
+    """Where they lie, if it is not in the pictures' pixels and a homography brings them back."""
 
 
 def event_findings(capture: TrainingCapture) -> list[Finding]:
@@ -47,8 +48,9 @@ def event_findings(capture: TrainingCapture) -> list[Finding]:
 def check_events(capture: TrainingCapture, homography: Path | None = None) -> EventCheck:
     """Compare events with what frames show.
 
-    Where they lie beside the pictures the finding tells what to type; that takes a file with the
-    `Placement.homography`, which whoever calls writes at ``homography``, or `evsplat inspect`.
+    Where they lie beside the pictures, turned or mirrored, the finding tells what to type; that
+    takes a file with the homography of what is mendable, which whoever calls writes at
+    ``homography``, or `evsplat inspect`.
 
     Compared are at most 60 pairs of frames with the events between them, so that of a
     long recording a part is looked at; pauses of the events are found wherever they are. Without
@@ -71,7 +73,7 @@ def check_events(capture: TrainingCapture, homography: Path | None = None) -> Ev
         findings.warning(
             events.path, _WHICH_WAY[bool(other_way.turned)],
             str(other_way), "events in the pixels of the frames, 1 where it grows brighter",
-            "Write the events anew that way (evsplat.events.write_events), or the pictures.",
+            _sentence(_way_there(capture, events, other_way, homography)),
         )  # fmt: skip
     asked = signed and not sign and other_way is None
     beside = estimate_placement(pairs, events) if asked else None
@@ -98,7 +100,8 @@ def check_events(capture: TrainingCapture, homography: Path | None = None) -> Ev
             "pictures are finer than the sensor, and have to be made as coarse "
             "(docs/own-capture.md, two sensors).",
         )  # fmt: skip
-    return EventCheck(findings.items, None if _is_distorted(capture) else beside)
+    moved = other_way if other_way is not None and other_way.turned else beside
+    return EventCheck(findings.items, None if _is_distorted(capture) else moved)
 
 
 def _is_distorted(capture: TrainingCapture) -> bool:
@@ -106,20 +109,33 @@ def _is_distorted(capture: TrainingCapture) -> bool:
 
 
 def _way_there(
-    capture: TrainingCapture, events: EventStore, beside: Placement, homography: Path | None
+    capture: TrainingCapture,
+    events: EventStore,
+    found: Placement | Disagreement,
+    homography: Path | None,
 ) -> str:
-    """What to type to bring events into the pixels of the pictures."""
-    if _is_distorted(capture):
+    """What to type to bring events into the pixels of the pictures, and to their polarity."""
+    turned = not isinstance(found, Disagreement) or bool(found.turned)
+    if turned and _is_distorted(capture):
         # found is a homography of the pinhole camera, and events are stored as its lens bent them
         return (
             "undistort the pictures and bring the events there (docs/event-formats.md, events into "
             "the pixels of the pictures)."
         )
-    if homography is None:
+    if turned and homography is None:
         return f"what brings them there is told by: {command('inspect', capture.path)}"
-    new, size = events.path.with_name("moved.h5"), map(str, beside.size_px)
-    convert = command("convert", events.path, new, "--homography", homography, "--size", *size)
+    options: list[str] = []
+    if turned:
+        options += ["--homography", str(homography), "--size", *map(str, found.size_px)]
+    if isinstance(found, Disagreement) and found.inverted:
+        options.append("--invert")
+    new = events.path.with_name("moved.h5")
+    convert = command("convert", events.path, new, *options)
     return f"bring them there: {convert} && {shlex.join(['mv', str(new), str(events.path)])}"
+
+
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:]
 
 
 def _tell_lost(findings: Findings, events: EventStore, lost: Lost) -> None:
