@@ -13,7 +13,7 @@ from evsplat.errors import ConfigError
 from evsplat.options.declare import FLAT, Flag, check_options, given, option
 from evsplat.ranges import AtLeast
 
-CLASSES = [kind for name, kind in vars(options).items() if name[0].isupper() and name != "RECIPES"]
+CLASSES = [kind for name, kind in vars(options).items() if name[0].isupper()]
 
 
 @dataclass(frozen=True)

@@ -339,7 +339,7 @@ def test_larger_pictures_are_asked_where_the_smallest_leave_it_open(body, wrong)
     _, descent = staged(body, 1.0 if wrong else 0.0)
     limit, steps = TimeLimit(None, 1), (60, 10)
     track = still_track(body)
-    found = _descended(track, descent.targets, limit, steps, 500, 0, least_gain=LEAST_GAIN)
+    found = _descended(track, descent.targets, limit, steps, 500, least_gain=LEAST_GAIN)
     assert (found.coarse is not found.better) == wrong
     gain, coarse_gain = _mean_gain(found.better)[0], _mean_gain(found.coarse)[0]
     assert (min(gain, 2 * gain - coarse_gain) > LEAST_GAIN) == wrong

@@ -6,7 +6,7 @@ from evsplat.capture.body_track import load_body_track
 from evsplat.capture.capture import Capture, load_capture
 from evsplat.capture.coded import coded
 from evsplat.capture.finding import Finding
-from evsplat.capture.metadata import Frame, NovelView
+from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
 from evsplat.capture.sensor_estimate import (
     estimate_sensor,
@@ -25,7 +25,6 @@ __all__ = [
     "CaptureWriter",
     "Finding",
     "Frame",
-    "NovelView",
     "Policy",
     "TrainingCapture",
     "coded",

@@ -5,7 +5,6 @@ loads torch, so that ``--help`` is quick.
 """
 
 from evsplat.options.captures import (
-    RECIPES,
     PoseOptions,
     PoseSearch,
     ReadOptions,
@@ -15,7 +14,6 @@ from evsplat.options.captures import (
 from evsplat.options.runs import BenchOptions, ExportOptions, Film, TrainOptions
 
 __all__ = [
-    "RECIPES",
     "BenchOptions",
     "ExportOptions",
     "Film",

@@ -109,7 +109,6 @@ def judge(
     progress: bool = False,
     steps: tuple[int, int] = _STEPS,
     discs: int = _JUDGED_DISCS,
-    seed: int = 0,
 ) -> Verdict:
     """Compare a motion with one that is corrected, in a piece of the recording and small pictures.
 
@@ -130,7 +129,7 @@ def judge(
     targets = find_targets(track, capture, pictures, shrink=shrink)
     limit = TimeLimit(None, 5 * LOOK_STEPS + sum(steps), progress=progress)
     piece = between(track, min(times), max(times))
-    found = _descended(piece, targets, limit, steps, discs, seed, least_gain=LEAST_GAIN)
+    found = _descended(piece, targets, limit, steps, discs, least_gain=LEAST_GAIN)
     limit.close()
     errors = _given_errors(found.descent.correction, len(track.times_us))
     gain, coarse_gain = _mean_gain(found.better), _mean_gain(found.coarse)[0]
@@ -145,7 +144,6 @@ def refine(
     progress: bool = False,
     steps: tuple[int, int] = _STEPS,
     discs: int = DISCS,
-    seed: int = 0,
 ) -> Refined:
     """Correct a motion by the sharp pictures of a capture.
 
@@ -173,7 +171,7 @@ def refine(
             missed = error
             found.append(_Piece(torch.empty(0), _with_errors(given), None))
             continue
-        found.append(_finished(_descended(given, targets, limit, steps, discs, seed)))
+        found.append(_finished(_descended(given, targets, limit, steps, discs)))
     limit.close()
     bodies = [one.dressed for one in found if one.dressed is not None]
     if missed is not None and not bodies:
@@ -250,13 +248,12 @@ def _descended(
     limit: TimeLimit,
     steps: tuple[int, int],
     discs: int,
-    seed: int,
     *,
     least_gain: float | None = None,
 ) -> _Descended:
     """Ends after the smallest pictures where these say that the gain is below ``least_gain``."""
     correction = Correction(track, *expected_errors(track))
-    look = SurfaceDiscs(track.body, discs, torch.Generator().manual_seed(seed))
+    look = SurfaceDiscs(track.body, discs, torch.Generator().manual_seed(0))
     aside = _middles(targets)
     fitted = sorted(set(range(len(targets.times_us))) - set(aside)) or aside
     descent = Descent(correction, look, targets.rows(fitted), limit)

@@ -12,11 +12,11 @@ from evsplat.errors import DataError
 __all__ = ["load_motion"]
 
 
-def load_motion(path: Path | str, *, skeleton: Path | str | None = None) -> SkeletonMotion:
+def load_motion(path: Path | str) -> SkeletonMotion:
     """The motion in a file: DeepMimic ``.txt``, Acclaim ``.amc``, or ``.bvh``.
 
-    ``skeleton`` is the ``.asf`` of an ``.amc``, by default the one beside it whose name begins it
-    (``02.asf`` for ``02_05.amc``).
+    The skeleton of an ``.amc`` is the ``.asf`` beside it whose name begins it (``02.asf`` for
+    ``02_05.amc``).
 
     Raises:
         DataError: the file is missing, of another kind or damaged.
@@ -24,8 +24,7 @@ def load_motion(path: Path | str, *, skeleton: Path | str | None = None) -> Skel
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".amc":
-        beside = _skeleton_beside(path) if skeleton is None else Path(skeleton)
-        return checked_motion(read_acclaim(path, beside))
+        return checked_motion(read_acclaim(path, _skeleton_beside(path)))
     if suffix == ".bvh":
         return checked_motion(read_bvh(path))
     if suffix in (".txt", ".json"):

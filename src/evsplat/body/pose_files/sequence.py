@@ -63,12 +63,16 @@ class PoseSequence:
             world_to_camera=cameras,
         )
 
-    def times_us(self, fps: float | None = None, start_us: int = 0) -> Int[np.ndarray, "T"]:
-        """Times of the poses at a constant frame rate; ``start_us`` is the time of frame 0."""
+    def times_us(self, fps: float | None = None) -> Int[np.ndarray, "T"]:
+        """Times of the poses at a constant rate, by default the file's own; frame 0 is at 0.
+
+        Raises:
+            DataError: no rate, or one that is not above zero and finite.
+        """
         rate = fps if fps is not None else self.fps
         if rate is None or not np.isfinite(rate) or rate <= 0:
             raise DataError(f"{self.source}: the file has no frame rate; give fps= (found {rate}).")
-        return start_us + np.rint(self.frames * (1e6 / rate)).astype(np.int64)
+        return np.rint(self.frames * (1e6 / rate)).astype(np.int64)
 
 
 def make_sequence(

@@ -11,6 +11,9 @@ from torch.autograd.function import once_differentiable
 from evsplat.body.tree import level_inverse, tree_levels
 from evsplat.models.networks.mlp import uniform
 
+JOINT_DIM = 6
+"""Values of a joint's feature."""
+
 
 def normalise_joints(
     rest_joints: Float[Tensor, "J 3"], rest_vertices: Float[Tensor, "V 3"]
@@ -36,16 +39,13 @@ class PoseEncoder(nn.Module):
     constants: Tensor
     all_joints: Tensor
 
-    def __init__(
-        self, parents: Sequence[int], rest_joints: Float[Tensor, "J 3"], joint_dim: int = 6
-    ) -> None:
+    def __init__(self, parents: Sequence[int], rest_joints: Float[Tensor, "J 3"]) -> None:
         """``rest_joints`` in about [-1, 1], see `normalise_joints`."""
         super().__init__()
         parents = [int(parent) for parent in parents]
         joints = len(parents)
         levels = tree_levels(parents)
-        self.joint_dim = joint_dim
-        self.dim = joints * joint_dim
+        self.dim = joints * JOINT_DIM
         self.level_sizes = [len(level.joints) for level in levels]
         order = torch.cat([level.joints for level in levels])
         places = rest_joints.detach().clone()
@@ -63,13 +63,13 @@ class PoseEncoder(nn.Module):
             self.register_buffer(name, value, persistent=False)
         for depth, level in enumerate(levels):
             self.register_buffer(f"slots_{depth}", level.parent_slots, persistent=False)
-        inputs = 13 + joint_dim
-        self.root_weight = nn.Parameter(uniform((joint_dim, 12 * joints), 12 * joints))
-        self.root_bias = nn.Parameter(uniform((joint_dim,), 12 * joints))
+        inputs = 13 + JOINT_DIM
+        self.root_weight = nn.Parameter(uniform((JOINT_DIM, 12 * joints), 12 * joints))
+        self.root_bias = nn.Parameter(uniform((JOINT_DIM,), 12 * joints))
         self.first_weight = nn.Parameter(uniform((joints, inputs, inputs), inputs))
         self.first_bias = nn.Parameter(uniform((joints, 1, inputs), inputs))
-        self.second_weight = nn.Parameter(uniform((joints, inputs, joint_dim), inputs))
-        self.second_bias = nn.Parameter(uniform((joints, 1, joint_dim), inputs))
+        self.second_weight = nn.Parameter(uniform((joints, inputs, JOINT_DIM), inputs))
+        self.second_bias = nn.Parameter(uniform((joints, 1, JOINT_DIM), inputs))
 
     def forward(self, rotations: Float[Tensor, "T J 3 3"]) -> Float[Tensor, "T P"]:
         """Pose vectors (P = ``dim``, joint by joint) of local rotations; the root's is ignored."""
@@ -88,7 +88,7 @@ class PoseEncoder(nn.Module):
             ),
             -1,
         )
-        weight_own, weight_parent = self.first_weight.split((13, self.joint_dim), 1)
+        weight_own, weight_parent = self.first_weight.split((13, JOINT_DIM), 1)
         features: Tensor = _DownTheTree.apply(
             [(size, self.get_buffer(f"slots_{k}")) for k, size in enumerate(self.level_sizes)],
             feature,
