@@ -15,6 +15,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.options.declare import LAST, Flag
 from evsplat.pictures.files import read_image
 from evsplat.pictures.light import Transfer
+from evsplat.pictures.squares import square_means
 from evsplat.untrusted.pictures import image_size
 
 GUIDE = "docs/import.md shows the tree"
@@ -163,10 +164,8 @@ def shrunk(pixels: np.ndarray, factor: int) -> np.ndarray:
     """
     if factor == 1:
         return pixels
-    height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
-    cut = pixels[: height * factor, : width * factor]
-    squares = cut.reshape(height, factor, width, factor, *pixels.shape[2:])
-    means = squares.mean(axis=(1, 3), dtype=np.float64)
+    # with the axes turned about, channels come before columns and rows
+    means = square_means(pixels.T, factor, np.float64).T
     return means if pixels.dtype.kind == "f" else (means + 0.5).astype(pixels.dtype)
 
 

@@ -1,0 +1,33 @@
+import numpy as np
+import pytest
+
+from evsplat.importers.base import shrunk
+
+
+def test_a_smaller_picture_holds_rounded_means_of_each_channel():
+    """By hand; the third column and row fill no square of 2 x 2."""
+    red = [[0, 1, 9], [1, 1, 9], [9, 9, 9]]
+    green = [[10, 10, 0], [10, 12, 0], [0, 0, 0]]
+    pixels = np.stack([red, green], axis=-1).astype(np.uint8)
+    small = shrunk(pixels, 2)
+    assert small.dtype == np.uint8 and small.shape == (1, 1, 2)
+    assert small[0, 0].tolist() == [1, 11]  # 0.75 and 10.5, the half upwards
+
+
+def test_rows_and_columns_of_a_smaller_picture_stay_where_they_were():
+    pixels = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
+    assert shrunk(pixels, 2).tolist() == [[350, 550, 750], [1550, 1750, 1950]]
+
+
+@pytest.mark.parametrize("shape", [(5, 4), (5, 4, 3)])
+def test_shares_of_a_mask_are_not_rounded(shape):
+    mask = np.zeros(shape, np.float32)
+    mask[0, 0] = 1
+    small = shrunk(mask, 2)
+    assert small.shape == (2, 2, *shape[2:])
+    assert np.unique(small[0, 0]).tolist() == [0.25] and not small[1:].any()
+
+
+def test_by_a_factor_of_one_a_picture_is_given_back_itself():
+    pixels = np.zeros((3, 3), np.uint8)
+    assert shrunk(pixels, 1) is pixels
