@@ -130,14 +130,19 @@ def evaluate(
             )
             result["events"] = _event_maps(capture, drawn_frames, keep, reasons, split)
     remark = measured.human_remark()
-    if remark:
-        logger.warning("%s", remark)
     result["remarks"] = [remark] if remark else []
     result["weights"] = weights
+    result["protocol_notes"] = {protocol.name: protocol.summary for protocol in protocols}
+    _tell(result)
+    return result
+
+
+def _tell(result: dict[str, Any]) -> None:
+    """Log how the figures may mislead, and which distances are left out for want of weights."""
+    for sentence in result["remarks"]:
+        logger.warning("%s", sentence)
     for sentence in missing_networks(result):
         logger.info("%s", sentence)
-    result["protocol_notes"] = {protocol.name: protocol.summary for protocol in protocols}
-    return result
 
 
 def _frames_of(capture: Capture, split: Split) -> tuple[Frame, ...]:

@@ -99,17 +99,7 @@ class Folder(Importer):
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Put the parts together; see `Importer.write`."""
-        need(source, "the folder of the recording")
-        if not source.is_dir():
-            raise DataError(
-                f"{source}: is a file, expected the folder of the recording; a video alone is read "
-                "by 'evsplat import video', a DAVIS recording by 'evsplat import davis'."
-            )
-        if self.fps is not None:
-            check_positive(fps=self.fps)
-        images = self._images(source)
-        footage = open_footage(images, self._rate(source, images), rate_option="--fps")
-        exposures = self._exposures(source, footage)
+        footage, exposures = self._recording(source)
         middles = exposures.sum(axis=1) // 2
         path = self._poses(source)
         size = footage.width, footage.height
@@ -162,6 +152,20 @@ class Folder(Importer):
             "shrink": self.shrink,
         }
         return notes + _add_body(writer, path, motion, middles[seen], seen, smpl)
+
+    def _recording(self, source: Path) -> tuple[Footage, Int64[np.ndarray, "N 2"]]:
+        """The pictures of a folder, and start and end of every exposure, microseconds."""
+        need(source, "the folder of the recording")
+        if not source.is_dir():
+            raise DataError(
+                f"{source}: is a file, expected the folder of the recording; a video alone is read "
+                "by 'evsplat import video', a DAVIS recording by 'evsplat import davis'."
+            )
+        if self.fps is not None:
+            check_positive(fps=self.fps)
+        images = self._images(source)
+        footage = open_footage(images, self._rate(source, images), rate_option="--fps")
+        return footage, self._exposures(source, footage)
 
     def _images(self, source: Path) -> Path:
         if self.images is not None:
