@@ -33,7 +33,6 @@ from evsplat.models.networks.colour import SceneColour, scene_rgb
 from evsplat.models.networks.non_rigid import draw_pose_noise
 from evsplat.models.pose_correction import PoseCorrection
 from evsplat.models.scene_places import SceneAlone, ScenePlaces
-from evsplat.render import rows_in_view
 
 NORMAL_SAMPLES = 20_000
 """Points of the body's surface among which a Gaussian finds its normal and its bones."""
@@ -303,14 +302,14 @@ class DiscModel(PosedModel):
     ) -> Float[Tensor, "S 3"]:
         """The network's colours of the scene, which may be black outside of the picture."""
         assert self.scene_colour is not None and view.center is not None
-        rows = rows_in_view(means, scales, *view.shown) if view.shown else None
         return scene_rgb(
             self.scene_colour,
             colours,
             means,
+            scales,
             view.center,
+            shown=view.shown,
             hide_direction=view.hide_direction,
-            rows=rows,
         )
 
     def _light(

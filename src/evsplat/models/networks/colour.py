@@ -1,17 +1,20 @@
 """Colour networks of human and scene Gaussians."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from evsplat.body.rotations import axis_angle_to_matrix
+from evsplat.camera import Camera
 from evsplat.compiled import native, runs_native
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.networks.spherical_harmonics import sh_basis
+from evsplat.render import rows_in_view
 
 _DIRECTION_DIM = 15
 
@@ -73,16 +76,19 @@ def scene_rgb(
     network: nn.Module,
     features: Float[Tensor, "S 32"],
     means: Float[Tensor, "S 3"],
+    scales: Float[Tensor, "S 3"],
     camera_center: Float[Tensor, "3"],
     *,
+    shown: Sequence[Camera],
     hide_direction: bool,
-    rows: Int[Tensor, " V"] | None,
 ) -> Float[Tensor, "S 3"]:
-    """Colours of a scene by a `SceneColour`, of some ``rows`` or of all; the others are black.
+    """Colours of a scene by a `SceneColour`; places in metres, ``scales`` standard deviations.
 
-    ``hide_direction``: the network sees no view direction in this step.
+    ``shown``: only these cameras' pictures are asked for, if any are given; rows that reach into
+    none of them may be black. ``hide_direction``: the network sees no view direction in this step.
     """
     count = len(means)
+    rows = rows_in_view(means, scales, *shown) if shown else None
     if rows is not None:
         features, means = features.index_select(0, rows), means.detach().index_select(0, rows)
     directions = view_directions(means[None], camera_center)[0]

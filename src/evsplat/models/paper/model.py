@@ -28,7 +28,7 @@ from evsplat.models.networks.non_rigid import PoseDeformation, draw_pose_noise
 from evsplat.models.networks.skinning_network import SkinningNetwork, SkinningTurns
 from evsplat.models.paper.per_frame import FrameLatents, FramePoses, UnseenFrames
 from evsplat.models.paper.placement import Placement, StraightThrough
-from evsplat.render import LOW_PASS, rows_in_view
+from evsplat.render import LOW_PASS
 
 LATENT_DIM = 16
 """Size of the per-frame latent of the person's colour."""
@@ -48,6 +48,21 @@ class _Noise:
     view_turn: Float[Tensor, "3 3"]
     """Rotation of canonical view directions."""
     hide_scene_direction: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Posed:
+    """The person deformed and skinned at T times, and where the scene is drawn."""
+
+    means: Float[Tensor, "T H 3"]
+    scales: Float[Tensor, "#T H 3"]
+    quaternions: Float[Tensor, "#T H 4"]
+    transforms: Float[Tensor, "T H 4 4"]
+    linear: Float[Tensor, "T H 3 3"]
+    """See `skin_with_linear`, as of ``transforms``."""
+    feature: Float[Tensor, "T H F"]
+    """What the non-rigid network gives to the colour."""
+    scene_means: Float[Tensor, "S 3"]
 
 
 class PaperModel(PosedModel):
@@ -202,55 +217,75 @@ class PaperModel(PosedModel):
             gaussians.of_parts(values)
             for values in (gaussians.means, gaussians.scales_log, gaussians.quaternions)
         ]
-        scene_means, scene_scales_log, scene_quaternions = (scene for _, scene in parts)
-        rotations, bones = self.pose(times_us)
-        rows = self.placement.posed_scene_rows(gaussians, self.deformation)
-        posed = [
-            human if rows is None else torch.cat([human, scene[rows]]) for human, scene in parts
-        ]
-        centers, scales, quaternions, feature = self._deformed(posed, rotations, noise)
-        world, transforms, linear = skin_with_linear(centers, weights_at(centers), bones)
-        human_means, scene_means = self.placement.places(gaussians, rows, world, scene_means)
-
-        people = slice(0, gaussians.human_count)
-        human_features, scene_features = gaussians.of_parts(gaussians.get_parameter("features"))
-        # Detached as in 3DGS-Avatar: colour must not be bought by moving the body.
+        posed = self._posed(times_us, parts, weights_at, noise)
+        features, scene_features = gaussians.of_parts(gaussians.get_parameter("features"))
         turn = None if noise is None else noise.view_turn
-        seen_from = view_directions(human_means, camera_center, transforms[:, people], turn)
-        rgb = self.human_colour(
-            human_features, seen_from, feature[:, people], self.latents(times_us)
-        )
+        # Detached as in 3DGS-Avatar: colour must not be bought by moving the body.
+        seen_from = view_directions(posed.means, camera_center, posed.transforms, turn)
+        rgb = self.human_colour(features, seen_from, posed.feature, self.latents(times_us))
         labels = gaussians.human_mask().float() if hard_semantics else gaussians.semantics()
         semantics, scene_semantics = gaussians.of_parts(labels)
         opacities, scene_opacities = gaussians.of_parts(gaussians.opacities())
+        _, scene_scales_log, scene_quaternions = (scene for _, scene in parts)
         scene_scales = scene_scales_log.exp()
-        in_view = rows_in_view(scene_means, scene_scales, *shown) if shown else None
+        scene_colours = scene_rgb(
+            self.scene_colour,
+            scene_features,
+            posed.scene_means,
+            scene_scales,
+            camera_center,
+            shown=shown,
+            hide_direction=noise is not None and noise.hide_scene_direction,
+        )
         return Layers(
             human_splats(
-                human_means,
-                quaternions[:, people],
-                scales[:, people],
+                posed.means,
+                posed.quaternions,
+                posed.scales,
                 opacities,
                 rgb,
                 semantics,
-                linear[:, people],
+                posed.linear,
             ),
             scene_splats(
-                scene_means,
+                posed.scene_means,
                 scene_quaternions,
                 scene_scales,
                 scene_opacities,
-                scene_rgb(
-                    self.scene_colour,
-                    scene_features,
-                    scene_means,
-                    camera_center,
-                    hide_direction=noise is not None and noise.hide_scene_direction,
-                    rows=in_view,
-                ),
+                scene_colours,
                 scene_semantics,
             ),
+            posed.transforms,
+        )
+
+    def _posed(
+        self,
+        times_us: Sequence[int],
+        parts: list[tuple[Tensor, Tensor]],
+        weights_at: Callable[[Tensor], Tensor],
+        noise: _Noise | None,
+    ) -> _Posed:
+        """The person at its times, with the rows of the scene that `placement` poses beside it.
+
+        ``parts`` are centres, log-scales and quaternions, each of person and scene.
+        """
+        rotations, bones = self.pose(times_us)
+        rows = self.placement.posed_scene_rows(self.gaussians, self.deformation)
+        given = [
+            human if rows is None else torch.cat([human, scene[rows]]) for human, scene in parts
+        ]
+        centers, scales, quaternions, feature = self._deformed(given, rotations, noise)
+        world, transforms, linear = skin_with_linear(centers, weights_at(centers), bones)
+        means, scene_means = self.placement.places(self.gaussians, rows, world, parts[0][1])
+        people = slice(0, self.gaussians.human_count)
+        return _Posed(
+            means,
+            scales[:, people],
+            quaternions[:, people],
             transforms[:, people],
+            linear[:, people],
+            feature[:, people],
+            scene_means,
         )
 
     def _deformed(
