@@ -33,6 +33,9 @@ def make_body(
 ) -> tuple[Body, list[int]]:
     """A checked `Body` from arrays whose joints may come in any order, and the order it took.
 
+    Places are metres, of the body at rest; the parent of the root is negative. ``weights`` are
+    scaled so that each vertex's sum to 1. ``source`` begins what errors say.
+
     Raises:
         DataError: shapes that do not fit, no single root, cycles, face indices out of range, values
             that are not finite, negative weights, or a vertex without any.
@@ -90,7 +93,13 @@ def rig_arrays(body: Body) -> dict[str, np.ndarray]:
 
 
 def default_body(betas: Float[np.ndarray, "B"] | None = None, *, source: str = "betas") -> Body:
-    """The shipped parametric body (CC0) with up to 10 shape coefficients, each about -3..3."""
+    """The shipped parametric body (CC0) with up to 10 shape coefficients, each about -3..3.
+
+    Metres, z up. ``source`` begins what errors say.
+
+    Raises:
+        DataError: more coefficients, or some that are not finite.
+    """
     data = _default_arrays()
     shape = fit_betas(betas, len(data["shapedirs"]), source)
     vertices = data["v_template"] + np.einsum("b,bvd->vd", shape, data["shapedirs"])

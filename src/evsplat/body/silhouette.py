@@ -17,7 +17,11 @@ NEAR = 0.01
 def silhouette(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: Camera
 ) -> Bool[Tensor, "H W"]:
-    """Pixels whose centre lies inside a projected triangle of the mesh (world coordinates)."""
+    """Pixels whose centre lies inside a projected triangle of the mesh.
+
+    ``vertices`` lie in the world, metres; ``faces`` are their indices. Triangles with a corner
+    nearer to the camera's plane than `NEAR`, or behind it, are left out.
+    """
     pixels, depth = camera.project(vertices.detach())
     places, in_front = pixels.double().cpu(), (depth > NEAR).cpu()
     if native is not None:
@@ -29,7 +33,7 @@ def silhouette(
 
 
 def track_silhouette(track: BodyTrack, time_us: int, camera: Camera) -> Bool[Tensor, "H W"]:
-    """Pixels whose centre the posed body covers."""
+    """Pixels whose centre the body covers as it is posed at a time, microseconds."""
     return silhouette(track.vertices(time_us), track.body.faces, camera)
 
 
@@ -62,7 +66,8 @@ def _filled(
 def body_box(vertices: Float[Tensor, "V 3"], camera: Camera, margin: float = 0.1) -> Box | None:
     """Pixels around a posed body, enlarged on each side and clipped to the picture.
 
-    ``margin`` is a share of the box's own extent. None where the body is out of view.
+    ``vertices`` lie in the world, metres; ``margin`` is a share of the box's own extent. None where
+    the body is out of view.
     """
     pixels, depth = camera.project(vertices.detach())
     seen = pixels[depth > NEAR].double().cpu().numpy()

@@ -102,7 +102,11 @@ def exposure(
 
 
 def pair(before: Exposure, after: Exposure, recorded_us: Span) -> FramePair:
-    """Two exposures as a pair, and when around them events were recorded and may be read."""
+    """Two exposures as a pair; ``recorded_us``: when events were recorded and may be read.
+
+    Raises:
+        DataError: pictures of two sizes.
+    """
     if before.log_luminance.shape != after.log_luminance.shape:
         raise DataError(
             f"frames of {before.log_luminance.shape[::-1]} and {after.log_luminance.shape[::-1]} "
@@ -116,9 +120,10 @@ def pair(before: Exposure, after: Exposure, recorded_us: Span) -> FramePair:
 def pair_indices(
     spans_us: Sequence[tuple[int, int]], most: int, *, stretch: Sequence[Span] | None = None
 ) -> list[tuple[int, int]]:
-    """Pairs of frames next to each other but `SHORTEST_GAP_US` apart, evenly spread.
+    """At most ``most`` pairs of frames next to each other but `SHORTEST_GAP_US` apart, spread.
 
-    ``stretch`` is the stretch of time of each frame; pairs lie in one.
+    ``spans_us`` are start and end of each exposure, ascending; ``stretch`` is the stretch of time
+    of each frame; pairs lie in one.
     """
     middle = np.array([(start + end) / 2 for start, end in spans_us])
     after = np.searchsorted(middle, middle + SHORTEST_GAP_US)

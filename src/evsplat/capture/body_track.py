@@ -28,6 +28,9 @@ def load_body_track(
 
     The dense poses are for evaluation and ablation, never for training. ``body_models`` is as of
     `load_body`.
+
+    Raises:
+        DataError: no body, no dense poses where they are asked for, or poses of other joints.
     """
     body, order = load_body(capture.body_file, body_models)
     file = capture.body_file

@@ -37,7 +37,10 @@ def deblur(
     ``events`` are on the camera's clock and cover the exposure and all of ``times_us``, which may
     lie outside of the exposure. They see luminance only: all three linear channels are multiplied
     by the same factor, so that the hue of a pixel stays what it was in the blurry picture. Without
-    events at a pixel it stays as it is.
+    events at a pixel it stays as it is. ``exposure_us``: start and end.
+
+    Raises:
+        DataError: an exposure without length, or events outside of the picture.
     """
     height, width = blurry_srgb.shape[:2]
     gain = log_gain(events, exposure_us, times_us, contrast_threshold, height, width)

@@ -21,7 +21,11 @@ VoxelScaling = Literal["none", "standard"]
 
 
 def count_map(stream: EventStream, height: int, width: int) -> Float[Tensor, "H W"]:
-    """Sum of polarities per pixel (the event map E of paper eq. 8)."""
+    """Sum of polarities per pixel (the event map E of paper eq. 8).
+
+    Raises:
+        DataError: an event lies outside, as for all maps here.
+    """
     return _sums(event_pixels(stream, height, width), stream.p, (height, width))
 
 
@@ -100,7 +104,11 @@ def voxel_grid(
     """Polarities shared between the two nearest of ``bins`` instants, linearly in time.
 
     The instants divide the window evenly and include both of its ends (Zhu et al., 2019, eq. 1-2;
-    the input of E2VID). The sum over bins is `count_map` of the window.
+    the input of E2VID). The sum over bins is `count_map` of the window, by default from the first
+    event to the last.
+
+    Raises:
+        ValueError: no bin, or a window that ends before it starts.
     """
     if bins < 1:
         raise ValueError(f"a voxel grid needs at least one bin, not {bins}")
@@ -126,7 +134,10 @@ def time_surface(
     """``exp(-(time_us - t) / decay_us)`` of the last event of each polarity; 0 where none was.
 
     Later events than ``time_us``, by default the last one, do not count (Lagorce et al., HOTS,
-    2017, with polarities apart).
+    2017, with polarities apart). ON is the first map.
+
+    Raises:
+        ValueError: a decay that is not above 0.
     """
     if not decay_us > 0:
         raise ValueError(f"the decay of a time surface must be above 0 us, not {decay_us:g}")

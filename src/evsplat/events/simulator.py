@@ -97,7 +97,11 @@ PRESETS: dict[Sensor, SensorSettings] = {
 
 
 def sensor_settings(preset: Sensor = "clean", **changes: Any) -> SensorSettings:
-    """A preset with some fields changed; those given as None stay."""
+    """A preset with some fields changed; those given as None stay.
+
+    Raises:
+        ConfigError: no such preset or field, or a value out of range.
+    """
     if preset not in PRESETS:
         raise ConfigError(f"preset {preset!r}: expected one of {', '.join(PRESETS)}.")
     changed = {name: value for name, value in changes.items() if value is not None}
@@ -209,7 +213,10 @@ def simulate_events(
     """Events of timed pictures (microseconds; linear light (H, W) or (H, W, 3)), step by step.
 
     One slice for each picture but the first, in order, so that memory does not grow with the
-    number of pictures.
+    number of pictures. Equal seeds give equal events.
+
+    Raises:
+        DataError: as of `SensorSimulator.step`, when its slice is asked for.
     """
     sensor: SensorSimulator | None = None
     for time_us, picture in frames:

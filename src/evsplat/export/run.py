@@ -64,6 +64,10 @@ def export_run(
 
     ``parts`` are person and scene or one of them; by default all, of an avatar the person.
     Lengths are metres. Without ``out`` the file goes to ``run/exports/``.
+
+    Raises:
+        ConfigError: an unknown ``kind``, or an option that is out of range or of no use to it.
+        DataError: no run that can be read, or a folder where the file shall be.
     """
     if kind not in _SUFFIXES:
         raise ConfigError(f"{kind}: unknown format; choose one of {', '.join(_SUFFIXES)}.")

@@ -118,7 +118,7 @@ def run_importer(
     poses: PoseOptions | None = None,
     keypoints: Path | None = None,
 ) -> Path:
-    """`import_capture` with the options as a checked object."""
+    """`import_capture` with the options as a checked object; errors are the same."""
     source, out = Path(source), Path(out)
     smpl = None if smpl is None else Path(smpl)
     if blur is not None and importer.blur_recipe is None:

@@ -41,7 +41,10 @@ _SHOWN_HOT_PIXELS = 6
 
 
 def inspect(path: Path | str, out_dir: Path | str, *, repair: bool = False) -> InspectReport:
-    """Inspect a capture folder (`inspect_capture`) or an event recording (`inspect_recording`)."""
+    """Inspect a capture folder (`inspect_capture`) or an event recording (`inspect_recording`).
+
+    ``repair`` is of recordings alone.
+    """
     path = Path(path)
     # a ROS 2 bag is a folder with a metadata.yaml
     if path.is_file() or (path / "metadata.yaml").is_file():

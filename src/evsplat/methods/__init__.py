@@ -50,7 +50,13 @@ DEFAULT_METHOD = "evsplat"
 
 
 def method_config(method: str, values: dict[str, Any], *, where: str) -> MethodConfig:
-    """The configuration of a method with ``values`` over its defaults."""
+    """The configuration of a method with ``values`` over its defaults.
+
+    ``where`` they come from begins what errors say.
+
+    Raises:
+        ConfigError: no such method or setting, or a value of another type or out of range.
+    """
     if not isinstance(method, str):
         raise ConfigError(f"{where}: method is {brief(method)}; expected a name.")
     if method not in TRAINABLE:

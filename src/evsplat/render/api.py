@@ -189,6 +189,10 @@ def choose_device(asked: str) -> str:
 
     ``auto`` is ``cuda`` where an NVIDIA GPU, its driver, PyTorch with CUDA, gsplat and the means to
     build its kernels are all there, otherwise ``cpu``; which one it is, is logged once.
+
+    Raises:
+        ConfigError: none of ``auto``, ``cpu`` and ``cuda``.
+        BackendError: ``cuda`` is asked for and cannot run.
     """
     if asked not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"--device {asked}: expected auto, cpu or cuda.")

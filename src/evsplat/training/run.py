@@ -252,9 +252,13 @@ def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:
 
 
 def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = None) -> Run:
-    """Read a run at its last checkpoint; a folder without one is a `DataError`.
+    """Read a run at its last checkpoint; ``state`` is another checkpoint or snapshot of it.
 
-    ``state`` is another checkpoint or snapshot of it.
+    ``device`` is as of `evsplat.render.choose_device`.
+
+    Raises:
+        DataError: no run, no sound checkpoint in it, or its capture is gone or another one.
+        ConfigError: settings of the run that are unknown or out of range.
     """
     device = choose_device(device)
     folder = RunFolder(Path(run_dir))
