@@ -153,3 +153,22 @@ def camera():
     """Looks along z; one metre away, one metre is 50 px."""
     K = torch.tensor([[50.0, 0, 20.5], [0, 50.0, 16.5], [0, 0, 1]])
     return PlainCamera(41, 33, K, torch.eye(4))
+
+
+@pytest.fixture
+def pile():
+    """300 faint Gaussians at one place, numbered by their channel, and what is seen at its middle.
+
+    Front to back in the order of their rows.
+    """
+    count = 300
+    splats = Splats(
+        means=torch.tensor([[[0.0, 0, 1.0]]]).expand(1, count, 3),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
+        scales=torch.full((count, 3), 0.2),
+        opacities=torch.full((count,), 0.02),
+        channels=torch.arange(count).float()[None, :, None],
+    )
+    alpha = torch.tensor(0.02, dtype=torch.float64)
+    weights = alpha * (1 - alpha) ** torch.arange(count)
+    return splats, (weights * torch.arange(count)).sum().item()

@@ -171,18 +171,9 @@ def test_a_broken_gaussian_is_not_drawn_and_harms_no_other(field, bad, device, r
     assert torch.isfinite(gradient[0, others]).all()
 
 
-def test_equal_depths_keep_the_order_of_the_gaussians(device, camera):
-    count = 300
-    splats = Splats(
-        means=torch.tensor([[[0.0, 0, 1.0]]]).expand(1, count, 3),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
-        scales=torch.full((count, 3), 0.2),
-        opacities=torch.full((count,), 0.02),
-        channels=torch.arange(count).float()[None, :, None],
-    )
+def test_equal_depths_keep_the_order_of_the_gaussians(device, camera, pile):
+    splats, expected = pile
     out = render(on(splats, device), camera, backend="gsplat")
-    alpha = torch.tensor(0.02, dtype=torch.float64)
-    expected = (alpha * (1 - alpha) ** torch.arange(count) * torch.arange(count)).sum().item()
     assert out.image[0, 16, 20, 0].item() == pytest.approx(expected, rel=1e-4)
 
 
