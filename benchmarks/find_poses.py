@@ -33,7 +33,7 @@ from evsplat.camera import Camera
 from evsplat.capture import Capture, Policy, load_body_track, load_capture
 from evsplat.capture.derive import derived_capture
 from evsplat.errors import DataError
-from evsplat.inspection.capture import body_mask_overlap
+from evsplat.inspection import body_mask_overlap
 from evsplat.landmarks import (
     COCO_17,
     LandmarkNetwork,

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import BodyTrack, default_body, up_axis
-from evsplat.inspection.capture import _up_lines
+from evsplat.inspection.summary import _up_lines
 
 AXES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
 

@@ -1,10 +1,14 @@
 """`evsplat inspect`: a capture or an event recording checked, in words and in pictures."""
 
 from evsplat.inspection.belonging import Belonging, judge_body
-from evsplat.inspection.body_check import check_body, fit_sheet, save_fit_sheet
+from evsplat.inspection.body_check import (
+    body_mask_overlap,
+    check_body,
+    fit_sheet,
+    save_fit_sheet,
+)
 from evsplat.inspection.capture import (
     InspectReport,
-    body_mask_overlap,
     inspect_capture,
     warn_of_capture,
 )

@@ -1,6 +1,7 @@
 """Warnings about a body that does not belong to its recording; its outline over what moves."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from evsplat.body import BodyTrack, track_silhouette
 from evsplat.camera import Camera
-from evsplat.capture import Frame, TrainingCapture, load_body_track
+from evsplat.capture import Capture, Frame, TrainingCapture, load_body_track
 from evsplat.capture.finding import Finding, Findings
 from evsplat.commands import command
 from evsplat.errors import DataError
@@ -94,6 +95,23 @@ def _elsewhere_findings(found: Belonging) -> list[Finding]:
         folder = found.frames[0].image.parent
         findings.warning(folder, "", found.elsewhere.sentence, EXPECTED, REMEDY)
     return findings.items
+
+
+def body_mask_overlap(capture: Capture, track: BodyTrack, frames: Sequence[Frame]) -> list[float]:
+    """Intersection over union of posed body and person mask, for the frames that have a mask.
+
+    Frames with neither in the picture, as after somebody has left, tell nothing and are passed
+    over.
+    """
+    overlaps = []
+    for frame in frames:
+        mask = capture.mask(frame)
+        if mask is not None:
+            body = track_silhouette(track, frame.mid_us, capture.camera(frame)).numpy()
+            person = mask.numpy() > 0.5
+            if (either := int((body | person).sum())) > 0:
+                overlaps.append(float((body & person).sum() / either))
+    return overlaps
 
 
 def save_fit_sheet(capture: TrainingCapture, found: Belonging, folder: Path) -> Path:

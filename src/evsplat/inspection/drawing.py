@@ -24,8 +24,8 @@ OVERSAMPLING = 2
 """Curves are drawn larger and reduced, because Pillow's lines have no soft edges."""
 # Longer windows cover the person so densely that single edges cannot be told apart.
 EVENT_WINDOW_US = 20_000
-DETAIL_PX = 380
-"""Longer side of the pictures of a detailed sheet."""
+DETAIL_FRAMES, DETAIL_PX = 8, 380
+"""Pictures of a detailed sheet, and their longer side."""
 _GAP, _LABEL_HEIGHT, _HEADER_HEIGHT, _BORDER = 10, 20, 62, 4
 
 
