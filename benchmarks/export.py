@@ -23,19 +23,21 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
 import evsplat as ev
-from evsplat.capture import Camera
+from evsplat.capture import Camera, Frame
 from evsplat.export.avatar import avatar_of
 from evsplat.export.bake import at_rest, with_correctives
 from evsplat.export.cloud import cloud_of
 from evsplat.export.gaussians import file_rotation
 from evsplat.render import render
 from evsplat.similarity import psnr
+from evsplat.training.run import Run
 
 CHROMIUM = (
     "--no-sandbox --disable-quic --use-angle=swiftshader --enable-unsafe-swiftshader "
@@ -75,36 +77,7 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
 
     site = folder / "site"
     site.mkdir()
-    shots = []
-    for kind in ("ply", "spz", "splat"):
-        file, own = site / f"run.{kind}", source.low_pass
-        ev.export_run(run.path, kind, frame=frame.name, out=file, low_pass=own, device="cpu")
-        view = seen_from(camera, file_rotation(source.track, kind, None))
-        for rules in ("3dgs", "default"):
-            shots.append(
-                {"page": "spark.html", "file": f"run.{kind}", "rules": rules, "camera": view,
-                 "low_pass": source.low_pass, "picture": f"spark-{kind}-{rules}.png"}
-            )  # fmt: skip
-    for low_pass in (None, 0.075, 0.3):
-        name = "run.ply" if low_pass is None else f"run-{low_pass}.ply"
-        out_file = site / name
-        ev.export_run(
-            run.path, "ply", out=out_file, frame=frame.name, low_pass=low_pass, device="cpu"
-        )
-        view = seen_from(camera, file_rotation(source.track, "ply", None))
-        for viewer in VIEWERS:
-            shots.append(
-                {"page": f"{viewer}.html", "file": name, "camera": view,
-                 "picture": f"{viewer}{name[3:-4]}.png"}
-            )  # fmt: skip
-    page = site / "avatar.html"
-    ev.export_run(arguments.run, "avatar", parts="all", out=page, device="cpu")
-    first = min(f.mid_us for f in capture.frames)
-    seconds = (frame.mid_us - first) / 1e6
-    shots.append(
-        {"page": "avatar.html", "clip": 0, "seconds": seconds, "timed": 10,
-         "camera": seen_from(camera, np.eye(3)), "picture": "avatar.png"}
-    )  # fmt: skip
+    shots = exported(run, camera, frame, site)
     seen = photograph(arguments, site, shots, out)
 
     person_alone = avatar_of(with_correctives(run, at_rest(run, None), None))
@@ -128,6 +101,42 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
     print(f"avatar page: {seen['avatar_ms']:.1f} ms per picture {camera.width} x {camera.height}")
     figures["avatar_page_ms_per_picture"] = seen["avatar_ms"]
     return {name: round(value, 3) for name, value in figures.items()} | gsply_agrees(site)
+
+
+def exported(run: Run, camera: Camera, frame: Frame, site: Path) -> list[dict[str, Any]]:
+    """Write the run at a frame as every file that is drawn; gives what to draw of each."""
+    source = run.reconstruction
+    shots: list[dict[str, Any]] = []
+    for kind in ("ply", "spz", "splat"):
+        file, own = site / f"run.{kind}", source.low_pass
+        ev.export_run(run.path, kind, frame=frame.name, out=file, low_pass=own, device="cpu")
+        view = seen_from(camera, file_rotation(source.track, kind, None))
+        for rules in ("3dgs", "default"):
+            shots.append(
+                {"page": "spark.html", "file": f"run.{kind}", "rules": rules, "camera": view,
+                 "low_pass": source.low_pass, "picture": f"spark-{kind}-{rules}.png"}
+            )  # fmt: skip
+    for low_pass in (None, 0.075, 0.3):
+        name = "run.ply" if low_pass is None else f"run-{low_pass}.ply"
+        out_file = site / name
+        ev.export_run(
+            run.path, "ply", out=out_file, frame=frame.name, low_pass=low_pass, device="cpu"
+        )
+        view = seen_from(camera, file_rotation(source.track, "ply", None))
+        for viewer in VIEWERS:
+            shots.append(
+                {"page": f"{viewer}.html", "file": name, "camera": view,
+                 "picture": f"{viewer}{name[3:-4]}.png"}
+            )  # fmt: skip
+    page = site / "avatar.html"
+    ev.export_run(run.path, "avatar", parts="all", out=page, device="cpu")
+    first = min(f.mid_us for f in run.capture.frames)
+    seconds = (frame.mid_us - first) / 1e6
+    shots.append(
+        {"page": "avatar.html", "clip": 0, "seconds": seconds, "timed": 10,
+         "camera": seen_from(camera, np.eye(3)), "picture": "avatar.png"}
+    )  # fmt: skip
+    return shots
 
 
 def seen_from(camera: Camera, rotation: np.ndarray) -> dict[str, object]:
