@@ -75,9 +75,7 @@ class Body:
         """Transforms of each bone, canonical pose to world (3DGS-Avatar)."""
         return self.joint_transforms(rotations, transl) @ self._to_canonical.to(rotations.dtype)
 
-    def sample_surface(
-        self, count: int, generator: torch.Generator | None = None
-    ) -> SurfaceSamples:
+    def sample_surface(self, count: int, generator: torch.Generator) -> SurfaceSamples:
         """Points spread evenly by area over the canonical mesh, with normals and weights."""
         return sample_mesh(self._canonical_vertices, self.faces, self.weights, count, generator)
 

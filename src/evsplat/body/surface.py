@@ -41,7 +41,7 @@ def sample_mesh(
     faces: Int[Tensor, "F 3"],
     weights: Float[Tensor, "V J"],
     count: int,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator,
 ) -> SurfaceSamples:
     """Draw ``count`` independent points, uniform by area; the generator is on the mesh's device."""
     a, b, c = vertices[faces].unbind(1)

@@ -141,7 +141,7 @@ def draw_curve(
     y: Float[np.ndarray, "N"],
     *,
     x_label: str,
-    x_unit: float = 1.0,
+    x_unit: float,
     marks: Sequence[float] = (),
 ) -> Image.Image:
     """A curve over whole-number ``x``, with ticks at round multiples, shown divided by ``x_unit``.

@@ -51,9 +51,9 @@ class PosedBody:
 
 
 def soft_silhouette(
-    track: BodyTrack, time_us: int, camera: Camera, *, margin_px: float = 0.0
+    track: BodyTrack, time_us: int, camera: Camera, *, margin_px: float
 ) -> Float[Tensor, "H W"]:
-    """Share of each pixel that the posed body covers, in [0, 1]."""
+    """Share of each pixel that the posed body covers, wider by ``margin_px``, in [0, 1]."""
     large = camera.resized(camera.width * OVERSAMPLING, camera.height * OVERSAMPLING)
     fine = track_silhouette(track, time_us, large)
     if margin_px > 0 and bool(fine.any()):

@@ -19,7 +19,7 @@ PerceptualChoice = Literal["available", "none", "lpips_vgg", "st_lpips"]
 
 
 def choose_perceptual(
-    choice: PerceptualChoice, *, device: torch.device | str = "cpu"
+    choice: PerceptualChoice, *, device: torch.device | str
 ) -> tuple[PerceptualName, PerceptualMetric | None]:
     """The distance of a choice and its name; what was not available is logged with the reason."""
     if choice != "available":

@@ -22,7 +22,7 @@ class Cloth:
     """
 
     def __init__(
-        self, character: Character, track: BodyTrack, amplitude_m: float, seed: int = 0
+        self, character: Character, track: BodyTrack, amplitude_m: float, seed: int
     ) -> None:
         self.character = character
         self.amplitude_m = amplitude_m

@@ -240,7 +240,7 @@ class FootageSource(Source):
         footage: Footage,
         body: Path | None,
         camera: Path | None,
-        pose_source: PoseSource | None = None,
+        pose_source: PoseSource | None,
     ) -> None:
         if body is not None and camera is None:
             raise ConfigError(

@@ -77,12 +77,12 @@ class DiscModel(PosedModel):
         shading: bool,
         lamps: int,
         self_shadow: bool,
-        scene_network: bool = False,
-        camera: Camera | None = None,
-        residual: PoseCorrection | None = None,
-        residual_start: float = 0.0,
-        deformation_start: float | None = None,
-        deformation_freedom: float = 1.0,
+        scene_network: bool,
+        camera: Camera | None,
+        residual: PoseCorrection | None,
+        residual_start: float,
+        deformation_start: float | None,
+        deformation_freedom: float,
     ) -> None:
         """Start at ``gaussians``, whose colours are their own.
 

@@ -248,7 +248,7 @@ class PoseDeformation(BodyBox):
         *,
         width: int,
         feature_dim: int,
-        last_std: float | None = 1e-3,
+        last_std: float | None,
     ) -> None:
         """``feature_dim`` values for a colour network; ``last_std`` as in `NonRigidNetwork`."""
         super().__init__(body)
