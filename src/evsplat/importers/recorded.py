@@ -309,8 +309,8 @@ def _refuse_turned(
         raise DataError(
             f"{path}: its events agree with the changes of the pictures only if they were {words} "
             f"(correlation {correlation:.2f}, at an offset of {offset_us:.0f} us); write them anew "
-            "that way (evsplat convert --invert, --homography: docs/event-formats.md), or the "
-            "pictures."
+            "that way by 'evsplat convert --invert' or 'evsplat convert --homography' "
+            "(docs/event-formats.md), or the pictures."
         )
 
 
