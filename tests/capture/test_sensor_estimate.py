@@ -115,7 +115,9 @@ def test_a_stall_between_the_pairs_that_are_compared_is_found_once(
     rng = np.random.default_rng()
     drawn = (
         (tiny_capture(str(seed), frames=30, width=96, height=72, seed=int(seed)), int(first))
-        for seed, first in zip(rng.integers(10_000, size=30), rng.choice([11, 21], 30), strict=True)
+        for seed, first in zip(
+            rng.integers(10_000, size=300), rng.choice([11, 21], 300), strict=True
+        )
     )
     path, first = next(one for one in drawn if changes_much(one[0], one[1], one[1] + 1))
     assert lost_events(seen(path)) == Lost()

@@ -63,7 +63,7 @@ def test_of_events_without_polarity_is_told_what_needs_none(
     """That the sensor lost some, and that they lie elsewhere; not which way, which they hide."""
     drawn = (
         tiny_capture(str(seed), frames=12, width=96, height=72, seed=int(seed))
-        for seed in np.random.default_rng().integers(10_000, size=30)
+        for seed in np.random.default_rng().integers(10_000, size=300)
     )
     path = next(one for one in drawn if changes_much(one, 5, 6))
     with h5py.File(path / "events.h5") as file:
