@@ -4,3 +4,8 @@
 def counted(number: float, noun: str) -> str:
     """A number with its noun, such as "1 frame" and "2.5 frames"."""
     return f"{number:.15g} {noun}" + ("s" if number != 1 else "")
+
+
+def begun(words: str) -> str:
+    """Words, at least a letter of them, as a sentence begins."""
+    return words[0].upper() + words[1:]

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from evsplat.errors import DataError
+from evsplat.wording import begun
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def reason_and_remedy(error: DataError, file: Path) -> tuple[str, str]:
     reason, mark, remedy = str(error).removeprefix(f"{file}: ").rpartition("; ")
     if not mark:
         return remedy, ""
-    return reason, f"{remedy[0].upper()}{remedy[1:]}"
+    return reason, begun(remedy)
 
 
 def nearest(key: str, known: tuple[str, ...]) -> str:

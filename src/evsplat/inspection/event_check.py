@@ -20,6 +20,7 @@ from evsplat.capture.finding import Finding, Findings
 from evsplat.capture.sensor_estimate import frame_pairs
 from evsplat.commands import command
 from evsplat.events import EventStore
+from evsplat.wording import begun
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +74,7 @@ def check_events(capture: TrainingCapture, homography: Path | None = None) -> Ev
         findings.warning(
             events.path, _WHICH_WAY[bool(other_way.turned)],
             str(other_way), "events in the pixels of the frames, 1 where it grows brighter",
-            _sentence(_way_there(capture, events, other_way, homography)),
+            begun(_way_there(capture, events, other_way, homography)),
         )  # fmt: skip
     asked = signed and not sign and other_way is None
     beside = estimate_placement(pairs, events) if asked else None
@@ -132,10 +133,6 @@ def _way_there(
     new = events.path.with_name("moved.h5")
     convert = command("convert", events.path, new, *options)
     return f"bring them there: {convert} && {shlex.join(['mv', str(new), str(events.path)])}"
-
-
-def _sentence(words: str) -> str:
-    return words[0].upper() + words[1:]
 
 
 def _tell_lost(findings: Findings, events: EventStore, lost: Lost) -> None:

@@ -18,6 +18,7 @@ from evsplat.evaluation.tables import (
     without_truth,
 )
 from evsplat.pages import folded, section
+from evsplat.wording import begun
 
 _REFERENCES = {"trivial": "the best trivial row", "camera": "the camera’s own blurry picture"}
 
@@ -27,7 +28,7 @@ def figures(source: Source) -> str:
     metrics = source.metrics
     why = no_test_figures(metrics)
     if why is not None:
-        return section("Figures", why[0].upper() + why[1:], "")
+        return section("Figures", begun(why), "")
     first, *others = tables_of(metrics)
     compat = "".join(folded(table.title, _with_note(table)) for table in others)
     remarks = [*metrics.get("remarks", ()), *missing_networks(metrics)]

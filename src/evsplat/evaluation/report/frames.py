@@ -28,6 +28,7 @@ from evsplat.pictures import to_bytes
 from evsplat.pictures.box import Box
 from evsplat.pictures.colours import ERROR_FULL_SCALE, css_gradient
 from evsplat.spread import evenly_spread
+from evsplat.wording import begun
 
 _WORTH_ENLARGING = 0.8
 """Crops wider than this share of the picture show nothing new."""
@@ -56,7 +57,7 @@ def test_frames(source: Source) -> str:
     words = words_of(source.metrics)
     why = no_test_figures(source.metrics)
     if why is not None:
-        return section(words.title, "", f'<p class="note">{why[0].upper()}{why[1:]}</p>')
+        return section(words.title, "", f'<p class="note">{begun(why)}</p>')
     entries = source.metrics["per_frame"]
     # Per frame four pictures and crops of about a third of their area.
     camera = source.capture.camera(entries[0]["frame"])
