@@ -20,7 +20,7 @@ import numpy as np
 
 import evsplat as ev
 from evsplat.benching.drawn import Draw, drawn_settings
-from evsplat.calibration.offset import BlockLevels, OffsetEstimate, estimate_offset
+from evsplat.calibration.offset import BlockChanges, OffsetEstimate, estimate_offset
 from evsplat.capture import Capture, load_capture
 from evsplat.capture.metadata import Frame
 from evsplat.events import EventStream
@@ -67,7 +67,7 @@ def part_of(length: int, least: float, rng: np.random.Generator) -> tuple[int, i
 
 def search(capture: Capture, frames: Sequence[Frame], events: EventStream) -> OffsetEstimate | None:
     """The offset of ``events`` among these frames of a capture."""
-    levels = BlockLevels(capture.transfer(frames[0]))
+    levels = BlockChanges(capture.transfer(frames[0]))
     for frame in frames:
         levels.add(capture.image(frame), frame.exposure_us)
     camera = capture.camera(frames[0])

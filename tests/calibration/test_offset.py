@@ -1,12 +1,16 @@
 """Offsets of any length between two clocks, of a light that wanders through the picture."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 
 from evsplat.calibration import offset
-from evsplat.calibration.offset import BlockLevels, OffsetEstimate, TooLong, estimate_offset
-from evsplat.events import EventStream
+from evsplat.calibration.brightness import level_steps
+from evsplat.calibration.offset import BlockChanges, OffsetEstimate, TooLong, estimate_offset
+from evsplat.events import EventStream, open_recording
+from evsplat.pictures.files import to_unit_range
 
 HEIGHT, WIDTH = 24, 36
 STEP_US, PERIOD_US, EXPOSURE_US = 1_000, 40_000, 25_000
@@ -32,19 +36,27 @@ def logarithms(places: np.ndarray) -> np.ndarray:
     return np.log(0.08 + 0.7 * np.exp(-np.array(squares) / 18))
 
 
-def seen(light: np.ndarray, first: int, count: int) -> BlockLevels:
-    """The frames from one on, each the mean of the light in its exposure."""
-    levels = BlockLevels("linear")
+def seen(
+    light: np.ndarray,
+    first: int,
+    count: int,
+    read: Callable[[np.ndarray], np.ndarray] = lambda frame: frame,
+) -> BlockChanges:
+    """The frames from one on, each the mean of the light in its exposure, as ``read`` by a chip."""
+    levels = BlockChanges("linear")
     for start in range(first * PERIOD_US, (first + count) * PERIOD_US, PERIOD_US):
         part = light[start // STEP_US : (start + EXPOSURE_US) // STEP_US]
-        image = torch.from_numpy(np.exp(part).mean(0)).float()
+        image = torch.from_numpy(read(np.exp(part).mean(0))).float()
         levels.add(image, (start, start + EXPOSURE_US))
     return levels
 
 
 def sent(light: np.ndarray, first_us: int = 0) -> EventStream:
-    """An event at each whole threshold that a pixel passes."""
-    steps = np.diff(np.floor((light - light[0]) / THRESHOLD + 0.5), axis=0).astype(int)
+    """An event at each whole threshold that a pixel passes since its last one."""
+    level, steps = light[0].copy(), np.zeros((len(light) - 1, *light.shape[1:]), int)
+    for step, now in zip(steps, light[1:], strict=True):
+        step[:] = np.trunc((now - level) / THRESHOLD)
+        level += THRESHOLD * step
     time, y, x = np.nonzero(steps)
     repeats = np.abs(steps[time, y, x])
     t = np.repeat(first_us + STEP_US * (time + 1), repeats)
@@ -52,7 +64,7 @@ def sent(light: np.ndarray, first_us: int = 0) -> EventStream:
     return EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
 
 
-def found(levels: BlockLevels, *events: EventStream) -> OffsetEstimate:
+def found(levels: BlockChanges, *events: EventStream) -> OffsetEstimate:
     estimate = estimate_offset(levels, events, (WIDTH, HEIGHT))
     assert estimate is not None
     return estimate
@@ -90,6 +102,50 @@ def test_noise_of_one_sign_changes_little() -> None:
     estimate = found(levels, noisy)
     assert estimate.is_certain and abs(estimate.offset_us) < 3_000
     assert estimate.correlation > found(levels, clean).correlation - 0.1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_of_dark_places_does_not_outweigh_what_moves(seed) -> None:
+    """As of a sensor that stores light: one step of 8 bits is a quarter of what is dark there."""
+    light, rng = logarithms(path(seed, 60 * PERIOD_US)), np.random.default_rng(seed)
+    events = sent(light)
+    dark = np.where(X < WIDTH // 3, np.log(0.004), light)
+
+    def read(frame: np.ndarray) -> np.ndarray:
+        noisy = frame + rng.normal(0, 0.006, frame.shape)
+        return np.round(255 * noisy.clip(0, 1)) / 255
+
+    estimate = found(seen(dark, 0, 60, read), events.take(events.x >= WIDTH // 3))
+    assert estimate.is_certain and estimate.correlation > 0.95
+    assert abs(estimate.offset_us) < 3_000
+
+
+def test_a_street_with_cars_is_on_the_clock_that_its_description_says(recordings_root) -> None:
+    recording = open_recording(recordings_root / "davis346.aedat4")
+    changes = BlockChanges("linear")
+    for frame in recording.frames():
+        changes.add(to_unit_range(frame.image), frame.exposure_us)
+    estimate = estimate_offset(changes, recording.chunks(), (346, 260))
+    assert estimate is not None and estimate.is_certain
+    assert estimate.offset_us == pytest.approx(-5_000, abs=2_000)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_levels_of_a_recording_in_pieces_are_those_of_the_whole(seed) -> None:
+    rng = np.random.default_rng(seed)
+    pixel, brighter = rng.integers(0, 5, 200), rng.random(200) < 0.5
+    last = np.zeros(5)
+    pieces = [
+        level_steps(pixel[part], brighter[part], last)
+        for part in (slice(0, 3), slice(3, 3), slice(3, 120), slice(120, None))
+    ]
+    assert (np.concatenate(pieces) == level_steps(pixel, brighter)).all()
+    assert level_steps(np.array([4, 4, 1, 4]), np.array([1, 1, 0, 0]) > 0).tolist() == [
+        1.5,
+        1.0,
+        -1.5,
+        -2.0,
+    ]
 
 
 def vars_of(events: EventStream) -> tuple[np.ndarray, ...]:

@@ -195,6 +195,24 @@ def test_frames_are_chosen_by_number_and_by_subject(tmp_path: Path, models: Path
     assert capture.provenance["frames"] == [2, 5]
 
 
+@pytest.mark.parametrize(
+    ("kind", "written", "frames"),
+    [
+        ("mmhpsd", lambda root: trees.write_mmhpsd_raw(root, signed=True), (2, 5)),
+        ("neuman", trees.write_neuman, (2, 5)),
+        ("zju-mocap-blur", lambda root: trees.write_zju_blur(root, unit=1.0), (6, 19)),
+    ],
+)
+def test_the_provenance_says_which_frames_were_taken(
+    tmp_path: Path, kind: str, written, frames: tuple[int, int]
+) -> None:
+    source = tmp_path / "377"
+    written(source)
+    source = source / trees.ACTION if kind == "mmhpsd" else source
+    capture = run(kind, source, tmp_path / "out", frames=frames)
+    assert capture.provenance["frames"] == list(frames)
+
+
 @pytest.mark.parametrize("shrink", [1, 4])
 def test_mmhpsd_raw_with_signed_events(tmp_path: Path, models: Path, shrink: int) -> None:
     files = trees.write_mmhpsd_raw(tmp_path / "data", signed=True)

@@ -100,6 +100,7 @@ def test_a_part_of_a_davis_recording_begins_with_its_first_frame(
     capture = run("davis", davis, tmp_path / "out", frames=(4, 9), focal=55.0, transfer="power")
     assert [frame.name for frame in capture.frames] == [f"{i:06d}" for i in range(4, 9)]
     assert capture.frames[0].exposure_us == (0, EXPOSURE_US)
+    assert capture.provenance["frames"] == [4, 9]
     begin, end = 3_000 + 4 * PERIOD_US, 3_000 + 8 * PERIOD_US + EXPOSURE_US
     assert capture.events is not None
     assert len(capture.events) == len(some_events(0).between(begin, end))
@@ -196,6 +197,14 @@ def test_a_davis_whose_events_have_a_clock_of_their_own_is_brought_onto_that_of_
     first, last = part.events.time_range_us
     assert start == 0 and start <= first < start + PERIOD_US and end - PERIOD_US < last <= end
     assert part.clock_offset_us == pytest.approx(expected_us, abs=PERIOD_US / 2)
+
+
+def test_a_davis_whose_offset_is_not_found_is_told_that_it_needs_none(
+    davis: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match="at no offset .*leave --clock-offset-us out, as a sensor"):
+        import_capture("davis", davis, tmp_path / "out", clock_offset_us="auto")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_davis_recording_is_made_smaller_as_a_video_is(davis: Path, tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ class PairEvents:
         self._t = near.t[kept]
         self._brighter = near.p[kept] > 0
         pixels, self._pixel = np.unique(pixel[kept], return_inverse=True)
-        self._steps = _level_steps(self._pixel, self._brighter)
+        self._steps = level_steps(self._pixel, self._brighter)
         self.change: Float[np.ndarray, K] = pair.change.reshape(-1)[pixels].astype(np.float64)
         self.usable: Bool[np.ndarray, K] = pair.usable.reshape(-1)[pixels]
 
@@ -175,7 +175,7 @@ class PairEvents:
         return plus, np.bincount(pixel, weight, len(self.change)) - plus
 
     def level_change(self, lag_us: float) -> tuple[Float[np.ndarray, "K"], Bool[np.ndarray, "K"]]:
-        """Change of the most likely level in thresholds (`_level_steps`); who has any event."""
+        """Change of the most likely level in thresholds (`level_steps`); who has any event."""
         within, weight = self._weights(lag_us)
         pixel, count = self._pixel[within], len(self.change)
         level = np.bincount(pixel, weight * self._steps[within], count)
@@ -189,8 +189,10 @@ class PairEvents:
         return within, pair.weights(t)
 
 
-def _level_steps(
-    pixel: Int64[np.ndarray, "N"], brighter: Bool[np.ndarray, "N"]
+def level_steps(
+    pixel: Int64[np.ndarray, "N"],
+    brighter: Bool[np.ndarray, "N"],
+    last: Float[np.ndarray, "P"] | None = None,
 ) -> Float[np.ndarray, "N"]:
     """Thresholds by which each event lifts the most likely level.
 
@@ -199,13 +201,19 @@ def _level_steps(
     would always be late. So an event with the polarity of its pixel's last one counts 1, and one
     of the other polarity takes back the half threshold of the last and adds its own. What was
     before the first is not known: it counts one and a half.
+
+    Of a recording that is read in pieces ``last`` has the polarity of every pixel's last event, 0
+    before the first; it is brought up to date.
     """
     order = np.argsort(pixel, kind="stable")
-    sign = np.where(brighter[order], 1.0, -1.0)
-    last = np.zeros(len(sign))
-    last[1:] = np.where(np.diff(pixel[order]) == 0, sign[:-1], 0.0)
+    sign, place = np.where(brighter[order], 1.0, -1.0), pixel[order]
+    goes_on = np.diff(place, prepend=-1) == 0
+    before = np.concatenate([[0.0], sign])[:-1]
+    before = np.where(goes_on, before, 0.0 if last is None else last[place])
+    if last is not None:
+        last[place] = sign  # of several events at a pixel numpy keeps the one assigned last
     steps = np.empty(len(sign))
-    steps[order] = sign + 0.5 * (sign - last)
+    steps[order] = sign + 0.5 * (sign - before)
     return steps
 
 

@@ -4,18 +4,19 @@
 both recorded the same. Frames and events are compared in a coarse grid of blocks, at all offsets.
 """
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
-from evsplat.calibration.brightness import exposure, pair_indices
+from evsplat.calibration.brightness import SHORTEST_GAP_US, exposure, level_steps
 from evsplat.calibration.peak import top_near
 from evsplat.events import EventStream
-from evsplat.pictures.light import Transfer
+from evsplat.pictures.light import Transfer, decode
+from evsplat.spread import evenly_spread
 
 LEAST_CORRELATION = 0.5
 """Frames and events that agree less may be of two recordings."""
@@ -28,8 +29,12 @@ _BLOCKS = 12
 _MOST_PAIRS = 120
 _STEPS_PER_GAP = 16
 _LEAST_STEP_US = 1_000
-_DARK = math.log(1e-3)
-"""Noise decides how much darker than this a pixel seems, in frames as in events."""
+_ROUNDING = 0.1
+"""Change of log luminance by which one step of 8 bits moves the darkest pixels that are told apart:
+such that are darker count as if they were no darker."""
+_LEAST_CHANGE = 1.5 * _ROUNDING
+"""Smaller changes of a pixel count as none. Most are noise of the picture, which outweighs what
+moves where most of it stands; and an event comes of a whole threshold alone."""
 _LAGS_AT_ONCE = 2_048
 
 
@@ -53,31 +58,37 @@ class OffsetEstimate:
         return self.correlation >= LEAST_CORRELATION and self.rival < RIVAL * self.correlation
 
 
-class BlockLevels:
-    """Brightness of frames in blocks, gathered one frame at a time."""
+class BlockChanges:
+    """How blocks change from frame to frame, gathered one frame at a time, ascending in time."""
 
     def __init__(self, transfer: Transfer) -> None:
-        self._transfer = transfer
-        self._levels: list[Float[np.ndarray, " B"]] = []
-        self.spans_us: list[tuple[int, int]] = []
+        self._transfer: Transfer = transfer
+        self._darkest = _darkest(transfer)
+        self._before: tuple[Float[np.ndarray, "H W"], tuple[int, int]] | None = None
+        self.changes: list[Float[np.ndarray, " B"]] = []
+        """Mean change of log luminance in each block, of each pair of frames."""
+        self.spans_us: list[tuple[tuple[int, int], tuple[int, int]]] = []
+        """Exposures of both frames of each pair."""
 
     def add(self, image: Float[Tensor, "..."], span_us: tuple[int, int]) -> None:
-        """A picture (H, W) or (H, W, 3) of coded values in [0, 1] and its exposure."""
-        seen = exposure(image, span_us, transfer=self._transfer)
-        rows, columns, count = _grid(*seen.log_luminance.shape)
-        block = rows[:, None] * count + columns
-        light = np.maximum(seen.log_luminance, _DARK)
-        self._levels.append(np.bincount(block.ravel(), light.ravel()) / np.bincount(block.ravel()))
-        self.spans_us.append(span_us)
+        """A picture (H, W) or (H, W, 3) of coded values in [0, 1] and its exposure.
 
-    @property
-    def levels(self) -> Float[np.ndarray, "N B"]:
-        """Mean of the logarithm of luminance."""
-        return np.array(self._levels)
+        One less than `SHORTEST_GAP_US` after the last that was taken is passed over.
+        """
+        if self._before is not None and sum(span_us) - sum(self._before[1]) < 2 * SHORTEST_GAP_US:
+            return
+        seen = exposure(image, span_us, transfer=self._transfer).log_luminance
+        light = np.maximum(seen, self._darkest)
+        if self._before is not None:
+            change = light - self._before[0]
+            change[np.abs(change) < _LEAST_CHANGE] = 0.0
+            self.changes.append(block_means(change))
+            self.spans_us.append((self._before[1], span_us))
+        self._before = light, span_us
 
 
 def estimate_offset(
-    frames: BlockLevels, events: Iterable[EventStream], size: tuple[int, int]
+    frames: BlockChanges, events: Iterable[EventStream], size: tuple[int, int]
 ) -> OffsetEstimate | None:
     """The offset at which what events add up to correlates best with how frames change.
 
@@ -88,19 +99,19 @@ def estimate_offset(
     Raises:
         TooLong: The recording is longer than `LONGEST_S`.
     """
-    pairs = pair_indices(frames.spans_us, _MOST_PAIRS)
+    pairs = evenly_spread(range(len(frames.changes)), _MOST_PAIRS)
     if not pairs:
         return None
-    spans = np.array(frames.spans_us, dtype=np.int64)
-    gap_us = float(np.median([spans[j].mean() - spans[i].mean() for i, j in pairs]))
+    spans = np.array(frames.spans_us, dtype=np.int64)[pairs]
+    gap_us = float(np.median(spans[:, 1].mean(-1) - spans[:, 0].mean(-1)))
     step_us = max(_LEAST_STEP_US, round(gap_us / _STEPS_PER_GAP))
     level, first_us = _summed(events, size, step_us)
     if not len(level):
         return None
-    changes = frames.levels[[j for _, j in pairs]] - frames.levels[[i for i, _ in pairs]]
-    begin_us = int(spans[pairs[0][0], 0])
-    starts = np.round((spans[:, 0] - begin_us) / step_us).astype(int)[np.array(pairs)]
-    exposed = _exposed(level, float(np.median(spans[:, 1] - spans[:, 0])) / step_us)
+    changes = np.array(frames.changes)[pairs]
+    begin_us = int(spans[0, 0, 0])
+    starts = np.round((spans[..., 0] - begin_us) / step_us).astype(int)
+    exposed = _exposed(level, float(np.median(spans[..., 1] - spans[..., 0])) / step_us)
     first_lag = -int(starts[:, 1].max())
     score = _scores(exposed, changes, starts, first_lag, len(exposed))
     if not (score > 0).any():
@@ -118,12 +129,29 @@ def _grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray, int]:
     return np.arange(height) // side, np.arange(width) // side, -(-width // side)
 
 
+def block_means(pixels: Float[np.ndarray, "H W"]) -> Float[np.ndarray, " B"]:
+    """Mean over the pixels of each block."""
+    rows, columns, count = _grid(*pixels.shape)
+    block = (rows[:, None] * count + columns).ravel()
+    return np.bincount(block, pixels.ravel()) / np.bincount(block)
+
+
+def _darkest(transfer: Transfer) -> float:
+    """Logarithm of the least light at which one step of 8 bits changes it by `_ROUNDING`."""
+    light = torch.log(decode(torch.arange(1, 256, dtype=torch.float64) / 255, transfer))
+    return float(light[int(torch.argmax((light.diff() <= _ROUNDING).int()))])
+
+
 def _summed(
     events: Iterable[EventStream], size: tuple[int, int], step_us: int
 ) -> tuple[Float32[np.ndarray, "T B"], int]:
-    """Sum of polarities in each block up to the end of each step, and the first one's start."""
+    """Sum of the pixels' levels in each block at the end of each step, and the first one's start.
+
+    Levels are in thresholds, the most likely ones after each event (`level_steps`).
+    """
     rows, columns, count = _grid(size[1], size[0])
     blocks = (rows[-1] + 1) * count
+    last = np.zeros(size[0] * size[1])
     pieces: list[tuple[int, np.ndarray]] = []
     first_us = 0
     for piece in events:
@@ -137,8 +165,9 @@ def _summed(
             )
         start = int(step[0])
         place = (step - start) * blocks + rows[piece.y] * count + columns[piece.x]
-        weights = np.where(np.asarray(piece.p) > 0, 1.0, -1.0)
-        sums = np.bincount(place, weights, minlength=(int(step[-1]) - start + 1) * blocks)
+        pixel = piece.y.astype(np.int64) * size[0] + piece.x
+        lifted = level_steps(pixel, np.asarray(piece.p) > 0, last)
+        sums = np.bincount(place, lifted, minlength=(int(step[-1]) - start + 1) * blocks)
         pieces.append((start, sums.reshape(-1, blocks).astype(np.float32)))
     total = np.zeros((max((s + len(a) for s, a in pieces), default=0), blocks), np.float32)
     for start, sums in pieces:

@@ -90,7 +90,7 @@ class Davis(Importer):
             contrast=self.contrast,
             exposed_only=self.frames is not None,
             shrink=self.shrink,
-            unit_is_known=True,
+            one_file=True,
         )
         notes = [*recording.notes, *notes, *large_pictures(small), *([guessed] if guessed else [])]
         writer.provenance |= {
@@ -98,6 +98,7 @@ class Davis(Importer):
             "focal": focal,
             "started_us": begin,
             "notes": notes,
+            "frames": [kept[0], kept[-1] + 1],
             "shrink": self.shrink,
         }
         writer.leave_out_body()

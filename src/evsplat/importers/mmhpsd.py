@@ -85,6 +85,7 @@ class Mmhpsd(Importer):
             "source": "MMHPSD",
             "layout": layout.name,
             "sequence": layout.action,
+            "frames": [kept[0], kept[-1] + 1],
             "shrink": self.shrink,
             "fps_nominal": self.fps,
             "event_duty": self.event_duty,

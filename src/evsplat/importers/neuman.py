@@ -95,6 +95,7 @@ class Neuman(Importer):
         writer.provenance |= {
             "source": "NeuMan",
             "sequence": source.resolve().name,
+            "frames": [kept[0], kept[-1] + 1],
             "shrink": self.shrink,
             "fps_nominal": self.fps,
             "colmap_units_per_metre": scale,

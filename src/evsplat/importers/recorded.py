@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from evsplat.calibration.offset import LEAST_CORRELATION, BlockLevels, TooLong, estimate_offset
+from evsplat.calibration.offset import LEAST_CORRELATION, BlockChanges, TooLong, estimate_offset
 from evsplat.capture.camera_file import read_camera
 from evsplat.capture.write import CaptureWriter
 from evsplat.commands import command
@@ -82,13 +82,13 @@ def large_pictures(size: tuple[int, int]) -> list[str]:
 
 def offset_or_levels(
     clock_offset_us: int | Literal["auto"], camera: dict[str, Any]
-) -> int | BlockLevels:
+) -> int | BlockChanges:
     """The clock's offset; where it is to be found, what is to be gathered of the frames for it."""
     if not isinstance(clock_offset_us, str):
         return clock_offset_us
     if clock_offset_us != "auto":
         raise ConfigError(f"--clock-offset-us {clock_offset_us}: expected microseconds or auto.")
-    return BlockLevels(camera.get("transfer", "power"))
+    return BlockChanges(camera.get("transfer", "power"))
 
 
 def pictures_of(footage: Footage, wanted: Sequence[int]) -> Iterator[tuple[int, TimedPicture]]:
@@ -104,7 +104,7 @@ def add_recorded_frame(
     writer: CaptureWriter,
     picture: TimedPicture,
     exposure_us: tuple[int, int],
-    clock_offset: int | BlockLevels,
+    clock_offset: int | BlockChanges,
     *,
     shrink: int = 1,
     mask: Float[np.ndarray, "H W"] | None = None,
@@ -123,7 +123,7 @@ def add_recorded_frame(
         mask=None if mask is None else shrunk(mask, shrink),
         world_to_camera=world_to_camera,
     )
-    if isinstance(clock_offset, BlockLevels):
+    if isinstance(clock_offset, BlockChanges):
         clock_offset.add(to_unit_range(pixels), exposure_us)
 
 
@@ -131,7 +131,7 @@ def add_recorded_events(
     writer: CaptureWriter,
     path: Path | None,
     size: tuple[int, int],
-    clock_offset: int | BlockLevels,
+    clock_offset: int | BlockChanges,
     *,
     contrast: tuple[float, float] | None,
     repair: bool,
@@ -185,7 +185,7 @@ def add_recorded_events(
         contrast=contrast,
         exposed_only=exposed_only,
         shrink=shrink,
-        unit_is_known=False,
+        one_file=False,
     )
     # Repairs are known once the events have been read.
     return [*(recording.notes if mover is None else mover.notes(recording)), *notes]
@@ -196,20 +196,21 @@ def write_recorded_events(
     pieces: Callable[[], Iterable[EventStream]],
     path: Path,
     size: tuple[int, int],
-    clock_offset: int | BlockLevels,
+    clock_offset: int | BlockChanges,
     *,
     contrast: tuple[float, float] | None,
     exposed_only: bool,
     shrink: int,
-    unit_is_known: bool,
+    one_file: bool,
 ) -> list[str]:
     """Write the events of ``path``, which ``pieces`` gives anew each time; gives notes.
 
-    The rest is as of `add_recorded_events`. ``unit_is_known``: the format says that of the times.
+    The rest is as of `add_recorded_events`. ``one_file``: the pictures are in it as well, on
+    one clock, and the format says the unit of its times.
     """
     passed, notes = _Passed(), []
-    if isinstance(clock_offset, BlockLevels):
-        clock_offset, note = _found_offset(clock_offset, pieces, path, size)
+    if isinstance(clock_offset, BlockChanges):
+        clock_offset, note = _found_offset(clock_offset, pieces, path, size, one_file=one_file)
         notes.append(note)
     start, end = (time - clock_offset for time in writer.exposed_us)
     shrunken = passed.watching(_shrunk_events(pieces(), size, shrink))
@@ -221,7 +222,7 @@ def write_recorded_events(
         simulated=False,
         clock_offset_us=clock_offset,
     )
-    return notes + passed.notes(path, writer.exposed_us, clock_offset, unit_is_known=unit_is_known)
+    return notes + passed.notes(path, writer.exposed_us, clock_offset, one_file=one_file)
 
 
 def _shrunk_events(
@@ -242,10 +243,12 @@ def _shrunk_contrast(contrast: tuple[float, float], factor: int) -> tuple[float,
 
 
 def _found_offset(
-    levels: BlockLevels,
+    levels: BlockChanges,
     pieces: Callable[[], Iterable[EventStream]],
     path: Path,
     size: tuple[int, int],
+    *,
+    one_file: bool,
 ) -> tuple[int, str]:
     """The offset of the events' clock, us, and a note of it; raises where it is not certain."""
     try:
@@ -253,6 +256,8 @@ def _found_offset(
     except TooLong as error:
         raise DataError(f"{path}: {error}; cut it, or give --clock-offset-us US.") from None
     give = "give --clock-offset-us US, or film more that moves"
+    if one_file:
+        give = "leave --clock-offset-us out, as a sensor has one clock for both; or " + give
     if found is None or not found.is_certain:
         _refuse_turned(levels, pieces, path, size)
     if found is None or found.correlation < LEAST_CORRELATION:
@@ -276,7 +281,7 @@ def _found_offset(
 
 
 def _refuse_turned(
-    levels: BlockLevels,
+    levels: BlockChanges,
     pieces: Callable[[], Iterable[EventStream]],
     path: Path,
     size: tuple[int, int],
@@ -334,7 +339,7 @@ class _Passed:
             yield piece
 
     def notes(
-        self, path: Path, exposed_us: tuple[int, int], offset_us: int, *, unit_is_known: bool
+        self, path: Path, exposed_us: tuple[int, int], offset_us: int, *, one_file: bool
     ) -> list[str]:
         """What is odd about them; raises where none is at the time of a picture."""
         if not self.count:
@@ -348,7 +353,7 @@ class _Passed:
             raise DataError(
                 f"{path}: its events are {times}, expected events while there are pictures; give "
                 "--clock-offset-us auto, which finds the offset"
-                + ("." if unit_is_known else f", or the unit of their times with {SAY_UNIT}.")
+                + ("." if one_file else f", or the unit of their times with {SAY_UNIT}.")
             )
         notes, unit = [], f"the unit of the times ({SAY_UNIT})"
         covered = (min(last, end) - max(first, start)) / (end - start)
@@ -356,7 +361,7 @@ class _Passed:
             notes.append(
                 f"events: {path.name} covers {covered:.1%} of the pictures' time (it is {times}); "
                 "check the clock (--clock-offset-us auto finds its offset)"
-                + ("" if unit_is_known else f", the rate of the pictures and {unit}")
+                + ("" if one_file else f", the rate of the pictures and {unit}")
             )
         if self.count >= _MANY and self.brighter in (0, self.count):
             sign = "brighter" if self.brighter else "darker"

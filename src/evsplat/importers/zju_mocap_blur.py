@@ -70,7 +70,8 @@ class ZjuMocapBlur(Importer):
         }
         cameras[first].add_to(writer, "main", frames[first], self.shrink, transfer="linear")
         exposure_us, sub_frames = _exposure(list(moments), list(moments.values()), unit)
-        kept = {pictures[n].stem for n in chosen_frames(self.frames, list(pictures), source)}
+        numbers = chosen_frames(self.frames, list(pictures), source)
+        kept = {pictures[number].stem for number in numbers}
         moments = {name: time for name, time in moments.items() if name in kept}
         times = []
         for name in tqdm(moments, desc="pictures", unit="frame", leave=False):
@@ -99,6 +100,7 @@ class ZjuMocapBlur(Importer):
         writer.provenance |= {
             "source": "ZJU-MoCap-Blur of ExFMan",
             "sequence": source.resolve().name,
+            "frames": [numbers[0], numbers[-1] + 1],
             "shrink": self.shrink,
             "sub_frames_per_picture": sub_frames,
             "blur": "mean of sub-frames of coded values (not linear light), which therefore count "
