@@ -6,7 +6,7 @@ from typing import Any
 
 from evsplat.errors import DataError
 from evsplat.events.formats import find_format
-from evsplat.events.formats.base import Damage, RecordedFrame, Source
+from evsplat.events.formats.base import Damage, RawEvents, RecordedFrame, Source
 from evsplat.events.formats.checks import checked
 from evsplat.events.stream import EventStream
 from evsplat.options import ReadOptions
@@ -22,8 +22,11 @@ SIZE_UNKNOWN = (
 class EventRecording:
     """A recording on disk. Every pass (`chunks`, `read`, `frames`) reads the file anew."""
 
-    def __init__(self, path: Path, format: str, source: Source, damage: Damage) -> None:
+    def __init__(
+        self, path: Path, format: str, source: Source, damage: Damage, options: ReadOptions
+    ) -> None:
         self.path = path
+        self._skip, self._stop = options.skip, options.stop
         self.format = format
         self.width, self.height = source.width, source.height
         """Columns and rows of the sensor; None where neither the file nor the caller says."""
@@ -45,7 +48,12 @@ class EventRecording:
         """
         self._damage.begin()
         return checked(
-            self._source.blocks(), self._damage, self.width, self.height, self.has_polarity
+            _part_of(self._source.blocks(), self.path, self._skip, self._stop),
+            self._damage,
+            self.width,
+            self.height,
+            self.has_polarity,
+            first=self._skip,
         )
 
     def read(self, start_us: int | None = None, end_us: int | None = None) -> EventStream:
@@ -70,6 +78,31 @@ class EventRecording:
     def frames(self) -> Iterator[RecordedFrame]:
         """Pictures recorded beside the events (AEDAT 3.1 and 4 only), in order of the file."""
         return self._source.frames()
+
+
+def _part_of(
+    blocks: Iterator[RawEvents], path: Path, skip: int, stop: int | None
+) -> Iterator[RawEvents]:
+    """The events of a file from number ``skip`` up to ``stop``; raises where it has none of them.
+
+    An empty recording is left to whoever reads it.
+    """
+    first = 0
+    for block in blocks:
+        end = first + len(block.t)
+        if skip <= first and (stop is None or end <= stop):
+            yield block
+        elif end > skip:
+            part = slice(max(0, skip - first), None if stop is None else stop - first)
+            yield RawEvents(*(column[part] for column in block))
+        first = end
+        if stop is not None and first >= stop:
+            return
+    if skip and first <= skip:
+        raise DataError(
+            f"{path}: holds {first:,} events, expected more than the {skip:,} that are to be left "
+            "out (--skip); give a smaller number."
+        )
 
 
 def open_recording(
@@ -107,7 +140,7 @@ def open_recording(
         raise DataError(f"{path}: its header gives {source.width} x {source.height} pixels.")
     if source.width is None:
         source.notes.append(SIZE_UNKNOWN)
-    return EventRecording(path, found.name, source, damage)
+    return EventRecording(path, found.name, source, damage, options)
 
 
 def read_events(

@@ -29,9 +29,18 @@ class ReadOptions:
     """Columns of the sensor."""
     height: Annotated[int | None, Within(1, 65536), option("PX", default="as the file says")] = None
     """Rows of the sensor."""
+    skip: Annotated[int, AtLeast(0), option("N")] = 0
+    """Leave out so many events at the beginning of the file, as of another recording."""
+    stop: Annotated[int | None, AtLeast(1), option("N", default="the end")] = None
+    """Leave out event N of the file, counted from 0, and all after it."""
 
     def __post_init__(self) -> None:
         check_options(self)
+        if self.stop is not None and self.stop <= self.skip:
+            raise ConfigError(
+                f"--stop {self.stop}: leaves nothing after --skip {self.skip}, expected a number "
+                "above it."
+            )
         if isinstance(self.columns, str):
             object.__setattr__(self, "columns", tuple(self.columns.split(",")))
         elif isinstance(self.columns, Sequence):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evsplat.commands import command
 from evsplat.errors import DataError
 from evsplat.options import ReadOptions
 from evsplat.untrusted.faults import open_bytes
@@ -62,7 +63,7 @@ class Damage:
     details: dict[str, str] = field(default_factory=dict)
     """Of a kind of repair, how bad it was where it was worst."""
     warnings: dict[str, str] = field(default_factory=dict)
-    """Of a kind of repair, why what it makes may be wrong."""
+    """Of a kind of repair, why what it makes may be wrong; or of what needs none, what is odd."""
 
     def begin(self) -> None:
         """Forget what was found: the file is read anew."""
@@ -182,6 +183,12 @@ class ByteReader(ExitStack):
             ) from None
         self.offset += len(data)
         return data
+
+
+def parts_said(path: Path, event: int) -> str:
+    """How the user takes the recording before an event of a file, or that from it on."""
+    first = command("convert", path, "PART.h5", "--stop", str(event))
+    return f"'{first}' keeps the one before, --skip {event} the other"
 
 
 def two_recordings(path: Path, at: int, *, zipped: bool) -> DataError:

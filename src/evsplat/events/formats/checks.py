@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import SAY_UNIT, Damage, RawEvents
+from evsplat.events.formats.base import SAY_UNIT, Damage, RawEvents, parts_said
 from evsplat.events.formats.order import Block, ascending, in_order
 from evsplat.events.stream import EventStream
 
@@ -15,6 +15,8 @@ _COUNTER_RANGES_US = ((1 << 32, 0), (1 << 31, -(1 << 31)), (1 << 31, 0))
 _MIN_BLOCK_EVENTS = 1 << 16
 _MAX_TIME_US = 1 << 60
 _LONGEST_US = 24 * 3600 * 1_000_000
+_SILENCE_US = 10_000_000
+"""Longer times without an event are remarked: sensors have noise, where no filter takes it."""
 
 
 def checked(
@@ -23,14 +25,18 @@ def checked(
     width: int | None,
     height: int | None,
     has_polarity: bool,
+    *,
+    first: int,
 ) -> Iterator[EventStream]:
     """Streams that follow each other in time, as `EventStream` promises.
+
+    ``first`` is the number of the first event in its file.
 
     With ``damage.repair``: times of a counter that wrapped go on rising, disorder within about one
     block is sorted and events later than that, events beside the sensor and events without
     polarity among others that have one are left out. Otherwise the first of these is a `DataError`.
     """
-    settled = _Settled(blocks, damage, width, height, has_polarity)
+    settled = _Settled(blocks, damage, width, height, has_polarity, first)
     ordered = in_order(settled, damage) if damage.repair else ascending(settled, damage)
     return _within_a_day(ordered, damage)
 
@@ -61,8 +67,10 @@ class _Settled:
         width: int | None,
         height: int | None,
         has_polarity: bool,
+        first: int,
     ) -> None:
         self._blocks = blocks
+        self._first = first
         self._damage = damage
         # x and y are kept in 16 bits
         self._limits = (width or 1 << 16, height or 1 << 16)
@@ -70,11 +78,14 @@ class _Settled:
         self._seen_zero = self._seen_negative = self._zeros_as_darker = False
         self._shift_us = 0
         self._last_raw_us: int | None = None
+        self._latest_us: int | None = None
+        self._longest_us = _SILENCE_US
 
     def __iter__(self) -> Iterator[Block]:
-        index = 0
+        index = self._first
         for block in _gathered(self._blocks):
             t, rising = self._unwrapped(block.t.astype(np.int64, copy=False), index)
+            self._remark_silence(t, rising, index)
             p, keep = self._polarity(block.p, index)
             keep = self._on_sensor(block.x, block.y, keep, index)
             x, y = block.x, block.y
@@ -113,6 +124,23 @@ class _Settled:
         shifts = np.cumsum(shifts) + self._shift_us
         self._shift_us = int(shifts[-1])
         return t + shifts, False
+
+    def _remark_silence(self, t: np.ndarray, rising: bool, index: int) -> None:
+        """Warn of the longest time without an event, as between two recordings in a file."""
+        before = int(t[0]) if self._latest_us is None else self._latest_us
+        self._latest_us = max(before, int(t[-1] if rising else t.max()))
+        if self._latest_us - before <= self._longest_us:
+            return
+        latest = np.maximum.accumulate(np.concatenate([[before], t]))
+        silent = np.diff(latest)
+        at = int(silent.argmax())
+        if silent[at] > self._longest_us:
+            self._longest_us = int(silent[at])
+            self._damage.warnings["silence"] = (
+                f"no event comes for {1e-6 * self._longest_us:,.1f} s before event {index + at} at "
+                f"{t[at]} us; unless nothing moved meanwhile, two recordings are in this file: "
+                + parts_said(self._damage.path, index + at)
+            )
 
     def _polarity(self, p: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Polarity +1/-1 (all 0 where there is none), and which events to keep (None: all)."""

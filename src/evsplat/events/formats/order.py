@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
-from evsplat.events.formats.base import BLOCK_EVENTS, Damage
+from evsplat.events.formats.base import BLOCK_EVENTS, Damage, parts_said
 from evsplat.events.stream import EventStream
 
 _SORTS = "sorts events that are out of order"
@@ -14,6 +14,8 @@ _LEAVES_OUT = "leaves out events too late to be sorted in"
 _JUMP_US, _STRETCH_EVENTS = 1_000, 32
 """A clock jumped if it fell by so much and at least so many events follow from there on; sensors
 that are read row by row are out of order by less, and a packet that came late fills a gap."""
+_ANEW_US = 100_000
+"""By which a clock falls that begins anew; packets come late by less."""
 _OWN_ORDER, _SHARED = 0.01, 0.1
 """Shares of those events: of the most that fall again, by a tenth of the jump, as at random
 delays; and of earlier events at the same times, from which on both are mixed."""
@@ -37,11 +39,15 @@ def ascending(blocks: Iterable[Block], damage: Damage) -> Iterator[EventStream]:
             previous = np.concatenate([[block.t[0] if last_us is None else last_us], block.t[:-1]])
             falls = block.t < previous
             at = int(np.argmax(falls))
-            damage.found(
+            found = (
                 f"event {first + at} is at {block.t[at]} us, after one at {previous[at]} us "
-                f"({int(falls.sum())} steps back among events {first} to {first + len(falls) - 1})",
-                repaired_by=_SORTS,
+                f"({int(falls.sum())} steps back among events {first} to {first + len(falls) - 1})"
             )
+            if previous[at] - block.t[at] >= _ANEW_US:
+                found += (
+                    f", as of two recordings in one file: {parts_said(damage.path, first + at)}"
+                )
+            damage.found(found, repaired_by=_SORTS)
         last_us = int(block.t[-1])
         yield block
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import RawEvents, Source, peek
+from evsplat.events.formats.base import RawEvents, Source, parts_said, peek
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
 
@@ -25,6 +25,9 @@ _PACKET_TYPES = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/Even
 _ENCODING = "evt3"
 _PIXEL = [("x", "<u2"), ("y", "<u2")]
 _TIME_AND_POLARITY = [("seconds", "<u4"), ("nanoseconds", "<u4"), ("p", "u1")]
+_LOOP_US, _RENUMBERED = (1 << 24) // 2, 100
+"""Half the loop of EVT 3's counter, the longest time in which it is known how often it went round;
+and by how much the numbers of packets fall where they begin anew, and not where some came late."""
 _ROS1_EVENT = np.dtype([*_PIXEL, *_TIME_AND_POLARITY])
 # ROS 2 aligns each number, not each event: all events but the first begin two bytes after a
 # multiple of four, so that two bytes of padding come before their time and one after them.
@@ -39,6 +42,7 @@ class RosBag(Source):
 
     def read_header(self, options: ReadOptions) -> None:
         """See `Source`."""
+        self._skip = options.skip
         types = _ARRAY_TYPES + _PACKET_TYPES
         with _opened(self.path) as bag:
             topics = {c.topic: c.msgtype for c in bag.connections if c.msgtype in types}
@@ -55,13 +59,28 @@ class RosBag(Source):
 
     def blocks(self) -> Iterator[RawEvents]:
         """One message at a time."""
-        decoder = WordDecoder(_ENCODING, self.damage)
+        decoder, count = WordDecoder(_ENCODING, self.damage), 0
+        before: _Message | None = None
         with _opened(self.path) as bag:
             for number, message in self._messages(bag):
-                if message.encoding:
-                    yield from self._packet(decoder, message, number)
-                else:
+                if not message.encoding:
                     yield _array(message)
+                    continue
+                why = None if before is None else _begins_anew(before, message)
+                if why is not None:
+                    # who wants less has stopped asking before
+                    if self._skip < count:
+                        raise DataError(
+                            f"{self.path}: another recording begins at message {number} of "
+                            f"{self._topic} ({why}), expected one in a bag: "
+                            f"{parts_said(self.path, count)}; give the part that belongs to the "
+                            "pictures."
+                        )
+                    decoder = WordDecoder(_ENCODING, self.damage)
+                before = message
+                for events in self._packet(decoder, message, number):
+                    count += len(events.t)
+                    yield events
 
     def _packet(
         self, decoder: WordDecoder, message: "_Message", number: int
@@ -100,6 +119,23 @@ class _Message:
     events: bytes
     kind: np.dtype
     """Layout of an event of an array."""
+    stamp_us: int
+    """When the driver sent it, by ROS's clock."""
+    packet: int
+    """Number of a packet, by its driver; 0 of an array."""
+
+
+def _begins_anew(before: _Message, after: _Message) -> str | None:
+    """Why a packet cannot be the next one of a recording; None where it may be.
+
+    The counter of the sensor in it says neither that it began again, nor how often it went round.
+    """
+    if after.packet < before.packet - _RENUMBERED:
+        return f"its packets are numbered from {after.packet} after {before.packet}"
+    apart_us = after.stamp_us - before.stamp_us
+    if not -_LOOP_US <= apart_us <= _LOOP_US:
+        return f"it was sent {1e-6 * apart_us:,.1f} s after the one before"
+    return None
 
 
 def _array(message: _Message) -> RawEvents:
@@ -139,8 +175,9 @@ class _Cursor:
 
 def _read_message(data: bytes, is_ros1: bool, is_packet: bool) -> _Message:
     fields = _Cursor(data, is_ros1)
-    for _ in range(3 if is_ros1 else 2):  # sequence number (ROS 1), seconds, nanoseconds
-        fields.number("I")
+    if is_ros1:
+        fields.number("I")  # of the message
+    stamp_us = fields.number("I") * 1_000_000 + fields.number("I") // 1000
     fields.text()
     height, width = fields.number("I"), fields.number("I")
     if not (0 < width <= 1 << 16 and 0 < height <= 1 << 16):
@@ -151,11 +188,13 @@ def _read_message(data: bytes, is_ros1: bool, is_packet: bool) -> _Message:
         events = fields.take(count * kind.itemsize - (0 if is_ros1 or not count else 3))
         if not is_ros1 and count:
             events = events[:4] + bytes(2) + events[4:] + bytes(1)
-        return _Message(width, height, "", events, kind)
-    fields.number("Q"), fields.number("Q")
-    encoding = fields.text()
+        return _Message(width, height, "", events, kind, stamp_us, 0)
+    packet = fields.number("Q")
+    fields.number("Q")  # a base of time, of other encodings
+    encoding = fields.text() or "unknown"
     fields.take(1)
-    return _Message(width, height, encoding or "unknown", fields.take(fields.number("I")), kind)
+    events = fields.take(fields.number("I"))
+    return _Message(width, height, encoding, events, kind, stamp_us, packet)
 
 
 @contextmanager
