@@ -133,6 +133,28 @@ def test_a_gain_that_is_given_is_kept(tiny_capture: Factory, tmp_path: Path) -> 
     assert {frame.gain for frame in kept.frames} == {(0.5, 1.0, 1.0)}
 
 
+@pytest.mark.parametrize("changes", [False, True])
+def test_gains_of_a_camera_that_moves_are_found(tmp_path: Path, changes: bool) -> None:
+    rng = np.random.default_rng(int(changes))
+    wall = np.kron(rng.uniform(0.1, 0.8, (8, 20, 3)), np.ones((8, 8, 1)))
+    gains = 1 - 0.4 * changes * np.linspace(0, 1, 14)
+    with CaptureWriter(tmp_path / "on_the_way", gains=True) as writer:
+        writer.add_camera("main", 96, 64, [[90, 0, 48], [0, 90, 32], [0, 0, 1]])
+        for i, gain in enumerate(gains):
+            pose = np.eye(4)
+            pose[0, 3] = -0.1 * i
+            pixels = np.uint8(255 * encode(torch.from_numpy(gain * wall[:, 3 * i : 3 * i + 96])))
+            writer.add_frame(
+                f"{i:02d}", "main", pixels, (50_000 * i, 50_000 * i + 20_000), world_to_camera=pose
+            )
+        factor = writer.find_gains()
+        writer.leave_out_body()
+    capture = load_capture(tmp_path / "on_the_way", needs_body=False)
+    assert factor == pytest.approx(1 / gains[-1], rel=0.04)
+    for frame, gain in zip(capture.frames, gains / gains[0], strict=True):
+        assert (frame.gain or (1.0,) * 3) == pytest.approx([gain] * 3, rel=0.05)
+
+
 def test_only_a_writer_that_is_asked_to_looks_at_pictures(
     tiny_capture: Factory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -276,14 +276,18 @@ def test_equal_pictures_without_events_between_them_are_of_somebody_who_stands_s
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("longer", [True, False])
+@pytest.mark.parametrize(("longer", "moves"), [(True, False), (False, False), (True, True)])
 @pytest.mark.parametrize("factor", [1.0, 1.3, 4.0])
 def test_pictures_whose_brightness_changes_are_told_and_no_lost_events_are(
-    tiny_capture: Factory, tmp_path: Path, factor: float, longer: bool
+    tiny_capture: Factory, tmp_path: Path, factor: float, longer: bool, moves: bool
 ) -> None:
     """As of a camera that sets its exposure by itself, or of one beside a lamp that goes on."""
     path = tiny_capture(frames=20, width=96, height=72, seed=round(10 * factor))
     document = json.loads((path / "capture.json").read_text())
+    for i, frame in enumerate(document["frames"] if moves else []):
+        frame["world_to_camera"] = np.array(document["cameras"]["main"]["world_to_camera"])
+        frame["world_to_camera"][0, 3] += 1e-3 * i
+        frame["world_to_camera"] = frame["world_to_camera"].tolist()
     for frame in document["frames"][::2]:
         file = path / frame["image"]
         with Image.open(file) as image:
@@ -297,8 +301,9 @@ def test_pictures_whose_brightness_changes_are_told_and_no_lost_events_are(
     told = [finding.found for finding in findings if finding.file.name == "images"]
     assert len(told) == (factor != 1)
     for found in told:
-        stated = re.search(r"three quarters of the scene ([\d.]+) times as bright", found)
-        assert stated and float(stated[1]) == pytest.approx(factor, rel=0.05)
+        stated = re.search(r"(three quarters of )?the scene ([\d.]+) times as bright", found)
+        assert stated and bool(stated[1]) != moves
+        assert float(stated[2]) == pytest.approx(factor, rel=0.05)
         assert ("longer exposures brighter" in found) == longer
     assert not [finding for finding in findings if finding.field == "events/t"]
 

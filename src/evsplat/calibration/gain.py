@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from evsplat.pictures.files import to_unit_range
 from evsplat.pictures.light import Transfer, decode
 
-_DARKEST, _BRIGHTEST = 0.04, 0.98
+DARKEST, BRIGHTEST = 0.04, 0.98
 """Coded values: blocks darker than that in the mean are mostly noise, brighter pixels clipped."""
 _STEADY = 1.02
 """Factor of light between two pictures up to which a camera counts as one of fixed exposure."""
@@ -51,7 +51,7 @@ class GainMeter:
         coded = to_unit_range(pixels.astype(np.float32) if pixels.dtype.kind in "fb" else pixels)
         channels = coded[None] if coded.ndim == 2 else coded.movedim(-1, 0)
         side = math.ceil(max(channels.shape[1:]) / _BLOCKS)
-        usable = (avg_pool2d(channels, side) > _DARKEST) & (max_pool2d(channels, side) < _BRIGHTEST)
+        usable = (avg_pool2d(channels, side) > DARKEST) & (max_pool2d(channels, side) < BRIGHTEST)
         logs = avg_pool2d(decode(channels, transfer), side).log()
         self._logs.append(torch.where(usable, logs, torch.nan).flatten(1))
 
@@ -79,12 +79,24 @@ class GainMeter:
             before, level = level, _changes(logs, logs - level[..., None]).nanmedian(2).values
             if float((level - before).abs().nan_to_num().max()) < _SETTLED:
                 break
-        levels, order = level.double().numpy(), np.arange(len(level))
-        for channel, known in zip(levels.T, told.T.numpy(), strict=True):
-            channel[:] = np.interp(order, order[known], channel[known])
-        brightest = np.quantile(levels, 1 - _BRIGHTER, axis=0, method="lower")
-        gains: Float[np.ndarray, "N C"] = np.exp(levels - brightest)
-        return gains
+        return gains_of_levels(level.double().numpy(), told.numpy())
+
+
+def gains_of_levels(
+    levels: Float[np.ndarray, "N C"], told: Bool[np.ndarray, "N C"]
+) -> Float[np.ndarray, "N C"]:
+    """Gains against the brightest pictures of logarithms of light; between those ``told``."""
+    order = np.arange(len(levels))
+    levels = np.stack(
+        [
+            np.interp(order, order[known], channel[known])
+            for channel, known in zip(levels.T, told.T, strict=True)
+        ],
+        axis=1,
+    )
+    brightest = np.quantile(levels, 1 - _BRIGHTER, axis=0, method="lower")
+    gains: Float[np.ndarray, "N C"] = np.exp(levels - brightest)
+    return gains
 
 
 def common_change(

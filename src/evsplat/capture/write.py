@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from evsplat.body.pose_errors import PoseSource
 from evsplat.calibration.gain import GainMeter
+from evsplat.calibration.moving_gain import MovingGainMeter
 from evsplat.capture.body_file import key_poses, save_arrays, write_body
 from evsplat.capture.parse import FORMAT, VERSION
 from evsplat.capture.parse_frames import default_split
@@ -38,7 +39,7 @@ class CaptureWriter:
     """Builds a capture folder that appears under its name only when it is whole and valid.
 
     A context manager: pictures and events go to a hidden folder beside ``path`` as they come, so
-    that memory grows by no more than a few KB with each picture. When the block ends well, the
+    that memory grows by no more than some 20 KB with each picture. When the block ends well, the
     quick checks of `load_capture` run and the folder is renamed; on an error or Ctrl-C it is
     removed and ``path`` stays as it was.
 
@@ -75,6 +76,7 @@ class CaptureWriter:
         self._folder: Path | None = None
         self._overwrite = overwrite
         self._gains = GainMeter() if gains else None
+        self._moving_gains = MovingGainMeter() if gains else None
         self._making = new_folder(self.path, replace=overwrite)
         self._check_target()
 
@@ -156,7 +158,8 @@ class CaptureWriter:
         index = len(self._frames)
         start, end = exposure_us
         entry: dict[str, Any] = {"name": name, "camera": camera}
-        entry["image"] = self._store(f"images/{name}", camera, image, self._gains)
+        meter = self._gains if world_to_camera is None else self._moving_gains
+        entry["image"] = self._store(f"images/{name}", camera, image, meter)
         entry["exposure_us"] = [int(start), int(end)]
         entry["split"] = split or default_split(index)
         if sharp is True:
@@ -186,22 +189,24 @@ class CaptureWriter:
     def find_gains(self) -> float:
         """Find what light each picture shows against the others, as automatic exposure changes it.
 
-        For one camera that stands still, by what its pictures show of the scene. Gives the factor
-        from the darkest to the brightest picture: 1 where the camera's brightness is one, or where
-        frames were given a gain, and then nothing is written.
+        For one camera, by what its pictures show of the scene; of one that moves each is laid over
+        those before and after it. Gives the factor from the darkest to the brightest picture: 1
+        where the camera's brightness is one, where that cannot be told, or where frames were given
+        a gain, and then nothing is written.
 
         Raises:
             DataError: The writer was not made with ``gains``, so that nothing is known of them.
         """
-        if self._gains is None:
+        meter = self._moving_gains if self.camera_moves else self._gains
+        if meter is None:
             raise DataError(
                 f"{self.path}: the pictures were not looked at as they came; "
                 "use CaptureWriter(..., gains=True) to have their gains found."
             )
         given = any("gain" in frame for frame in self._frames)
         several = len({frame["camera"] for frame in self._frames}) > 1
-        gains = None if given or several or self.camera_moves else self._gains.gains()
-        if gains is None:
+        gains = None if given or several else meter.gains()
+        if gains is None or len(gains) < len(self._frames):
             return 1.0
         for frame, gain in zip(self._frames, gains.round(4).tolist(), strict=True):
             frame["gain"] = gain if len(gain) > 1 else gain[0]
@@ -335,7 +340,7 @@ class CaptureWriter:
         stem: str,
         camera: str,
         image: np.ndarray | Path | str,
-        meter: GainMeter | None = None,
+        meter: GainMeter | MovingGainMeter | None = None,
     ) -> str:
         """Write or copy a picture of a camera, looked at by ``meter``; its path in the capture."""
         if camera not in self._cameras:

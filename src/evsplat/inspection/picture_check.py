@@ -16,14 +16,18 @@ from tqdm import tqdm
 
 from evsplat.calibration import Exposure, exposure
 from evsplat.calibration.gain import LOOKED_AT_PX, QUARTERS, common_change
+from evsplat.calibration.moving_gain import MovingGainMeter
 from evsplat.capture import Frame, TrainingCapture
 from evsplat.capture.finding import Finding, Findings
 from evsplat.pictures.files import to_grey
+from evsplat.spread import evenly_spread
 
 logger = logging.getLogger(__name__)
 
 _LOOKED_AT = 12
 """Frames, spread over the recording."""
+_LOOKED_AT_ON_THE_WAY = 60
+"""Frames of a camera that moves, which have to show much of what the next ones do."""
 _BRIGHT = 0.99
 """Quantile that stands for the brightest of a picture, single lamps and glints left out."""
 _DARK = 1 / 12
@@ -81,16 +85,19 @@ def picture_findings(capture: TrainingCapture) -> list[Finding]:
             "the camera took: of a repeat the person is where they were, and events say that they "
             "moved. Whatever is told of clock and thresholds is wrong until then.",
         )  # fmt: skip
-    elif capture.is_static_camera:
-        light = [
-            exposure(picture, frame.exposure_us, transfer=capture.transfer(frame))
-            for picture, frame in zip(pictures, looked_at, strict=True)
-        ]
-        factor, follows_exposure = _brightness_changes(light)
+    else:
+        if capture.is_static_camera:
+            light = [
+                exposure(picture, frame.exposure_us, transfer=capture.transfer(frame))
+                for picture, frame in zip(pictures, looked_at, strict=True)
+            ]
+            part, (factor, follows_exposure) = "three quarters of ", _brightness_changes(light)
+        else:
+            part, (factor, follows_exposure) = "", _changes_on_the_way(capture)
         if factor > _STEADY:
             findings.warning(
                 folder, "",
-                f"pictures of which some show three quarters of the scene {factor:.2g} times as "
+                f"pictures of which some show {part}the scene {factor:.2g} times as "
                 f"bright as others{', longer exposures brighter' if follows_exposure else ''}",
                 "one brightness of what stands still",
                 "Import the recording again, which gives each picture its gain, or give it in "
@@ -159,6 +166,22 @@ def _brightness_changes(pictures: Sequence[Exposure]) -> tuple[float, bool]:
             continue
         levels.append(float(common_change(*np.quantile((values - usual)[of_use], QUARTERS))))
         exposures_us.append(picture.span_us[1] - picture.span_us[0])
+    return _factor(levels, exposures_us)
+
+
+def _changes_on_the_way(capture: TrainingCapture) -> tuple[float, bool]:
+    """The same of a camera that moves, by pictures laid over those next to them."""
+    frames = evenly_spread(capture.train_frames, _LOOKED_AT_ON_THE_WAY)
+    meter = MovingGainMeter()
+    for frame in tqdm(frames, "pictures", unit="picture", leave=False, disable=None):
+        meter.add(capture.image(frame).numpy(), capture.transfer(frame))
+    gains = meter.gains()
+    levels = [0.0] if gains is None else np.log(gains).mean(1).tolist()
+    return _factor(levels, [frame.exposure_us[1] - frame.exposure_us[0] for frame in frames])
+
+
+def _factor(levels: Sequence[float], exposures_us: Sequence[int]) -> tuple[float, bool]:
+    """From the least to the largest of levels, logarithms; whether they grow with exposures."""
     if len(levels) < 2:
         return 1.0, False
     factor = float(np.exp(max(levels) - min(levels)))
