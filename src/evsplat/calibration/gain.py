@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from evsplat.pictures.files import to_unit_range
 from evsplat.pictures.light import Transfer, decode
 
-DARKEST, BRIGHTEST = 0.04, 0.98
+_DARKEST, BRIGHTEST = 0.04, 0.98
 """Coded values: blocks darker than that in the mean are mostly noise, brighter pixels clipped."""
 _STEADY = 1.02
 """Factor of light between two pictures up to which a camera counts as one of fixed exposure."""
@@ -46,14 +46,8 @@ class GainMeter:
 
     def add(self, pixels: np.ndarray, transfer: Transfer) -> None:
         """The next picture, (H, W) or (H, W, 3), as stored or in [0, 1], by its camera's curve."""
-        step = math.ceil(max(pixels.shape[:2]) / LOOKED_AT_PX)
-        pixels = np.ascontiguousarray(pixels[::step, ::step])
-        coded = to_unit_range(pixels.astype(np.float32) if pixels.dtype.kind in "fb" else pixels)
-        channels = coded[None] if coded.ndim == 2 else coded.movedim(-1, 0)
-        side = math.ceil(max(channels.shape[1:]) / _BLOCKS)
-        usable = (avg_pool2d(channels, side) > DARKEST) & (max_pool2d(channels, side) < BRIGHTEST)
-        logs = avg_pool2d(decode(channels, transfer), side).log()
-        self._logs.append(torch.where(usable, logs, torch.nan).flatten(1))
+        light, usable = light_in_squares(pixels, transfer, _BLOCKS)
+        self._logs.append(torch.where(usable, light.log(), torch.nan).flatten(1))
 
     def gains(self) -> Float[np.ndarray, "N C"] | None:
         """Light of each picture and channel (of grey ones: one) against the brightest pictures.
@@ -80,6 +74,23 @@ class GainMeter:
             if float((level - before).abs().nan_to_num().max()) < _SETTLED:
                 break
         return gains_of_levels(level.double().numpy(), told.numpy())
+
+
+def light_in_squares(
+    pixels: np.ndarray, transfer: Transfer, most: int
+) -> tuple[Float[Tensor, "C h w"], Bool[Tensor, "C h w"]]:
+    """Mean light of each square of a picture, at most so many along its longer side.
+
+    With it, whether the square is neither dark nor clipped anywhere. ``pixels`` are (H, W) or
+    (H, W, 3), as stored or in [0, 1]; of large pictures every n-th row and column is looked at.
+    """
+    step = math.ceil(max(pixels.shape[:2]) / LOOKED_AT_PX)
+    pixels = np.ascontiguousarray(pixels[::step, ::step])
+    coded = to_unit_range(pixels.astype(np.float32) if pixels.dtype.kind in "fb" else pixels)
+    channels = coded[None] if coded.ndim == 2 else coded.movedim(-1, 0)
+    side = math.ceil(max(channels.shape[1:]) / most)
+    usable = (avg_pool2d(channels, side) > _DARKEST) & (max_pool2d(channels, side) < BRIGHTEST)
+    return avg_pool2d(decode(channels, transfer), side), usable
 
 
 def gains_of_levels(

@@ -4,7 +4,6 @@ Pictures near each other in time are laid over each other, and what most of the 
 show change by is the camera's. Parallax and the person are what places differ by beside it.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +13,11 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d
 
-from evsplat.calibration.gain import BRIGHTEST, DARKEST, LOOKED_AT_PX, gains_of_levels
+from evsplat.calibration.gain import BRIGHTEST, gains_of_levels, light_in_squares
 from evsplat.calibration.overlay import back, carried, laid_over, one_after_the_other, unmoved
-from evsplat.pictures.files import to_unit_range
-from evsplat.pictures.light import Transfer, decode
+from evsplat.pictures.light import Transfer
 
 _SIDE = 48
 """Pictures are kept as means over squares, no longer than this."""
@@ -58,13 +56,8 @@ class MovingGainMeter:
 
     def add(self, pixels: np.ndarray, transfer: Transfer) -> None:
         """The next picture, (H, W) or (H, W, 3), as stored or in [0, 1], by its camera's curve."""
-        step = math.ceil(max(pixels.shape[:2]) / LOOKED_AT_PX)
-        pixels = np.ascontiguousarray(pixels[::step, ::step])
-        coded = to_unit_range(pixels.astype(np.float32) if pixels.dtype.kind in "fb" else pixels)
-        channels = coded[None] if coded.ndim == 2 else coded.movedim(-1, 0)
-        side = math.ceil(max(channels.shape[1:]) / _SIDE)
-        usable = (avg_pool2d(channels, side) > DARKEST) & (max_pool2d(channels, side) < BRIGHTEST)
-        self._light.append(avg_pool2d(decode(channels, transfer), side).half())
+        light, usable = light_in_squares(pixels, transfer, _SIDE)
+        self._light.append(light.half())
         self._usable.append(usable)
 
     def gains(self) -> Float[np.ndarray, "N C"] | None:
