@@ -10,7 +10,12 @@ import pytest
 from PIL import Image
 
 from evsplat.errors import DataError
-from evsplat.inspection import inspect, inspect_capture, inspect_recording
+from evsplat.inspection import (
+    inspect,
+    inspect_capture,
+    inspect_recording,
+    warn_of_capture,
+)
 
 Factory = Callable[..., Path]
 
@@ -70,10 +75,12 @@ def test_what_is_no_recording_is_one_error(tmp_path: Path) -> None:
 
 
 def test_a_wrong_clock_offset_is_a_warning_that_says_what_to_try(
-    tiny_capture: Factory, tmp_path: Path
+    tiny_capture: Factory, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tiny_capture(frames=20, width=96, height=72)
     assert inspect_capture(path, tmp_path / "right").findings == ()
+    warn_of_capture(path)
+    assert not any("clock" in record.getMessage() for record in caplog.records)
     document = json.loads((path / "capture.json").read_text())
     document["events"]["clock_offset_us"] = 9_000
     (path / "capture.json").write_text(json.dumps(document))
@@ -81,8 +88,13 @@ def test_a_wrong_clock_offset_is_a_warning_that_says_what_to_try(
     (finding,) = report.findings
     assert report.usable and finding.field == "events.clock_offset_us"
     assert "lag the frames" in finding.found
-    assert abs(int(finding.remedy.strip("Try .").replace(".", ""))) < 3_000
+    tried = re.fullmatch(
+        r"Write (-?\d+) there, or import again with --clock-offset-us (-?\d+)\.", finding.remedy
+    )
+    assert tried is not None and tried[1] == tried[2] and abs(int(tried[1])) < 3_000
     assert f"warning: {finding}" in report.summary
+    warn_of_capture(path)  # as an import does, from training frames alone
+    assert any("found 9000, with which events lag" in r.getMessage() for r in caplog.records)
 
 
 def test_the_davis_recording_is_read_with_its_frames(recordings_root: Path, tmp_path: Path) -> None:

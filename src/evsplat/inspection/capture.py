@@ -131,9 +131,13 @@ def warn_of_capture(path: Path, body_models: Path | None = None) -> None:
     for finding in found:
         if finding.field.startswith("frames"):  # notes of an import speak of events and body
             logger.warning("%s", finding)
-    seen = Capture(metadata).for_training(Policy())
-    warn_of_pictures(seen)
-    warn_of_events(seen)
+    capture = Capture(metadata)
+    seen = capture.for_training(Policy())
+    with shared_pairs(seen):
+        warn_of_pictures(seen)
+        estimate = estimate_sensor(seen) if warn_of_events(seen) else None
+    for finding in clock_findings(capture, estimate):
+        logger.warning("%s", finding)
     try:
         if seen.has_body:
             check_body(seen, refuse=False, body_models=body_models)

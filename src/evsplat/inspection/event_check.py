@@ -183,17 +183,19 @@ def lie_elsewhere(findings: Iterable[Finding]) -> bool:
     return any(finding.field in _WHICH_WAY for finding in findings)
 
 
-def warn_of_events(capture: TrainingCapture, *, thresholds: bool = False) -> None:
+def warn_of_events(capture: TrainingCapture, *, thresholds: bool = False) -> bool:
     """Log what is found about events, before a training that learns from them.
 
     ``thresholds``: whether it takes them by their contrast thresholds, which are told then if they
-    do not fit.
+    do not fit. Gives whether events tell of clock and thresholds, unlike such as lie elsewhere.
     """
     findings = event_findings(capture)
     for finding in findings + flicker_findings(capture):
         logger.warning("%s", finding)
-    if thresholds and not lie_elsewhere(findings):
+    tell = not lie_elsewhere(findings)
+    if thresholds and tell:
         warn_of_contrast(capture, estimate_sensor(capture))
+    return tell
 
 
 def _only_sign(pairs: list[FramePair], events: EventStore) -> str:

@@ -48,12 +48,12 @@ def clock_findings(capture: Capture, estimate: SensorEstimate | None) -> list[Fi
     """A warning where the estimated clock is far from what capture.json says."""
     if estimate is None or not estimate.clock.differs:
         return []
-    findings = Findings()
+    findings, aligning = Findings(), _aligning_us(estimate.clock, capture.clock_offset_us)
     findings.warning(
         capture.path / "capture.json",
         "events.clock_offset_us",
         f"{capture.clock_offset_us}, with which events {_lag_text(estimate.clock)}",
         "events and frames on one clock",
-        f"Try {_aligning_us(estimate.clock, capture.clock_offset_us)}.",
+        f"Write {aligning} there, or import again with --clock-offset-us {aligning}.",
     )
     return findings.items
