@@ -20,6 +20,8 @@ import torch
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
+from evsplat.body import Body, default_body
+
 # Workers beside each other share the cores; processes that tests start take the same number.
 if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
     threads = max(1, (os.cpu_count() or 1) // workers)
@@ -94,6 +96,12 @@ def recordings_root() -> Path:
 def demo_capture_path() -> Path:
     """The capture that ships with the package."""
     return REPOSITORY / "src" / "evsplat" / "data" / "demo_capture"
+
+
+@pytest.fixture(scope="session")
+def body() -> Body:
+    """The body that ships, of middling shape."""
+    return default_body()
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import default_body
 from evsplat.body.pose_noise import (
     NOISE_PRESETS,
     PoseNoise,
@@ -15,11 +14,6 @@ from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import ConfigError
 
 from .helpers import posed_joints
-
-
-@pytest.fixture(scope="module")
-def body():
-    return default_body()
 
 
 def bent_poses(body, times, seed=0):

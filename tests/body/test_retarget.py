@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import Body, axis_angle_to_matrix, default_body
+from evsplat.body import axis_angle_to_matrix
 from evsplat.body.retarget import COLLAR_SHARE, retarget, smallest_rotation
 from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.skeleton import find_skeleton
@@ -34,11 +34,6 @@ BONES = [
         ("shin", "foot"),
     )
 ]
-
-
-@pytest.fixture(scope="module")
-def body() -> Body:
-    return default_body()
 
 
 def own_skeleton(body):

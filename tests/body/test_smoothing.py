@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import CubicSpline, make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import BodyTrack, default_body
+from evsplat.body import BodyTrack
 from evsplat.body.smoothing import (
     _STIFFNESSES,
     MotionNoise,
@@ -15,11 +15,6 @@ from evsplat.body.smoothing import (
     moving_joints,
     smoothed,
 )
-
-
-@pytest.fixture(scope="module")
-def body():
-    return default_body()
 
 
 def motion(body, seed: int, keys: int = 60, gap_s: float = 0.04):

@@ -7,7 +7,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import BodyTrack, default_body
+from evsplat.body import BodyTrack
 from evsplat.body.spline_error import (
     _CARRIED,
     _ERROR_RATIO,
@@ -15,11 +15,6 @@ from evsplat.body.spline_error import (
     apart_from_errors,
     spline_error,
 )
-
-
-@pytest.fixture(scope="module")
-def body():
-    return default_body()
 
 
 def wander(body, seed: int, keys_per_bend: float):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from evsplat.body import Body, default_body
+from evsplat.body import Body
 from evsplat.gaussians import (
     FEATURE_DIM,
     BodyFrames,
@@ -14,11 +14,6 @@ from evsplat.gaussians import (
 )
 from evsplat.gaussians.flip import REACH_M
 from evsplat.gaussians.initialise import gaussians_at
-
-
-@pytest.fixture(scope="module")
-def body() -> Body:
-    return default_body()
 
 
 def frames_of(body: Body, seed: int) -> BodyFrames:

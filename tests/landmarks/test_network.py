@@ -23,11 +23,6 @@ LARGEST = {"points": 256.0, "flag": 1.0, "mask": 64.0, "heat": 64.0, "world": 1.
 """Outputs are compared as shares of what they reach."""
 
 
-@pytest.fixture(scope="module")
-def network() -> LandmarkNetwork:
-    return LandmarkNetwork()
-
-
 def demo_crop() -> torch.Tensor:
     """The dancer of the capture that ships, blurry."""
     capture = load_capture(demo_capture())

@@ -12,7 +12,7 @@ import torch
 from evsplat.body.skeleton import find_skeleton
 from evsplat.capture import Policy, load_body_track, load_capture
 from evsplat.errors import DataError
-from evsplat.landmarks import LandmarkNetwork, find_landmarks, sharp_pictures
+from evsplat.landmarks import find_landmarks, sharp_pictures
 from evsplat.landmarks.detect import MIRRORED, Found, Region, find_in
 from evsplat.landmarks.landmarks import BLAZEPOSE_33
 from evsplat.landmarks.motion import Motion, global_shift, pieces
@@ -43,11 +43,6 @@ class Changed:
     def median_background(self):
         pictures = torch.stack([self.image(frame) for frame in self.train_frames])
         return pictures.median(0).values
-
-
-@pytest.fixture(scope="module")
-def network() -> LandmarkNetwork:
-    return LandmarkNetwork()
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +104,16 @@ def test_points_of_somebody_hardly_recognised_count_alike(middles, carried, beli
     # 0.8 pixels in a region of 100, and what the copies disagree by.
     expected = factor * picture.sigma * np.hypot(0.8, spread)
     np.testing.assert_allclose(_sigma(picture, found), expected)
+
+
+def test_points_at_which_the_copies_disagree_count_less(middles):
+    spread, visible = np.linspace(0, 1.4, 33), np.linspace(1, 0.3, 33)
+    nowhere, region = np.zeros((33, 3)), Region(np.zeros(2), 100.0)
+    found = Found(nowhere[:, :2], spread, visible, nowhere, 0.9, region)
+    assert found.is_person
+    # Twice the 0.8 pixels that clear points have in such a region halve the belief.
+    np.testing.assert_allclose(_seen(middles[0], found), 0.9 * visible / (1 + (spread / 1.6) ** 2))
+    np.testing.assert_allclose(_sigma(middles[0], found), middles[0].sigma * np.hypot(0.8, spread))
 
 
 def somebody(flag: float, doubt: float = 0.0) -> Found:

@@ -5,15 +5,10 @@ import pytest
 from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import BodyTrack, PoseErrors, default_body
+from evsplat.body import BodyTrack, PoseErrors
 from evsplat.posing.bridging import _GOES_ON_S, _LONGEST_END_S, _LONGEST_S, _SMOOTH_S, bridged
 
 EXPOSURE_US, PERIOD_US, FRAMES = 30_000, 66_000, 14
-
-
-@pytest.fixture(scope="module")
-def body():
-    return default_body()
 
 
 def smooth_motion(body, seed: int):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.body import BodyTrack, PoseErrors, default_body
+from evsplat.body import BodyTrack, PoseErrors
 from evsplat.capture import load_body_track
 from evsplat.posing import pieces as cutting
 from evsplat.posing import refine as refining
@@ -17,11 +17,6 @@ from ..seen import seen
 
 KEYS = np.arange(40) * 40_000
 SPANS = [(0, 600_000), (440_000, 1_120_000), (1_000_000, int(KEYS[-1]))]
-
-
-@pytest.fixture(scope="module")
-def body():
-    return default_body()
 
 
 def moving_track(body, seed=0, errors=None):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.body import BodyTrack, default_body
+from evsplat.body import BodyTrack
 from evsplat.body.silhouette import silhouette
 from evsplat.body.surface import vertex_normals
 from evsplat.camera import Camera
@@ -35,11 +35,6 @@ from evsplat.posing.time_limit import TimeLimit
 from ..seen import seen
 
 TIMES = list(range(0, 400_001, 20_000))
-
-
-@pytest.fixture(scope="module")
-def body():
-    return default_body()
 
 
 def still_track(body, keys=11):

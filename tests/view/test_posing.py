@@ -4,17 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.body import BodyTrack, default_body
+from evsplat.body import BodyTrack
 from evsplat.body.skeleton import find_skeleton
 from evsplat.view.posing import HeldPose, pose_sliders, turned
 
 UP, LEFT, AHEAD = np.eye(3)[2], np.eye(3)[0], -np.eye(3)[1]
 """Of the body that ships: z up, facing -y, its left at +x."""
-
-
-@pytest.fixture(scope="module")
-def body():
-    return default_body()
 
 
 def _joints(body, rotations):
