@@ -34,6 +34,8 @@ from interruption import KINDS, Disk, Interruption, Outcome, Usual, run  # noqa:
 from tests.conftest import write_tiny_capture  # noqa: E402
 from tests.small_model import SMALL  # noqa: E402
 
+from evsplat.training import loop  # noqa: E402
+
 EXPECTED = {
     "kill": {-9},
     "term": {130, -15},
@@ -71,8 +73,7 @@ class Job:
 
 def save_after_every_step() -> None:
     """Checkpoints have no time between them."""
-    # The package has a function of the module's name.
-    vars(import_module("evsplat.training.train"))["CHECKPOINT_SECONDS"] = 0.0
+    loop.CHECKPOINT_SECONDS = 0.0
 
 
 def jobs(given: Path) -> dict[str, Job]:

@@ -58,9 +58,8 @@ def _telling(work: Callable[..., None], out: Path, *given: Any) -> None:
 
 
 def _train(out: Path, capture: Path, asked: dict[str, Any], without: Sequence[str]) -> None:
-    training = importlib.import_module("evsplat.training.train")
-    training.CHECKPOINT_SECONDS = 0.0
-    training.train(capture, out=out, threads=1, **asked)
+    importlib.import_module("evsplat.training.loop").CHECKPOINT_SECONDS = 0.0
+    importlib.import_module("evsplat.training").train(capture, out=out, threads=1, **asked)
     assert not set(without) & set(sys.modules)
 
 

@@ -33,6 +33,7 @@ from evsplat.config import Setting, settings, to_dict  # noqa: E402
 from evsplat.config_docs import flow  # noqa: E402
 from evsplat.errors import EvsplatError  # noqa: E402
 from evsplat.methods import DEFAULT_METHOD, TRAINABLE  # noqa: E402
+from evsplat.training import loop  # noqa: E402
 from evsplat.training.run import load_run  # noqa: E402
 from evsplat.training.train import train  # noqa: E402
 
@@ -202,7 +203,7 @@ def main() -> None:
     options = parser.parse_args()
     logging.disable()
     torch.set_num_threads(1)
-    sys.modules[train.__module__].LOG_EVERY = 1
+    loop.LOG_EVERY = 1
     for title, value in (rows := measured(options.method, inert=options.inert)).items():
         print(f"| {title} | {f'{len(value)}: ' if isinstance(value, list) else ''}{value} |")
     print(json.dumps(rows))

@@ -1,6 +1,5 @@
 """A bench that is killed, fails in places or is asked again ends with the same table."""
 
-import importlib
 import json
 import os
 import random
@@ -25,7 +24,7 @@ from evsplat.cli import main
 from evsplat.errors import ConfigError
 from evsplat.evaluation import evaluate
 from evsplat.restore import WEIGHT_FILES
-from evsplat.training import load_run
+from evsplat.training import load_run, loop
 from evsplat.training.checkpoint import latest_checkpoint
 from evsplat.training.trainer import Trainer
 from evsplat.untrusted.text import read_json
@@ -33,8 +32,6 @@ from evsplat.untrusted.text import read_json
 from ..own_process import errors_of, start_bench
 from ..small_model import SMALL
 from .helpers import MEDIAN, PAPER, cells_in_this_process, records, write_suite
-
-training = importlib.import_module("evsplat.training.train")
 
 
 def wait_until_begun(lock: Path, process: BaseProcess, *, before: str) -> str:
@@ -76,7 +73,7 @@ def test_killed_at_random_moments_and_started_again_it_ends_with_the_same_record
 
 def test_a_cell_that_died_goes_on_from_its_checkpoint(tiny_capture, tmp_path, monkeypatch):
     suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, PAPER)
-    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
     step, seen = Trainer.step, []
 
     def counted(trainer, stop_at=None):

@@ -16,7 +16,7 @@ import torch
 from evsplat.cli import main
 from evsplat.disk import held
 from evsplat.errors import ConfigError, DataError, MachineError, OutputError
-from evsplat.training import Stopped, load_run, train
+from evsplat.training import Stopped, load_run, loop, train
 from evsplat.training.checkpoint import checkpoints
 from evsplat.training.trainer import Trainer
 from evsplat.training_sign import is_training
@@ -102,7 +102,7 @@ def test_a_run_without_a_checkpoint_is_begun_anew_with_an_empty_log(tiny_capture
 def test_a_run_goes_on_from_before_a_damaged_checkpoint(
     tiny_capture, tmp_path, caplog, monkeypatch
 ):
-    monkeypatch.setattr(MODULE, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
     capture = tiny_capture()
     options = {"iterations": 6, "overrides": small("evsplat")}
     whole = train(capture, out=tmp_path / "whole", **options)

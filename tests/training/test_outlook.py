@@ -3,14 +3,13 @@
 import io
 import logging
 import shutil
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
 
-from evsplat.training import load_run, train
+from evsplat.training import load_run, loop, train
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
 from evsplat.training.outlook import FIRST, PARTS, REST, SPAN, Outlook
 from evsplat.training.trainer import Trainer
@@ -122,8 +121,7 @@ def test_a_run_on_poses_that_err_makes_all_its_steps(tiny_capture, tmp_path, mon
 
 
 def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(ended, tmp_path, monkeypatch):
-    module = sys.modules["evsplat.training.train"]  # its name in the package is the function
-    step, usual = Trainer.step, module.CHECKPOINT_SECONDS
+    step, usual = Trainer.step, loop.CHECKPOINT_SECONDS
     turn = load_run(ended.out).iteration - round(STEPS * REST)
     for kill_at in (turn - 1, turn + 3):
 
@@ -131,7 +129,7 @@ def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(ended, tmp_path, 
             if self.clock.iteration == kill_at:
                 raise Killed
             if self.clock.iteration == kill_at - 1:  # saved behind the last step, not behind each
-                monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
+                monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
             return step(self)
 
         out = tmp_path / f"killed{kill_at}"
@@ -139,7 +137,7 @@ def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(ended, tmp_path, 
         with pytest.raises(Killed):
             train(ended.capture, out=out, overrides=ended.settings)
         monkeypatch.setattr(Trainer, "step", step)
-        monkeypatch.setattr(module, "CHECKPOINT_SECONDS", usual)
+        monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", usual)
         assert int(latest_checkpoint(out / "checkpoints").stem) == kill_at
         train(ended.capture, out=out, resume=True)
         ends = [load_checkpoint(latest_checkpoint(run / "checkpoints")) for run in (ended.out, out)]

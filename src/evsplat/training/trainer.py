@@ -1,4 +1,4 @@
-"""The training loop: draw a frame, render what the objectives need, compare, step, densify."""
+"""A training step: draw a frame, render what the objectives need, compare, step, densify."""
 
 import logging
 import math
