@@ -80,12 +80,12 @@ def test_sizes_are_those_expected_at_each_key_and_linear_between(seed):
     )
     for each in (sized, plain):
         fill(each.errors, seed)
-    times = [5 * STEP_US, int(6.25 * STEP_US), -10]
+    times = [5 * STEP_US, int(6.25 * STEP_US), -10, (KEYS + 1) * STEP_US]
     turns, shifts = (value.detach().numpy() for value in sized.residual(times))
     unit_turns, unit_shifts = (value.detach().numpy() for value in plain.residual(times))
-    at = [joint_rad[5], 0.75 * joint_rad[6] + 0.25 * joint_rad[7], joint_rad[0]]
+    at = [joint_rad[5], 0.75 * joint_rad[6] + 0.25 * joint_rad[7], *joint_rad[[0, -1]]]
     assert np.allclose(turns, unit_turns * np.array(at)[..., None], atol=1e-5)
-    at = [root_m[5], 0.75 * root_m[6] + 0.25 * root_m[7], root_m[0]]
+    at = [root_m[5], 0.75 * root_m[6] + 0.25 * root_m[7], *root_m[[0, -1]]]
     assert np.allclose(shifts, unit_shifts * np.array(at), atol=1e-5)
     assert not turns[:, 3].any()
 
