@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from evsplat.body import axis_angle_to_matrix
-from evsplat.body.retarget import COLLAR_SHARE, retarget, smallest_rotation
+from evsplat.body.retarget import COLLAR_SHARE, rest_from_zero, retarget, smallest_rotation
 from evsplat.body.rotations import nearest_axis_angle
 from evsplat.body.skeleton import find_skeleton
 from evsplat.errors import DataError
@@ -299,3 +299,20 @@ def test_vectors_follow_each_other_and_mean_the_same_rotations(seed):
     assert np.allclose(turns, np.round(turns), atol=1e-9)
     same = Rotation.from_rotvec(found[:, 0]) * Rotation.from_rotvec(written[:, 0]).inv()
     assert same.magnitude().max() < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_between_poses_that_lie_askew_the_whole_turn_is_found_and_nothing_is_stretched(seed):
+    names, parents, joints = tables(SMPL)
+    skeleton = find_skeleton(parents.tolist(), names)
+    rng = np.random.default_rng(seed)
+    # From no axis to any other by less than 35 degrees.
+    turn = Rotation.from_rotvec(np.radians(45) * np.eye(3)[seed]).as_matrix()
+    turn = turn @ Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix()
+    found = rest_from_zero(skeleton, joints, skeleton, joints @ turn.T)
+    np.testing.assert_allclose(found, turn, atol=1e-9)
+    # What differs by a few degrees only is taken as drawn along axes.
+    lean = Rotation.from_rotvec([np.radians(9), 0, 0]).as_matrix()
+    np.testing.assert_allclose(
+        rest_from_zero(skeleton, joints, skeleton, joints @ lean.T), np.eye(3)
+    )

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from evsplat.calibration import flicker_period_us
+from evsplat.calibration.flicker import _STEP_US, _period_us
 from evsplat.events import EventStore, EventStream, SensorSimulator, sensor_settings, write_events
 
 HEIGHT, WIDTH = 20, 28
@@ -73,3 +74,19 @@ def test_nothing_is_found_in_too_little(tmp_path):
     blind = EventStream(no_signs.t, no_signs.x, no_signs.y, 0 * no_signs.p)
     write_events(tmp_path / "blind.h5", blind)
     assert flicker_period_us(EventStore(tmp_path / "blind.h5", WIDTH, HEIGHT)) is None
+
+
+@pytest.mark.parametrize("second", [0.95, 1.15])
+def test_of_several_periods_the_first_is_told_though_the_next_fits_a_little_better(second):
+    """A signal that is like itself after 20.5 steps, after twice as many, and a little before."""
+    lags = np.arange(80)
+    alike = 10 * np.cos(2 * np.pi * lags / 20.5)
+    alike[31:52] *= second
+    alike[13:16] = 3, 6, 3
+    assert _period_us(alike) == pytest.approx(20.5 * _STEP_US, rel=0.01)
+
+
+def test_a_signal_that_comes_again_hardly_has_no_period():
+    lags = np.arange(80)
+    assert _period_us(np.cos(2 * np.pi * lags / 20.5) * np.exp(-lags / 4)) is None
+    assert _period_us(np.exp(-lags / 4)) is None

@@ -114,3 +114,23 @@ def test_event_lookup_follows_the_pictures_pixels() -> None:
             max(0, to_y - 1) : to_y + 2, max(0, to_x - 1) : to_x + 2
         ]
         assert spot.max() > 0.2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_resized_camera_stretches_each_side_by_its_own_factor(seed: int) -> None:
+    camera = random_camera(seed)
+    points = torch.randn(20, 3, generator=torch.Generator().manual_seed(seed))
+    resized = camera.resized(WIDTH // 2, 3 * HEIGHT)
+    assert (resized.width, resized.height) == (WIDTH // 2, 3 * HEIGHT)
+    (before, depth), (after, same) = camera.project(points), resized.project(points)
+    torch.testing.assert_close(after, before * torch.tensor([0.5, 3.0]), atol=1e-3, rtol=1e-4)
+    assert torch.equal(depth, same)
+
+
+def test_a_widened_camera_has_its_picture_in_the_middle() -> None:
+    camera = random_camera(0)
+    wide = camera.widened(7, 11)
+    assert (wide.width, wide.height) == (WIDTH + 14, HEIGHT + 22)
+    points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    moved = wide.project(points)[0] - camera.project(points)[0]
+    assert torch.allclose(moved, torch.tensor([7.0, 11.0]), atol=1e-2)

@@ -19,6 +19,7 @@ from evsplat.events import (
     voxel_grid,
     window_counts,
 )
+from evsplat.events import maps as maps_module
 
 WIDTH, HEIGHT = 19, 13
 EVENTCV_VOXEL_US = 30_000
@@ -196,6 +197,10 @@ def test_counts_of_windows_are_those_of_each_and_what_has_begun(
         expected = expected + begun[1:] - begun[:-1]
     counts = window_counts(stream, at, HEIGHT, WIDTH, reach_us=reach_us)
     assert (counts - expected).abs().max() < 1e-5
+    with pytest.MonkeyPatch.context() as without:
+        without.setattr(maps_module, "native", None)
+        plain = window_counts(stream, at, HEIGHT, WIDTH, reach_us=reach_us)
+    assert (plain - expected).abs().max() < 1e-5
 
 
 def test_nothing_has_begun_between_opposite_or_distant_events() -> None:

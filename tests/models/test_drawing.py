@@ -9,7 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from evsplat.capture import load_capture
 from evsplat.errors import ConfigError
-from evsplat.models.drawing import _enlarge, draw, draw_for_training, shadowed_scene
+from evsplat.models.drawing import (
+    _enlarge,
+    draw,
+    draw_depth,
+    draw_for_training,
+    shadowed_scene,
+)
 from evsplat.models.scene_places import places_of
 from evsplat.render import LOW_PASS, Splats, render
 
@@ -223,3 +229,30 @@ def test_a_point_of_the_scene_moves_in_the_pictures_as_the_camera_does(shadowed,
         assert (found - each.project(place[:3])[0]).abs().max() < 0.05
     ways = [each.project(place[:3])[0] for each in cameras]
     assert (ways[1] - ways[0]).norm() > 0.2
+
+
+def large(depth_m: float, opacity: float, camera) -> Splats:
+    """A Gaussian on the camera's axis that fills its picture."""
+    pose = camera.world_to_camera
+    means = (torch.tensor([0.0, 0.0, depth_m]) - pose[:3, 3]) @ pose[:3, :3]
+    return Splats(
+        means=means[None, None],
+        quaternions=torch.tensor([[[1.0, 0, 0, 0]]]),
+        scales=torch.full((1, 1, 3), 50.0),
+        opacities=torch.tensor([[opacity]]),
+        channels=torch.rand(1, 1, 4),
+    )
+
+
+def test_depth_is_the_mean_of_what_is_shown_however_little_covers_the_pixel(shadowed):
+    _, layers, camera = shadowed
+    person, wall = large(2.0, 0.4, camera), large(5.0, 0.5, camera)
+    layers = replace(layers, human=person, scene=wall)
+    middle = camera.height // 2, camera.width // 2
+    shares = 0.4, 0.6 * 0.5
+    both = (2 * shares[0] + 5 * shares[1]) / sum(shares)
+    for parts, expected in (("human", 2.0), ("scene", 5.0), ("all", both)):
+        found = draw_depth(layers, camera, parts=parts)
+        assert float(found[0][middle]) == pytest.approx(expected, rel=1e-3), parts
+    nothing = replace(layers, human=large(2.0, 0.0, camera))
+    assert not draw_depth(nothing, camera, parts="human").any()

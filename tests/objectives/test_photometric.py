@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from evsplat.objectives import Photometric
+from evsplat.pictures.box import Box
 from evsplat.similarity import ssim
 
 
@@ -36,3 +37,29 @@ def test_terms_without_weight_are_not_computed_and_the_middle_of_the_exposure_is
     assert set(objective.loss(step)) == {"l1"}
     assert objective.times(step.capture.train_frames[1], 0.0) == (20,)
     assert objective.state() == {}
+
+
+def test_the_perceptual_distance_is_of_crops_between_minus_one_and_one_that_are_large_enough():
+    plain, step, pictures = make(1)
+    seen = []
+
+    def metric(image, reference):
+        seen.append((image, reference))
+        return (image - reference).abs().mean()
+
+    metric.network = SimpleNamespace(min_side=8)
+    boxes = {"a": Box(2, 18, 3, 11), "b": Box(2, 18, 3, 10)}
+    for chosen, crops in ((boxes, 1), (boxes | {"a": None}, 0)):
+        seen.clear()
+        objective = Photometric(
+            step.capture, lambda frame, at=chosen: at[frame.name], dssim=True, perceptual=metric
+        )
+        terms = objective.loss(step)
+        assert len(seen) == crops and {"l1", "dssim"} <= set(terms)
+        if not crops:
+            assert "perceptual" not in terms
+            continue
+        image, reference = seen[0]
+        assert torch.equal(image, 2 * step.rgb[0][2:18, 3:11] - 1)
+        assert torch.equal(reference, 2 * pictures["a"][2:18, 3:11] - 1)
+        assert float(terms["perceptual"]) == pytest.approx(float((image - reference).abs().mean()))

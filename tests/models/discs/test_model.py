@@ -1,6 +1,7 @@
 """The disc model put together: who carries a disc, what lights it, and where gradients reach."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -335,3 +336,24 @@ def test_random_points_take_their_colours_from_a_network_that_sees_the_direction
         if value.numel() and (value.grad is None or not value.grad.any())
     ]
     assert silent == []
+
+
+def test_cameras_that_stand_in_one_place_see_the_shadows_that_one_camera_sees(tiny_capture):
+    """Of a camera that moves, each time's picture lies in the shadow of its own time."""
+    model, capture, _, _ = model_of(tiny_capture(frames=10))
+    activate(model)
+    with torch.no_grad():
+        model.shadow.share_logits.fill_(1.0)
+    frame = capture.train_frames[0]
+    times = [each.mid_us for each in capture.train_frames[:5:2]]
+    camera = capture.camera(frame)
+    one, several = (
+        model.training_drawing(times, frame, cameras, torch.Generator().manual_seed(0))
+        for cameras in ([camera] * 3, [replace(camera) for _ in times])
+    )
+    pictures = torch.stack(one.rgb)
+    torch.testing.assert_close(torch.stack(several.rgb), pictures, atol=1e-5, rtol=0)
+    with torch.no_grad():
+        model.shadow.share_logits.fill_(-50.0)
+        light = model.training_drawing(times, frame, [camera] * 3, torch.Generator().manual_seed(0))
+    assert (torch.stack(light.rgb) - pictures).abs().max() > 0.05

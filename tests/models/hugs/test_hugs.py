@@ -219,3 +219,13 @@ def test_without_masks_it_says_what_to_run(tiny_capture):
     (path / "capture.json").write_text(json.dumps(document))
     with pytest.raises(DataError, match=r"no mask .* evsplat masks"):
         composed(path)
+
+
+def test_gaussians_are_drawn_with_the_sizes_that_densification_reads(tiny_capture):
+    capture = load_capture(tiny_capture(frames=10))
+    model = composed(capture.path).model
+    with torch.no_grad():
+        model.human.scales_log += 0.5 * torch.randn_like(model.human.scales_log)
+    frame = capture.train_frames[0]
+    layers = model.at([frame.mid_us], capture.camera(frame).center())
+    torch.testing.assert_close(layers.human.scales[0].abs(), model.human.shape().scales)

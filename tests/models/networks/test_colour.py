@@ -5,10 +5,12 @@ import math
 import pytest
 import torch
 
+from evsplat.camera import Camera
 from evsplat.models.networks.colour import (
     HumanColour,
     SceneColour,
     beside_basis,
+    scene_rgb,
     view_directions,
     view_jitter,
 )
@@ -121,3 +123,19 @@ def test_compiled_view_directions_equal_plain_torch_in_float64(seed, turned):
     plain = view_directions(positions.double(), center.double(), *(m.double() for m in more))
     torch.testing.assert_close(compiled.double(), plain, rtol=1e-4, atol=1e-5)
     assert not compiled.requires_grad and (compiled[1, 7] == 0).all()
+
+
+@pytest.mark.parametrize("hide", [False, True])
+def test_a_scenes_colours_are_asked_for_where_the_pictures_reach_alone(hide):
+    torch.manual_seed(1)
+    network, features = SceneColour(), torch.randn(9, 32)
+    camera = Camera(32, 24, torch.tensor([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]]), torch.eye(4))
+    means = torch.tensor([0.0, 0.0, 4.0]) + 0.3 * torch.randn(9, 3)
+    means[::2] *= -1  # behind the camera
+    scales, center = torch.full((9, 3), 0.01), torch.tensor([0.2, -0.1, 0.3])
+    found = scene_rgb(network, features, means, scales, center, shown=[camera], hide_direction=hide)
+    whole = scene_rgb(network, features, means, scales, center, shown=[], hide_direction=hide)
+    directions = torch.nn.functional.normalize(means - center, dim=-1) * (not hide)
+    torch.testing.assert_close(whole, network(features, directions), atol=1e-6, rtol=0)
+    torch.testing.assert_close(found[1::2], whole[1::2], atol=1e-6, rtol=0)
+    assert found.shape == (9, 3) and not found[::2].any()
